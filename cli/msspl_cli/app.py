@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The two programs. Heavy modules are imported inside the commands, so that ``--help`` answers at once."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import typer
+
+from msspl_cli.commands import compare, fuse, inspect, models
+from msspl_cli.errors import run
+from oiio_msspl import __version__
+
+_SETTINGS: dict[str, Any] = {
+    "add_completion": False,
+    "rich_markup_mode": "rich",
+    "pretty_exceptions_enable": False,
+    "context_settings": {"help_option_names": ["-h", "--help"]},
+}
+
+fuse_app = typer.Typer(**_SETTINGS)
+fuse_app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
+
+app = typer.Typer(no_args_is_help=True, **_SETTINGS)
+
+
+@app.callback(invoke_without_command=True)
+def _main(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
+    """Look at renders and models, and compare results. To fuse a pair, see [bold]msspl-fuse --help[/bold]."""
+    if version:
+        print(__version__)
+        raise typer.Exit
+
+
+app.command(epilog=inspect.EXAMPLES)(inspect.inspect)
+app.command(epilog=models.EXAMPLES)(models.models)
+app.command(epilog=compare.EXAMPLES)(compare.compare)
+app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
+
+
+def msspl_fuse() -> None:
+    run(fuse_app)
+
+
+def msspl() -> None:
+    run(app)

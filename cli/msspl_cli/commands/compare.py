@@ -1,0 +1,57 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from msspl_cli import options, show
+
+
+EXAMPLES = """[bold]Examples[/bold]
+
+  msspl compare out.exr hr.exr lr.exr --reference ref.exr
+
+  msspl compare out.exr -r ref.exr --error-map error.png
+"""
+
+
+def compare(
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to judge.", show_default=False)],
+    reference: Annotated[
+        Path, typer.Option("--reference", "-r", metavar="EXR", help="What they should be.", show_default=False)
+    ],
+    error_map: Annotated[
+        Path | None,
+        typer.Option(metavar="PNG", help="Write the first image's error as a picture (log RelMSE, dark is small)."),
+    ] = None,
+    overwrite: options.Overwrite = False,
+    as_json: options.Json = False,
+    debug: options.Debug = False,
+) -> None:
+    """Measure images against a reference: PSNR (sRGB), RelMSE in both of the paper's conventions, SSIM.
+
+    Images smaller than the reference by x2, x4 or x8 are upsampled bicubically first.
+    """
+    from oiio_msspl.comparison import compare_files, write_error_map
+
+    results = compare_files(images, reference)
+    if error_map is not None:
+        write_error_map(error_map, images[0], reference, overwrite=overwrite)
+    if as_json:
+        print(json.dumps([{"image": str(p), **scores} for p, scores in zip(images, results, strict=True)], indent=2))
+        return
+    rows = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
+    for path, scores in zip(images, results, strict=True):
+        rows.append(
+            (
+                str(path),
+                f"{scores['psnr']:.2f} dB",
+                f"{scores['relmse']:.5f}",
+                f"{scores['relmse_gharbi']:.5f}",
+                f"{scores['ssim']:.4f}",
+            )
+        )
+    show.table(rows, "")

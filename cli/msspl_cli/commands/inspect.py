@@ -1,0 +1,52 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from msspl_cli import options, show
+
+
+EXAMPLES = """[bold]Examples[/bold]
+
+  msspl inspect hr.exr
+
+  msspl inspect hr.exr --map normal=N_bump --json
+"""
+
+
+def inspect(
+    files: Annotated[list[Path], typer.Argument(metavar="FILE...", help="EXR files.", show_default=False)],
+    mapping: options.Map = [],  # noqa: B006
+    map_file: options.MapFile = None,
+    view_layer: options.ViewLayer = None,
+    as_json: options.Json = False,
+    debug: options.Debug = False,
+) -> None:
+    """Say what a render holds, and which of its layers the network would read.
+
+    A file that can't be used is explained; the exit code is then 2.
+    """
+    from oiio_msspl.inspection import inspect_file
+
+    inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
+    found = [inspect_file(path, inputs) for path in files]
+    if as_json:
+        data = [inspection.as_dict() for inspection in found]
+        print(json.dumps(data if len(data) > 1 else data[0], indent=2))
+    else:
+        for inspection in found:
+            print(inspection.path)
+            for line in inspection.facts:
+                print(f"  {line}")
+            if inspection.resolution is not None:
+                show.aov_table(inspection.resolution)
+                if inspection.passed_through:
+                    print(f"  passed through: {', '.join(inspection.passed_through)}")
+            for problem in inspection.problems:
+                print(f"  can't be used: {problem}")
+    if any(inspection.problems for inspection in found):
+        raise typer.Exit(2)

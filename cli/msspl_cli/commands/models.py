@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from msspl_cli import options, show
+
+
+EXAMPLES = """[bold]Examples[/bold]
+
+  msspl models
+
+  msspl models --json
+"""
+
+
+def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
+    """List the models inside the package, and the devices that can run them."""
+    from oiio_msspl.session import PROVIDERS, Session, shipped_models, usable_devices
+
+    rows: list[dict[str, Any]] = []
+    for name, path in shipped_models().items():
+        contract = Session(path).contract
+        rows.append(
+            {
+                "name": name,
+                "scale": contract.scale,
+                "size_mb": round(path.stat().st_size / 1e6, 1),
+                "training_spp": contract.training_spp,
+                "provenance": contract.provenance,
+            }
+        )
+    devices = usable_devices()
+    if as_json:
+        print(json.dumps({"models": rows, "devices": devices}, indent=2))
+        return
+    header = ("model", "scale", "size", "trained at LRHS spp", "HRLS spp")
+    spans = [["{}-{}".format(*row["training_spp"].get(key, ("?", "?"))) for key in ("lrhs", "hrls")] for row in rows]
+    show.table(
+        [header, *((r["name"], f"x{r['scale']}", f"{r['size_mb']} MB", *s) for r, s in zip(rows, spans, strict=True))],
+        "",
+    )
+    print(f"devices: {', '.join(devices)} (of {', '.join(PROVIDERS)})")

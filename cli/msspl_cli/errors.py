@@ -1,0 +1,27 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exceptions to one sentence and an exit code: 2 for the caller's mistake, 1 for a failure of ours."""
+
+from __future__ import annotations
+
+import sys
+
+import typer
+
+from oiio_msspl.errors import MssplError
+
+
+def run(app: typer.Typer) -> None:
+    """Run a program and exit. Typer itself answers wrong usage with exit code 2; ``--debug`` lets exceptions pass."""
+    try:
+        app()
+    except Exception as error:
+        if "--debug" in sys.argv:
+            raise
+        if isinstance(error, MssplError):
+            message, code = str(error), error.exit_code
+        elif isinstance(error, MemoryError):
+            message, code = "out of memory; try a smaller --max-memory", 1
+        else:
+            message, code = f"unexpected {type(error).__name__}: {error} (--debug shows where)", 1
+        print(f"error: {message}", file=sys.stderr)
+        sys.exit(code)

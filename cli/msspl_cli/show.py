@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Text tables."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from oiio_msspl.aovs import Resolution
+
+
+def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> None:
+    """Print rows with their columns aligned."""
+    widths = [max(len(row[i]) for row in rows) for i in range(len(rows[0]))]
+    for row in rows:
+        print((indent + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip())
+
+
+def aov_table(resolution: Resolution) -> None:
+    """What each feature is read from."""
+    table(
+        [
+            (r["feature"], r["status"], r["source"] + (f" ({r['note']})" if r["note"] else ""))
+            for r in resolution.table()
+        ]
+    )
+    for note in resolution.notes:
+        print(f"  note: {note}")

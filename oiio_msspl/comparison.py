@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Comparing files with a reference."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from oiio_msspl import metrics, schema, transforms
+from oiio_msspl.aovs import Resolution, resolve
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr import open_exr
+from oiio_msspl.output import check_target
+from oiio_msspl.preview import write_png
+from oiio_msspl.render import Array
+
+
+def scores(image: Array, reference: Array) -> dict[str, float]:
+    """``psnr`` (dB), ``relmse`` (0.5, 0.01), ``relmse_gharbi`` (1, 1e-4) and ``ssim`` of two (h, w, 3) pictures."""
+    return {
+        "psnr": metrics.psnr(image, reference),
+        "relmse": metrics.relmse(image, reference),
+        "relmse_gharbi": metrics.relmse(image, reference, metrics.RELMSE_GHARBI),
+        "ssim": metrics.ssim(image, reference),
+    }
+
+
+def compare_files(images: Sequence[Path], reference: Path) -> list[dict[str, float]]:
+    """Scores of each image. One that is smaller by x2, x4 or x8 is upsampled bicubically first.
+
+    Raises:
+        InputError: a file can't be read, or its size does not fit the reference.
+    """
+    truth_file = resolve(open_exr(reference))
+    truth = _beauty(truth_file)
+    return [scores(_fitted(resolve(open_exr(path)), truth, reference), truth) for path in images]
+
+
+def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool) -> None:
+    """log10 RelMSE (0.5, 0.01) a pixel, from 1e-5 (black) to 1 (white) on OpenImageIO's "inferno" colours."""
+    check_target(path, overwrite=overwrite)
+    truth = _beauty(resolve(open_exr(reference)))
+    error = metrics.relmse_map(_fitted(resolve(open_exr(image)), truth, reference), truth).mean(axis=-1)
+    grey = ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)
+    mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(grey[..., None])), 0, "inferno")
+    if mapped.has_error:
+        raise MssplError(f"{path}: {mapped.geterror()}")
+    write_png(path, np.asarray(mapped.get_pixels(oiio.FLOAT))[..., :3])
+
+
+def upsample_bicubic(image: Array, width: int, height: int) -> Array:
+    """Bicubic (B-spline free, OpenImageIO's "cubic") resampling; negative lobes are cut at 0."""
+    buffer = oiio.ImageBuf(np.ascontiguousarray(image))
+    result = oiio.ImageBufAlgo.resize(buffer, filtername="cubic", roi=oiio.ROI(0, width, 0, height))
+    return np.maximum(np.asarray(result.get_pixels(oiio.FLOAT), dtype=np.float32), 0)
+
+
+def _beauty(file: Resolution) -> Array:
+    return transforms.repair(file.read(file.data_window, [schema.RGB])[schema.RGB])[0]
+
+
+def _fitted(file: Resolution, truth: Array, reference: Path) -> Array:
+    image = _beauty(file)
+    height, width = truth.shape[:2]
+    if image.shape == truth.shape:
+        return image
+    if any(image.shape[:2] == (-(-height // s), -(-width // s)) for s in schema.SCALES):
+        return upsample_bicubic(image, width, height)
+    raise InputError(
+        f"{file.name} is {image.shape[1]}x{image.shape[0]}, but {reference} is {width}x{height}; "
+        "compare pictures of one size"
+    )

@@ -1,0 +1,94 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What a model needs and was made from, stored in the ONNX file's own metadata.
+
+Training writes it, inference reads it, and refuses a file whose contract it can't honour: so the two cannot disagree
+about scale, channel order, transforms or defaults.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from oiio_msspl import schema, transforms
+from oiio_msspl.errors import InputError
+
+#: Key of the metadata entry in the ONNX file.
+METADATA_KEY = "msspl"
+#: Raised when the meaning of a field changes; a newer file is refused by older code.
+FORMAT = 1
+
+
+def current_transforms() -> dict[str, Any]:
+    """The transforms that this version of the code applies, as the contract records them."""
+    return {
+        "curve": "log1p",
+        "mu": transforms.MU,
+        "key": transforms.KEY,
+        "max_radiance": transforms.MAX_RADIANCE,
+        "max_albedo": transforms.MAX_ALBEDO,
+    }
+
+
+@dataclass(frozen=True)
+class Contract:
+    """Everything that inference must know about a model.
+
+    ONNX inputs: ``lrhs`` (1, C_l, h, w) and ``hrls`` (1, C_h, s*h, s*w), float32, transformed;
+    output: ``fused`` (1, 3, s*h, s*w), transformed RGB.
+    """
+
+    name: str
+    """Short name, e.g. ``paper-x4``."""
+    scale: int
+    """Upsampling factor s: 2, 4 or 8."""
+    alignment: int = 1
+    """Height and width of the LRHS must be multiples of this, in LRHS pixels."""
+    overlap: int = 16
+    """LRHS pixels that neighbouring tiles share on each side: the network's receptive field, or what of it matters."""
+    bytes_per_pixel: int = 2000
+    """Peak memory of a tile for each of its HRLS pixels, measured at export: bounds the tile size."""
+    lrhs: list[str] = field(default_factory=lambda: schema.channel_names(schema.LRHS_FEATURES))
+    hrls: list[str] = field(default_factory=lambda: schema.channel_names(schema.HRLS_FEATURES))
+    transforms: dict[str, Any] = field(default_factory=current_transforms)
+    defaults: dict[str, float] = field(default_factory=lambda: dict(schema.DEFAULTS))
+    training_spp: dict[str, list[int]] = field(default_factory=dict)
+    """Lowest and highest spp seen in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
+    provenance: dict[str, Any] = field(default_factory=dict)
+    """Where the weights come from: data, steps, loss, seed, date, code version."""
+    format: int = FORMAT
+
+    def to_json(self) -> str:
+        return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def from_json(cls, text: str, source: str) -> Contract:
+        """Read a contract; ``source`` names the model file in errors.
+
+        Raises:
+            InputError: it is no contract, or one that this version can't honour.
+        """
+        try:
+            contract = cls(**json.loads(text))
+        except (ValueError, TypeError) as error:
+            raise InputError(
+                f"{source}: the '{METADATA_KEY}' metadata can't be read ({error}); export it again"
+            ) from error
+        if contract.format != FORMAT:
+            raise InputError(
+                f"{source}: contract format {contract.format}, this version reads {FORMAT}; update one of them"
+            )
+        expected = {
+            "lrhs": schema.channel_names(schema.LRHS_FEATURES),
+            "hrls": schema.channel_names(schema.HRLS_FEATURES),
+            "transforms": current_transforms(),
+        }
+        for key, value in expected.items():
+            if getattr(contract, key) != value:
+                raise InputError(
+                    f"{source}: made for {key} {getattr(contract, key)}, this version has {value}; export it again"
+                )
+        if contract.scale not in schema.SCALES:
+            raise InputError(f"{source}: scale {contract.scale} is none of {schema.SCALES}")
+        return contract

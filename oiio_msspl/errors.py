@@ -1,0 +1,16 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Exceptions whose message is one sentence for the user: what was seen, where, and what to do."""
+
+from __future__ import annotations
+
+
+class MssplError(Exception):
+    """Something failed that the caller could not have avoided (exit code 1)."""
+
+    exit_code = 1
+
+
+class InputError(MssplError):
+    """The caller's mistake: a file, an option or a pair that can't be used (exit code 2)."""
+
+    exit_code = 2

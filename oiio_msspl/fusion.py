@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The method: an LRHS and an HRLS in, the fused frame out."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl import checks, schema, tensors, tiling, transforms
+from oiio_msspl.errors import InputError
+from oiio_msspl.pairing import Pairing, Source, pair
+from oiio_msspl.render import Array, Window
+from oiio_msspl.session import Session
+
+#: Memory that a run may use by default.
+MAX_MEMORY = 3 << 30
+#: Interpreter, libraries, weights and buffers that do not grow with the frame.
+FIXED_MEMORY = 350 << 20
+
+
+@dataclass
+class Fused:
+    """The result over the HRLS's data window."""
+
+    rgb: Array
+    """Scene linear, (height, width, 3), finite and >= 0."""
+    alpha: Array | None
+    """(height, width, 1) in [0, 1], or None if the HRLS has none."""
+    pairing: Pairing
+    exposure: float
+    """What the scene was scaled by for the network."""
+    repaired: dict[str, int]
+    """Values that were NaN, infinite or (but for normals) negative, by layer, ``lrhs.`` or ``hrls.`` in front."""
+    warnings: list[str] = field(default_factory=list)
+    tiles: int = 1
+    seconds: float = 0.0
+    """In the network alone."""
+
+
+def fuse(
+    lr: Source,
+    hr: Source,
+    session: Session,
+    *,
+    max_memory: int = MAX_MEMORY,
+    progress: Callable[[int, int], None] | None = None,
+) -> Fused:
+    """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
+
+    Args:
+        lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.resolve`) or renders in memory.
+        session: a model for the pair's scale.
+        max_memory: bytes that the whole process should stay below.
+        progress: called with (tiles done, tiles in all).
+
+    Raises:
+        InputError: the pair does not fit, or the model is for another scale.
+    """
+    pairing = pair(lr, hr)
+    contract = session.contract
+    if contract.scale != pairing.scale:
+        raise InputError(f"model {contract.name} is for x{contract.scale}, but this pair is x{pairing.scale}")
+    scale, grid = pairing.scale, pairing.grid
+
+    lr_repaired: dict[str, int] = {}
+    low = tensors.read(lr, grid, pairing.lr_data, counts=lr_repaired, counted=grid)
+    exposure = transforms.exposure_of(low[schema.RGB])
+    warnings = checks.check(low[schema.RGB], hr, pairing, lr.name)
+    lrhs = tensors.pack(low, schema.LRHS_FEATURES, exposure)
+
+    hr_data = pairing.hr_data
+    rgb = np.empty((hr_data.height, hr_data.width, 3), dtype=np.float32)
+    alpha: Array | None = None
+    hr_repaired: dict[str, int] = {}
+    # What is held of the frame: the result (colour and alpha), and the LRHS as it is and as the network wants it.
+    frame_bytes = rgb.nbytes * 4 // 3 + lrhs.nbytes + sum(values.nbytes for values in low.values())
+    largest = _largest_tile(session, frame_bytes, max_memory)
+    plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
+    seconds = 0.0
+    for done, tile in enumerate(plan):
+        area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
+        target = core.intersect(hr_data)
+        layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
+        start = time.perf_counter()
+        hrls = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
+        values = session.run(np.ascontiguousarray(lrhs[tile.area.slices(grid)]), hrls)
+        rgb[target.slices(hr_data)] = transforms.expand(values[target.slices(area)], exposure)
+        if "alpha" in layers:
+            if alpha is None:
+                alpha = np.empty((hr_data.height, hr_data.width, 1), dtype=np.float32)
+            low_alpha = low["alpha"][tile.area.slices(grid)] if "alpha" in low else None
+            alpha[target.slices(hr_data)] = _fuse_alpha(low_alpha, layers, session, scale)[target.slices(area)]
+        seconds += time.perf_counter() - start
+        if progress is not None:
+            progress(done + 1, len(plan))
+    if alpha is not None and "alpha" not in low:
+        warnings.append("the LRHS has no alpha: the HRLS's is passed through as it is")
+    repaired = {f"lrhs.{k}": v for k, v in lr_repaired.items()} | {f"hrls.{k}": v for k, v in hr_repaired.items()}
+    return Fused(rgb, alpha, pairing, exposure, repaired, warnings, len(plan), seconds)
+
+
+def _scaled(window: Window, scale: int) -> Window:
+    return Window(window.x0 * scale, window.y0 * scale, window.x1 * scale, window.y1 * scale)
+
+
+def _largest_tile(session: Session, frame_bytes: int, max_memory: int) -> int:
+    """LRHS pixels of the largest tile that fits beside what is kept of the frame."""
+    contract = session.contract
+    left = max_memory - FIXED_MEMORY - frame_bytes
+    pixels = min(left // contract.bytes_per_pixel, tiling.LARGEST)
+    if pixels <= 0:
+        needed = (FIXED_MEMORY + frame_bytes) / 2**30
+        raise InputError(f"--max-memory: this frame alone takes {needed:.1f} GiB; allow at least {needed + 0.5:.1f}G")
+    return int(pixels) // contract.scale**2
+
+
+def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, scale: int) -> Array:
+    """Coverage through the same network, as a grey picture with the HRLS's albedo and normal; (h, w, 1) in [0, 1].
+
+    Where both renders agree that a pixel and its surroundings are wholly covered, or wholly empty, it stays exactly so;
+    a tile that is all one or all the other never reaches the network.
+    """
+    alpha = np.clip(high["alpha"], 0.0, 1.0)
+    if low is None:
+        return high["alpha"]
+    low = np.clip(low, 0.0, 1.0)
+    solid, empty = _settled(low, alpha, scale, 1.0), _settled(low, alpha, scale, 0.0)
+    if (solid | empty).all():
+        return solid.astype(np.float32)
+    grey = {name: values for name, values in high.items() if name in (schema.ALBEDO, schema.NORMAL)}
+    grey[schema.RGB] = np.repeat(alpha, 3, axis=-1)
+    lrhs = tensors.pack({schema.RGB: np.repeat(low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0)
+    values = session.run(lrhs, tensors.pack(grey, schema.HRLS_FEATURES, 1.0))
+    fused = np.clip(transforms.expand(values, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
+    return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
+
+
+def _settled(low: Array, high: Array, scale: int, value: float) -> NDArray[np.bool_]:
+    """Where an HRLS pixel and the 3 x 3 LRHS pixels around it all have ``value``."""
+    same = np.pad((low[..., 0] == value), 1, mode="edge")
+    height, width = low.shape[:2]
+    around = np.ones((height, width), dtype=bool)
+    for dy in range(3):
+        for dx in range(3):
+            around &= same[dy : dy + height, dx : dx + width]
+    return (np.repeat(np.repeat(around, scale, 0), scale, 1) & (high[..., 0] == value))[..., None]

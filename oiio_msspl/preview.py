@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture of the result for a quick look: 8-bit PNG."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.output import replacing
+from oiio_msspl.render import Array, Window
+from oiio_msspl.transforms import srgb
+
+#: Pinned: OpenColorIO's "-latest" configurations change their default view between releases.
+OCIO_CONFIG = "ocio://cg-config-v2.2.0_aces-v1.3_ocio-v2.4"
+OCIO_DISPLAY = "sRGB - Display"
+OCIO_INPUT = "lin_rec709"
+
+
+def write(path: Path, rgb: Array, data_window: Window, display_window: Window, view: str | None = None) -> None:
+    """Write scene-linear ``rgb`` (height, width, 3) over ``data_window`` as it lies in the display window.
+
+    Args:
+        view: None for the paper's sRGB curve; otherwise a view of OpenColorIO's built-in CG configuration, e.g.
+            ``Un-tone-mapped`` or ``ACES 1.0 - SDR Video``.
+
+    Raises:
+        InputError: no such view.
+    """
+    linear = np.zeros((display_window.height, display_window.width, 3), dtype=np.float32)
+    seen = data_window.intersect(display_window)
+    linear[seen.slices(display_window)] = rgb[seen.slices(data_window)]
+    display = srgb(linear) if view is None else _through_ocio(linear, view)
+    write_png(path, display)
+
+
+def write_png(path: Path, display: Array) -> None:
+    """Write display values in [0, 1], (height, width, 3), as an 8-bit PNG, atomically."""
+    height, width = display.shape[:2]
+    pixels = (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8)
+    with replacing(path) as temporary:
+        writer = oiio.ImageOutput.create(str(temporary))
+        if writer is None:
+            raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
+        spec = oiio.ImageSpec(width, height, 3, "uint8")
+        spec.attribute("oiio:ColorSpace", "sRGB")
+        ok = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
+        ok = writer.close() and ok
+        if not ok:
+            raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
+
+
+def _through_ocio(linear: Array, view: str) -> Array:
+    config = oiio.ColorConfig(OCIO_CONFIG)
+    views = config.getViewNames(OCIO_DISPLAY)
+    if view not in views:
+        raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
+    image = oiio.ImageBuf(np.ascontiguousarray(linear))
+    result = oiio.ImageBufAlgo.ociodisplay(
+        image, OCIO_DISPLAY, view, fromspace=OCIO_INPUT, unpremult=False, colorconfig=OCIO_CONFIG
+    )
+    if result.has_error:
+        raise MssplError(f"OpenColorIO: {result.geterror()}")
+    return np.asarray(result.get_pixels(oiio.FLOAT), dtype=np.float32)

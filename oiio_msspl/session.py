@@ -1,0 +1,128 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Models and the runtime that evaluates them: the only module that imports onnxruntime."""
+
+from __future__ import annotations
+
+import logging
+from importlib import resources
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from oiio_msspl.contract import METADATA_KEY, Contract
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.render import Array
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+log = logging.getLogger(__name__)
+
+#: ``--device`` name -> onnxruntime execution provider.
+PROVIDERS = {
+    "cpu": "CPUExecutionProvider",
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "directml": "DmlExecutionProvider",
+}
+
+
+def shipped_models() -> dict[str, Path]:
+    """Name -> file of the models inside the package."""
+    folder = Path(str(resources.files("oiio_msspl").joinpath("models")))
+    return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
+
+
+def find_model(scale: int, name: str | None = None) -> Path:
+    """The shipped model for a scale, or the one that ``name`` (a shipped name or a file) means.
+
+    Raises:
+        InputError: there is no such model.
+    """
+    models = shipped_models()
+    if name is None:
+        name = f"paper-x{scale}"
+    if name in models:
+        return models[name]
+    if Path(name).is_file():
+        return Path(name)
+    raise InputError(f"no model {name!r}: neither a file nor one of {', '.join(models) or '(none shipped)'}")
+
+
+def usable_devices() -> list[str]:
+    """Keys of ``PROVIDERS`` that the installed onnxruntime was built for."""
+    import onnxruntime
+
+    available = onnxruntime.get_available_providers()
+    return [device for device, provider in PROVIDERS.items() if provider in available]
+
+
+class Session:
+    """A loaded model on a device, with its contract.
+
+    Args:
+        path: an ONNX file that carries a contract.
+        device: a key of ``PROVIDERS``.
+        threads: CPU threads; 0 lets onnxruntime use one a core.
+
+    Raises:
+        InputError: no model, no contract, or a device that this onnxruntime was not built for.
+    """
+
+    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
+        import onnxruntime
+
+        if device not in PROVIDERS:
+            raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
+        if device not in usable_devices():
+            raise InputError(
+                f"--device {device}: the installed onnxruntime {onnxruntime.__version__} has no {PROVIDERS[device]}; "
+                f"usable here: {', '.join(usable_devices())}"
+            )
+        options = onnxruntime.SessionOptions()
+        options.intra_op_num_threads = threads
+        # The arena keeps the largest tile's buffers for good; without it memory returns after every tile, and
+        # convolutions are so long that allocation does not show.
+        options.enable_cpu_mem_arena = False
+        options.log_severity_level = 3
+        try:
+            self._session: onnxruntime.InferenceSession = onnxruntime.InferenceSession(
+                str(path), options, providers=list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
+            )
+        except Exception as error:
+            raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        if METADATA_KEY not in metadata:
+            raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
+        self.contract = Contract.from_json(metadata[METADATA_KEY], str(path))
+        self.path = Path(path)
+        self.provider = self._session.get_providers()[0]
+        if self.provider != PROVIDERS[device]:
+            log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
+        log.info("model %s on %s", self.contract.name, self.provider)
+
+    def run(self, lrhs: Array, hrls: Array) -> Array:
+        """Evaluate the network.
+
+        Args:
+            lrhs: (h, w, C_l), transformed, channels as in the contract.
+            hrls: (s*h, s*w, C_h), likewise.
+
+        Returns:
+            (s*h, s*w, 3), transformed.
+        """
+        feed: dict[str, Any] = {
+            "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
+            "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
+        }
+        try:
+            (fused,) = self._session.run(["fused"], feed)
+        except Exception as error:
+            raise MssplError(
+                f"{self.contract.name} failed on {self.provider} ({str(error).splitlines()[0]}); "
+                "try --max-memory with a smaller value, or --device cpu"
+            ) from error
+        return fused[0].transpose(1, 2, 0)

@@ -1,0 +1,73 @@
+# SPDX-License-Identifier: Apache-2.0
+"""From a source's pixels to the network's stacked channels."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from oiio_msspl import schema, transforms
+from oiio_msspl.pairing import Source
+from oiio_msspl.render import Array, Window
+
+#: Features that may be negative.
+SIGNED = {schema.NORMAL}
+
+
+def pack(layers: dict[str, Array], features: dict[str, int], exposure: float) -> Array:
+    """Stack repaired features (h, w, c) in the order of the schema, transformed; absent ones at their default.
+
+    Returns:
+        float32 (h, w, sum of channels).
+    """
+    height, width = layers[schema.RGB].shape[:2]
+    stack = np.empty((height, width, sum(features.values())), dtype=np.float32)
+    position = 0
+    for name, channels in features.items():
+        target = stack[..., position : position + channels]
+        if name in layers:
+            target[...] = transforms.forward(name, layers[name], exposure)
+        else:
+            target[...] = schema.DEFAULTS[name]
+        position += channels
+    return stack
+
+
+def read(
+    source: Source,
+    want: Window,
+    have: Window,
+    *,
+    counts: dict[str, int] | None = None,
+    counted: Window | None = None,
+    features: Iterable[str] | None = None,
+) -> dict[str, Array]:
+    """Repaired layers of a source over ``want``; beyond ``have`` the nearest pixel is repeated.
+
+    Args:
+        want, have: what to read, and the source's data window, both counted from its display window's top left.
+        counts: repaired values by layer are added here, as far as they lie in ``counted`` (overlaps are read twice).
+        features: which layers; all if None.
+    """
+    inside = want.intersect(have)
+    if inside.width == 0 or inside.height == 0:
+        # The data window ends before this rectangle begins: its nearest pixel stands in.
+        x = min(max(want.x0, have.x0), have.x1 - 1)
+        y = min(max(want.y0, have.y0), have.y1 - 1)
+        inside = Window(x, y, x + 1, y + 1)
+    layers = source.read(inside.shift(source.display_window.x0, source.display_window.y0), features)
+    result = {}
+    for name, values in layers.items():
+        repaired, bad = transforms.repair(values, signed=name in SIGNED)
+        if bad is not None and counts is not None and counted is not None:
+            changed = int(np.count_nonzero(bad[counted.intersect(inside).slices(inside)]))
+            counts[name] = counts.get(name, 0) + changed
+        result[name] = repaired if inside == want else _clamped(repaired, inside, want)
+    return result
+
+
+def _clamped(values: Array, have: Window, want: Window) -> Array:
+    rows = np.clip(np.arange(want.y0, want.y1) - have.y0, 0, have.height - 1)
+    columns = np.clip(np.arange(want.x0, want.x1) - have.x0, 0, have.width - 1)
+    return values[rows[:, None], columns[None, :]]

@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small renders and models that the tests make for themselves; nothing here needs files from outside."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import OpenEXR
+import pytest
+
+from oiio_msspl import schema
+from oiio_msspl.contract import METADATA_KEY, Contract
+
+SHARED = Path(__file__).resolve().parents[2] / "shared"
+EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
+
+
+def needs_shared(*parts: str):
+    """Mark a test that reads other people's files, which lie beside the project on some machines only."""
+    path = SHARED.joinpath(*parts)
+    return pytest.mark.skipif(not path.exists(), reason=f"{'/'.join(('shared', *parts))} is not here")
+
+
+def write_exr(path, parts, *, display=None, compression=OpenEXR.ZIP_COMPRESSION, **attributes):
+    """Write an EXR with OpenEXR's own module.
+
+    ``parts``: a list of (name, {channel: array}, (x, y) of the data window), or one {channel: array}. Types follow the
+    arrays' dtypes.
+    """
+    if isinstance(parts, dict):
+        parts = [("", parts, (0, 0))]
+    made = []
+    for name, channels, (x, y) in parts:
+        height, width = next(iter(channels.values())).shape
+        window = (np.array([x, y], np.int32), np.array([x + width - 1, y + height - 1], np.int32))
+        shown = window if display is None else display
+        header = {
+            "compression": compression,
+            "type": OpenEXR.scanlineimage,
+            "dataWindow": window,
+            "displayWindow": shown,
+            **attributes,
+        }
+        made.append(OpenEXR.Part(header, {k: np.ascontiguousarray(v) for k, v in channels.items()}, name))
+    with OpenEXR.File(made) as file:
+        file.write(str(path))
+    return path
+
+
+def rgb(values, prefix="", names="RGB"):
+    """{channel name: plane} of an (h, w, c) array."""
+    return {f"{prefix}{c}": values[..., i] for i, c in enumerate(names)}
+
+
+def read_bits(path):
+    """[(part name, {channel: array})] with OpenEXR's own reader, in stored types."""
+    with OpenEXR.File(str(path), separate_channels=True) as file:
+        return [
+            (part.header.get("name", ""), {k: v.pixels.copy() for k, v in part.channels.items()}) for part in file.parts
+        ]
+
+
+def same_bits(a, b):
+    return a.dtype == b.dtype and a.shape == b.shape and a.tobytes() == b.tobytes()
+
+
+def picture(height, width, seed=0):
+    """A smooth coloured picture with edges and a highlight, (height, width, 3) float32."""
+    y, x = np.mgrid[0:height, 0:width] / max(height, width)
+    base = np.stack([0.2 + 0.5 * x, 0.3 + 0.3 * np.sin(6 * y), 0.1 + 0.4 * x * y], axis=-1)
+    base[(x - 0.5) ** 2 + (y - 0.4) ** 2 < 0.02] = (4.0, 3.0, 1.0)
+    base[(x > 0.7) & (y > 0.2)] *= 0.05
+    return base.astype(np.float32)
+
+
+def noisy(clean, spp, seed=0):
+    """Multiplicative noise of unit mean whose variance falls with spp, as path tracing's does."""
+    rng = np.random.default_rng(seed)
+    return (clean * rng.gamma(spp, 1 / spp, clean.shape)).astype(np.float32)
+
+
+def downsample(values, scale):
+    """Box average over scale x scale pixels."""
+    height, width = values.shape[0] // scale, values.shape[1] // scale
+    return values[: height * scale, : width * scale].reshape(height, scale, width, scale, -1).mean((1, 3))
+
+
+@pytest.fixture(scope="session")
+def bilinear_models(tmp_path_factory):
+    """{scale: ONNX file} of models that upsample the LRHS bilinearly and ignore the HRLS: exact, local, without weights."""
+    onnx = pytest.importorskip("onnx")
+    from onnx import TensorProto, helper
+
+    folder = tmp_path_factory.mktemp("models")
+    made = {}
+    for scale in schema.SCALES:
+        contract = Contract(name=f"bilinear-x{scale}", scale=scale, overlap=2, bytes_per_pixel=300)
+        nodes = [
+            helper.make_node("Resize", ["lrhs", "", "scales"], ["up"], mode="linear"),
+            # Reads the HRLS without using it: a graph must use its inputs.
+            helper.make_node("Slice", ["hrls", "zero", "three", "one"], ["head"]),
+            helper.make_node("Mul", ["head", "nothing"], ["none"]),
+            helper.make_node("Add", ["up", "none"], ["fused"]),
+        ]
+        constants = [
+            helper.make_tensor("scales", TensorProto.FLOAT, [4], [1, 1, scale, scale]),
+            helper.make_tensor("zero", TensorProto.INT64, [1], [0]),
+            helper.make_tensor("three", TensorProto.INT64, [1], [3]),
+            helper.make_tensor("one", TensorProto.INT64, [1], [1]),
+            helper.make_tensor("nothing", TensorProto.FLOAT, [], [0.0]),
+        ]
+        graph = helper.make_graph(
+            nodes,
+            "bilinear",
+            [
+                helper.make_tensor_value_info("lrhs", TensorProto.FLOAT, [1, 3, "h", "w"]),
+                helper.make_tensor_value_info("hrls", TensorProto.FLOAT, [1, 16, "H", "W"]),
+            ],
+            [helper.make_tensor_value_info("fused", TensorProto.FLOAT, [1, 3, "H", "W"])],
+            constants,
+        )
+        model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)
+        helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+        made[scale] = folder / f"bilinear-x{scale}.onnx"
+        onnx.save(model, made[scale])
+    return made

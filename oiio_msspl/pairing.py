@@ -68,8 +68,8 @@ def pair(lr: Source, hr: Source) -> Pairing:
     missing = max(lr_data.x0 - grid.x0, lr_data.y0 - grid.y0, grid.x1 - lr_data.x1, grid.y1 - lr_data.y1)
     if missing > 1:  # one pixel is rounding, of odd sizes and of crop regions
         raise InputError(
-            f"framing differs: {hr.name} covers {hr_data} of its frame, which needs {grid} of the low-resolution frame, "
-            f"but {lr.name} covers only {lr_data}; render both with the same crop region and overscan"
+            f"framing differs: {hr.name} covers {hr_data} of its frame, which needs {grid} of the low-resolution "
+            f"frame, but {lr.name} covers only {lr_data}; render both with the same crop region and overscan"
         )
     return Pairing(scale, grid, lr_data, hr_data)
 

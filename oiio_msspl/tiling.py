@@ -53,7 +53,8 @@ def _split(
             break
         if min(width, height) < SMALLEST_CORE:
             raise InputError(
-                f"not enough memory: even a tile of {width}x{height} low-resolution pixels needs more; raise --max-memory"
+                f"not enough memory: even a tile of {width}x{height} low-resolution pixels needs more; "
+                "raise --max-memory"
             )
         if width >= height:
             nx += 1

@@ -1,0 +1,395 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from oiio_msspl.aovs import parse_map_options, read_map_file, resolve
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr import open_exr
+from tests.conftest import SHARED, needs_shared, rgb, write_exr
+
+H = W = 8
+
+
+def plane(value):
+    return np.full((H, W), value, np.float32)
+
+
+def layer(name, value, names="RGB"):
+    """Channels of one layer, constant."""
+    return {f"{name}.{c}" if name else c: plane(value + i / 10) for i, c in enumerate(names)}
+
+
+def resolved(tmp_path, channels, mapping=None, stem="hr", **options):
+    attributes = options.pop("attributes", {})
+    return resolve(open_exr(write_exr(tmp_path / f"{stem}.exr", channels, **attributes)), mapping, **options)
+
+
+def found(resolution):
+    return {row["feature"]: row["source"] for row in resolution.table() if row["status"] in ("found", "computed")}
+
+
+CASES = {
+    "Arnold": (
+        layer("", 1)
+        | layer("denoise_albedo", 2)
+        | layer("N", 0, "XYZ")
+        | layer("diffuse", 3)
+        | layer("specular", 4)
+        | layer("variance", 5),
+        {"arnold/version": "Arnold 7"},
+        {
+            "rgb": "R G B",
+            "albedo": "denoise_albedo",
+            "normal": "N",
+            "diffuse": "diffuse",
+            "specular": "specular",
+            "variance": "variance",
+        },
+    ),
+    "V-Ray": (
+        layer("", 1)
+        | layer("diffuse", 2)
+        | layer("normals", 0, "XYZ")
+        | layer("lighting", 3)
+        | layer("GI", 4)
+        | layer("specular", 5)
+        | layer("reflection", 6),
+        {"vrayInfo/vraycore": "6"},
+        {
+            "rgb": "R G B",
+            "albedo": "diffuse",
+            "normal": "normals",
+            "diffuse": "lighting + GI",
+            "specular": "specular + reflection",
+        },
+    ),
+    "RenderMan": (
+        layer("Ci", 1, "rgb")
+        | layer("albedo", 2, "rgb")
+        | layer("normal", 0, "rgb")
+        | layer("diffuse", 3, "rgb")
+        | layer("specular", 4, "rgb")
+        | layer("mse", 5, "rgb"),
+        {},
+        {
+            "rgb": "Ci",
+            "albedo": "albedo",
+            "normal": "normal",
+            "diffuse": "diffuse",
+            "specular": "specular",
+            "variance": "mse",
+        },
+    ),
+    "Cycles": (
+        layer("ViewLayer.Combined", 1)
+        | layer("ViewLayer.Denoising Albedo", 2)
+        | layer("ViewLayer.Normal", 0, "XYZ")
+        | layer("ViewLayer.DiffDir", 3)
+        | layer("ViewLayer.DiffInd", 4)
+        | layer("ViewLayer.DiffCol", 5)
+        | layer("ViewLayer.GlossDir", 3)
+        | layer("ViewLayer.GlossInd", 4)
+        | layer("ViewLayer.GlossCol", 5),
+        {},
+        {
+            "rgb": "ViewLayer.Combined",
+            "albedo": "ViewLayer.Denoising Albedo",
+            "normal": "ViewLayer.Normal",
+            "diffuse": "(ViewLayer.DiffDir + ViewLayer.DiffInd) * ViewLayer.DiffCol",
+            "specular": "(ViewLayer.GlossDir + ViewLayer.GlossInd) * ViewLayer.GlossCol",
+        },
+    ),
+    "Mantra": (
+        layer("C", 1) | layer("basecolor", 2) | layer("N", 0, "XYZ") | layer("Pz", 3, "Z"),
+        {},
+        {"rgb": "C", "albedo": "basecolor", "normal": "N"},
+    ),
+    "Redshift": (
+        layer("", 1)
+        | layer("DiffuseFilter", 2)
+        | layer("BumpNormals", 0)
+        | layer("DiffuseLighting", 3)
+        | layer("GI", 4)
+        | layer("SpecularLighting", 5)
+        | layer("Reflections", 6),
+        {},
+        {
+            "rgb": "R G B",
+            "albedo": "DiffuseFilter",
+            "normal": "BumpNormals",
+            "diffuse": "DiffuseLighting + GI",
+            "specular": "SpecularLighting + Reflections",
+        },
+    ),
+    "pbrt-v4": (
+        layer("", 1) | layer("Albedo", 2) | layer("Ns", 0, "XYZ") | layer("Variance", 3),
+        {"samplesPerPixel": 4},
+        {"rgb": "R G B", "albedo": "Albedo", "normal": "Ns", "variance": "Variance"},
+    ),
+    "Mitsuba 3": (
+        layer("", 1) | layer("albedo", 2) | layer("nn", 0, "XYZ"),
+        {"Software": "Mitsuba 3"},
+        {"rgb": "R G B", "albedo": "albedo", "normal": "nn"},
+    ),
+    "appleseed": (
+        layer("", 1, "RGBA") | layer("albedo_aov", 2) | layer("normal_aov", 0),
+        {},
+        {"rgb": "R G B", "albedo": "albedo_aov", "normal": "normal_aov", "alpha": "A"},
+    ),
+    "Unreal": (
+        layer("", 1, "RGBA")
+        | layer("FinalImageMovieRenderQueue_WorldNormal", 0)
+        | layer("FinalImageMovieRenderQueue_WorldDepth", 0, "R"),
+        {},
+        {"rgb": "R G B", "normal": "FinalImageMovieRenderQueue_WorldNormal", "alpha": "A"},
+    ),
+}
+
+
+@pytest.mark.parametrize("renderer", CASES)
+def test_each_renderers_layers_are_found(tmp_path, renderer):
+    channels, attributes, expected = CASES[renderer]
+    resolution = resolved(tmp_path, channels, attributes=attributes)
+    assert resolution.renderer == renderer
+    assert found(resolution) == expected
+
+
+def test_karmas_layers_come_from_part_names_alone(tmp_path):
+    parts = [
+        ("C", layer("", 1, "RGBA"), (0, 0)),
+        ("albedo", layer("", 2), (0, 0)),
+        ("N", {"x": plane(0), "y": plane(0), "z": plane(1)}, (0, 0)),
+        ("combineddiffuse", layer("", 3), (0, 0)),
+    ]
+    resolution = resolved(tmp_path, parts)
+    assert resolution.renderer == "Karma"
+    assert found(resolution) == {
+        "rgb": "C",
+        "albedo": "albedo",
+        "normal": "N",
+        "diffuse": "combineddiffuse",
+        "alpha": "A",
+    }
+
+
+def test_blender_5_writes_the_layer_in_part_and_channel(tmp_path):
+    names = ["Combined", "Diffuse Direct", "Diffuse Indirect", "Diffuse Color"]
+    parts = [(f"ViewLayer.{n}", layer(f"ViewLayer.{n}", i + 1), (0, 0)) for i, n in enumerate(names)]
+    resolution = resolved(tmp_path, parts, attributes={"cycles.ViewLayer.samples": "16"})
+    assert resolution.spp == 16
+    values = resolution.read(resolution.data_window)
+    np.testing.assert_allclose(
+        values["diffuse"][0, 0], (np.array([2, 2.1, 2.2]) + [3, 3.1, 3.2]) * [4, 4.1, 4.2], rtol=1e-6
+    )
+
+
+def test_luxcores_files_are_layers_of_one_frame(tmp_path):
+    """One file an AOV: the others are found beside the RGB, and each alone is explained."""
+    for stem, value in (("ALBEDO", 2), ("DIRECT_DIFFUSE", 3), ("INDIRECT_DIFFUSE", 4)):
+        write_exr(tmp_path / f"{stem}.exr", layer("", value))
+    resolution = resolved(tmp_path, layer("", 1), stem="RGB_IMAGEPIPELINE")
+    assert resolution.renderer == "LuxCore"
+    values = resolution.read(resolution.data_window)
+    assert values["albedo"][0, 0, 0] == 2
+    assert values["diffuse"][0, 0, 0] == 7
+    with pytest.raises(InputError, match="LuxCore's ALBEDO alone"):
+        resolve(open_exr(tmp_path / "ALBEDO.exr"))
+
+
+def test_view_layers_are_told_apart(tmp_path):
+    """Names with dots and spaces; the first view layer by default, another on request, never layers of two mixed."""
+    channels = {}
+    for i, name in enumerate(("Main.Beauty v1.2", "fg.chars")):
+        channels |= layer(f"{name}.Combined", 10 * (i + 1)) | layer(f"{name}.Denoising Albedo", 10 * (i + 1) + 1)
+    first = resolved(tmp_path, channels)
+    assert (first.view, first.other_views) == ("Main.Beauty v1.2", ["fg.chars"])
+    second = resolved(tmp_path, channels, view="fg.chars")
+    values = second.read(second.data_window)
+    assert values["rgb"][0, 0, 0] == 20
+    assert values["albedo"][0, 0, 0] == 21
+    with pytest.raises(InputError, match=r"no view or view layer 'bg'; the file has Main.Beauty v1.2, fg.chars"):
+        resolved(tmp_path, channels, view="bg")
+
+
+def test_stereo_views_of_one_part(tmp_path):
+    channels = layer("", 1, "RGBA") | layer("left", 2, "RGBA") | {"forward.left.u": plane(0)}
+    attributes = {"multiView": ["right", "left"]}
+    assert resolved(tmp_path, channels, attributes=attributes).view == "right"
+    left = resolved(tmp_path, channels, attributes=attributes, view="left")
+    assert left.read(left.data_window)["rgb"][0, 0, 0] == 2
+
+
+@pytest.mark.parametrize(
+    ("entry", "expected"),
+    [
+        ({"layer": "v", "kind": "mean"}, 0.64),
+        ({"layer": "v", "kind": "per_sample"}, 0.16),
+        ({"layer": "v", "kind": "relative"}, 0.64 * 0.5 / 4),
+        ({"layer": "v", "kind": "second_moment"}, (0.64 - 0.25) / 4),
+        ({"layer": "v", "kind": "deviation"}, 0.64**2),
+        ({"halves": ["a", "b"]}, (0.6 - 0.2) ** 2 / 4),
+    ],
+)
+def test_every_kind_of_variance_becomes_that_of_the_mean(tmp_path, entry, expected):
+    """A grey pixel of 0.5 with 4 spp: all six descriptions give the variance of the mean luminance."""
+    channels = {c: plane(0.5) for c in "RGB"}
+    channels |= {f"{n}.{c}": plane(v) for n, v in (("v", 0.64), ("a", 0.6), ("b", 0.2)) for c in "RGB"}
+    resolution = resolved(tmp_path, channels, {"variance": entry}, spp=4)
+    np.testing.assert_allclose(resolution.read(resolution.data_window)["variance"], expected, rtol=1e-5)
+
+
+def test_a_luminance_variance_is_taken_as_it_is(tmp_path):
+    resolution = resolved(tmp_path, layer("", 1) | {"variance.Y": plane(0.25)})
+    assert resolution.read(resolution.data_window)["variance"].shape == (H, W, 1)
+    assert resolution.read(resolution.data_window)["variance"][0, 0, 0] == 0.25
+
+
+def test_a_variance_per_sample_without_spp_is_defaulted_and_said(tmp_path):
+    channels = layer("", 1) | layer("Albedo", 2) | layer("Ns", 0, "XYZ") | layer("Variance", 3)
+    resolution = resolved(tmp_path, channels)
+    assert "variance" not in found(resolution)
+    assert "needs the samples per pixel" in resolution.notes[0]
+
+
+def test_encoded_normals_are_recognised_by_their_pixels(tmp_path):
+    """n * 0.5 + 0.5 comes back as n; signed normals are left alone."""
+    rng = np.random.default_rng(0)
+    normal = rng.normal(size=(H, W, 3))
+    normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
+    for stored in (normal, normal * 0.5 + 0.5):
+        resolution = resolved(tmp_path, layer("", 1) | rgb(stored, "normal."))
+        np.testing.assert_allclose(resolution.read(resolution.data_window)["normal"], normal, atol=1e-6)
+
+
+def test_the_users_mapping_wins(tmp_path):
+    channels = layer("", 1) | layer("albedo", 2) | layer("my_albedo", 3)
+    resolution = resolved(tmp_path, channels, parse_map_options(["albedo=my_albedo"]))
+    assert resolution.read(resolution.data_window)["albedo"][0, 0, 0] == 3
+
+
+def test_a_mapping_may_add_layers_or_name_another_file(tmp_path):
+    other = write_exr(tmp_path / "other.exr", layer("", 7))
+    mapping = parse_map_options(["diffuse=direct+indirect", f"albedo={other}"])
+    resolution = resolved(tmp_path, layer("", 1) | layer("direct", 2) | layer("indirect", 3), mapping)
+    values = resolution.read(resolution.data_window)
+    assert values["diffuse"][0, 0, 0] == 5
+    assert values["albedo"][0, 0, 0] == 7
+
+
+def test_a_mapping_file_takes_what_the_table_takes(tmp_path):
+    (tmp_path / "map.toml").write_text('diffuse = { sum = ["a", "b"], times = "c" }\n')
+    channels = layer("", 1) | layer("a", 2) | layer("b", 3) | layer("c", 4)
+    resolution = resolved(tmp_path, channels, read_map_file(tmp_path / "map.toml"))
+    assert resolution.read(resolution.data_window)["diffuse"][0, 0, 0] == 20
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["albedo"], "write it as feature=layer"),
+        (["colour=x"], "'colour' is no feature; use one of rgb, albedo"),
+    ],
+)
+def test_a_wrong_mapping_option_is_explained(options, message):
+    with pytest.raises(InputError, match=message):
+        parse_map_options(options)
+
+
+def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
+    channels = layer("", 1) | {"mask.A": plane(1)}
+    with pytest.raises(InputError, match="no layer for --map albedo=nothing"):
+        resolved(tmp_path, channels, {"albedo": "nothing"})
+    with pytest.raises(InputError, match=r"layer 'mask' has channels A, not R, G, B"):
+        resolved(tmp_path, channels, {"albedo": "mask"})
+
+
+def test_an_aov_of_the_wrong_channel_count_is_not_used_silently(tmp_path):
+    resolution = resolved(tmp_path, layer("", 1) | {"albedo.R": plane(1), "albedo.G": plane(1)})
+    assert "albedo" not in found(resolution)
+    assert "albedo: layer 'albedo' has channels R, G" in resolution.notes[0]
+
+
+def test_no_beauty_names_what_is_there(tmp_path):
+    with pytest.raises(InputError, match=r"no beauty \(R, G, B\) found among: crypto00, depth"):
+        resolved(tmp_path, layer("crypto00", 1, "RGBA") | {"depth.Z": plane(1)})
+
+
+def test_beauty_spread_over_parts_with_odd_names(tmp_path):
+    parts = [("part0", {"R": plane(1)}, (0, 0)), ("part1", {"G": plane(2)}, (0, 0)), ("part2", {"B": plane(3)}, (0, 0))]
+    resolution = resolved(tmp_path, parts)
+    np.testing.assert_array_equal(resolution.read(resolution.data_window)["rgb"][0, 0], [1, 2, 3])
+
+
+REAL = {
+    "arnold/rgba_N_P_diffuse_direct_specular": ("Arnold", {"rgb", "normal", "diffuse", "specular", "alpha"}),
+    "cycles-4.2/cycles_border_region": ("Cycles", {"rgb", "albedo", "normal", "diffuse", "specular", "alpha"}),
+    "cycles-4.2/cycles_viewlayer_dwaa16": ("Cycles", {"rgb", "albedo", "normal", "diffuse", "specular", "alpha"}),
+    "cycles-4.2/cycles_viewlayer_zip32": ("Cycles", {"rgb", "albedo", "normal", "diffuse", "specular", "alpha"}),
+    "cycles-5.0/cycles_two_dotted_viewlayers_piz16": (
+        "Cycles",
+        {"rgb", "albedo", "normal", "diffuse", "specular", "alpha"},
+    ),
+    "cycles-5.0/cycles_viewlayer_zip32": ("Cycles", {"rgb", "albedo", "normal", "diffuse", "specular", "alpha"}),
+    "gaffer/channelTestNukePartPerLayer": ("unknown", {"rgb", "alpha"}),
+    "gaffer/channelTestSinglePart": ("unknown", {"rgb", "alpha"}),
+    "gaffer/multipartDefaultChannels": ("unknown", {"rgb", "alpha"}),
+    "gaffer/unsupportedMultipart": ("unknown", {"rgb", "alpha"}),
+    "gaffer/weirdPartNames": ("unknown", {"rgb", "alpha"}),
+    "karma/rgba_crypto": ("Karma", {"rgb", "alpha"}),
+    "luxcore/RGB": ("LuxCore", {"rgb", "albedo", "normal"}),
+    "oiio-images/grid-overscan": ("unknown", {"rgb", "alpha"}),
+    "openexr-images/BrightRingsNanInf": ("unknown", {"rgb"}),
+    "openexr-images/beachball_multipart": ("unknown", {"rgb", "alpha"}),
+    "openexr-images/beachball_singlepart": ("unknown", {"rgb", "alpha"}),
+    "openexr-images/displaywindow_t02": ("unknown", {"rgb"}),
+    "openexr-images/displaywindow_t04": ("unknown", {"rgb"}),
+    "openexr-images/displaywindow_t15": ("unknown", {"rgb"}),
+    "openexr-rs/negative_window": ("unknown", {"rgb", "alpha"}),
+    "seesharp/rgb_variance_Y": ("unknown", {"rgb", "variance"}),
+    "vray/rgba_z_crypto_diffuse_normals": ("V-Ray", {"rgb", "albedo", "normal", "alpha"}),
+}
+UNUSABLE = {
+    "arnold/crypto_only": "no beauty",
+    "arnold/deep": "deep data only",
+    **{
+        f"luxcore/{n}": "alone, no beauty"
+        for n in ("ALBEDO", "AVG_SHADING_NORMAL", "DEPTH", "DIRECT_DIFFUSE", "INDIRECT_GLOSSY", "NOISE")
+    },
+}
+
+
+@needs_shared("exr")
+def test_every_real_file_is_expected_here():
+    names = {p.relative_to(SHARED / "exr").with_suffix("").as_posix() for p in SHARED.glob("exr/**/*.exr")}
+    assert names == REAL.keys() | UNUSABLE.keys()
+
+
+@needs_shared("exr")
+@pytest.mark.parametrize("name", REAL)
+def test_real_files_are_mapped(name):
+    renderer, features = REAL[name]
+    resolution = resolve(open_exr(SHARED / "exr" / f"{name}.exr"))
+    assert resolution.renderer == renderer
+    assert found(resolution).keys() == features
+
+
+@needs_shared("exr")
+@pytest.mark.parametrize("name", UNUSABLE)
+def test_real_files_that_cannot_be_used_are_explained(name):
+    with pytest.raises(InputError, match=UNUSABLE[name]):
+        resolve(open_exr(SHARED / "exr" / f"{name}.exr"))
+
+
+@needs_shared("exr")
+def test_cycles_layers_add_up_to_the_beauty():
+    """The paper's equations: diffuse + gloss + transmission + emission + environment is the beauty."""
+    resolution = resolve(
+        open_exr(SHARED / "exr/cycles-5.0/cycles_viewlayer_zip32.exr"),
+        {
+            "albedo": {"sum": ["Transmission Direct", "Transmission Indirect"], "times": "Transmission Color"},
+            "normal": {"sum": ["Emission", "Environment"]},
+        },
+    )
+    values = resolution.read(resolution.data_window)
+    total = values["diffuse"] + values["specular"] + values["albedo"] + values["normal"]
+    np.testing.assert_allclose(total, values["rgb"], atol=1e-4)

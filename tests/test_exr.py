@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import OpenEXR
+import pytest
+
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr import open_exr
+from oiio_msspl.render import Window
+from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
+
+COMPRESSIONS = ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"]
+
+
+def test_pixels_are_read_by_rectangle(tmp_path):
+    """Any rectangle of the data window equals that rectangle of the whole, whatever rows the bands begin on."""
+    image = picture(150, 40)
+    file = open_exr(write_exr(tmp_path / "a.exr", [("", rgb(image), (-7, -100))]))
+    part = file.parts[0]
+    assert part.data_window == Window(-7, -100, 33, 50)
+    window = Window(0, -31, 20, 37)
+    rows, columns = window.slices(part.data_window)
+    np.testing.assert_array_equal(file.read(part.channels, window), image[rows, columns])
+
+
+def test_outside_the_data_window_is_zero(tmp_path):
+    file = open_exr(write_exr(tmp_path / "a.exr", rgb(picture(8, 8))))
+    pixels = file.read(file.parts[0].channels, Window(-2, -2, 10, 10))
+    assert not pixels[:2].any()
+    assert not pixels[:, -2:].any()
+    assert pixels[2:10, 2:10].any()
+
+
+@pytest.mark.parametrize("compression", COMPRESSIONS)
+def test_every_compression_is_read(tmp_path, compression):
+    image = picture(70, 33).astype(np.float16)
+    path = write_exr(tmp_path / "a.exr", rgb(image), compression=getattr(OpenEXR, f"{compression}_COMPRESSION"))
+    file = open_exr(path)
+    values = file.read(file.parts[0].channels, file.parts[0].data_window)
+    lossy = compression in ("B44", "B44A", "DWAA", "DWAB")
+    np.testing.assert_allclose(values, image.astype(np.float32), rtol=0.1 if lossy else 0, atol=0.1 if lossy else 0)
+
+
+def test_half_float_and_uint_keep_their_types(tmp_path):
+    image = picture(8, 8)
+    channels = rgb(image.astype(np.float16)) | {"Z": image[..., 0], "id": np.full((8, 8), 2**32 - 5, np.uint32)}
+    file = open_exr(write_exr(tmp_path / "a.exr", channels))
+    part = file.parts[0]
+    assert {c.name: c.type for c in part.channels} == {
+        "R": "half",
+        "G": "half",
+        "B": "half",
+        "Z": "float",
+        "id": "uint",
+    }
+    index = next(c.index for c in part.channels if c.name == "id")
+    (_, _, rows), *_ = file.native_bands(part, index, index + 1)
+    assert rows.dtype == np.uint32
+    assert (rows == 2**32 - 5).all()
+
+
+def test_channels_of_several_parts_are_read_together(tmp_path):
+    image = picture(8, 8)
+    parts = [("rgba", rgb(image), (0, 0)), ("albedo", rgb(image * 2), (0, 0))]
+    file = open_exr(write_exr(tmp_path / "a.exr", parts))
+    wanted = [file.parts[1].channels[0], file.parts[0].channels[2]]
+    values = file.read(wanted, file.parts[0].data_window)
+    np.testing.assert_allclose(values, np.stack([image[..., 0] * 2, image[..., 2]], -1))
+
+
+def test_a_missing_file_is_named(tmp_path):
+    with pytest.raises(InputError, match=r"nothing\.exr: no such file"):
+        open_exr(tmp_path / "nothing.exr")
+
+
+def test_a_file_that_is_no_exr_is_named(tmp_path):
+    (tmp_path / "text.exr").write_text("hello " * 100)
+    with pytest.raises(InputError, match=r"text\.exr: can't be opened as an EXR"):
+        open_exr(tmp_path / "text.exr")
+
+
+def test_a_truncated_file_says_where_it_ends(tmp_path):
+    rng = np.random.default_rng(0)
+    path = write_exr(tmp_path / "a.exr", rgb(rng.random((256, 64, 3)).astype(np.float32)))
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    file = open_exr(path)
+    with pytest.raises(InputError, match=r"a\.exr: part 0 .*rows \d+ to \d+ can't be read"):
+        file.read(file.parts[0].channels, file.parts[0].data_window)
+
+
+@needs_shared("exr")
+@pytest.mark.parametrize("path", sorted(SHARED.glob("exr/**/*.exr")), ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_real_headers_are_read(path):
+    """Every real file opens, and its channels and windows are what OpenEXR's own reader finds."""
+    file = open_exr(path)
+    with OpenEXR.File(str(path), header_only=True) as expected:
+        assert len(file.parts) == len(expected.parts)
+        for part, other in zip(file.parts, expected.parts, strict=True):
+            assert {c.name for c in part.channels} == {c.name for c in other.header["channels"]}
+            low, high = other.header["dataWindow"]
+            assert part.data_window == Window(low[0], low[1], high[0] + 1, high[1] + 1)

@@ -1,0 +1,270 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Network, losses, training data and export. Needs PyTorch, which the runtime library does not."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from oiio_msspl import schema, transforms  # noqa: E402
+from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
+from training import data, losses  # noqa: E402
+from training.network import RDB, MultiResolutionFusion  # noqa: E402
+
+TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
+SIZE = 64
+
+
+def pair(scale: int, height: int = 10, width: int = 14) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return (
+        torch.rand(2, 3, height, width, generator=generator),
+        torch.rand(2, 16, scale * height, scale * width, generator=generator),
+    )
+
+
+def features_of(stack: np.ndarray) -> dict[str, np.ndarray]:
+    """Named layers of an HRLS stack (H, W, 16)."""
+    ends = np.cumsum(list(schema.HRLS_FEATURES.values()))[:-1]
+    return dict(zip(schema.HRLS_FEATURES, np.split(stack, ends, axis=-1), strict=True))
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> Path:
+    """Two views: a gradient with known noise, one unit normal that turns over the image."""
+    rng = np.random.default_rng(0)
+    x = np.linspace(0.2, 1.0, SIZE)
+    colour = np.broadcast_to(x[:, None, None], (SIZE, SIZE, 3))
+    angle = np.pi * x
+    normal = np.broadcast_to(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)[None], (SIZE, SIZE, 3))
+    clean = np.concatenate([colour, 0.5 * colour, normal, 0.7 * colour, 0.3 * colour], axis=-1)
+    for name in ("train", "validation"):
+        noise = np.zeros((8, SIZE, SIZE, 15))
+        noise[..., :3] = 0.02 * rng.standard_normal((8, SIZE, SIZE, 1))
+        np.savez(
+            tmp_path / f"{name}.npz",
+            hr=(clean + noise).astype(np.float16),
+            lr=np.repeat(colour[None], 5, axis=0).astype(np.float16),
+            lr_spp=np.array([1, 1, 2, 4, 8]),
+            ref=colour.astype(np.float16),
+            meta=json.dumps({"split": name, "seed": 1}),
+        )
+    return tmp_path
+
+
+# Network
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_output_has_the_size_of_the_hrls(scale: int) -> None:
+    lrhs, hrls = pair(scale)
+    assert MultiResolutionFusion(scale, **TINY)(lrhs, hrls).shape == (2, 3, 10 * scale, 14 * scale)
+
+
+def test_default_network_is_the_papers() -> None:
+    """G = 3 groups of B = 5 blocks of 4 convolutions; D = log2(s) deshuffle and shuffle layers; 64 channels."""
+    network = MultiResolutionFusion(8)
+    convolutions = [m for m in network.modules() if isinstance(m, torch.nn.Conv2d)]
+    assert sum(isinstance(m, RDB) for m in network.modules()) == 15
+    assert len(convolutions) == 15 * 4 + 2 + 3 + 1 + 3 + 1
+    assert network.fuse.in_channels == 128 and network.fuse.kernel_size == (1, 1)
+    assert all(c.kernel_size == (3, 3) for c in convolutions if c is not network.fuse)
+
+
+def test_rdb_adds_to_its_input() -> None:
+    """With its last convolution at zero, an RDB is the identity."""
+    block = RDB(channels=16, growth=8, dense=3)
+    torch.nn.init.zeros_(block.last.weight)
+    torch.nn.init.zeros_(block.last.bias)
+    x = torch.randn(1, 16, 5, 5)
+    assert torch.equal(block(x), x)
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_new_network_upsamples_the_lrhs(scale: int) -> None:
+    """Without its random part, a new network is bilinear upsampling (away from the zero-padded border)."""
+    network = MultiResolutionFusion(scale, **TINY)
+    with torch.no_grad():
+        network.h_rec.weight[:, 3:] = 0  # all but the channels that carry the LRHS
+        network.fuse.weight[:] = 0
+        for block in network.modules():
+            if isinstance(block, RDB):
+                block.last.weight[:] = 0
+    lrhs, hrls = pair(scale)
+    fused = network(lrhs, hrls)
+    expected = lrhs
+    while expected.shape[-1] < fused.shape[-1]:
+        expected = torch.nn.functional.interpolate(expected, scale_factor=2, mode="bilinear", align_corners=False)
+    inner = (..., slice(2 * scale, -2 * scale), slice(2 * scale, -2 * scale))
+    torch.testing.assert_close(fused[inner], expected[inner])
+
+
+def test_scale_that_is_no_power_of_two_is_refused() -> None:
+    with pytest.raises(ValueError, match="got 3"):
+        MultiResolutionFusion(3)
+
+
+# Losses
+
+
+def test_robust_loss_by_hand() -> None:
+    """Errors of 0, 0.1 and 0.9 with beta 0.1 cost 0, 0.5 and 0.9."""
+    loss = losses.robust(torch.tensor([1.0, 0.1, -0.9]), torch.tensor([1.0, 0.0, 0.0]))
+    assert loss.item() == pytest.approx((0 + 0.5 + 0.9) / 3)
+
+
+def test_robust_loss_is_bounded_and_so_is_its_gradient() -> None:
+    error = torch.logspace(-6, 6, 100).requires_grad_()
+    loss = losses.robust(error, torch.zeros(100))
+    loss.backward()
+    assert loss.item() < 1
+    assert error.grad.max() * 100 <= 1 / losses.BETA  # * 100: the mean over elements
+
+
+# Data
+
+
+def test_hrls_is_the_mean_of_passes(views: Path) -> None:
+    (view,) = data.Folder(views).split("train")
+    everything = slice(0, SIZE)
+    passes = data.read_hrls(view, [2, 5], everything, everything)
+    expected = (view.hr[2, ..., :3].astype(np.float32) + view.hr[5, ..., :3]) / 2
+    np.testing.assert_array_equal(passes.mean(0)[..., :3], expected)
+
+
+def test_variance_is_that_of_the_mean_and_unbiased() -> None:
+    """n passes of unit noise have a mean of variance 1/n, however small n is."""
+    noise = np.random.default_rng(0).standard_normal((3, 400, 400)).astype(np.float32)
+    assert data.variance_of_mean(noise).mean() == pytest.approx(1 / 3, rel=0.01)
+    assert data.variance_of_mean(noise[:2]).mean() == pytest.approx(1 / 2, rel=0.01)
+
+
+def test_sample_shapes_ranges_and_agreement(views: Path) -> None:
+    """The parts of a pair show the same pixels: without noise, LRHS and target agree after downsampling."""
+    (view,) = data.Folder(views).split("train")
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        sample = data.draw(view, 4, 32, rng, data.Sampling())
+        assert sample["lrhs"].shape == (8, 8, 3)
+        assert sample["hrls"].shape == (32, 32, 16)
+        assert sample["target"].shape == (32, 32, 3)
+        assert all(np.isfinite(part).all() for part in sample.values())
+        np.testing.assert_allclose(data.box_downsample(sample["target"], 4), sample["lrhs"], atol=0.01)
+
+
+def test_absent_layers_have_their_defaults(views: Path) -> None:
+    (view,) = data.Folder(views).split("train")
+    sample = data.draw(view, 4, 32, np.random.default_rng(0), data.Sampling(drop_all=1.0))
+    layers = features_of(sample["hrls"])
+    assert all((layers[name] == schema.DEFAULTS[name]).all() for name in schema.OPTIONAL_FEATURES)
+    assert layers[schema.RGB].std() > 0
+
+
+@pytest.mark.parametrize("determinant", [1, -1])
+def test_normals_are_turned_with_the_right_handedness(determinant: int) -> None:
+    turned = data.random_orthogonal(np.random.default_rng(0), determinant)
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(turned) == pytest.approx(determinant)
+
+
+def test_normals_keep_their_lengths_and_angles(views: Path) -> None:
+    """The normal turns from one column to the next, before and after all augmentation, by the same angle."""
+    (view,) = data.Folder(views).split("train")
+    keep = data.Sampling(drop_each=0, drop_lobes=0, drop_all=0)
+    rng = np.random.default_rng(0)
+    step = np.cos(np.pi * 0.8 / (SIZE - 1))
+    for _ in range(8):
+        normal = features_of(data.draw(view, 2, 32, rng, keep)["hrls"])[schema.NORMAL]
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=2e-3)
+        along, across = np.sum(normal[:, 1:] * normal[:, :-1], -1), np.sum(normal[1:] * normal[:-1], -1)
+        np.testing.assert_allclose(sorted([along.mean(), across.mean()]), [step, 1], atol=2e-3)
+
+
+def test_new_views_are_found_and_broken_ones_wait(views: Path) -> None:
+    folder = data.Folder(views)
+    (views / "late.npz").write_bytes((views / "train.npz").read_bytes()[:1000])
+    folder.scan()
+    assert len(folder.split("train")) == 1
+    (views / "late.npz").write_bytes((views / "train.npz").read_bytes())
+    folder.scan()
+    assert len(folder.split("train")) == 2
+
+
+# Training and export
+
+
+@pytest.fixture
+def tiny_network() -> MultiResolutionFusion:
+    torch.manual_seed(0)
+    return MultiResolutionFusion(4, **TINY).eval()
+
+
+def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
+    """SIGTERM leaves a checkpoint, and the same command goes on from it."""
+    root = Path(__file__).parents[1]
+    command = [
+        sys.executable, "-m", "training.train", "--scale", "2", "--data", str(views), "--out", str(tmp_path / "run"),
+        "--minutes", "5", "--batch", "1", "--patch", "16", "--val-patch", "16", "--checkpoint-seconds", "0.5",
+    ]  # fmt: skip
+    for _ in range(2):
+        with subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, text=True) as process:
+            lines = []
+            for line in process.stderr:
+                lines.append(line)
+                if sum(" step " in text for text in lines) == 2:
+                    process.send_signal(signal.SIGTERM)
+            assert process.wait() == 0, "".join(lines)
+    assert any("continues at step" in line for line in lines)
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert state["step"] > 0 and state["training_spp"] == {"hrls": [1, 8], "lrhs": [4, 64]}
+
+
+def test_warm_start_takes_what_fits(tiny_network: MultiResolutionFusion, tmp_path: Path) -> None:
+    """All of a x4 network serves a x8 one; the stage it lacks stays as initialised."""
+    from training.train import warm_start
+
+    torch.save({"ema": tiny_network.state_dict()}, tmp_path / "x4.pt")
+    wider = MultiResolutionFusion(8, **TINY)
+    fresh = wider.deshuffle[2].conv.weight.clone()
+    warm_start(wider, tmp_path / "x4.pt")
+    assert torch.equal(wider.groups[0].blocks[0].last.weight, tiny_network.groups[0].blocks[0].last.weight)
+    assert torch.equal(wider.deshuffle[2].conv.weight, fresh)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, tmp_path: Path, half: bool) -> None:
+    """One operator for each of the network's, the same numbers, and the contract comes back as it went in."""
+    pytest.importorskip("onnxscript")
+    onnx = pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    from training import export
+
+    path = tmp_path / "tiny.onnx"
+    contract = Contract(name="tiny-x4", scale=4, overlap=12, training_spp={"hrls": [1, 8], "lrhs": [16, 256]})
+    onnx.save(export.to_onnx(tiny_network, contract, half=half), path)
+
+    assert export.parity(tiny_network, path) < (5e-3 if half else 1e-5)
+    kinds = {node.op_type for node in onnx.load(path).graph.node}
+    assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
+    assert str(Path(__file__).parents[1]).encode() not in path.read_bytes()
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert Contract.from_json(metadata[METADATA_KEY], str(path)) == contract
+
+
+def test_validation_scores_a_perfect_output_perfectly() -> None:
+    from training.train import psnr_srgb, rel_mse
+
+    image = np.random.default_rng(0).random((8, 8, 3), dtype=np.float32)
+    assert psnr_srgb(image, image) == pytest.approx(100)
+    assert rel_mse(image, image) == 0
+    restored = transforms.expand(transforms.compress(image, 0.7), 0.7)
+    np.testing.assert_allclose(restored, image, rtol=1e-4, atol=1e-6)

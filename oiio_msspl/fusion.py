@@ -67,7 +67,7 @@ def fuse(
     scale, grid = pairing.scale, pairing.grid
 
     lr_repaired: dict[str, int] = {}
-    low = tensors.read(lr, grid, pairing.lr_data, counts=lr_repaired, counted=grid)
+    low = _read_low(lr, pairing, lr_repaired)
     exposure = transforms.exposure_of(low[schema.RGB])
     warnings = checks.check(low[schema.RGB], hr, pairing, lr.name)
     lrhs = tensors.pack(low, schema.LRHS_FEATURES, exposure)
@@ -101,6 +101,32 @@ def fuse(
         warnings.append("the LRHS has no alpha: the HRLS's is passed through as it is")
     repaired = {f"lrhs.{k}": v for k, v in lr_repaired.items()} | {f"hrls.{k}": v for k, v in hr_repaired.items()}
     return Fused(rgb, alpha, pairing, exposure, repaired, warnings, len(plan), seconds)
+
+
+def _read_low(lr: Source, pairing: Pairing, repaired: dict[str, int]) -> dict[str, Array]:
+    """Colour and alpha of the LRHS over the grid, resampled where an odd size was rounded."""
+    grid = pairing.grid
+    names = [schema.RGB, "alpha"]
+    if pairing.stretch == (1.0, 1.0):
+        return tensors.read(lr, grid, pairing.lr_data, counts=repaired, counted=grid, features=names)
+    whole = pairing.lr_data
+    low = tensors.read(lr, whole, whole, counts=repaired, counted=whole, features=names)
+    for axis, first, last, stretch, begin in (
+        (0, grid.y0, grid.y1, pairing.stretch[1], whole.y0),
+        (1, grid.x0, grid.x1, pairing.stretch[0], whole.x0),
+    ):
+        position = (np.arange(first, last) + 0.5) * stretch - 0.5 - begin
+        low = {name: _interpolated(values, position, axis) for name, values in low.items()}
+    return low
+
+
+def _interpolated(values: Array, position: NDArray[np.float64], axis: int) -> Array:
+    """Linear interpolation along an axis; the edge pixel is repeated beyond the ends."""
+    position = np.clip(position, 0, values.shape[axis] - 1)
+    before = np.minimum(position.astype(np.int64), values.shape[axis] - 1)
+    after = np.minimum(before + 1, values.shape[axis] - 1)
+    share = (position - before).astype(np.float32).reshape([-1 if i == axis else 1 for i in range(values.ndim)])
+    return values.take(before, axis) * (1 - share) + values.take(after, axis) * share
 
 
 def _scaled(window: Window, scale: int) -> Window:

@@ -41,13 +41,15 @@ class Pairing:
     """The LRHS's data window, relative to its display window."""
     hr_data: Window
     """The HRLS's data window, relative to its display window: what is written."""
+    stretch: tuple[float, float] = (1.0, 1.0)
+    """LRHS pixels a grid pixel, in x and y: 1 unless an odd size was rounded."""
 
 
 def pair(lr: Source, hr: Source) -> Pairing:
     """Match an LRHS and an HRLS.
 
-    An HRLS of odd size (1921 x 1081) may come with an LRHS rounded up or down (961 x 541 or 960 x 540); the rounding
-    moves a pixel by less than one HRLS pixel over the whole frame, and is left as it is.
+    An HRLS of odd size (1921 x 1081) may come with an LRHS rounded up or down (961 x 541 or 960 x 540). Renderers fit
+    the whole frame into either, so its pixels are not exactly s HRLS pixels wide: ``stretch`` says by how much.
 
     Raises:
         InputError: swapped inputs, another pixel aspect, framing or ratio; the message says what was seen.
@@ -71,7 +73,8 @@ def pair(lr: Source, hr: Source) -> Pairing:
             f"framing differs: {hr.name} covers {hr_data} of its frame, which needs {grid} of the low-resolution "
             f"frame, but {lr.name} covers only {lr_data}; render both with the same crop region and overscan"
         )
-    return Pairing(scale, grid, lr_data, hr_data)
+    stretch = (low.width * scale / high.width, low.height * scale / high.height)
+    return Pairing(scale, grid, lr_data, hr_data, stretch)
 
 
 def _scale(low: Window, high: Window) -> int | None:

@@ -1,0 +1,34 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from oiio_msspl.errors import InputError
+from oiio_msspl.render import Window
+from oiio_msspl.tiling import tiles
+
+
+@pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
+@pytest.mark.parametrize("largest", [4096, 20000, 10**9])
+@pytest.mark.parametrize("alignment", [1, 4])
+def test_cores_cover_the_grid_once_and_areas_fit(grid, largest, alignment):
+    covered = np.zeros((grid.height, grid.width), int)
+    for tile in tiles(grid, largest, overlap=8, alignment=alignment):
+        covered[tile.core.slices(grid)] += 1
+        assert tile.area.intersect(grid) == tile.area
+        assert tile.area.intersect(tile.core) == tile.core
+        for inner, outer, border in (
+            (tile.core.x0, tile.area.x0, grid.x0),
+            (tile.core.y0, tile.area.y0, grid.y0),
+        ):
+            assert inner - outer == 8 or outer == border
+    assert (covered == 1).all()
+
+
+def test_a_tile_never_holds_more_than_allowed():
+    for tile in tiles(Window(0, 0, 500, 300), 10000, overlap=16):
+        assert tile.area.width * tile.area.height <= 10000
+
+
+def test_too_little_memory_is_said():
+    with pytest.raises(InputError, match="raise --max-memory"):
+        list(tiles(Window(0, 0, 500, 300), 100, overlap=16))

@@ -201,7 +201,7 @@ def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
     spec.nchannels = len(channels)
     spec.channelnames = tuple(channels)
     spec.channelformats = ()
-    spec.format = oiio.TypeDesc({"uint": "uint32"}.get(kind, kind))
+    spec.format = oiio.TypeDesc(kind)
     _prepare(spec, name, _kept_compression(part))
     return spec
 

@@ -159,7 +159,7 @@ def open_exr(path: str | Path) -> ExrFile:
                 name=str(spec.getattribute("oiio:subimagename") or ""),
                 view=str(spec.getattribute("view") or ""),
                 channels=tuple(
-                    Channel(path, index, i, name, {"uint32": "uint"}.get(kind, kind))
+                    Channel(path, index, i, name, kind)
                     for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
                 ),
                 data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),

@@ -30,11 +30,11 @@ def write_exr(path, parts, *, display=None, compression=OpenEXR.ZIP_COMPRESSION,
     """
     if isinstance(parts, dict):
         parts = [("", parts, (0, 0))]
-    made = []
+    made, shown = [], display
     for name, channels, (x, y) in parts:
         height, width = next(iter(channels.values())).shape
         window = (np.array([x, y], np.int32), np.array([x + width - 1, y + height - 1], np.int32))
-        shown = window if display is None else display
+        shown = shown or window  # the parts of a file share one
         header = {
             "compression": compression,
             "type": OpenEXR.scanlineimage,
@@ -88,7 +88,7 @@ def downsample(values, scale):
 
 @pytest.fixture(scope="session")
 def bilinear_models(tmp_path_factory):
-    """{scale: ONNX file} of models that upsample the LRHS bilinearly and ignore the HRLS: exact, local, without weights."""
+    """{scale: ONNX file} of models that upsample the LRHS bilinearly and ignore the HRLS: exact, local, no weights."""
     onnx = pytest.importorskip("onnx")
     from onnx import TensorProto, helper
 

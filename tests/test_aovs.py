@@ -178,9 +178,7 @@ def test_blender_5_writes_the_layer_in_part_and_channel(tmp_path):
     resolution = resolved(tmp_path, parts, attributes={"cycles.ViewLayer.samples": "16"})
     assert resolution.spp == 16
     values = resolution.read(resolution.data_window)
-    np.testing.assert_allclose(
-        values["diffuse"][0, 0], (np.array([2, 2.1, 2.2]) + [3, 3.1, 3.2]) * [4, 4.1, 4.2], rtol=1e-6
-    )
+    np.testing.assert_allclose(values["diffuse"][0, 0], np.array([5, 5.2, 5.4]) * np.array([4, 4.1, 4.2]), rtol=1e-6)
 
 
 def test_luxcores_files_are_layers_of_one_frame(tmp_path):

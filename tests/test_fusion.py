@@ -109,7 +109,7 @@ def test_odd_sizes_are_stretched_to_fit(session, scale):
 
 
 def test_alpha_is_fused_and_exact_where_both_agree(session, scale):
-    low, high, clean = pair_of(scale)
+    low, high, _ = pair_of(scale)
     y, x = np.mgrid[0:96, 0:128]
     coverage = (((x - 64) ** 2 + (y - 48) ** 2) < 900).astype(np.float32)[..., None]
     high.layers["alpha"] = coverage
@@ -132,7 +132,7 @@ def test_alpha_without_a_partner_is_passed_through_and_said(session, scale):
 
 
 def test_a_black_beauty_is_refused(session, scale):
-    low, high, clean = pair_of(scale, albedo=np.ones((96, 128, 3), np.float32))
+    low, high, _ = pair_of(scale, albedo=np.ones((96, 128, 3), np.float32))
     high.layers["rgb"][:] = 0
     with pytest.raises(InputError, match="hr: the beauty is black everywhere, while that of lr is not"):
         fuse(low, high, session)

@@ -1,0 +1,298 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is written: reopened with OpenEXR's own reader, compared in bits."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import pytest
+
+from oiio_msspl import assemble
+from oiio_msspl.aovs import resolve
+from oiio_msspl.assemble import LAYOUTS, WriteOptions
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr import open_exr
+from oiio_msspl.output import check_target, replacing
+from tests.conftest import picture, read_bits, rgb, same_bits, write_exr
+
+H, W = 70, 40
+
+
+def everything(seed=0):
+    """Layers of all types with every bit pattern that survives: NaN payloads, infinities, denormals, big integers."""
+    rng = np.random.default_rng(seed)
+    beauty = picture(H, W).astype(np.float16)
+    ids = rng.integers(0, 2**32, (H, W), dtype=np.uint32)
+    return rgb(beauty) | {
+        "A": np.ones((H, W), np.float16),
+        "Z": rng.integers(0, 2**32, (H, W), dtype=np.uint32).view(np.float32),
+        "crypto00.R": rng.integers(0, 2**32, (H, W), dtype=np.uint32).view(np.float32),
+        "crypto00.G": rng.random((H, W), dtype=np.float32),
+        "id.X": ids,
+        "mask.matte": rng.integers(0, 2**16, (H, W), dtype=np.uint16).view(np.float16),
+        "albedo.R": beauty[..., 0].astype(np.float32),
+        "albedo.G": beauty[..., 1],
+        "albedo.B": beauty[..., 2],
+    }
+
+
+def written(tmp_path, parts, options=None, **attributes):
+    """Write a fused frame over a file; returns the fused colour, and what OpenEXR reads back."""
+    path = write_exr(tmp_path / "hr.exr", parts, **attributes)
+    hr = resolve(open_exr(path))
+    height, width = hr.data_window.height, hr.data_window.width
+    fused = np.full((height, width, 3), 0.1, np.float32) + np.arange(3, dtype=np.float32)
+    alpha = np.full((height, width, 1), 0.25, np.float32) if hr.alpha else None
+    out = tmp_path / "out.exr"
+    assemble.write(out, hr, fused, alpha, {"msspl/model": "test"}, options or WriteOptions())
+    return fused, out, read_bits(out)
+
+
+def flat(parts):
+    """{(layer, channel's last name): plane} whatever part it lies in."""
+    result = {}
+    for name, channels in parts:
+        for channel, plane in channels.items():
+            layer, _, component = channel.rpartition(".")
+            result[(layer or name, component)] = plane
+    return result
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_layers_are_passed_on_bit_for_bit(tmp_path, layout):
+    """Half, float, uint, NaN payloads: every layer but the beauty keeps every bit and its type."""
+    source = everything()
+    _, _, parts = written(tmp_path, source, WriteOptions(layout=layout))
+    after = flat(parts)
+    for name, plane in source.items():
+        if name in "RGBA":
+            continue
+        layer, _, component = name.rpartition(".")
+        # A layer of two pixel types becomes two parts in the nuke layout: albedo and albedo2.
+        candidates = [v for (part, c), v in after.items() if c == component and part.startswith(layer)]
+        assert any(same_bits(plane, v) for v in candidates), name
+
+
+def test_the_fused_beauty_comes_first(tmp_path):
+    fused, _, parts = written(tmp_path, everything())
+    name, channels = parts[0]
+    assert name == "rgba"
+    assert set(channels) == {"R", "G", "B", "A"}
+    assert channels["G"].dtype == np.float16  # as the HRLS has it
+    np.testing.assert_array_equal(channels["G"], fused[..., 1].astype(np.float16))
+    np.testing.assert_array_equal(channels["A"], np.float16(0.25))
+
+
+def test_multi_part_files_keep_their_parts(tmp_path):
+    """Blender 5's parts: the beauty's moves to the front, the others stay as they were, windows and all."""
+    source = [
+        ("VL.Depth", {"VL.Depth.Z": picture(H, W)[..., 0]}, (0, 0)),
+        ("VL.Combined", rgb(picture(H, W), "VL.Combined."), (0, 0)),
+        ("VL.Mist", {"VL.Mist.Z": picture(20, 10)[..., 1]}, (5, -3)),
+    ]
+    _, out, parts = written(tmp_path, source)
+    assert [name for name, _ in parts] == ["VL.Combined", "VL.Depth", "VL.Mist"]
+    assert same_bits(parts[1][1]["VL.Depth.Z"], source[0][1]["VL.Depth.Z"])
+    assert same_bits(parts[2][1]["VL.Mist.Z"], source[2][1]["VL.Mist.Z"])
+    window = open_exr(out).parts[2].data_window
+    assert (window.x0, window.y0, window.width, window.height) == (5, -3, 10, 20)
+
+
+def test_mixed_parts_are_copied_whole(tmp_path):
+    """A part of half, float and uint channels beside the beauty's."""
+    rest = {k: v for k, v in everything().items() if k not in "RGBA"}
+    source = [("rgba", rgb(picture(H, W)), (0, 0)), ("rest", rest, (0, 0))]
+    _, _, parts = written(tmp_path, source)
+    for name, plane in rest.items():
+        assert same_bits(parts[1][1][name], plane), name
+
+
+def test_windows_and_metadata_are_kept(tmp_path):
+    display = (np.array([0, 0], np.int32), np.array([99, 79], np.int32))
+    _, out, _ = written(
+        tmp_path,
+        [("", everything(), (-4, -6))],
+        display=display,
+        framesPerSecond=(24000, 1001),
+        pixelAspectRatio=2.0,
+        capDate="2026:01:01 00:00:00",
+        shot="sq010",
+    )
+    with OpenEXR.File(str(out), header_only=True) as file:
+        for part in file.parts:
+            low, high = part.header["dataWindow"]
+            assert (*low, *high) == (-4, -6, W - 5, H - 7)
+            assert (*part.header["displayWindow"][0], *part.header["displayWindow"][1]) == (0, 0, 99, 79)
+            assert part.header["pixelAspectRatio"] == 2
+        assert file.parts[0].header["shot"] == "sq010"
+        assert file.parts[0].header["msspl/model"] == "test"
+        assert tuple(file.parts[0].header["framesPerSecond"]) == (24000, 1001)
+
+
+@pytest.mark.parametrize("kind", ["half", "float"])
+@pytest.mark.parametrize("compression", ["none", "zips", "piz", "dwaa"])
+def test_pixel_type_and_compression_of_the_beauty(tmp_path, kind, compression):
+    source = everything()
+    _, out, parts = written(tmp_path, source, WriteOptions(pixel_type=kind, compression=compression))
+    assert parts[0][1]["R"].dtype == {"half": np.float16, "float": np.float32}[kind]
+    file = open_exr(out)
+    assert file.parts[0].compression == compression
+    assert all(part.compression == "zip" for part in file.parts[1:])
+    assert same_bits(flat(parts)[("id", "X")], source["id.X"])
+
+
+def test_lossy_sources_are_not_compressed_a_second_time(tmp_path):
+    """Layers decoded from DWA are stored without loss: encoding them again would change them."""
+    path = write_exr(tmp_path / "hr.exr", everything(), compression=OpenEXR.DWAA_COMPRESSION)
+    decoded = dict(read_bits(path)[0][1])
+    hr = resolve(open_exr(path))
+    assemble.write(
+        tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), np.ones((H, W, 1), np.float32), {}, WriteOptions()
+    )
+    after = flat(read_bits(tmp_path / "out.exr"))
+    assert same_bits(after[("albedo", "G")], decoded["albedo.G"])
+    assert open_exr(tmp_path / "out.exr").parts[0].compression == "zip"
+
+
+def test_nuke_layout_names_layers_by_part_alone(tmp_path):
+    _, _, parts = written(tmp_path, everything(), WriteOptions(layout="nuke"))
+    names = {name: set(channels) for name, channels in parts}
+    assert names["rgba"] == {"R", "G", "B", "A"}
+    assert names["crypto00"] == {"R", "G"}
+    assert names["depth"] == {"Z"}
+
+
+def test_multilayer_layout_is_one_part(tmp_path):
+    _, _, parts = written(tmp_path, everything(), WriteOptions(layout="multilayer"))
+    assert len(parts) == 1
+    assert parts[0][1].keys() == everything().keys()
+
+
+def test_multilayer_refuses_parts_of_different_windows(tmp_path):
+    source = [("rgba", rgb(picture(H, W)), (0, 0)), ("mist", {"mist.Z": picture(20, 10)[..., 1]}, (5, 3))]
+    with pytest.raises(InputError, match=r"part 'mist' of .* one part can hold only one, use --layout spec"):
+        written(tmp_path, source, WriteOptions(layout="multilayer"))
+    assert not (tmp_path / "out.exr").exists()
+
+
+def test_what_spec_and_multilayer_write_is_read_as_the_same_features(tmp_path):
+    for layout in ("spec", "multilayer"):
+        _, out, _ = written(tmp_path, everything(), WriteOptions(layout=layout))
+        assert {"rgb", "albedo"} <= resolve(open_exr(out)).features.keys()
+
+
+def test_values_beyond_half_are_written_as_its_largest(tmp_path):
+    hr = resolve(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W).astype(np.float16)))))
+    assemble.write(tmp_path / "out.exr", hr, np.full((H, W, 3), 1e6, np.float32), None, {}, WriteOptions())
+    assert (read_bits(tmp_path / "out.exr")[0][1]["R"] == 65504).all()
+
+
+def test_the_aces_container_flag_is_not_passed_on(tmp_path):
+    """ST 2065-4 forbids it on compressed or multi-layer files."""
+    for layout in ("spec", "multilayer"):
+        _, out, _ = written(tmp_path, everything(), WriteOptions(layout=layout), acesImageContainerFlag=1)
+        assert "acesImageContainerFlag" not in open_exr(out).metadata
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"layout": "x"}, "use one of spec, nuke, multilayer"), ({"compression": "x"}, "use one of none")],
+)
+def test_unknown_options_are_refused(options, message):
+    with pytest.raises(InputError, match=message):
+        WriteOptions(**options)
+
+
+# ---------------------------------------------------------------------------------------------- whole or not at all
+
+
+def test_a_failing_block_leaves_the_old_file(tmp_path):
+    target = tmp_path / "out.exr"
+    target.write_text("old")
+    with pytest.raises(RuntimeError), replacing(target) as temporary:
+        temporary.write_text("half of the n")
+        raise RuntimeError
+    assert target.read_text() == "old"
+    assert os.listdir(tmp_path) == ["out.exr"]
+
+
+def test_targets_are_checked_before_any_work(tmp_path):
+    (tmp_path / "there.exr").write_text("old")
+    with pytest.raises(InputError, match="exists; pass --overwrite"):
+        check_target(tmp_path / "there.exr", overwrite=False)
+    assert check_target(tmp_path / "there.exr", overwrite=True)
+    with pytest.raises(InputError, match="does not exist; create it first"):
+        check_target(tmp_path / "nowhere" / "x.exr", overwrite=False)
+    with pytest.raises(InputError, match="is a folder"):
+        check_target(tmp_path, overwrite=True)
+
+
+_WRITE = """
+import resource, sys
+import numpy as np
+from pathlib import Path
+from oiio_msspl import assemble
+from oiio_msspl.aovs import resolve
+from oiio_msspl.errors import MssplError
+from oiio_msspl.exr import open_exr
+limit = int(sys.argv[2])
+if limit:
+    import signal
+    signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as a full disk: write() fails
+    resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+folder = Path(sys.argv[1])
+hr = resolve(open_exr(folder / "hr.exr"))
+rgb = np.random.default_rng(0).random((hr.data_window.height, hr.data_window.width, 3), dtype=np.float32)
+print("writing", flush=True)
+try:
+    for _ in range(int(sys.argv[3])):
+        assemble.write(folder / "out.exr", hr, rgb, None, {}, assemble.WriteOptions())
+except MssplError as error:
+    print(error)
+    sys.exit(error.exit_code)
+"""
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX limits")
+@pytest.mark.parametrize("limit", [1000, 100_000, 700_000])
+def test_a_full_disk_leaves_the_old_file(tmp_path, limit):
+    """Wherever the disk fills up - header, beauty, passed-on layers - the old file stays and no scrap is left."""
+    noise = np.random.default_rng(1).random((300, 200, 3)).astype(np.float32)
+    write_exr(tmp_path / "hr.exr", rgb(noise) | rgb(noise * 2, "albedo."))
+    (tmp_path / "out.exr").write_text("old")
+    done = subprocess.run(
+        [sys.executable, "-c", _WRITE, str(tmp_path), str(limit), "1"], capture_output=True, text=True
+    )
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "the target is as it was" in done.stdout
+    assert (tmp_path / "out.exr").read_text() == "old"
+    assert sorted(os.listdir(tmp_path)) == ["hr.exr", "out.exr"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs SIGKILL")
+def test_killed_half_way_the_old_file_is_whole(tmp_path):
+    noise = np.random.default_rng(1).random((300, 200, 3)).astype(np.float32)
+    write_exr(tmp_path / "hr.exr", rgb(noise) | rgb(noise * 2, "albedo."))
+    (tmp_path / "out.exr").write_text("old")
+    for delay in (0.0, 0.02, 0.05):
+        process = subprocess.Popen([sys.executable, "-c", _WRITE, str(tmp_path), "0", "100"], stdout=subprocess.PIPE)
+        process.stdout.readline()
+        time.sleep(delay)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+        content = (tmp_path / "out.exr").read_bytes()
+        if content != b"old":
+            file = open_exr(tmp_path / "out.exr")  # a whole frame from an earlier turn of the loop
+            assert np.isfinite(file.read(file.parts[0].channels, file.parts[0].data_window)).all()
+
+
+def test_an_unwritable_path_is_our_failure_not_a_traceback(tmp_path, monkeypatch):
+    hr = resolve(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W)))))
+    monkeypatch.setattr(oiio.ImageOutput, "create", staticmethod(lambda path: None))
+    with pytest.raises(MssplError, match="OpenImageIO can't write it"):
+        assemble.write(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())

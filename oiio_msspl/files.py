@@ -135,6 +135,8 @@ def fuse_files(
         raise InputError(f"{output}: is one of the inputs; write the result elsewhere")
     if preview_path is not None:
         check_target(preview_path, overwrite=overwrite)
+        if view_transform is not None:
+            preview.check_view(view_transform)
     lr, hr = resolve_pair(lr_path, hr_path, inputs)
     scale = pair(lr, hr).scale
     session = Session(find_model(scale, model), device, threads)

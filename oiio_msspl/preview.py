@@ -19,6 +19,13 @@ OCIO_DISPLAY = "sRGB - Display"
 OCIO_INPUT = "lin_rec709"
 
 
+def check_view(view: str) -> None:
+    """Raise InputError if OpenColorIO's configuration has no such view."""
+    views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
+    if view not in views:
+        raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
+
+
 def write(path: Path, rgb: Array, data_window: Window, display_window: Window, view: str | None = None) -> None:
     """Write scene-linear ``rgb`` (height, width, 3) over ``data_window`` as it lies in the display window.
 
@@ -53,10 +60,7 @@ def write_png(path: Path, display: Array) -> None:
 
 
 def _through_ocio(linear: Array, view: str) -> Array:
-    config = oiio.ColorConfig(OCIO_CONFIG)
-    views = config.getViewNames(OCIO_DISPLAY)
-    if view not in views:
-        raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
+    check_view(view)
     image = oiio.ImageBuf(np.ascontiguousarray(linear))
     result = oiio.ImageBufAlgo.ociodisplay(
         image, OCIO_DISPLAY, view, fromspace=OCIO_INPUT, unpremult=False, colorconfig=OCIO_CONFIG

@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The programs as users run them: a process, its exit code, and what it wrote, reopened."""
+
+import json
+import shutil
+import subprocess
+import sys
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from oiio_msspl.aovs import resolve
+from oiio_msspl.exr import open_exr
+from tests.conftest import EXAMPLES, SHARED, downsample, needs_shared, noisy, picture, rgb, write_exr
+
+
+def run(program, *arguments, cwd=None):
+    code = f"import sys; from msspl_cli.app import {program} as main; sys.argv[0] = '{program}'; main()"
+    command = [sys.executable, "-c", code, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
+
+
+def fuse(*arguments):
+    return run("msspl_fuse", *arguments)
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A x4 pair with albedo, alpha and a mask, and its reference."""
+    clean = picture(96, 128)
+    ones = np.ones((96, 128), np.float16)
+    channels = rgb(noisy(clean, 1).astype(np.float16)) | {"A": ones} | rgb((clean > 0.3).astype(np.float16), "albedo.")
+    write_exr(tmp_path / "hr.exr", channels | {"mask.X": ones * 7})
+    low = noisy(downsample(clean, 4), 16).astype(np.float16)
+    write_exr(tmp_path / "lr.exr", rgb(low) | {"A": ones[::4, ::4]})
+    write_exr(tmp_path / "ref.exr", rgb(clean))
+    return tmp_path
+
+
+def test_the_main_job(files, bilinear_models):
+    done = fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4])
+    assert done.returncode == 0, done.stderr
+    assert "albedo    found    albedo" in done.stdout
+    assert "variance  default" in done.stdout
+    assert done.stderr == ""
+    out = resolve(open_exr(files / "out.exr"))
+    values = out.read(out.data_window)
+    assert values["rgb"].shape == (96, 128, 3)
+    assert (values["alpha"] == 1).all()
+    mask = next(p for p in out.file.parts if p.name == "mask")
+    assert (out.file.read(mask.channels, mask.data_window) == 7).all()
+    assert out.metadata["msspl/model"] == "bilinear-x4"
+    preview = oiio.ImageBuf(str(files / "out.png"))
+    assert (preview.spec().width, preview.spec().height, preview.spec().nchannels) == (128, 96, 3)
+
+
+def test_the_report_for_machines(files, bilinear_models):
+    done = fuse(
+        files / "lr.exr",
+        files / "hr.exr",
+        "-o",
+        files / "out.exr",
+        "--model",
+        bilinear_models[4],
+        "--json",
+        "--lr-spp",
+        16,
+        "--hr-spp",
+        1,
+        "--no-preview",
+    )
+    report = json.loads(done.stdout)
+    assert report["spp"] == {"lrhs": 16, "hrls": 1, "average": 2}
+    assert report["preview"] is None
+    assert not (files / "out.png").exists()
+    assert {row["feature"]: row["status"] for row in report["aovs"]}["diffuse"] == "default"
+
+
+def test_quiet_says_nothing(files, bilinear_models):
+    done = fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4], "-q")
+    assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
+
+
+def test_nothing_is_overwritten_without_being_told(files, bilinear_models):
+    arguments = [files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4]]
+    (files / "out.exr").write_text("old")
+    done = fuse(*arguments)
+    assert done.returncode == 2
+    assert done.stderr == f"error: {files}/out.exr: exists; pass --overwrite to replace it\n"
+    assert (files / "out.exr").read_text() == "old"
+    (files / "out.exr").unlink()
+    (files / "out.png").write_text("old")
+    assert fuse(*arguments).returncode == 2
+    assert not (files / "out.exr").exists()
+    assert fuse(*arguments, "--overwrite").returncode == 0
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["hr.exr", "lr.exr"], "the inputs look swapped"),
+        (["hr.exr", "hr.exr"], "given twice"),
+        (["lr.exr", "nothing.exr"], "nothing.exr: no such file"),
+        (["lr.exr", "text.exr"], "text.exr: can't be opened as an EXR"),
+        (["lr.exr", "hr.exr", "--map", "albedo=nothing"], "no layer for --map albedo=nothing"),
+        (["lr.exr", "hr.exr", "--device", "abacus"], "use one of cpu"),
+        (["lr.exr", "hr.exr", "--model", "nothing"], "no model 'nothing'"),
+        (["lr.exr", "hr.exr", "--layout", "x"], "use one of spec"),
+        (["lr.exr", "hr.exr", "--max-memory", "lots"], "write it as 3G or 800M"),
+        (["lr.exr", "hr.exr", "--max-memory", "1M"], "allow at least"),
+        (["lr.exr", "hr.exr", "--view-layer", "fg"], "no view or view layer 'fg'"),
+        (["lr.exr", "hr.exr", "--view", "sepia"], "--view 'sepia'"),
+        (["lr.exr", "hr.exr", "-o", "hr.exr", "--overwrite"], "is one of the inputs"),
+        (["lr.exr", "hr.exr", "-o", "out.png"], "the result is an EXR"),
+    ],
+)
+def test_the_callers_mistakes_are_one_sentence_and_exit_code_2(files, bilinear_models, arguments, message):
+    (files / "text.exr").write_text("hello " * 50)
+    names = [str(files / a) if a.endswith((".exr", ".png")) else a for a in arguments]
+    if "--model" not in names:
+        names += ["--model", str(bilinear_models[4])]
+    if "-o" not in names:
+        names += ["-o", str(files / "out.exr")]
+    done = fuse(*names)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
+    assert done.stderr.count("\n") == 1
+    assert not (files / "out.exr").exists()
+
+
+def test_debug_shows_the_traceback(files):
+    done = fuse(files / "hr.exr", files / "lr.exr", "-o", files / "out.exr", "--debug")
+    assert "Traceback" in done.stderr
+
+
+def test_wrong_usage_is_exit_code_2(files):
+    assert fuse(files / "lr.exr").returncode == 2
+
+
+def test_opencolorio_views_of_the_preview(files, bilinear_models):
+    arguments = [
+        files / "lr.exr",
+        files / "hr.exr",
+        "-o",
+        files / "out.exr",
+        "--model",
+        bilinear_models[4],
+        "--overwrite",
+    ]
+    pictures = []
+    for extra in ([], ["--view", "Un-tone-mapped"], ["--view", "ACES 1.0 - SDR Video"]):
+        assert fuse(*arguments, *extra).returncode == 0
+        pictures.append(np.asarray(oiio.ImageBuf(str(files / "out.png")).get_pixels(oiio.UINT8)).astype(int))
+    assert np.abs(pictures[0] - pictures[1]).max() <= 2  # the paper's curve is sRGB, clipped at white
+    assert np.abs(pictures[0] - pictures[2]).mean() > 5
+
+
+def test_inspect_tells_a_person_and_a_machine(files):
+    done = run("msspl", "inspect", files / "hr.exr")
+    assert done.returncode == 0
+    assert "display window 128x96+0+0" in done.stdout
+    assert "passed through: mask" in done.stdout
+    data = json.loads(run("msspl", "inspect", files / "hr.exr", "--json").stdout)
+    assert data["usable"]
+    assert data["parts"][0]["channels"]["mask.X"] == "half"
+
+
+def test_inspect_explains_what_cannot_be_used(files):
+    write_exr(files / "black.exr", rgb(np.zeros((8, 8, 3), np.float32)) | rgb(picture(8, 8), "albedo."))
+    done = run("msspl", "inspect", files / "black.exr")
+    assert done.returncode == 2
+    assert "can't be used: the beauty is black everywhere, though albedo are not" in done.stdout
+
+
+@needs_shared("exr")
+@pytest.mark.parametrize("path", sorted(SHARED.glob("exr/**/*.exr")), ids=lambda p: f"{p.parent.name}/{p.stem}")
+def test_inspect_handles_every_real_file(path):
+    """Usable with a mapped beauty, or explained in a sentence: never a traceback."""
+    done = run("msspl", "inspect", path, "--json")
+    data = json.loads(done.stdout)
+    assert done.stderr == ""
+    assert done.returncode == (0 if data["usable"] else 2)
+    assert data["usable"] == (not data["problems"])
+    unusable = {
+        "crypto_only",
+        "deep",
+        "ALBEDO",
+        "AVG_SHADING_NORMAL",
+        "DEPTH",
+        "DIRECT_DIFFUSE",
+        "INDIRECT_GLOSSY",
+        "NOISE",
+    }
+    # The V-Ray file holds headers and no pixels; gaffer's test files are black or constant.
+    unusable |= {"rgba_z_crypto_diffuse_normals"}
+    assert data["usable"] == (path.stem not in unusable), data["problems"]
+
+
+def test_compare_prints_the_papers_measures(files, bilinear_models):
+    fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4])
+    names = ["out.exr", "hr.exr", "lr.exr"]
+    done = run(
+        "msspl",
+        "compare",
+        *(files / n for n in names),
+        "-r",
+        files / "ref.exr",
+        "--json",
+        "--error-map",
+        files / "e.png",
+    )
+    assert done.returncode == 0, done.stderr
+    scores = json.loads(done.stdout)
+    assert scores[0]["psnr"] > scores[1]["psnr"]
+    assert set(scores[0]) == {"image", "psnr", "relmse", "relmse_gharbi", "ssim"}
+    assert oiio.ImageBuf(str(files / "e.png")).spec().width == 128
+
+
+def test_compare_refuses_other_sizes(files):
+    write_exr(files / "small.exr", rgb(picture(50, 50)))
+    done = run("msspl", "compare", files / "small.exr", "-r", files / "ref.exr")
+    assert done.returncode == 2
+    assert "is 50x50, but" in done.stderr
+
+
+def test_models_lists_what_ships():
+    data = json.loads(run("msspl", "models", "--json").stdout)
+    assert {m["name"] for m in data["models"]} >= {"paper-x2", "paper-x4", "paper-x8"}
+    assert "cpu" in data["devices"]
+
+
+@pytest.mark.parametrize("program", ["msspl_fuse", "msspl"])
+def test_help_imports_nothing_heavy_and_ends_with_examples(program):
+    """--help stays quick because NumPy, OpenImageIO and onnxruntime are not imported for it."""
+    code = (
+        f"import sys; from msspl_cli.app import {program} as main\n"
+        "sys.argv[1:] = ['--help']\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print('HEAVY', [m for m in ('numpy', 'OpenImageIO', 'onnxruntime', 'torch', 'OpenEXR') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.endswith("HEAVY []\n"), done.stdout[-300:] + done.stderr
+    if program == "msspl_fuse":
+        assert "msspl-fuse lr.exr hr.exr -o out.exr" in done.stdout
+
+
+def test_installed_programs_are_on_the_path():
+    assert shutil.which("msspl-fuse"), "install the package: pip install -e '.[test]'"
+    assert shutil.which("msspl")
+
+
+def test_the_readmes_first_command_shows_a_result(tmp_path):
+    """Our own example pair through the shipped model: finite, closer to the LRHS's light than the HRLS is."""
+    done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr", "--json")
+    assert done.returncode == 0, done.stderr
+    report = json.loads(done.stdout)
+    assert (report["scale"], report["spp"]["average"]) == (4, 2)
+    out = resolve(open_exr(tmp_path / "out.exr"))
+    values = out.read(out.data_window)["rgb"]
+    assert np.isfinite(values).all()
+    low = resolve(open_exr(EXAMPLES / "lr.exr"))
+    expected = low.read(low.data_window)["rgb"]
+    difference = np.abs(downsample(values, 4) - expected).mean() / expected.mean()
+    assert difference < 0.15
+    names = {p.name for p in out.file.parts}
+    assert any("CryptoObject00" in n for n in names)

@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+import json
+
+import numpy as np
+import pytest
+
+from oiio_msspl import schema
+from oiio_msspl.contract import METADATA_KEY, Contract
+from oiio_msspl.errors import InputError
+from oiio_msspl.session import PROVIDERS, Session, find_model, shipped_models, usable_devices
+
+
+def test_a_model_ships_for_every_scale():
+    assert {f"paper-x{s}" for s in schema.SCALES} <= shipped_models().keys()
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_shipped_models_load_and_say_where_they_come_from(scale):
+    session = Session(find_model(scale))
+    assert session.contract.scale == scale
+    assert session.contract.training_spp.keys() == {"hrls", "lrhs"}
+    assert session.contract.provenance["steps"] > 0
+    values = session.run(np.zeros((6, 8, 3), np.float32), np.zeros((6 * scale, 8 * scale, 16), np.float32))
+    assert values.shape == (6 * scale, 8 * scale, 3)
+    assert np.isfinite(values).all()
+
+
+def test_a_contract_survives_its_json():
+    contract = Contract(name="x", scale=4, training_spp={"hrls": [1, 8]}, provenance={"steps": 1})
+    assert Contract.from_json(contract.to_json(), "x.onnx") == contract
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"format": 99}, "contract format 99, this version reads 1"),
+        ({"hrls": ["rgb.R"]}, "made for hrls"),
+        ({"transforms": {"curve": "linear"}}, "made for transforms"),
+        ({"scale": 3}, "scale 3 is none of"),
+        ({"surprise": 1}, "can't be read"),
+    ],
+)
+def test_a_contract_that_cannot_be_honoured_is_refused(change, message):
+    text = json.dumps(json.loads(Contract(name="x", scale=4).to_json()) | change)
+    with pytest.raises(InputError, match=rf"x\.onnx: .*{message}"):
+        Contract.from_json(text, "x.onnx")
+
+
+def test_files_that_are_no_models_are_named(tmp_path, bilinear_models):
+    (tmp_path / "text.onnx").write_text("hello")
+    with pytest.raises(InputError, match=r"text\.onnx: onnxruntime can't load it"):
+        Session(tmp_path / "text.onnx")
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(bilinear_models[2])
+    del model.metadata_props[:]
+    onnx.save(model, tmp_path / "bare.onnx")
+    with pytest.raises(InputError, match=rf"bare\.onnx: has no '{METADATA_KEY}' metadata"):
+        Session(tmp_path / "bare.onnx")
+    with pytest.raises(InputError, match="no model 'nothing': neither a file nor one of"):
+        find_model(4, "nothing")
+
+
+def test_devices_that_are_not_there_are_said(bilinear_models):
+    with pytest.raises(InputError, match="use one of cpu, cuda"):
+        Session(bilinear_models[2], "gpu")
+    absent = next(d for d in PROVIDERS if d not in usable_devices())
+    with pytest.raises(InputError, match=r"has no .*; usable here: cpu"):
+        Session(bilinear_models[2], absent)
+
+
+def test_the_cpu_is_named_as_provider(bilinear_models):
+    assert Session(bilinear_models[2]).provider == "CPUExecutionProvider"

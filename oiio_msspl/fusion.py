@@ -115,7 +115,7 @@ def _read_low(lr: Source, pairing: Pairing, repaired: dict[str, int]) -> dict[st
         (0, grid.y0, grid.y1, pairing.stretch[1], whole.y0),
         (1, grid.x0, grid.x1, pairing.stretch[0], whole.x0),
     ):
-        position = (np.arange(first, last) + 0.5) * stretch - 0.5 - begin
+        position = (np.arange(first, last, dtype=np.float64) + 0.5) * stretch - 0.5 - begin
         low = {name: _interpolated(values, position, axis) for name, values in low.items()}
     return low
 

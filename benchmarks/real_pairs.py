@@ -99,7 +99,8 @@ def run_pair(lr: Path, hr: Path, out: Path, arguments: list[str]) -> dict:
     }
     reference = hr.with_name("ref.exr")
     if reference.exists():
-        result["scores"] = dict(zip(("fused", "hrls", "lrhs bicubic"), compare_files([out, hr, lr], reference), strict=True))
+        fused, high, low = compare_files([out, hr, lr], reference)
+        result["scores"] = {"fused": fused, "hrls": high, "lrhs bicubic": low}
     return result
 
 

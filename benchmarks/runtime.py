@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time and peak memory for one 1024 x 1024 frame at x2, x4 and x8: the work of the paper's table of runtimes.
+
+    python -m benchmarks.runtime --json results/runtime.json
+
+Each measurement is a process of its own; the network's time is the median of the repeats after one that warms up, and
+OIDN's (if pyoidn is installed) is taken in turn with ours, so that a machine whose speed drifts does not favour one.
+Peak memory is the process's largest resident set, libraries and weights included. `--size 8192x4320` shows what an 8K
+frame takes from file to file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import platform
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+#: Seconds on a Titan Xp GPU and MB of its memory, from the paper's table 3 and text.
+PAPER = {2: (0.362, 1134), 4: (0.118, 749), 8: (0.052, 737)}
+
+
+def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
+    """Random layers: times do not depend on what is in the pixels."""
+    import numpy as np
+
+    rng = np.random.default_rng(seed)
+    return {
+        "rgb": rng.random((height, width, 3), dtype=np.float32),
+        "albedo": rng.random((height, width, 3), dtype=np.float32),
+        "normal": rng.random((height, width, 3), dtype=np.float32),
+    }
+
+
+def measure_network(scale: int, height: int, width: int, repeats: int, threads: int) -> dict[str, Any]:
+    """Seconds of :func:`oiio_msspl.fuse` on arrays, and the process's peak memory (in this process)."""
+    from oiio_msspl import Render, Session, find_model, fuse
+
+    session = Session(find_model(scale), threads=threads)
+    layers = frame(height, width)
+    high = Render.from_arrays("hr", **layers)
+    low = Render.from_arrays("lr", rgb=layers["rgb"][::scale, ::scale].copy())
+    fuse(low, high, session)
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        fuse(low, high, session)
+        times.append(time.perf_counter() - start)
+    return {"seconds": times, "peak_mb": peak_mb()}
+
+
+def measure_oidn(scale: int, height: int, width: int, repeats: int, threads: int) -> dict[str, Any]:
+    import pyoidn
+
+    layers = frame(height, width)
+    pyoidn.denoise(layers["rgb"], albedo=layers["albedo"], normal=layers["normal"], hdr=True, quality="high")
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        pyoidn.denoise(layers["rgb"], albedo=layers["albedo"], normal=layers["normal"], hdr=True, quality="high")
+        times.append(time.perf_counter() - start)
+    return {"seconds": times, "peak_mb": peak_mb()}
+
+
+def measure_files(scale: int, height: int, width: int, max_memory: int) -> dict[str, Any]:
+    """A whole job from file to file: half-float EXRs with the layers of a Cycles render."""
+    import numpy as np
+    import OpenEXR
+
+    from oiio_msspl import fuse_files
+
+    with tempfile.TemporaryDirectory() as folder:
+        for name, h, w in (("lr", height // scale, width // scale), ("hr", height, width)):
+            # Written by a process of its own, so that its memory is not ours.
+            subprocess.run(
+                [sys.executable, "-m", "benchmarks.runtime", "--write", f"{folder}/{name}.exr", f"{w}x{h}"], check=True
+            )
+        del np, OpenEXR
+        start = time.perf_counter()
+        report = fuse_files(f"{folder}/lr.exr", f"{folder}/hr.exr", f"{folder}/out.exr", max_memory=max_memory)
+        return {
+            "seconds": [time.perf_counter() - start],
+            "peak_mb": peak_mb(),
+            "tiles": report.tiles,
+            "parts": report.seconds,
+        }
+
+
+def write_frame(path: str, width: int, height: int) -> None:
+    import numpy as np
+    import OpenEXR
+
+    layers = frame(height, width)
+    channels = {}
+    for name, suffixes in (
+        ("rgb", "RGB"),
+        ("albedo", "RGB"),
+        ("normal", "XYZ"),
+        ("diffuse", "RGB"),
+        ("specular", "RGB"),
+    ):
+        source = layers.get(name, layers["rgb"])
+        for i, suffix in enumerate(suffixes):
+            channel = suffix if name == "rgb" else f"{name}.{suffix}"
+            channels[channel] = np.ascontiguousarray(source[..., i].astype(np.float16))
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, channels) as file:
+        file.write(path)
+
+
+def peak_mb() -> float:
+    """Largest resident set of this process so far, in MB (Linux counts in KiB, macOS in bytes)."""
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+
+
+def in_process(kind: str, scale: int, size: str, *extra: str) -> dict[str, Any]:
+    command = [sys.executable, "-m", "benchmarks.runtime", "--measure", kind, str(scale), "--size", size, *extra]
+    done = subprocess.run(command, capture_output=True, text=True)
+    if done.returncode:
+        raise SystemExit(done.stderr)
+    return json.loads(done.stdout)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--size", default="1024x1024")
+    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--rounds", type=int, default=2, help="times that each is measured, in turn")
+    parser.add_argument("--threads", type=int, default=0)
+    parser.add_argument("--max-memory", type=int, default=3 << 30)
+    parser.add_argument(
+        "--files", type=int, metavar="SCALE", help="measure a whole job from file to file at this scale"
+    )
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--write", nargs=2, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    width, height = (int(v) for v in (args.write[1] if args.write else args.size).split("x"))
+    if args.write:
+        return write_frame(args.write[0], width, height)
+    if args.measure:
+        kind, scale = args.measure[0], int(args.measure[1])
+        if kind == "files":
+            result = measure_files(scale, height, width, args.max_memory)
+        else:
+            measure = measure_network if kind == "network" else measure_oidn
+            result = measure(scale, height, width, args.repeats, args.threads)
+        print(json.dumps(result))
+        return None
+    if args.files:
+        result = in_process("files", args.files, args.size, "--max-memory", str(args.max_memory))
+        print(
+            f"{args.size} x{args.files}, file to file: {result['seconds'][0]:.1f} s, peak {result['peak_mb']:.0f} MB, "
+            f"{result['tiles']} tiles; {result['parts']}"
+        )
+        results: Any = {"files": result}
+    else:
+        results = compare(args)
+    if args.json:
+        args.json.parent.mkdir(parents=True, exist_ok=True)
+        args.json.write_text(
+            json.dumps({"size": args.size, "machine": platform.processor(), "results": results}, indent=1)
+        )
+    return None
+
+
+def compare(args: argparse.Namespace) -> dict[str, Any]:
+    """Ours at each scale and OIDN, in turn; prints the table."""
+    try:
+        import pyoidn  # noqa: F401
+
+        peers = [("oidn", 1)]
+    except ImportError:
+        peers = []
+    cases = [*(("network", s) for s in (2, 4, 8)), *peers]
+    seconds: dict[tuple[str, int], list[float]] = {case: [] for case in cases}
+    peak: dict[tuple[str, int], float] = dict.fromkeys(cases, 0.0)
+    for _ in range(args.rounds):
+        for case in cases:
+            result = in_process(*case, args.size, "--repeats", str(args.repeats), "--threads", str(args.threads))
+            seconds[case] += result["seconds"]
+            peak[case] = max(peak[case], result["peak_mb"])
+    reference = statistics.median(seconds[("oidn", 1)]) if peers else None
+    print(f"| {args.size} | median s | of OIDN's time | peak MB | paper, Titan Xp |")
+    print("|---|---|---|---|---|")
+    table = {}
+    for kind, scale in cases:
+        name = f"paper-x{scale}" if kind == "network" else "OIDN 2.5.1, quality high"
+        median = statistics.median(seconds[(kind, scale)])
+        ratio = f"{median / reference:.2f}" if reference else "-"
+        paper = f"{PAPER[scale][0]} s, {PAPER[scale][1]} MB" if kind == "network" else "-"
+        print(f"| {name} | {median:.2f} | {ratio} | {peak[(kind, scale)]:.0f} | {paper} |")
+        table[name] = {"seconds": seconds[(kind, scale)], "peak_mb": peak[(kind, scale)]}
+    return table
+
+
+if __name__ == "__main__":
+    main()

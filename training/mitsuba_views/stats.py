@@ -1,0 +1,114 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How hard a set of views is: `python -m training.mitsuba_views.stats DIR [--validation RENDERS]`.
+
+Every image is exposed to a log-mean luminance of 0.18 first, the reference's, as a viewer would see it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+_MEASURES = {
+    "psnr": "1-spp PSNR in sRGB [dB]",
+    "ref_psnr": "reference's own PSNR [dB]",
+    "log_mean": "log10 of the log-mean luminance",
+    "range": "decades of luminance, 1st to 99th percentile",
+    "black": "black pixels at 1 spp",
+    "clipped": "reference pixels over display white",
+    "edges": "pixels at an albedo edge",
+}
+
+
+def _display(color: np.ndarray) -> np.ndarray:
+    """Linear colour to sRGB 0..1."""
+    x = np.clip(color, 0, 1)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dict[str, float]:
+    """Numbers of one view from its 1-spp colour, its reference and a clean-ish albedo, each (H, W, 3)."""
+    luminance = np.maximum(reference @ _LUMINANCE, 0)
+    log_mean = np.exp(np.log(luminance + 1e-4 * luminance.mean() + 1e-12).mean())
+    exposure = 0.18 / log_mean
+    error = np.square(_display(noisy * exposure) - _display(reference * exposure)).mean()
+    low, high = np.percentile(luminance, (1, 99))
+    across = np.abs(np.diff(albedo, axis=1)).max(-1)[1:] > 0.08
+    down = np.abs(np.diff(albedo, axis=0)).max(-1)[:, 1:] > 0.08
+    return {
+        "psnr": float(-10 * np.log10(max(error, 1e-12))),
+        "log_mean": float(np.log10(log_mean)),
+        "range": float(np.log10(max(high, 1e-9) / max(low, 1e-6 * high, 1e-9))),
+        "black": float((noisy.max(-1) <= 0).mean()),
+        "clipped": float((luminance * exposure > 1).mean()),
+        "edges": float((across | down).mean()),
+    }
+
+
+def training_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
+    """(kind, numbers) of each training file."""
+    for path in sorted(folder.glob("mitsuba-*.npz")):
+        with np.load(path) as view:
+            hr, meta = view["hr"].astype(np.float32), json.loads(str(view["meta"]))
+            numbers = measure(hr[0, ..., :3], view["ref"].astype(np.float32), hr[..., 3:6].mean(0))
+        yield meta["kind"], {**numbers, "ref_psnr": meta["ref_psnr"]}
+
+
+def validation_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
+    """(scene, numbers) of each folder that holds `hr_1spp.exr` and `ref.exr`."""
+    import OpenImageIO as oiio
+
+    def read(path: Path, names: list[str]) -> np.ndarray:
+        buffer = oiio.ImageBuf(str(path))
+        have = buffer.spec().channelnames
+        return buffer.get_pixels(oiio.FLOAT)[..., [have.index(n) for n in names]]
+
+    for path in sorted(folder.glob("*/hr_1spp.exr")):
+        # The albedo of most samples: edges of a 1-spp albedo would count its aliasing.
+        best = max(path.parent.glob("hr_*spp.exr"), key=lambda p: int(p.stem[3:-3]))
+        rgb = list("RGB")
+        albedo = read(best, ["albedo.R", "albedo.G", "albedo.B"])
+        yield path.parent.name, measure(read(path, rgb), read(path.with_name("ref.exr"), rgb), albedo)
+
+
+def _row(name: str, views: list[dict[str, float]], key: str) -> str:
+    values = [v[key] for v in views if key in v]
+    if not values:
+        return f"  {name:14s} {'-':>8s}"
+    p10, p50, p90 = np.percentile(values, (10, 50, 90))
+    return f"  {name:14s} {p50:8.3f} {p10:8.3f} {p90:8.3f}   n={len(values)}"
+
+
+def main() -> None:
+    p = argparse.ArgumentParser(
+        prog="python -m training.mitsuba_views.stats", description=__doc__.split("\n")[0]
+    )
+    p.add_argument("folder", type=Path, help="folder of mitsuba-*.npz")
+    p.add_argument(
+        "--validation", type=Path, help="folder of <scene>/hr_1spp.exr and ref.exr to set beside it"
+    )
+    args = p.parse_args()
+
+    sets: dict[str, list[dict[str, float]]] = {"training": []}
+    kinds: dict[str, list[dict[str, float]]] = {}
+    for kind, numbers in training_views(args.folder):
+        sets["training"].append(numbers)
+        kinds.setdefault(kind, []).append(numbers)
+    if args.validation:
+        sets["validation"] = [numbers for _, numbers in validation_views(args.validation)]
+    for key, title in _MEASURES.items():
+        print(f"{title}: median, 10 %, 90 %")
+        for name, views in sets.items():
+            print(_row(name, views, key))
+    print(f"{_MEASURES['psnr']} by kind: median, 10 %, 90 %")
+    for kind, views in sorted(kinds.items()):
+        print(_row(kind, views, "psnr"))
+
+
+if __name__ == "__main__":
+    main()

@@ -125,7 +125,7 @@ def main() -> int:
                 f"; {name} {s['psnr']:.2f} dB {s['relmse']:.4f}" for name, s in result.get("scores", {}).items()
             )
             print(
-                f"{result['pair']}: {result['renderer']} x{result['scale']}, without {', '.join(defaulted) or 'nothing'}; "
+                f"{result["pair"]}: {result["renderer"]} x{result["scale"]}, without {', '.join(defaulted) or 'nothing'}; "
                 f"{result['passed_on']} channels passed on, {len(result['faults'])} differ{scores}"
             )
             for line in [*result["faults"], *result["warnings"]]:

@@ -47,8 +47,8 @@ class Contract:
     """Height and width of the LRHS must be multiples of this, in LRHS pixels."""
     overlap: int = 16
     """LRHS pixels that neighbouring tiles share on each side: the network's receptive field, or what of it matters."""
-    bytes_per_pixel: int = 2000
-    """Peak memory of a tile for each of its HRLS pixels, measured at export: bounds the tile size."""
+    bytes_per_pixel: int = 1000
+    """Peak memory of a tile for each of its HRLS pixels, rounded up: bounds the tile size."""
     lrhs: list[str] = field(default_factory=lambda: schema.channel_names(schema.LRHS_FEATURES))
     hrls: list[str] = field(default_factory=lambda: schema.channel_names(schema.HRLS_FEATURES))
     transforms: dict[str, Any] = field(default_factory=current_transforms)

@@ -3,7 +3,7 @@
 
     python -m benchmarks.real_pairs FOLDER... [--layout spec] [--model FILE]
 
-Each folder below FOLDER that holds lr.exr and hr.exr (or lr_*.exr beside hr.exr) is fused by the command line, and the
+In each folder below FOLDER, hr.exr or hr_1spp.exr is fused with every lr*.exr beside it by the command line, and the
 result opened with OpenEXR's own reader and with OpenImageIO's: every layer of the HRLS but the fused beauty must be in
 it, bit for bit. With a ref.exr the scores are printed too.
 """
@@ -32,7 +32,7 @@ def find_pairs(folders: list[Path]) -> list[tuple[Path, Path]]:
     return [
         (lr, hr)
         for folder in folders
-        for hr in sorted(folder.rglob("hr.exr"))
+        for hr in sorted([*folder.rglob("hr.exr"), *folder.rglob("hr_1spp.exr")])
         for lr in sorted(hr.parent.glob("lr*.exr"))
     ]
 
@@ -120,12 +120,12 @@ def main() -> int:
             if "error" in result:
                 print(f"{result['pair']}: {result['error']}")
                 continue
-            defaulted = [k for k, v in result["aovs"].items() if v in ("default", "absent")]
+            defaulted = [k for k, v in result["aovs"].items() if v in ("default", "absent")] or ["nothing"]
             scores = "".join(
                 f"; {name} {s['psnr']:.2f} dB {s['relmse']:.4f}" for name, s in result.get("scores", {}).items()
             )
             print(
-                f"{result["pair"]}: {result["renderer"]} x{result["scale"]}, without {', '.join(defaulted) or 'nothing'}; "
+                f"{result['pair']}: {result['renderer']} x{result['scale']}, without {', '.join(defaulted)}; "
                 f"{result['passed_on']} channels passed on, {len(result['faults'])} differ{scores}"
             )
             for line in [*result["faults"], *result["warnings"]]:

@@ -34,6 +34,8 @@ DEFAULT_COMPRESSION = "zip"
 
 #: OpenImageIO's attributes that describe how the source was stored; they are set anew or have no meaning in the copy.
 _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
+#: Attributes that must be the same in all parts of a file, and those that describe one part.
+_SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode", "view", "name", "oiio:subimagename", "compression")
 _DTYPES = {"half": np.float16, "float": np.float32, "uint": np.uint32}
 
 
@@ -161,11 +163,14 @@ def _passed_on(file: ExrFile, replaced: set[Channel], nuke: bool, first: Any) ->
         for channel in part.channels:
             if channel not in replaced:
                 groups.setdefault((layer_of.get(channel, ""), channel.type), []).append(channel)
-        for (layer_name, kind), channels in groups.items():
+        for number, ((layer_name, kind), channels) in enumerate(groups.items()):
             plain = layer_name or ("depth" if [c.name for c in channels] == ["Z"] else "other")
             name = _unique(plain.replace(".", "_") if nuke else plain, taken)
             names = [c.name.rpartition(".")[2] for c in channels] if nuke else [c.name for c in channels]
             spec = _spec(part, name, names, kind)
+            if touched or number:
+                # The metadata is already in the beauty's part, or in the first that this part became.
+                _keep_shared_attributes(spec)
             yield _OutPart(spec, part, tuple(_runs(channels)))
 
 
@@ -204,6 +209,13 @@ def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
     spec.format = oiio.TypeDesc(kind)
     _prepare(spec, name, _kept_compression(part))
     return spec
+
+
+def _keep_shared_attributes(spec: Any) -> None:
+    """Drop what one part of a file may say for all, such as cryptomatte's manifests of megabytes."""
+    for name in [attribute.name for attribute in spec.extra_attribs]:
+        if name not in _SHARED:
+            spec.erase_attribute(name)
 
 
 def _prepare(spec: Any, name: str, compression: str) -> None:

@@ -134,6 +134,17 @@ def test_windows_and_metadata_are_kept(tmp_path):
         assert tuple(file.parts[0].header["framesPerSecond"]) == (24000, 1001)
 
 
+def test_long_metadata_is_not_multiplied(tmp_path):
+    """A cryptomatte manifest of a single-part file appears once, beside the beauty, however many parts it becomes."""
+    for layout in ("spec", "nuke"):
+        _, out, _ = written(
+            tmp_path, everything(), WriteOptions(layout=layout), **{"cryptomatte/1/manifest": "x" * 999}
+        )
+        with OpenEXR.File(str(out), header_only=True) as file:
+            assert ["cryptomatte/1/manifest" in part.header for part in file.parts].count(True) == 1
+            assert "cryptomatte/1/manifest" in file.parts[0].header
+
+
 @pytest.mark.parametrize("kind", ["half", "float"])
 @pytest.mark.parametrize("compression", ["none", "zips", "piz", "dwaa"])
 def test_pixel_type_and_compression_of_the_beauty(tmp_path, kind, compression):

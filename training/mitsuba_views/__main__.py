@@ -21,16 +21,10 @@ def _seeds(text: str) -> range:
 
 def _arguments() -> argparse.Namespace:
     p = argparse.ArgumentParser(prog="python -m training.mitsuba_views", description="Render training views.")
-    p.add_argument(
-        "--out", type=Path, required=True, help="folder of the .npz files; finished views are kept"
-    )
+    p.add_argument("--out", type=Path, required=True, help="folder of the .npz files; finished views are kept")
     p.add_argument("--seeds", type=_seeds, default=range(0, 400), help="first:last, the last not included")
-    p.add_argument(
-        "--assets", type=Path, help="folder with hdri/ and models/; procedural content only without it"
-    )
-    p.add_argument(
-        "--minutes", type=float, default=float("inf"), help="start no further scene after this time"
-    )
+    p.add_argument("--assets", type=Path, help="folder with hdri/ and models/; procedural content only without it")
+    p.add_argument("--minutes", type=float, default=float("inf"), help="start no further scene after this time")
     p.add_argument("--threads", type=int, default=1)
     p.add_argument("--ref-spp", type=int, default=96)
     p.add_argument("--min-free", type=float, default=15.0, help="stop when the disk has fewer GiB left")

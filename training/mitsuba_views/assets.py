@@ -94,21 +94,9 @@ def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray | None]]:
         matrix = matrix @ local
         for p in doc["meshes"][node["mesh"]]["primitives"] if "mesh" in node else []:
             v = read(p["attributes"]["POSITION"]) @ matrix[:3, :3].T + matrix[:3, 3]
-            f = (
-                read(p["indices"]).reshape(-1, 3).astype(int)
-                if "indices" in p
-                else np.arange(len(v)).reshape(-1, 3)
-            )
-            uv = (
-                read(p["attributes"]["TEXCOORD_0"])
-                if "TEXCOORD_0" in p["attributes"]
-                else np.zeros((len(v), 2))
-            )
-            n = (
-                read(p["attributes"]["NORMAL"]) @ np.linalg.inv(matrix[:3, :3])
-                if "NORMAL" in p["attributes"]
-                else None
-            )
+            f = read(p["indices"]).reshape(-1, 3).astype(int) if "indices" in p else np.arange(len(v)).reshape(-1, 3)
+            uv = read(p["attributes"]["TEXCOORD_0"]) if "TEXCOORD_0" in p["attributes"] else np.zeros((len(v), 2))
+            n = read(p["attributes"]["NORMAL"]) @ np.linalg.inv(matrix[:3, :3]) if "NORMAL" in p["attributes"] else None
             if n is not None:
                 n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
             uv = np.asarray(uv, float) * (1, -1) + (0, 1)

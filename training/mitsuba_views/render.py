@@ -163,9 +163,7 @@ def render_scene(out: Path, seed: int, assets: Assets, ref_spp: int) -> tuple[in
     scene, plan = scenes.build(seed, assets)
     written = 0
     for view in missing:
-        renders = (
-            render_view(scene, plan, c, seed, view, ref_spp) for c in find_cameras(scene, plan, seed, view)
-        )
+        renders = (render_view(scene, plan, c, seed, view, ref_spp) for c in find_cameras(scene, plan, seed, view))
         arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
         if arrays is None:
             continue

@@ -41,9 +41,7 @@ class Scene:
 
     # -- building blocks ---------------------------------------------------------------------------
 
-    def add(
-        self, mesh: Mesh, bsdf: mat.Bsdf, radiance: np.ndarray | None = None, weight: float = 1.0
-    ) -> None:
+    def add(self, mesh: Mesh, bsdf: mat.Bsdf, radiance: np.ndarray | None = None, weight: float = 1.0) -> None:
         """Add a mesh; with a `radiance` (3,) it is a light, drawn in proportion to `weight`."""
         props = mi.Properties()
         props["bsdf"] = mi.load_dict(bsdf)
@@ -139,9 +137,7 @@ class Scene:
         rng, kind = self.rng, self.rng.random()
         self.focus.append(at + (0, 0, size * 0.4))
         if kind < 0.08:
-            self.add(
-                geo.rubble(rng, 25, size * 0.3, size * 0.35).moved(*at), mat.thing(rng, tex.palette(rng))
-            )
+            self.add(geo.rubble(rng, 25, size * 0.3, size * 0.35).moved(*at), mat.thing(rng, tex.palette(rng)))
         elif kind < 0.14:
             self._fur(at, size)
         elif kind < 0.24:
@@ -156,18 +152,14 @@ class Scene:
         out = geo.unit(rng.normal(size=(int(rng.integers(1500, 6000)), 3)))
         r = size * rng.uniform(0.25, 0.4)
         centre = at + (0, 0, size / 2)
-        hair = geo.strands(
-            rng, centre + out * r, out, size * rng.uniform(0.1, 0.35), size * rng.uniform(0.004, 0.015)
-        )
+        hair = geo.strands(rng, centre + out * r, out, size * rng.uniform(0.1, 0.35), size * rng.uniform(0.004, 0.015))
         colors = tex.foliage(rng)
         self.add(hair, mat.glossy(colors, 0.3) if rng.random() < 0.6 else mat.diffuse(colors))
         self.add(geo.sphere(r).moved(*centre), mat.diffuse(colors[-1:].repeat(2, 0)))
 
     def _plant(self, at: np.ndarray, size: float) -> None:
         rng = self.rng
-        pot = geo.lathe(
-            np.array([[1e-3, 0], [0.13, 0], [0.18, 0.25], [0.16, 0.25], [0.15, 0.2], [1e-3, 0.2]])
-        )
+        pot = geo.lathe(np.array([[1e-3, 0], [0.13, 0], [0.18, 0.25], [0.16, 0.25], [0.15, 0.2], [1e-3, 0.2]]))
         self.add(pot.scaled(size).moved(*at), mat.thing(rng, tex.pattern(rng, 0.6)))
         soil = at + (0, 0, 0.2 * size)
         if rng.random() < 0.5:
@@ -178,9 +170,7 @@ class Scene:
         else:
             roots = np.c_[rng.normal(size=(150, 2)) * 0.05 * size, np.zeros(150)] + soil
             leaf = geo.blades(rng, roots, size * 0.8, size * rng.uniform(0.01, 0.05), rng.uniform(0.3, 1))
-        self.add(
-            leaf, mat.glossy(tex.foliage(rng), 0.3) if rng.random() < 0.5 else mat.diffuse(tex.foliage(rng))
-        )
+        self.add(leaf, mat.glossy(tex.foliage(rng), 0.3) if rng.random() < 0.5 else mat.diffuse(tex.foliage(rng)))
 
     def _model(self, at: np.ndarray, size: float) -> None:
 
@@ -235,9 +225,7 @@ class Scene:
             self.add(geo.merge(rows).turned(angle).moved(*at), mat.thing(rng, tex.palette(rng)))
         else:
             w, d, h = rng.uniform(0.4, 1.2), rng.uniform(0.35, 0.6), rng.uniform(0.4, 1.8)
-            self.add(
-                geo.block(w, d, h).tiled(rng.uniform(0.5, 2)).turned(angle).moved(*at), mat.structure(rng)
-            )
+            self.add(geo.block(w, d, h).tiled(rng.uniform(0.5, 2)).turned(angle).moved(*at), mat.structure(rng))
             self.surfaces.append((at + (0, 0, h), w * 0.35, d * 0.35))
         self.focus.append(at + (0, 0, 0.6))
 
@@ -298,9 +286,7 @@ class Scene:
         shared = paint()
         dressing = mat.thing(rng, tex.plain(rng))
         for side in range(5):
-            mesh = geo.wall(lengths[side], heights[side], t, holes[side]).tiled(
-                rng.choice([0.4, 0.7, 1.0, 1.5])
-            )
+            mesh = geo.wall(lengths[side], heights[side], t, holes[side]).tiled(rng.choice([0.4, 0.7, 1.0, 1.5]))
             white = mat.diffuse(np.broadcast_to(tex.color(rng, 0.4, 0.85), (2, 2, 3)))
             bsdf = white if side == 4 and rng.random() < 0.7 else shared if same else paint()
             self.add(place(mesh, side), bsdf)
@@ -359,9 +345,7 @@ class Scene:
             self._picture()
         if rng.random() < 0.25:
             at = np.array([rng.uniform(-w / 3, w / 3), rng.uniform(-d / 3, d / 3), 0])
-            rail = geo.bars(
-                rng.uniform(1, 2.5), rng.uniform(0.7, 1.1), int(rng.integers(8, 40)), 0.015, False
-            )
+            rail = geo.bars(rng.uniform(1, 2.5), rng.uniform(0.7, 1.1), int(rng.integers(8, 40)), 0.015, False)
             self.add(rail.turned(rng.uniform(0, 6.3)).moved(*at), mat.thing(rng, None, 0.5, 0.0))
         if rng.random() < 0.2:
             steps = geo.stairs(rng.uniform(0.8, 1.4), 0.26, 0.18, int(rng.integers(4, 11)))
@@ -374,9 +358,7 @@ class Scene:
         w, d, _ = self.room
         a, b = rng.uniform(0.8, 2.0, 2)
         at = np.array([rng.uniform(-w / 4, w / 4), rng.uniform(-d / 4, d / 4), 0.004])
-        roots = (
-            np.c_[rng.uniform(-a / 2, a / 2, 12000), rng.uniform(-b / 2, b / 2, 12000), np.zeros(12000)] + at
-        )
+        roots = np.c_[rng.uniform(-a / 2, a / 2, 12000), rng.uniform(-b / 2, b / 2, 12000), np.zeros(12000)] + at
         pile = geo.blades(rng, roots, 0.04, 0.006, 0.8)
         pile.uv = roots[:, :2].repeat(5, 0)
         self.add(pile, mat.diffuse(tex.pattern(rng, 0.1)))
@@ -387,9 +369,7 @@ class Scene:
         a, b = rng.uniform(0.25, 1.1, 2)
         side, z = rng.integers(4), rng.uniform(0.9, h - 0.7)
         frame = geo.box((-a / 2 - 0.03, 0, -b / 2 - 0.03), (a / 2 + 0.03, 0.02, b / 2 + 0.03))
-        face = geo.quads(
-            np.array([[[-a, 0.022, -b], [a, 0.022, -b], [a, 0.022, b], [-a, 0.022, b]]]) / (2, 1, 2)
-        )
+        face = geo.quads(np.array([[[-a, 0.022, -b], [a, 0.022, -b], [a, 0.022, b], [-a, 0.022, b]]]) / (2, 1, 2))
         kind = rng.random()
         image = self.assets.picture(rng) if self.assets.hdris and kind < 0.4 else tex.pattern(rng, 0.0)
         if kind < 0.4 and self.assets.hdris:
@@ -409,9 +389,7 @@ class Scene:
         """A point in the room with its height between two shares of the room's."""
         w, d, h = self.room
         rng = self.rng
-        return np.array(
-            [rng.uniform(-0.42, 0.42) * w, rng.uniform(-0.42, 0.42) * d, rng.uniform(low, high) * h]
-        )
+        return np.array([rng.uniform(-0.42, 0.42) * w, rng.uniform(-0.42, 0.42) * d, rng.uniform(low, high) * h])
 
     # -- lamps of rooms ----------------------------------------------------------------------------
 
@@ -472,9 +450,7 @@ class Scene:
         partition = geo.box((-1, -0.04, 0), (1, 0.04, rng.uniform(0.6, 0.95) * self.room[2]))
         self.add(partition.turned(angle).moved(*at), mat.structure(rng))
         r = rng.uniform(0.02, 0.12)
-        offset = geo.rotation((0, 0, 1), angle) @ np.array(
-            [rng.uniform(-0.6, 0.6), 0.35, rng.uniform(0.3, 1.6)]
-        )
+        offset = geo.rotation((0, 0, 1), angle) @ np.array([rng.uniform(-0.6, 0.6), 0.35, rng.uniform(0.3, 1.6)])
         self.light(geo.sphere(r, 16).moved(*(at + offset)), self.tinted_light(0.5 / r**2))
 
     def lamp_spot(self) -> None:
@@ -562,12 +538,8 @@ def outdoors(s: Scene) -> None:
     if rng.random() < 0.6:
         count, spread = int(rng.integers(5000, 30000)), rng.uniform(1.0, 4.0)
         roots = np.c_[rng.normal(size=(count, 2)) * spread, np.zeros(count)]
-        grass = geo.blades(
-            rng, roots, rng.uniform(0.08, 0.5), rng.uniform(0.004, 0.015), rng.uniform(0.1, 0.8)
-        )
-        s.add(
-            grass, mat.glossy(tex.foliage(rng), 0.35) if rng.random() < 0.4 else mat.diffuse(tex.foliage(rng))
-        )
+        grass = geo.blades(rng, roots, rng.uniform(0.08, 0.5), rng.uniform(0.004, 0.015), rng.uniform(0.1, 0.8))
+        s.add(grass, mat.glossy(tex.foliage(rng), 0.35) if rng.random() < 0.4 else mat.diffuse(tex.foliage(rng)))
     for _ in range(rng.integers(0, 4)):
         x, y = rng.normal(size=2) * 3
         height = rng.uniform(1.5, 5)

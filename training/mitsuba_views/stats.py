@@ -85,13 +85,9 @@ def _row(name: str, views: list[dict[str, float]], key: str) -> str:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(
-        prog="python -m training.mitsuba_views.stats", description=__doc__.split("\n")[0]
-    )
+    p = argparse.ArgumentParser(prog="python -m training.mitsuba_views.stats", description=__doc__.split("\n")[0])
     p.add_argument("folder", type=Path, help="folder of mitsuba-*.npz")
-    p.add_argument(
-        "--validation", type=Path, help="folder of <scene>/hr_1spp.exr and ref.exr to set beside it"
-    )
+    p.add_argument("--validation", type=Path, help="folder of <scene>/hr_1spp.exr and ref.exr to set beside it")
     args = p.parse_args()
 
     sets: dict[str, list[dict[str, float]]] = {"training": []}

@@ -155,9 +155,7 @@ def palette(rng: Rng) -> np.ndarray:
 
 def foliage(rng: Rng) -> np.ndarray:
     """Like `palette`, but the kindred colours of one plant; darker towards v = 0."""
-    base = np.array(
-        colorsys.hsv_to_rgb(rng.uniform(0.08, 0.4), rng.uniform(0.4, 0.9), rng.uniform(0.08, 0.5))
-    )
+    base = np.array(colorsys.hsv_to_rgb(rng.uniform(0.08, 0.4), rng.uniform(0.4, 0.9), rng.uniform(0.08, 0.5)))
     c = base * rng.uniform(0.4, 1.5, (1, 64, 1)) * (1 + 0.12 * rng.normal(size=(1, 64, 3)))
     return np.clip(c * np.linspace(1.2, 0.5, 8)[:, None, None], 0.005, 0.9)
 

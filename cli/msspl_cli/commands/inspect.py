@@ -9,7 +9,6 @@ import typer
 
 from msspl_cli import options, show
 
-
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl inspect hr.exr

@@ -6,7 +6,6 @@ from typing import Any
 
 from msspl_cli import options, show
 
-
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl models

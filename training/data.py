@@ -1,0 +1,388 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training samples from rendered views.
+
+A view is an uncompressed ``.npz`` with
+
+* ``hr``: float16 (P, H, W, 15), P independent 1-spp passes of rgb, albedo, normal, diffuse, specular, three channels
+  each;
+* ``lr``: float16 (Q, H, W, 3), colour alone, also at full resolution and independent of ``hr``; ``lr_spp``: int (Q,);
+* ``ref``: float16 (H, W, 3), the reference colour;
+* ``meta``: a JSON string with ``split``: ``train``, ``validation`` or ``test``; and ``seed``, which tells scenes apart.
+
+Because passes are kept apart, one view yields many different pairs: an HRLS of n spp is the mean of any n passes, and
+an LRHS of scale s is the box average over s x s pixels of any ``lr`` passes, which is a render of s^2 times their spp
+at 1/s of the resolution.
+"""
+
+from __future__ import annotations
+
+import json
+import logging
+import math
+import mmap
+import queue
+import struct
+import threading
+import time
+import zipfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl import schema, transforms
+
+Array = NDArray[np.float32]
+log = logging.getLogger(__name__)
+
+#: Height and width of the HR patch for each scale, as in the paper.
+PAPER_PATCH = {2: 96, 4: 192, 8: 256}
+
+#: Features that a renderer writes, in the channel order of ``hr``: all but the variance, which comes from the passes.
+PASS_FEATURES = tuple(name for name in schema.HRLS_FEATURES if name != schema.VARIANCE)
+RADIANCE_FEATURES = (schema.RGB, schema.DIFFUSE, schema.SPECULAR)
+
+#: What a sample is made of, by name: (3, h, w), (16, s*h, s*w) and (3, s*h, s*w) once the channels are moved first.
+Batch = dict[str, NDArray[np.float32]]
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How training pairs are drawn: the renderings they imitate and the augmentations. Shares are probabilities."""
+
+    hrls_spp: tuple[float, ...] = (0.35, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05, 0.1)
+    """Weight of 1, 2, 3, ... spp in the HRLS; low ones are the hard and the useful case."""
+    lrhs_passes: tuple[float, ...] = (0.5, 0.2, 0.1, 0.1, 0.1)
+    """Weight of 1, 2, 3, ... ``lr`` passes in the LRHS."""
+    clip: float = math.inf
+    """Radiance is clipped here, before anything else. The log curve can do without."""
+    nearest: float = 0.0
+    """Share with the paper's nearest-neighbour LRHS instead of the box average that a renderer's pixel filter makes."""
+    exposure_stops: float = 0.5
+    """Exposure jitter, plus or minus: inference may estimate the exposure from another crop or frame."""
+    gain_stops: float = 0.5
+    """Colour of the light: a gain per channel, plus or minus. Applied to radiance alone: albedo is no light."""
+    permute: float = 0.5
+    """Share with shuffled colour channels, albedo included: the same scene with its wavelengths renamed."""
+    grey: float = 0.05
+    """Share with r = g = b in all radiance; the model also serves single-channel layers."""
+    drop_each: float = 0.25
+    """Share in which an optional feature is absent, for each on its own."""
+    drop_lobes: float = 0.4
+    """Share without diffuse and specular: many renderers have neither."""
+    drop_variance: float = 0.5
+    drop_all: float = 0.1
+
+
+#: ``Sampling`` as close to the paper's as its text tells: crops alone, every layer, clipped, nearest-neighbour LRHS.
+PAPER_SAMPLING = Sampling(
+    hrls_spp=(1.0,) * 8,
+    clip=100.0,
+    nearest=1.0,
+    exposure_stops=0.0,
+    gain_stops=0.0,
+    permute=0.0,
+    grey=0.0,
+    drop_each=0.0,
+    drop_lobes=0.0,
+    drop_variance=0.0,
+    drop_all=0.0,
+)
+
+
+# Views
+
+
+def map_npz(path: Path) -> dict[str, NDArray]:
+    """Arrays of an uncompressed ``.npz`` as views of the mapped file: nothing is read until it is indexed.
+
+    Raises:
+        ValueError, zipfile.BadZipFile: the file is incomplete, or compressed.
+    """
+    with path.open("rb") as file, zipfile.ZipFile(file) as archive:
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        arrays = {}
+        for member in archive.infolist():
+            if member.compress_type != zipfile.ZIP_STORED:
+                raise ValueError(f"{path}: {member.filename} is compressed; write it with numpy.savez")
+            # The local header repeats name and extra field with lengths of its own, in its last two shorts.
+            name_length, extra_length = struct.unpack_from("<HH", mapped, member.header_offset + 26)
+            file.seek(member.header_offset + 30 + name_length + extra_length)
+            version = np.lib.format.read_magic(file)
+            header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+            shape, fortran, dtype = header(file)
+            arrays[member.filename.removesuffix(".npy")] = np.ndarray(
+                shape, dtype, buffer=mapped, offset=file.tell(), order="F" if fortran else "C"
+            )
+    return arrays
+
+
+class View:
+    """One rendered view; its arrays stay on disk."""
+
+    def __init__(self, path: Path) -> None:
+        arrays = map_npz(path)
+        meta = json.loads(str(arrays["meta"]))
+        self.path = path
+        self.split: str = meta["split"]
+        self.scene: str = str(meta["seed"])
+        self.hr, self.lr, self.ref = arrays["hr"], arrays["lr"], arrays["ref"]
+        self.lr_spp = np.asarray(arrays["lr_spp"], dtype=np.int64)
+        channels = sum(schema.HRLS_FEATURES[name] for name in PASS_FEATURES)
+        if self.hr.ndim != 4 or self.hr.shape[-1] != channels or self.lr.shape[0] != len(self.lr_spp):
+            raise ValueError(f"{path}: hr is {self.hr.shape}, lr {self.lr.shape}, lr_spp {self.lr_spp.shape}")
+
+
+class Folder:
+    """All views of a folder, found again by :meth:`scan` while a renderer still adds to it."""
+
+    def __init__(self, root: Path) -> None:
+        self.root = root
+        self._views: dict[Path, View] = {}
+        self.scan()
+
+    def scan(self) -> None:
+        """Pick up new views; hidden files are still being written. One that can't be read is tried again next time."""
+        for path in sorted(self.root.glob("[!.]*.npz")):
+            if path not in self._views:
+                try:
+                    self._views[path] = View(path)
+                except (ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile) as error:
+                    log.warning("skipped %s: %s", path.name, error)
+
+    def split(self, name: str) -> list[View]:
+        """Views of one split, by name."""
+        return [view for _, view in sorted(self._views.items()) if view.split == name]
+
+
+# One pair
+
+
+def box_downsample(image: Array, scale: int) -> Array:
+    """Mean over ``scale`` x ``scale`` pixels: (H, W, C) to (H/s, W/s, C)."""
+    height, width, channels = image.shape
+    rows = image.reshape(height // scale, scale, width * channels).mean(axis=1)  # in two steps: several times faster
+    return rows.reshape(height // scale, width // scale, scale, channels).mean(axis=2)
+
+
+def nearest_downsample(image: Array, scale: int) -> Array:
+    """One pixel of each ``scale`` x ``scale``, the paper's degradation: (H, W, C) to (H/s, W/s, C)."""
+    return image[scale // 2 :: scale, scale // 2 :: scale]
+
+
+def variance_of_mean(luminance: Array) -> Array:
+    """Unbiased variance of the mean of n >= 2 independent passes (n, H, W), as (H, W)."""
+    return luminance.var(axis=0, ddof=1) / len(luminance)
+
+
+def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
+    """Uniformly random 3x3 rotation (determinant 1) or rotation with a mirroring (-1)."""
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    q *= np.sign(np.diag(r))  # makes the decomposition unique, thereby q uniform
+    if np.linalg.det(q) * determinant < 0:
+        q[:, 0] *= -1
+    return q.astype(np.float32)
+
+
+def split_features(passes: Array) -> dict[str, Array]:
+    """(..., 15) in the channel order of ``hr`` to named features."""
+    features, start = {}, 0
+    for name in PASS_FEATURES:
+        features[name] = passes[..., start : start + schema.HRLS_FEATURES[name]]
+        start += schema.HRLS_FEATURES[name]
+    return features
+
+
+def stack_features(features: dict[str, Array], exposure: float) -> Array:
+    """Named features (H, W, C) to the transformed HRLS stack (H, W, 16); the absent ones become their defaults."""
+    height, width, _ = features[schema.RGB].shape
+    stack = np.empty((height, width, sum(schema.HRLS_FEATURES.values())), dtype=np.float32)
+    start = 0
+    for name, count in schema.HRLS_FEATURES.items():
+        part = stack[..., start : start + count]
+        part[...] = transforms.forward(name, features[name], exposure) if name in features else schema.DEFAULTS[name]
+        start += count
+    return stack
+
+
+def read(values: NDArray, *, signed: bool = False) -> Array:
+    """Stored half floats as finite float32; radiance and albedo non-negative."""
+    return transforms.repair(values.astype(np.float32), signed=signed)[0]
+
+
+def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int]) -> Array:
+    """Mean of some ``lr`` passes of the whole view, each weighted by its spp: (H, W, 3)."""
+    weights = view.lr_spp[passes] / view.lr_spp[passes].sum()
+    return np.einsum("p,phwc->hwc", weights.astype(np.float32), read(view.lr[passes]))
+
+
+def read_hrls(view: View, passes: NDArray[np.int64] | list[int], rows: slice, columns: slice) -> Array:
+    """Some ``hr`` passes of a crop: (n, H, W, 15)."""
+    values = read(np.stack([view.hr[p, rows, columns] for p in passes]), signed=True)
+    for name, part in split_features(values).items():
+        if name != schema.NORMAL:
+            np.maximum(part, 0.0, out=part)
+    return values
+
+
+def draw(view: View, scale: int, patch: int, rng: np.random.Generator, sampling: Sampling) -> Batch:
+    """One random training pair of ``patch`` x ``patch`` HR pixels: ``lrhs``, ``hrls``, ``target``, (H, W, C) each."""
+    # Renderings: which passes, and which part of the view
+    nearest = rng.random() < sampling.nearest
+    while True:
+        n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
+        k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
+        lr_passes = rng.permutation(len(view.lr_spp))[:k]
+        if view.lr_spp[lr_passes].sum() * (1 if nearest else scale**2) > n:  # high and low spp: as in the paper
+            break
+    height, width, _ = view.ref.shape
+    top = scale * int(rng.integers((height - patch) // scale + 1))
+    left = scale * int(rng.integers((width - patch) // scale + 1))
+    rows, columns = slice(top, top + patch), slice(left, left + patch)
+    lrhs = np.minimum(mean_lrhs(view, lr_passes), sampling.clip)
+    lrhs = (nearest_downsample if nearest else box_downsample)(lrhs, scale)
+    passes = read_hrls(view, rng.permutation(len(view.hr))[:n], rows, columns)
+    target = np.minimum(read(view.ref[rows, columns]), sampling.clip)
+
+    # Light and colour, in linear values; the variance must see the changed light
+    renaming = np.eye(3, dtype=np.float32)[rng.permutation(3) if rng.random() < sampling.permute else range(3)]
+    light = _random_light(rng, sampling) @ renaming
+    features = split_features(passes)
+    for name in RADIANCE_FEATURES:
+        features[name] = np.minimum(features[name], sampling.clip) @ light
+    features[schema.ALBEDO] = features[schema.ALBEDO] @ renaming
+    lrhs, target = lrhs @ light, target @ light
+    variance = variance_of_mean(transforms.luminance(features[schema.RGB])) if n > 1 else None
+    features = {name: values.mean(axis=0) for name, values in features.items()}
+    if variance is not None:
+        features[schema.VARIANCE] = variance[..., None]
+
+    # Mirroring and turning. Normals may be in any space, so any rotation of them is right, as long as its handedness is
+    # that of the image.
+    mirrored, turns = rng.random() < 0.5, int(rng.integers(4))
+    features[schema.NORMAL] = features[schema.NORMAL] @ random_orthogonal(rng, -1 if mirrored else 1)
+
+    # Layers that a renderer did not write
+    for name in _random_absence(rng, sampling):
+        features.pop(name, None)
+
+    # Exposure as inference finds it, from the whole LRHS
+    exposure = transforms.exposure_of(lrhs) * 2.0 ** rng.uniform(-sampling.exposure_stops, sampling.exposure_stops)
+    lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
+    pair = {
+        "lrhs": transforms.compress(lrhs, exposure),
+        "hrls": stack_features(features, exposure),
+        "target": transforms.compress(target, exposure),
+    }
+    return {name: np.rot90(image[:, ::-1] if mirrored else image, turns) for name, image in pair.items()}
+
+
+def _normalised(weights: tuple[float, ...]) -> NDArray[np.float64]:
+    return np.asarray(weights) / np.sum(weights)
+
+
+def _random_light(rng: np.random.Generator, sampling: Sampling) -> Array:
+    """3x3 matrix L that changes the colour of the light: radiance' = radiance @ L."""
+    if rng.random() < sampling.grey:
+        return np.repeat(np.asarray(schema.LUMINANCE, dtype=np.float32)[:, None], 3, axis=1)
+    return np.diag(2.0 ** rng.uniform(-sampling.gain_stops, sampling.gain_stops, 3)).astype(np.float32)
+
+
+def _random_absence(rng: np.random.Generator, sampling: Sampling) -> set[str]:
+    """Names of optional features to leave out."""
+    if rng.random() < sampling.drop_all:
+        return set(schema.OPTIONAL_FEATURES)
+    share = {name: sampling.drop_each for name in schema.OPTIONAL_FEATURES} | {schema.VARIANCE: sampling.drop_variance}
+    absent = {name for name, probability in share.items() if rng.random() < probability}
+    if rng.random() < sampling.drop_lobes:
+        absent |= {schema.DIFFUSE, schema.SPECULAR}
+    return absent
+
+
+def spp_range(view: View, sampling: Sampling, scale: int) -> dict[str, list[int]]:
+    """Lowest and highest spp of the pairs that :func:`draw` makes of a view, for the model's contract."""
+    samples = scale**2 if sampling.nearest < 1 else 1
+    return {
+        "hrls": [1, min(len(sampling.hrls_spp), len(view.hr))],
+        "lrhs": [max(2, int(view.lr_spp.min()) * samples), int(view.lr_spp.sum()) * samples],
+    }
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A fixed pair for validation: the paper's (s^2 - 1), one sample per HR pixel in LRHS and HRLS each."""
+
+    lrhs: Array
+    """Linear (h, w, 3)."""
+    hrls: Array
+    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have."""
+    reference: Array
+    """Linear (s*h, s*w, 3)."""
+    exposure: float
+
+    @classmethod
+    def centre(cls, view: View, scale: int, patch: int) -> Evaluation:
+        """The middle ``patch`` x ``patch`` pixels of a view."""
+        height, width, _ = view.ref.shape
+        top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
+        rows, columns = slice(top, top + patch), slice(left, left + patch)
+        lrhs = box_downsample(mean_lrhs(view, [0]), scale)
+        exposure = transforms.exposure_of(lrhs)
+        features = split_features(read_hrls(view, [0], rows, columns)[0])
+        return cls(
+            lrhs=lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale],
+            hrls=stack_features(features, exposure),
+            reference=read(view.ref[rows, columns]),
+            exposure=exposure,
+        )
+
+
+# Batches
+
+
+class Prefetcher:
+    """Draws batches in a thread of its own, looks for new views, and knows how long training waited for it."""
+
+    def __init__(
+        self,
+        folder: Folder,
+        scale: int,
+        patch: int,
+        batch: int,
+        sampling: Sampling,
+        seed: int,
+        rescan_seconds: float = 120,
+    ) -> None:
+        self.folder, self.scale, self.patch, self.batch, self.sampling = folder, scale, patch, batch, sampling
+        self.waited = 0.0
+        """Seconds that :meth:`next` has blocked."""
+        self._rescan_seconds = rescan_seconds
+        self._rng = np.random.default_rng(seed)
+        self._queue: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
+        threading.Thread(target=self._work, daemon=True).start()
+
+    def next(self) -> Batch:
+        """``lrhs``, ``hrls`` and ``target`` as (N, H, W, C)."""
+        start = time.monotonic()
+        item = self._queue.get()
+        self.waited += time.monotonic() - start
+        if isinstance(item, BaseException):
+            raise item
+        return item
+
+    def _work(self) -> None:
+        try:
+            while True:
+                views = self.folder.split("train")
+                deadline = time.monotonic() + self._rescan_seconds
+                while time.monotonic() < deadline:
+                    self._queue.put(self._draw_batch(views))
+                self.folder.scan()
+        except BaseException as error:  # whatever it was, training must end with it instead of waiting for ever
+            self._queue.put(error)
+
+    def _draw_batch(self, views: list[View]) -> Batch:
+        chosen = self._rng.choice(len(views), self.batch)
+        pairs = [draw(views[i], self.scale, self.patch, self._rng, self.sampling) for i in chosen]
+        return {name: np.stack([pair[name] for pair in pairs]) for name in pairs[0]}

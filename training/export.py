@@ -1,0 +1,234 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write a training checkpoint's averaged weights as an ONNX file with its contract.
+
+    python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
+    python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
+
+With ``--half`` the weights are stored as half floats and cast to float32 when the file is loaded: half the size, while
+the computation stays in float32.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import copy
+import datetime
+import timeit
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import onnxruntime
+import torch
+from onnx import helper, numpy_helper
+from onnxscript import opset18
+
+from oiio_msspl import transforms
+from oiio_msspl.contract import METADATA_KEY, Contract
+from training import data
+from training.network import HRLS_CHANNELS, LRHS_CHANNELS, MultiResolutionFusion
+
+#: Operators and file format that ONNX Runtime 1.14 and newer understand.
+OPSET, IR_VERSION = 18, 8
+
+#: Smallest tensor that is worth a half float: biases are small, and precise at no cost.
+HALF_ELEMENTS = 256
+
+
+def load(checkpoint: Path) -> tuple[MultiResolutionFusion, dict[str, Any]]:
+    """The network with its averaged weights, and everything that the checkpoint holds."""
+    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
+    network = MultiResolutionFusion(**state["config"])
+    network.load_state_dict(state["ema"])
+    return network.eval(), state
+
+
+def contract_of(network: MultiResolutionFusion, name: str, overlap: int, state: dict[str, Any]) -> Contract:
+    """Contract of a checkpoint's network."""
+    return Contract(
+        name=name,
+        scale=network.scale,
+        overlap=overlap,
+        training_spp=state["training_spp"],
+        provenance=state["provenance"] | {"network": network.config, "date": datetime.date.today().isoformat()},
+    )
+
+
+def example(scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random ``lrhs`` and ``hrls`` for an LRHS of some size."""
+    generator = torch.Generator().manual_seed(seed)
+    return (
+        torch.rand(1, LRHS_CHANNELS, height, width, generator=generator),
+        torch.rand(1, HRLS_CHANNELS, height * scale, width * scale, generator=generator),
+    )
+
+
+# Graph
+
+
+def to_onnx(network: MultiResolutionFusion, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
+    """Graph with inputs ``lrhs`` and ``hrls``, output ``fused``, batch of 1, any height and width, and its contract."""
+    scale = network.scale
+    height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
+    program = torch.onnx.export(
+        _with_onnx_channel_order(network),
+        example(scale, 16, 24),
+        input_names=["lrhs", "hrls"],
+        output_names=["fused"],
+        opset_version=OPSET,
+        dynamo=True,
+        dynamic_shapes=({2: height, 3: width}, {2: scale * height, 3: scale * width}),
+        custom_translation_table={torch.ops.aten.pixel_unshuffle.default: _space_to_depth},
+        verbose=False,
+    )
+    model = program.model_proto
+    _strip_traces(model)
+    if half:
+        _store_as_half(model.graph)
+    model.ir_version = IR_VERSION
+    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _space_to_depth(x, downscale_factor: int):
+    """Pixel unshuffle as one operator; the exporter's own translation takes a dozen."""
+    return opset18.SpaceToDepth(x, blocksize=downscale_factor)
+
+
+def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:
+    """A copy whose deshuffle convolutions read (row, column, channel) as SpaceToDepth writes, not PyTorch's order."""
+    network = copy.deepcopy(network)
+    with torch.no_grad():
+        for stage in network.deshuffle:
+            weight = stage.conv.weight  # (C', C * row * column, 3, 3)
+            outputs, inputs, *kernel = weight.shape
+            reordered = weight.reshape(outputs, inputs // 4, 4, *kernel).transpose(1, 2).reshape_as(weight)
+            weight.copy_(reordered.clone())
+    return network
+
+
+def _strip_traces(model: onnx.ModelProto) -> None:
+    """Remove the exporter's notes: stack traces with paths of the machine that exported."""
+    graph = model.graph
+    for item in (model, graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
+        item.doc_string = ""
+        del item.metadata_props[:]
+    del graph.value_info[:]
+
+
+def _store_as_half(graph: onnx.GraphProto) -> None:
+    """Replace float32 weights by half floats and a Cast, which ONNX Runtime evaluates once, when it loads the file."""
+    casts = []
+    for tensor in graph.initializer:
+        if tensor.data_type == onnx.TensorProto.FLOAT and np.prod(tensor.dims) >= HALF_ELEMENTS:
+            name = tensor.name
+            values = numpy_helper.to_array(tensor).astype(np.float16)
+            tensor.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
+            casts.append(helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+# Checks
+
+
+def parity(network: MultiResolutionFusion, path: Path) -> float:
+    """Largest difference of an exported file from the network it was made of, in network values, odd sizes included."""
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    worst = 0.0
+    for height, width in ((24, 24), (17, 31)):
+        lrhs, hrls = example(network.scale, height, width, seed=height)
+        (fused,) = session.run(["fused"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
+        with torch.inference_mode():
+            expected = network(lrhs, hrls).numpy()
+        worst = max(worst, float(np.abs(fused - expected).max()))
+    return worst
+
+
+@torch.inference_mode()
+def measure_overlap(network: MultiResolutionFusion, views: list[data.View], tile: int = 16) -> dict[int, float]:
+    """How far the middle of a tile is from the same pixels of the whole image, for some overlaps in LRHS pixels.
+
+    The theoretical receptive field, over 60 LRHS pixels each way, is far larger than what trained weights use. Returns
+    the largest difference, in network values, of all views together, by overlap.
+    """
+    differences: dict[int, list[np.ndarray]] = collections.defaultdict(list)
+    for view in views:
+        pair = data.Evaluation.centre(view, network.scale, view.ref.shape[0])
+        lrhs = transforms.compress(pair.lrhs, pair.exposure)
+        # Mirrored on all sides, even a small view has room for the largest overlap
+        margin = 48
+        lrhs, hrls = (
+            torch.from_numpy(np.pad(image, ((m, m), (m, m), (0, 0)), "symmetric")).permute(2, 0, 1)[None]
+            for image, m in ((lrhs, margin), (pair.hrls, margin * network.scale))
+        )
+        whole = network(lrhs, hrls)
+        start = (lrhs.shape[-1] - tile) // 2
+        for overlap in (4, 8, 12, 16, 24, 32):
+            part = network(_square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, network.scale))
+            middle = _square(part, overlap, tile, 0, network.scale)
+            difference = middle - _square(whole, start, tile, 0, network.scale)
+            differences[overlap].append(difference.abs().numpy().ravel())
+    return {overlap: float(np.concatenate(values).max()) for overlap, values in differences.items()}
+
+
+def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int = 1) -> torch.Tensor:
+    """Square crop with a border; everything in LRHS pixels of an image ``scale`` times as large."""
+    part = slice((start - border) * scale, (start + size + border) * scale)
+    return image[..., part, part]
+
+
+def describe(path: Path, scale: int) -> None:
+    """Print what the file contains, what ONNX Runtime makes of it and how long it takes."""
+    model = onnx.load(path)
+    counts = collections.Counter(node.op_type for node in model.graph.node)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
+    options = onnxruntime.SessionOptions()
+    optimised = path.with_suffix(".optimised")
+    options.optimized_model_filepath = str(optimised)
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    counts = collections.Counter(node.op_type for node in onnx.load(optimised).graph.node)
+    optimised.unlink()
+    print(f"as loaded: {dict(counts)}")
+    if counts["Cast"]:
+        raise SystemExit(
+            f"{path}: {counts['Cast']} casts of weights are left after loading; they would slow every tile"
+        )
+
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    lrhs, hrls = (image.numpy() for image in example(scale, 64, 64))
+    seconds = min(timeit.repeat(lambda: session.run(None, {"lrhs": lrhs, "hrls": hrls}), number=1, repeat=3))
+    print(f"64x64 LRHS pixels: {seconds:.2f} s")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--half", action="store_true", help="store weights as half floats")
+    parser.add_argument("--overlap", type=int, default=16, help="LRHS pixels that tiles share on each side")
+    parser.add_argument(
+        "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on some views"
+    )
+    args = parser.parse_args()
+
+    network, state = load(args.checkpoint)
+    if args.measure_overlap:
+        views = data.Folder(args.measure_overlap).split("validation")[:8]
+        for overlap, difference in measure_overlap(network, views).items():
+            print(f"overlap {overlap}: {difference:.2g}")
+    if args.output:
+        contract = contract_of(network, args.name, args.overlap, state)
+        onnx.save(to_onnx(network, contract, half=args.half), args.output)
+        describe(args.output, network.scale)
+        print(f"largest difference from PyTorch: {parity(network, args.output):.2g}")
+
+
+if __name__ == "__main__":
+    main()

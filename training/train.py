@@ -1,0 +1,342 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Train the network for a given number of minutes.
+
+    python -m training.train --scale 4 --data VIEWS --out RUN --minutes 60
+    python -m training.train --scale 2 --data VIEWS --out RUN2 --minutes 20 --init RUN/checkpoint.pt
+
+The learning rate follows the share of the minutes that has passed, not the number of steps: a run ends when it was
+meant to, on any machine. The same command continues an interrupted run from its last checkpoint. RUN holds
+``checkpoint.pt``, written every few minutes and on SIGTERM, and ``log.csv``, a line for each.
+"""
+
+from __future__ import annotations
+
+import argparse
+import csv
+import logging
+import math
+import os
+import signal
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from oiio_msspl import transforms
+from training import data, losses
+from training.network import MultiResolutionFusion
+
+log = logging.getLogger(__name__)
+
+#: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
+WARM_UP, FINAL = 0.03, 0.01
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """How to optimise."""
+
+    optimizer: type[torch.optim.Optimizer]
+    lr: float
+    loss: str
+    batch: int
+    patch: dict[int, int]
+    """HR pixels of the training patches, by scale."""
+    schedule: bool
+    """Warm-up and cosine decay; otherwise the learning rate is constant."""
+    clip_gradient: float
+    """Largest norm of the gradient."""
+    sampling: data.Sampling
+
+
+RECIPES = {
+    # For a CPU and an hour: there, more and smaller steps beat fewer and larger ones.
+    "ours": Recipe(
+        optimizer=torch.optim.AdamW,
+        lr=6e-4,
+        loss="l1",
+        batch=4,
+        patch={2: 64, 4: 96, 8: 128},
+        schedule=True,
+        clip_gradient=1.0,
+        sampling=data.Sampling(),
+    ),
+    # As in the paper, whose 500 epochs took a week on a GPU; the input transform alone is ours.
+    "paper": Recipe(
+        optimizer=torch.optim.SGD,
+        lr=1e-4,
+        loss="robust",
+        batch=16,
+        patch=data.PAPER_PATCH,
+        schedule=False,
+        clip_gradient=math.inf,
+        sampling=data.PAPER_SAMPLING,
+    ),
+}
+
+
+# Evaluation
+
+
+def bicubic(lrhs: Tensor, scale: int) -> Tensor:
+    """Baseline: bicubic upsampling of the linear LRHS (N, 3, h, w)."""
+    return F.interpolate(lrhs, scale_factor=scale, mode="bicubic", align_corners=False).clamp(min=0)
+
+
+def psnr_srgb(output: data.Array, reference: data.Array) -> float:
+    """The paper's PSNR in dB: of the sRGB images, clipped to [0, 1]."""
+    error = np.mean((transforms.srgb(output) - transforms.srgb(reference)) ** 2)
+    return float(-10 * np.log10(max(error, 1e-10)))
+
+
+def rel_mse(output: data.Array, reference: data.Array) -> float:
+    """The paper's RelMSE for its BCR dataset: lambda_1 = 0.5, lambda_2 = 0.01, on linear values."""
+    return float(np.mean(0.5 * (output - reference) ** 2 / (reference**2 + 0.01)))
+
+
+@torch.inference_mode()
+def evaluate(
+    network: MultiResolutionFusion, pairs: Iterable[data.Evaluation], device: torch.device
+) -> dict[str, float]:
+    """Mean PSNR and RelMSE of the network and of bicubic upsampling over some pairs.
+
+    Views come at any brightness; they are scored at the exposure at which the network sees them, about that of a photo.
+    """
+    scores: dict[str, list[float]] = {"psnr": [], "relmse": [], "bicubic_psnr": [], "bicubic_relmse": []}
+    for pair in pairs:
+        lrhs = transforms.compress(pair.lrhs, pair.exposure)
+        fused = network(to_tensor(lrhs[None], device), to_tensor(pair.hrls[None], device))
+        output = transforms.expand(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
+        upsampled = bicubic(to_tensor(pair.lrhs[None], torch.device("cpu")), network.scale)[0].permute(1, 2, 0).numpy()
+        reference = pair.reference * pair.exposure
+        for prefix, image in (("", output), ("bicubic_", upsampled)):
+            scores[prefix + "psnr"].append(psnr_srgb(image * pair.exposure, reference))
+            scores[prefix + "relmse"].append(rel_mse(image * pair.exposure, reference))
+    return {name: float(np.mean(values)) if values else math.nan for name, values in scores.items()}
+
+
+# State
+
+
+def to_tensor(image: data.Array, device: torch.device) -> Tensor:
+    """(N, H, W, C) to (N, C, H, W) in channels-last memory, without copying on the CPU."""
+    return torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).to(device, non_blocking=True)
+
+
+def save(state: dict[str, Any], path: Path) -> None:
+    """Write whole or not at all: a run may be killed at any time."""
+    partial = path.with_suffix(".partial")
+    torch.save(state, partial)
+    os.replace(partial, path)
+
+
+def warm_start(network: MultiResolutionFusion, path: Path) -> None:
+    """Copy what fits from another run's averaged weights: all scales share the trunk, and their stages by position.
+
+    Stages that the other network lacks begin as plain resampling of their features, so a network of a larger scale
+    begins as the other one followed by bilinear upsampling.
+    """
+    for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
+        deshuffle.reset_to_average()
+        shuffle.reset_to_bilinear(network.config["channels"])
+    theirs = torch.load(path, map_location="cpu", weights_only=True)["ema"]
+    ours = network.state_dict()
+    fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
+    network.load_state_dict(ours | fitting)
+    log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
+
+
+class Average:
+    """Exponential moving average of a network's weights, in which a short memory grows to a long one."""
+
+    def __init__(self, network: MultiResolutionFusion, decay: float = 0.999) -> None:
+        self.network = MultiResolutionFusion(**network.config).to(network.h_rec.weight.device)
+        self.network.load_state_dict(network.state_dict())
+        self.network.requires_grad_(False).to(memory_format=torch.channels_last)
+        self.decay = decay
+
+    @torch.no_grad()
+    def update(self, network: MultiResolutionFusion, step: int) -> None:
+        weight = 1 - min(self.decay, (1 + step) / (10 + step))
+        torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
+
+
+def lr_factor(progress: float) -> float:
+    """Linear warm-up, then half a cosine, for a share of the run in [0, 1]."""
+    if progress < WARM_UP:
+        return max(progress / WARM_UP, 1e-3)
+    done = min((progress - WARM_UP) / (1 - WARM_UP), 1.0)
+    return FINAL + (1 - FINAL) * 0.5 * (1 + math.cos(math.pi * done))
+
+
+# The run
+
+
+def train(args: argparse.Namespace) -> None:
+    """Train until the minutes are over or a signal comes; see :func:`parse` for the arguments."""
+    recipe = RECIPES[args.preset]
+    batch = args.batch or recipe.batch
+    patch = args.patch or recipe.patch[args.scale]
+    peak_lr = args.lr or recipe.lr
+    loss_name = args.loss or recipe.loss
+    loss_function = losses.LOSSES[loss_name]
+    device = torch.device(args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    args.out.mkdir(parents=True, exist_ok=True)
+
+    # Data
+    folder = data.Folder(args.data)
+    if not folder.split("train"):
+        raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
+    validation: dict[Path, data.Evaluation] = {}
+
+    # Network, from the last checkpoint, from another run, or new
+    network = MultiResolutionFusion(args.scale)
+    checkpoint_path = args.out / "checkpoint.pt"
+    state = torch.load(checkpoint_path, map_location="cpu", weights_only=True) if checkpoint_path.exists() else None
+    if state is None and args.init:
+        warm_start(network, args.init)
+    network.to(device, memory_format=torch.channels_last)
+    average = Average(network)
+    optimizer = recipe.optimizer(network.parameters(), lr=peak_lr)
+    step, elapsed = 0, 0.0
+    if state is not None:
+        network.load_state_dict(state["network"])
+        average.network.load_state_dict(state["ema"])
+        optimizer.load_state_dict(state["optimizer"])
+        step, elapsed = state["step"], state["seconds"]
+        log.info("continues at step %d, minute %.1f", step, elapsed / 60)
+    prefetcher = data.Prefetcher(folder, args.scale, patch, batch, recipe.sampling, seed=args.seed + step)
+
+    stop = False
+
+    def on_signal(*_: object) -> None:
+        nonlocal stop
+        stop = True
+
+    signal.signal(signal.SIGTERM, on_signal)
+    signal.signal(signal.SIGINT, on_signal)
+
+    budget = args.minutes * 60
+    started = time.monotonic() - elapsed
+    since = {"time": time.monotonic(), "steps": 0, "loss": 0.0, "waited": 0.0}
+
+    def checkpoint() -> None:
+        """Evaluate, log a line and write the state."""
+        interval = max(time.monotonic() - since["time"], 1e-9)
+        for view in folder.split("validation"):  # there may be more than last time
+            if view.path not in validation and len(validation) < args.val_views:
+                validation[view.path] = data.Evaluation.centre(view, args.scale, args.val_patch)
+        scores = evaluate(average.network, validation.values(), device)
+        row = {
+            "step": step,
+            "minutes": elapsed / 60,
+            "loss": since["loss"] / max(since["steps"], 1),
+            "lr": optimizer.param_groups[0]["lr"],
+            "samples_per_s": since["steps"] * batch / interval,
+            "wait_share": (prefetcher.waited - since["waited"]) / interval,
+            "train_views": len(folder.split("train")),
+            "val_views": len(validation),
+            **scores,
+        }
+        write_row(args.out / "log.csv", row)
+        log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
+        views = folder.split("train")
+        save(
+            {
+                "network": network.state_dict(),
+                "ema": average.network.state_dict(),
+                "optimizer": optimizer.state_dict(),
+                "config": network.config,
+                "step": step,
+                "seconds": elapsed,
+                "training_spp": data.spp_range(views[0], recipe.sampling, args.scale),
+                "provenance": {
+                    "steps": step,
+                    "minutes": round(elapsed / 60, 1),
+                    "batch": batch,
+                    "patch": patch,
+                    "loss": loss_name,
+                    "preset": args.preset,
+                    "seed": args.seed,
+                    "views": len(views),
+                    "scenes": len({view.scene for view in views}),
+                    "torch": str(torch.__version__),
+                    "validation": {"views": len(validation), "hrls_spp": 1} | scores,
+                },
+            },
+            checkpoint_path,
+        )
+        since.update(time=time.monotonic(), steps=0, loss=0.0, waited=prefetcher.waited)
+
+    checkpoint()
+    next_checkpoint = elapsed + args.checkpoint_seconds
+    while not stop:
+        # One step
+        step += 1
+        for group in optimizer.param_groups:
+            group["lr"] = peak_lr * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
+        pair = {name: to_tensor(image, device) for name, image in prefetcher.next().items()}
+        with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
+            output = network(pair["lrhs"], pair["hrls"])
+        loss = loss_function(output.float(), pair["target"])
+        optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_gradient, error_if_nonfinite=True)
+        optimizer.step()
+        average.update(network, step)
+
+        # The clock decides what is next
+        since["steps"] += 1
+        since["loss"] += float(loss.detach())
+        elapsed = time.monotonic() - started
+        stop = stop or elapsed >= budget
+        if stop or elapsed >= next_checkpoint:
+            checkpoint()
+            next_checkpoint = elapsed + args.checkpoint_seconds
+
+
+def write_row(path: Path, row: dict[str, float]) -> None:
+    """Append a line to a CSV file, with a header when it is new."""
+    new = not path.exists()
+    with path.open("a", newline="") as file:
+        writer = csv.writer(file)
+        if new:
+            writer.writerow(row)
+        writer.writerow(f"{value:.5g}" if isinstance(value, float) else value for value in row.values())
+
+
+def parse(arguments: list[str] | None = None) -> argparse.Namespace:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scale", type=int, choices=(2, 4, 8), required=True)
+    parser.add_argument("--data", type=Path, required=True, help="folder of views (.npz)")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
+    parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
+    parser.add_argument("--preset", choices=RECIPES, default="ours")
+    parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
+    parser.add_argument("--batch", type=int, help="default: the preset's")
+    parser.add_argument("--patch", type=int, help="HR pixels; default: the preset's")
+    parser.add_argument("--lr", type=float, help="peak learning rate; default: the preset's")
+    parser.add_argument("--loss", choices=losses.LOSSES, help="default: the preset's")
+    parser.add_argument(
+        "--precision", choices=("bf16", "fp32"), default="bf16", help="of convolutions; weights stay fp32"
+    )
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads; more than idle cores is slower")
+    parser.add_argument("--device", default="auto")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--val-views", type=int, default=24, help="validation views, at most")
+    parser.add_argument("--val-patch", type=int, default=128, help="HR pixels of the validation crops")
+    parser.add_argument("--checkpoint-seconds", type=float, default=120)
+    return parser.parse_args(arguments)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    train(parse())

@@ -48,7 +48,8 @@ class Report:
     warnings: list[str]
     tiles: int
     seconds: dict[str, float]
-    """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
+    """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` (packing, network and
+    unpacking, a part of ``fuse``), ``write``."""
 
     @property
     def spp_avg(self) -> float | None:

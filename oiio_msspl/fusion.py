@@ -38,7 +38,7 @@ class Fused:
     warnings: list[str] = field(default_factory=list)
     tiles: int = 1
     seconds: float = 0.0
-    """In the network alone."""
+    """Of packing, network and unpacking, without reading."""
 
 
 def fuse(

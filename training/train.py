@@ -6,7 +6,8 @@
 
 The learning rate follows the share of the minutes that has passed, not the number of steps: a run ends when it was
 meant to, on any machine. The same command continues an interrupted run from its last checkpoint. RUN holds
-``checkpoint.pt``, written every few minutes and on SIGTERM, and ``log.csv``, a line for each.
+``checkpoint.pt``, written every few minutes and on SIGTERM, ``best.pt``, the one that was best on the validation views
+(as the paper selects its model), and ``log.csv``, a line for each.
 """
 
 from __future__ import annotations
@@ -34,6 +35,12 @@ from training.network import MultiResolutionFusion
 
 log = logging.getLogger(__name__)
 
+#: A step whose gradient is so many times longer than usual is left out: at these learning rates one bad batch can undo
+#: a run, though its length is clipped, because Adam divides it by the small gradients before it.
+SPIKE = 4.0
+#: A run that falls so many dB behind its own best goes back to it, at half the learning rate.
+COLLAPSE = 2.0
+
 #: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
 WARM_UP, FINAL = 0.03, 0.01
 
@@ -59,7 +66,7 @@ RECIPES = {
     # For a CPU and an hour: there, more and smaller steps beat fewer and larger ones.
     "ours": Recipe(
         optimizer=torch.optim.AdamW,
-        lr=6e-4,
+        lr=4e-4,
         loss="l1",
         batch=4,
         patch={2: 64, 4: 96, 8: 128},
@@ -199,19 +206,23 @@ def train(args: argparse.Namespace) -> None:
 
     # Network, from the last checkpoint, from another run, or new
     network = MultiResolutionFusion(args.scale)
-    checkpoint_path = args.out / "checkpoint.pt"
+    checkpoint_path, best_path = args.out / "checkpoint.pt", args.out / "best.pt"
     state = torch.load(checkpoint_path, map_location="cpu", weights_only=True) if checkpoint_path.exists() else None
     if state is None and args.init:
         warm_start(network, args.init)
     network.to(device, memory_format=torch.channels_last)
     average = Average(network)
     optimizer = recipe.optimizer(network.parameters(), lr=peak_lr)
-    step, elapsed = 0, 0.0
-    if state is not None:
+    step, elapsed, best_gain = 0, 0.0, -math.inf
+
+    def restore(state: dict[str, Any]) -> None:
         network.load_state_dict(state["network"])
         average.network.load_state_dict(state["ema"])
         optimizer.load_state_dict(state["optimizer"])
-        step, elapsed = state["step"], state["seconds"]
+
+    if state is not None:
+        restore(state)
+        step, elapsed, best_gain = state["step"], state["seconds"], state.get("best_gain", -math.inf)
         log.info("continues at step %d, minute %.1f", step, elapsed / 60)
     prefetcher = data.Prefetcher(folder, args.scale, patch, batch, recipe.sampling, seed=args.seed + step)
 
@@ -226,13 +237,14 @@ def train(args: argparse.Namespace) -> None:
 
     budget = args.minutes * 60
     started = time.monotonic() - elapsed
-    since = {"time": time.monotonic(), "steps": 0, "loss": 0.0, "waited": 0.0}
+    since = {"time": time.monotonic(), "steps": 0, "skipped": 0, "loss": 0.0, "waited": 0.0}
 
     def checkpoint() -> None:
-        """Evaluate, log a line and write the state."""
+        """Evaluate, log a line and write the state; step back if training has collapsed."""
+        nonlocal best_gain, peak_lr
         interval = max(time.monotonic() - since["time"], 1e-9)
-        for view in folder.split("validation"):  # there may be more than last time
-            if view.path not in validation and len(validation) < args.val_views:
+        if not validation:  # a set that grew would make scores of different times incomparable
+            for view in folder.split("validation")[: args.val_views]:
                 validation[view.path] = data.Evaluation.centre(view, args.scale, args.val_patch)
         scores = evaluate(average.network, validation.values(), device)
         row = {
@@ -240,6 +252,7 @@ def train(args: argparse.Namespace) -> None:
             "minutes": elapsed / 60,
             "loss": since["loss"] / max(since["steps"], 1),
             "lr": optimizer.param_groups[0]["lr"],
+            "skipped_steps": since["skipped"],
             "samples_per_s": since["steps"] * batch / interval,
             "wait_share": (prefetcher.waited - since["waited"]) / interval,
             "train_views": len(folder.split("train")),
@@ -249,35 +262,44 @@ def train(args: argparse.Namespace) -> None:
         write_row(args.out / "log.csv", row)
         log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
         views = folder.split("train")
-        save(
-            {
-                "network": network.state_dict(),
-                "ema": average.network.state_dict(),
-                "optimizer": optimizer.state_dict(),
-                "config": network.config,
-                "step": step,
-                "seconds": elapsed,
-                "training_spp": data.spp_range(views[0], recipe.sampling, args.scale),
-                "provenance": {
-                    "steps": step,
-                    "minutes": round(elapsed / 60, 1),
-                    "batch": batch,
-                    "patch": patch,
-                    "loss": loss_name,
-                    "preset": args.preset,
-                    "seed": args.seed,
-                    "views": len(views),
-                    "scenes": len({view.scene for view in views}),
-                    "torch": str(torch.__version__),
-                    "validation": {"views": len(validation), "hrls_spp": 1} | scores,
-                },
+        gain = scores["psnr"] - scores["bicubic_psnr"]
+        state = {
+            "network": network.state_dict(),
+            "ema": average.network.state_dict(),
+            "optimizer": optimizer.state_dict(),
+            "config": network.config,
+            "step": step,
+            "seconds": elapsed,
+            "best_gain": best_gain,
+            "training_spp": data.spp_range(views[0], recipe.sampling, args.scale),
+            "provenance": {
+                "steps": step,
+                "minutes": round(elapsed / 60, 1),
+                "batch": batch,
+                "patch": patch,
+                "loss": loss_name,
+                "preset": args.preset,
+                "seed": args.seed,
+                "views": len(views),
+                "scenes": len({view.scene for view in views}),
+                "torch": str(torch.__version__),
+                "validation": {"views": len(validation), "hrls_spp": 1} | scores,
             },
-            checkpoint_path,
-        )
-        since.update(time=time.monotonic(), steps=0, loss=0.0, waited=prefetcher.waited)
+        }
+        if gain < best_gain - COLLAPSE:
+            peak_lr /= 2
+            restore(torch.load(best_path, map_location="cpu", weights_only=True))
+            log.warning("collapsed to %+.1f dB, back to %+.1f dB, peak learning rate %.2g", gain, best_gain, peak_lr)
+        else:
+            if not gain <= best_gain:  # without validation views the newest is the best
+                best_gain = state["best_gain"] = gain
+                save(state, best_path)
+            save(state, checkpoint_path)
+        since.update(time=time.monotonic(), steps=0, skipped=0, loss=0.0, waited=prefetcher.waited)
 
     checkpoint()
     next_checkpoint = elapsed + args.checkpoint_seconds
+    usual = math.inf
     while not stop:
         # One step
         step += 1
@@ -289,9 +311,14 @@ def train(args: argparse.Namespace) -> None:
         loss = loss_function(output.float(), pair["target"])
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_gradient, error_if_nonfinite=True)
-        optimizer.step()
-        average.update(network, step)
+        length = float(torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_gradient))
+        if math.isfinite(length) and length < SPIKE * usual:
+            optimizer.step()
+            average.update(network, step)
+        else:
+            since["skipped"] += 1
+        if math.isfinite(length):
+            usual = length if math.isinf(usual) else 0.98 * usual + 0.02 * min(length, SPIKE * usual)
 
         # The clock decides what is next
         since["steps"] += 1

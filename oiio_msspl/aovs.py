@@ -27,7 +27,8 @@ from oiio_msspl.render import Array, Render, Window
 from oiio_msspl.transforms import luminance
 
 FEATURES = tuple(schema.HRLS_FEATURES)
-VARIANCE_KINDS = ("mean", "per_sample", "relative", "second_moment", "deviation", "halves")
+VARIANCE_KINDS = ("mean", "per_sample", "relative", "second_moment", "deviation")
+NORMAL_ENCODINGS = ("signed", "unsigned", "auto")
 
 #: Part names that say nothing about a layer: their channels without a prefix are plain R, G, B.
 _PLAIN_PART = re.compile(r"(rgba?|main|default|image|part ?\d+|subimage ?\d+)?", re.IGNORECASE)
@@ -62,7 +63,7 @@ class Source:
     terms: tuple[tuple[Channel, ...], ...]
     factor: tuple[Channel, ...] | None = None
     kind: str = "mean"
-    """Of a variance, one of ``VARIANCE_KINDS``."""
+    """Of a variance: one of ``VARIANCE_KINDS``, or ``halves``."""
     encoding: str = "signed"
     """Of a normal: ``signed`` or ``unsigned``."""
     text: str = ""
@@ -264,20 +265,20 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
     """A user's mapping: a TOML file with ``feature = candidate`` lines, as in the table.
 
     Raises:
-        InputError: unreadable, or it names something that is no feature.
+        InputError: unreadable, or an entry that is no candidate.
     """
     try:
         mapping = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, tomllib.TOMLDecodeError) as error:
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: can't be read as a mapping ({error})") from error
-    return _check_features(mapping, str(path))
+    return check_mapping(mapping, str(path))
 
 
 def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
     """``--map feature=layer`` options; ``layer`` may be a sum (``lighting+GI``) or another EXR file.
 
     Raises:
-        InputError: no ``=``, or no such feature.
+        InputError: no ``=``, no such feature, or a form that the feature can't take.
     """
     mapping: dict[str, Any] = {}
     for option in options:
@@ -288,14 +289,59 @@ def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
             mapping[feature] = "file:" + layer
         else:
             mapping[feature] = {"sum": layer.split("+")} if "+" in layer else layer
-    return _check_features(mapping, "--map")
+    return check_mapping(mapping, "--map")
 
 
-def _check_features(mapping: dict[str, Any], where: str) -> dict[str, Any]:
-    for feature in mapping:
+#: Keys of a candidate, and whether their value is a list of names.
+_FORMS = {"layer": False, "sum": True, "halves": True, "channels": True}
+_EXTRAS = {"times", "kind", "encoding", "note"}
+
+
+def check_mapping(mapping: dict[str, Any], where: str) -> dict[str, Any]:
+    """Return a mapping whose entries all have a form that :func:`resolve` understands.
+
+    Raises:
+        InputError: one has not; the message starts with ``where``.
+    """
+    for feature, candidate in mapping.items():
         if feature not in FEATURES:
             raise InputError(f"{where}: {feature!r} is no feature; use one of {', '.join(FEATURES)}")
+        problem = _problem(feature, candidate)
+        if problem:
+            raise InputError(f"{where}: {feature}: {problem}")
     return mapping
+
+
+def _problem(feature: str, candidate: Any) -> str | None:
+    """What is wrong with a candidate, or None."""
+    if isinstance(candidate, str):
+        is_file = candidate.startswith("file:")
+        return "the beauty must be a layer of the render itself" if feature == schema.RGB and is_file else None
+    if not isinstance(candidate, dict):
+        return f"{candidate!r} is neither a layer's name nor a table such as {{ sum = ['a', 'b'] }}"
+    forms = [key for key in candidate if key in _FORMS]
+    unknown = candidate.keys() - _FORMS.keys() - _EXTRAS
+    if len(forms) != 1 or unknown:
+        return f"has {', '.join(candidate) or 'nothing'}; give one of {', '.join(_FORMS)}, and {', '.join(_EXTRAS)}"
+    names = candidate[forms[0]]
+    is_list = isinstance(names, list) and len(names) > 0 and all(isinstance(n, str) for n in names)
+    if _FORMS[forms[0]] != is_list or not (is_list or isinstance(names, str)):
+        return f"{forms[0]} must be {'a list of names' if _FORMS[forms[0]] else 'a name'}"
+    if not isinstance(candidate.get("times", ""), str):
+        return "times must be a name"
+    if feature == schema.RGB and (forms[0] != "layer" or "times" in candidate):
+        return "the beauty is replaced by the result, so it must be a single layer"
+    if feature == schema.VARIANCE and (forms[0] == "sum" or "times" in candidate):
+        return "variances don't add up layer by layer; give one layer, or two halves"
+    if forms[0] == "halves" and (feature != schema.VARIANCE or len(names) != 2):
+        return "halves are the two half buffers of a variance"
+    if forms[0] == "channels" and len(names) not in ((1, 3) if feature == schema.VARIANCE else (3,)):
+        return f"has {len(names)} channels, not 3"
+    if "kind" in candidate and (feature != schema.VARIANCE or candidate["kind"] not in VARIANCE_KINDS):
+        return f"kind {candidate['kind']!r}: of a variance, use one of {', '.join(VARIANCE_KINDS)}"
+    if "encoding" in candidate and (feature != schema.NORMAL or candidate["encoding"] not in NORMAL_ENCODINGS):
+        return f"encoding {candidate['encoding']!r}: of a normal, use one of {', '.join(NORMAL_ENCODINGS)}"
+    return None
 
 
 def _detected(renderer: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:
@@ -336,13 +382,16 @@ class _Matcher:
         path = Path(stem) if stem.lower().endswith(".exr") else self.file.path.with_name(stem + ".exr")
         if path == self.file.path or not path.is_file():
             return None
-        other = self.file.siblings.setdefault(path, open_exr(path))
+        if path not in self.file.siblings:
+            self.file.siblings[path] = open_exr(path)
+        other = self.file.siblings[path]
         if other.display_window.size != self.file.display_window.size:
             raise InputError(
                 f"{path}: is {other.display_window.size}, but {self.file.path} is {self.file.display_window.size}; "
                 "give layers of the same frame"
             )
-        return next((replace(layer, name=path.name) for layer in layers_of(other) if layer.triple()), None)
+        layers = [replace(layer, name=path.name) for layer in layers_of(other)]
+        return next((layer for layer in layers if layer.triple()), layers[0] if layers else None)
 
     def source(self, feature: str, candidate: Any, problems: list[str]) -> Source | None:
         """A candidate's channels if all of it is there; what is there but unusable goes to ``problems``."""
@@ -392,6 +441,7 @@ def resolve(
     *,
     view: str | None = None,
     spp: float | None = None,
+    features: Sequence[str] = schema.OPTIONAL_FEATURES,
 ) -> Resolution:
     """Find the features of :mod:`oiio_msspl.schema` among a file's layers.
 
@@ -400,15 +450,17 @@ def resolve(
         mapping: the user's own candidates by feature; they win over the table, and must exist.
         view: view (``left``) or view layer (``ViewLayer``) to take; the file's first if None.
         spp: samples per pixel, if the header does not say or says it wrongly.
+        features: which to look for, beside the beauty.
 
     Raises:
-        InputError: deep data only, no beauty, no such view, or a mapped layer that is absent or has the wrong channels.
+        InputError: a mapping of no known form, deep data only, no beauty, no such view, integers where light should be,
+            or a mapped layer that is absent or has the wrong channels.
     """
     if all(part.deep for part in file.parts):
         raise InputError(
             f"{file.path}: holds deep data only; flatten it first (a deep pixel has no single colour to fuse)"
         )
-    mapping = mapping or {}
+    mapping = check_mapping(dict(mapping or {}), "mapping")
     deep = {part.index for part in file.parts if part.deep}
     layers = [layer for layer in layers_of(file) if not any(c.part in deep for c in layer.channels.values())]
     renderer = next(r for r in renderers() if _detected(r, file, layers))
@@ -428,26 +480,31 @@ def resolve(
     matcher = _Matcher(file, layers, chosen_view, group)
     rgb = beauty.triple()
     assert rgb is not None
-    features = {schema.RGB: Source((rgb,), text=beauty.name or " ".join(c.name for c in rgb))}
+    found_features = {schema.RGB: Source((rgb,), text=beauty.name or " ".join(c.name for c in rgb))}
     notes: list[str] = []
-    for feature in schema.OPTIONAL_FEATURES:
+    for feature in features:
         problems: list[str] = []
         candidates = [mapping[feature]] if feature in mapping else renderer.get(feature, [])
         found = next((s for c in candidates if (s := matcher.source(feature, c, problems))), None)
         if found is None and feature in mapping:
-            raise InputError(
-                f"{file.path}: " + (problems[0] if problems else f"no layer for --map {feature}={mapping[feature]}")
-            )
+            raise InputError(f"{file.path}: " + (problems[0] if problems else _absent(feature, mapping[feature])))
         notes += problems
         if found is not None:
-            features[feature] = found
+            found_features[feature] = found
+    for feature, source in found_features.items():
+        integers = [c.name for c in source.channels if c.type == "uint"]
+        if integers:
+            raise InputError(
+                f"{file.path}: {feature}: {', '.join(integers)} hold integers (ids, not light); "
+                f"choose another layer with --map {feature}=LAYER"
+            )
 
     resolution = Resolution(
         file=file,
         renderer=renderer["name"],
         view=_label(chosen_view, group),
         other_views=[label for label in labels if label != _label(chosen_view, group)],
-        features=features,
+        features=found_features,
         alpha=beauty.channels.get("A"),
         spp=spp if spp is not None else _spp(renderer, file, group),
         data_window=file.parts[rgb[0].part].data_window,
@@ -456,6 +513,11 @@ def resolve(
     _check_variance(resolution)
     _decide_normal_encoding(resolution)
     return resolution
+
+
+def _absent(feature: str, candidate: Any) -> str:
+    names = [candidate] if isinstance(candidate, str) else [str(v) for v in candidate.values()]
+    return f"{feature} is mapped to {' * '.join(names).removeprefix('file:')}, which is not there"
 
 
 def _beauties(layers: list[Layer], candidates: Sequence[Any]) -> list[tuple[str, str, Layer]]:
@@ -479,6 +541,8 @@ def _label(view: str, group: str) -> str:
 def _choose(file: ExrFile, beauties: list[tuple[str, str, Layer]], wanted: str | None) -> tuple[str, str, Layer]:
     if wanted is None:
         return beauties[0]
+    if len(beauties) == 1 and not _label(*beauties[0][:2]):
+        return beauties[0]  # a file with one view that has no name: it is the one that is meant
     for view, group, layer in beauties:
         if wanted in (view, group, _label(view, group)):
             return view, group, layer
@@ -503,8 +567,6 @@ def _check_variance(resolution: Resolution) -> None:
     source = resolution.features.get(schema.VARIANCE)
     if source is None:
         return
-    if source.kind not in VARIANCE_KINDS:
-        raise InputError(f"variance kind {source.kind!r} is none of {', '.join(VARIANCE_KINDS)}")
     if source.kind in ("per_sample", "relative", "second_moment") and not resolution.spp:
         del resolution.features[schema.VARIANCE]
         resolution.notes.append(

@@ -18,7 +18,7 @@ import OpenImageIO as oiio
 from oiio_msspl import schema
 from oiio_msspl.aovs import Resolution, layers_of
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr import Channel, ExrFile, Part
+from oiio_msspl.exr import BAND, Channel, ExrFile, Part, unreadable
 from oiio_msspl.output import replacing
 from oiio_msspl.render import Array
 
@@ -27,9 +27,8 @@ LAYOUTS = {
     "nuke": "a part a layer, the layer in the part's name alone, as Nuke writes",
     "multilayer": "a single part with all channels",
 }
-#: Compressions that change pixels.
-LOSSY = ("b44", "b44a", "dwaa", "dwab", "pxr24", "htj2k")
 LOSSLESS = ("none", "rle", "zip", "zips", "piz")
+COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab")
 DEFAULT_COMPRESSION = "zip"
 
 #: OpenImageIO's attributes that describe how the source was stored; they are set anew or have no meaning in the copy.
@@ -53,8 +52,8 @@ class WriteOptions:
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:
             raise InputError(f"--layout {self.layout!r}: use one of {', '.join(LAYOUTS)}")
-        if self.compression is not None and self.compression.split(":")[0] not in (*LOSSLESS, *LOSSY):
-            raise InputError(f"--compression {self.compression!r}: use one of {', '.join((*LOSSLESS, *LOSSY))}")
+        if self.compression is not None and self.compression not in COMPRESSIONS:
+            raise InputError(f"--compression {self.compression!r}: use one of {', '.join(COMPRESSIONS)}")
 
 
 @dataclass(frozen=True)
@@ -68,40 +67,63 @@ class _OutPart:
 
 
 def write(
-    path: Path, hr: Resolution, rgb: Array, alpha: Array | None, provenance: dict[str, str], options: WriteOptions
+    path: Path,
+    hr: Resolution,
+    rgb: Array,
+    alpha: Array | None,
+    provenance: dict[str, str],
+    options: WriteOptions,
+    *,
+    overwrite: bool = False,
 ) -> list[str]:
     """Write the fused frame to ``path``, atomically.
 
     Args:
         rgb: (height, width, 3) over the HRLS's data window.
-        alpha: (height, width, 1), or None to pass on what the HRLS has.
+        alpha: (height, width, 1) if the HRLS has one, otherwise None.
         provenance: attributes added to the beauty's part.
 
     Returns:
         Warnings, one sentence each.
 
     Raises:
-        InputError: the layout can't hold these parts.
+        InputError: the layout can't hold these parts, or a passed-on layer can't be read.
         MssplError: the file can't be written; what stood at ``path`` is untouched.
     """
-    beauty = fused_channels(hr)
-    fused = rgb if alpha is None else np.concatenate([rgb, alpha], axis=-1)
-    pixel_type = options.pixel_type or beauty[0].type
-    if pixel_type == "half":
-        fused = np.minimum(fused, np.float32(65504.0))
-    fused = np.ascontiguousarray(fused.astype(_DTYPES[pixel_type]))
-
+    fused = _Fused(rgb, alpha, _DTYPES[options.pixel_type or _widest_type(fused_channels(hr))])
     warnings = [
         f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
         for part in hr.file.parts
         if part.deep
     ]
-    with replacing(path) as temporary:
+    with replacing(path, overwrite=overwrite) as temporary:
         if options.layout == "multilayer":
-            _write_single_part(temporary, hr, beauty, fused, provenance, options)
+            _write_single_part(temporary, hr, fused, provenance, options)
         else:
-            _write_parts(temporary, hr, beauty, fused, provenance, options)
+            _write_parts(temporary, hr, fused, provenance, options)
     return warnings
+
+
+@dataclass(frozen=True)
+class _Fused:
+    """The fused beauty, converted to what is stored only as rows are written: a frame of 8K is half a gigabyte."""
+
+    rgb: Array
+    alpha: Array | None
+    dtype: Any
+
+    def rows(self, start: int, stop: int) -> Any:
+        """Rows in the stored type, (stop - start, width, 3 or 4)."""
+        values = self.rgb[start:stop]
+        if self.alpha is not None:
+            values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
+        if self.dtype == np.float16:
+            values = np.minimum(values, np.float32(65504.0))
+        return np.ascontiguousarray(values, dtype=self.dtype)
+
+
+def _widest_type(channels: Sequence[Channel]) -> str:
+    return "float" if any(c.type == "float" for c in channels) else "half"
 
 
 def fused_channels(hr: Resolution) -> list[Channel]:
@@ -112,16 +134,13 @@ def fused_channels(hr: Resolution) -> list[Channel]:
 # ---------------------------------------------------------------------------------------------- several parts
 
 
-def _write_parts(
-    path: Path, hr: Resolution, beauty: list[Channel], fused: Any, provenance: dict[str, str], options: WriteOptions
-) -> None:
+def _write_parts(path: Path, hr: Resolution, fused: _Fused, provenance: dict[str, str], options: WriteOptions) -> None:
     file = hr.file
+    beauty = fused_channels(hr)
     home = file.parts[beauty[0].part]
     nuke = options.layout == "nuke"
     names = ["R", "G", "B", "A"][: len(beauty)] if nuke else [c.name for c in beauty]
-    first = _spec(
-        home, "rgba" if nuke else home.name or "rgba", names, "half" if fused.dtype == np.float16 else "float"
-    )
+    first = _spec(home, _nuke_name("rgba", home.view) if nuke else home.name or "rgba", names, fused.dtype)
     first.attribute("compression", options.compression or _kept_compression(home))
     for key, value in provenance.items():
         first.attribute(key, value)
@@ -132,7 +151,10 @@ def _write_parts(
     if writer is None:
         raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
     ok = writer.open(str(path), specs) if len(specs) > 1 else writer.open(str(path), first)
-    ok = ok and writer.write_image(fused)
+    height = first.height
+    for start in range(0, height, BAND):
+        stop = min(start + BAND, height)
+        ok = ok and writer.write_scanlines(first.y + start, first.y + stop, 0, fused.rows(start, stop))
     for part in parts:
         ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
         ok = ok and _copy(file, part, writer)
@@ -146,39 +168,53 @@ def _write_parts(
 def _passed_on(file: ExrFile, replaced: set[Channel], nuke: bool, first: Any) -> Iterator[_OutPart]:
     """Everything of the HRLS but the channels that were fused."""
     taken = {str(first.getattribute("oiio:subimagename"))}
-    layer_of = {c: layer.name for layer in layers_of(file) for c in layer.channels.values()}
+    layer_of = {c: layer for layer in layers_of(file) for c in layer.channels.values()}
     for part in file.parts:
         if part.deep:
             continue
         touched = any(c in replaced for c in part.channels)
-        if not touched and not nuke:
+        uniform = len({c.type for c in part.channels}) == 1
+        # OpenEXR can't mix scan lines, which the beauty is written as, and tiles in a file of several parts.
+        if not touched and not nuke and (uniform or part.tile == (0, 0)):
             spec = oiio.ImageSpec(part.spec)
             _prepare(spec, _unique(part.name or f"part{part.index}", taken), _kept_compression(part))
-            uniform = len({c.type for c in part.channels}) == 1
             if uniform:
                 spec.tile_width = spec.tile_height = spec.tile_depth = 0
             yield _OutPart(spec, part, (part.channels,) if uniform else None)
             continue
-        groups: dict[tuple[str, str], list[Channel]] = {}
+        groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
             if channel not in replaced:
-                groups.setdefault((layer_of.get(channel, ""), channel.type), []).append(channel)
-        for number, ((layer_name, kind), channels) in enumerate(groups.items()):
+                layer = layer_of.get(channel)
+                # A channel that no layer has doubles another one (foo.r beside foo.R): it stays on its own.
+                key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
+                groups.setdefault(key, []).append(channel)
+        for number, ((view, layer_name, kind), channels) in enumerate(groups.items()):
             plain = layer_name or ("depth" if [c.name for c in channels] == ["Z"] else "other")
-            name = _unique(plain.replace(".", "_") if nuke else plain, taken)
+            name = _unique(_nuke_name(plain, view) if nuke else plain, taken)
             names = [c.name.rpartition(".")[2] for c in channels] if nuke else [c.name for c in channels]
-            spec = _spec(part, name, names, kind)
+            spec = _spec(part, name, names, _DTYPES[kind])
             if touched or number:
                 # The metadata is already in the beauty's part, or in the first that this part became.
                 _keep_shared_attributes(spec)
+            if nuke and view:
+                spec.attribute("view", view)
             yield _OutPart(spec, part, tuple(_runs(channels)))
+
+
+def _nuke_name(layer: str, view: str) -> str:
+    """Part name of a layer as Nuke writes it: no dots but the one before the view."""
+    return layer.replace(".", "_") + (f".{view}" if view else "")
 
 
 def _copy(file: ExrFile, part: _OutPart, writer: Any) -> bool:
     """Copy a part's pixels, in their own type."""
     if part.runs is None:
         source = oiio.ImageInput.open(str(file.path))
-        return bool(source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source))
+        copied = source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source)
+        if not copied and source is not None and source.has_error:
+            raise unreadable(file.path, part.source, source.geterror())
+        return bool(copied)
     streams = [file.native_bands(part.source, run[0].index, run[-1].index + 1) for run in part.runs]
     for bands in zip(*streams, strict=True):
         y0, y1 = bands[0][:2]
@@ -199,14 +235,14 @@ def _runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
     yield tuple(run)
 
 
-def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
+def _spec(part: Part, name: str, channels: list[str], dtype: Any) -> Any:
     """A scan-line part with some channels of another, keeping its windows and metadata."""
     spec = oiio.ImageSpec(part.spec)
     spec.tile_width = spec.tile_height = spec.tile_depth = 0
     spec.nchannels = len(channels)
     spec.channelnames = tuple(channels)
     spec.channelformats = ()
-    spec.format = oiio.TypeDesc(kind)
+    spec.format = oiio.TypeDesc(next(kind for kind, known in _DTYPES.items() if known == dtype))
     _prepare(spec, name, _kept_compression(part))
     return spec
 
@@ -245,34 +281,46 @@ def _unique(name: str, taken: set[str]) -> str:
 
 
 def _write_single_part(
-    path: Path, hr: Resolution, beauty: list[Channel], fused: Any, provenance: dict[str, str], options: WriteOptions
+    path: Path, hr: Resolution, fused: _Fused, provenance: dict[str, str], options: WriteOptions
 ) -> None:
-    """One part of mixed pixel types, through OpenEXR's own module: OpenImageIO converts them to a common type."""
+    """One part of mixed pixel types, through OpenEXR's own module: OpenImageIO converts them to a common type.
+
+    The module writes only what it holds whole: this layout needs memory for the file.
+    """
     import OpenEXR
 
     file = hr.file
+    beauty = fused_channels(hr)
     home = file.parts[beauty[0].part]
+    values = fused.rows(0, fused.rgb.shape[0])
+    channels: dict[str, Any] = {c.name: np.ascontiguousarray(values[..., i]) for i, c in enumerate(beauty)}
+    del values
     for part in file.parts:
-        if not part.deep and part.data_window != home.data_window:
+        if part.deep:
+            continue
+        if part.data_window != home.data_window:
             raise InputError(
                 f"--layout multilayer: part '{part.name}' of {file.path} has the data window {part.data_window}, "
                 f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
             )
-    channels: dict[str, Any] = {c.name: np.ascontiguousarray(fused[..., i]) for i, c in enumerate(beauty)}
-    for layer in layers_of(file):
-        for channel in layer.channels.values():
-            part = file.parts[channel.part]
-            if part.deep or channel.name in channels:
+        for channel in part.channels:
+            if channel in beauty:
                 continue
             # A part's name carries the layer where the channel's does not.
-            name = channel.name if "." in channel.name or not layer.name else f"{layer.name}.{channel.name}"
+            name = channel.name
+            if "." not in name and part.index != home.index:
+                name = f"{part.name or f'part{part.index}'}.{name}"
+            if name in channels:
+                raise InputError(
+                    f"--layout multilayer: two parts of {file.path} hold a channel '{name}'; use --layout spec"
+                )
             bands = [rows for _, _, rows in file.native_bands(part, channel.index, channel.index + 1)]
-            channels.setdefault(name, np.concatenate(bands)[..., 0])
+            channels[name] = np.concatenate(bands)[..., 0]
     with OpenEXR.File(str(file.path), header_only=True) as source:
         header = dict(source.parts[home.index].header)
     for key in ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name"):
         header.pop(key, None)
-    compression = (options.compression or _kept_compression(home)).split(":")[0]
+    compression = options.compression or _kept_compression(home)
     header["compression"] = getattr(OpenEXR, f"{compression.upper() if compression != 'none' else 'NO'}_COMPRESSION")
     header["type"] = OpenEXR.scanlineimage
     header.update(provenance)

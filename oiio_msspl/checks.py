@@ -32,16 +32,20 @@ def check(lr_rgb: Array, hr: Source, pairing: Pairing, lr_name: str) -> list[str
     low = luminance(lr_rgb)
     high = _averaged(hr, pairing)
     if not low.any() and not high.any():
-        return ["both renders are black: the result is black too"]
+        return ["both renders are black (or NaN) everywhere: the result is black"]
     for name, values, other in ((lr_name, low, hr.name), (hr.name, high, lr_name)):
         if not values.any():
             raise InputError(
-                f"{name}: the beauty is black everywhere, while that of {other} is not; "
+                f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
                 "check which layer it is (--map rgb=LAYER)"
             )
     warnings = []
-    # Fireflies rule a plain mean: compare below the brightest percent.
-    ratio = _mean_below(high, 0.99) / max(_mean_below(low, 0.99), 1e-30)
+    # Fireflies rule a plain mean: compare where neither is among the brightest percent of what is lit.
+    lit = (low > 0) | (high > 0)
+    plain = lit & (low <= np.quantile(low[lit], 0.99)) & (high <= np.quantile(high[lit], 0.99))
+    ratio = (
+        float(high[plain].sum(dtype=np.float64) / max(low[plain].sum(dtype=np.float64), 1e-30)) if plain.any() else 1.0
+    )
     if not 1 / EXPOSURE_RATIO < ratio < EXPOSURE_RATIO:
         warnings.append(f"the HRLS is {ratio:.3g} times as bright as the LRHS: are exposure and view layer the same?")
     correlation = _correlation(low, high)
@@ -64,11 +68,6 @@ def _averaged(hr: Source, pairing: Pairing) -> Array:
             (1, 3)
         )
     return result
-
-
-def _mean_below(values: Array, share: float) -> float:
-    limit = np.quantile(values, share)
-    return float(values[values <= limit].mean(dtype=np.float64))
 
 
 def _correlation(a: Array, b: Array) -> float:

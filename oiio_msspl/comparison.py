@@ -36,19 +36,28 @@ def compare_files(images: Sequence[Path], reference: Path) -> list[dict[str, flo
     """
     truth_file = resolve(open_exr(reference))
     truth = _beauty(truth_file)
+    if min(truth.shape[:2]) < metrics.SSIM_WINDOW:
+        size = truth_file.data_window.size
+        raise InputError(f"{reference}: is {size}; SSIM needs at least {metrics.SSIM_WINDOW} pixels each way")
     return [scores(_fitted(resolve(open_exr(path)), truth, reference), truth) for path in images]
+
+
+def check_error_map(path: Path, *, overwrite: bool) -> None:
+    """Raise InputError if no error map could be written here."""
+    if path.suffix.lower() != ".png":
+        raise InputError(f"{path}: the error map is a PNG; name it .png")
+    check_target(path, overwrite=overwrite)
 
 
 def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool) -> None:
     """log10 RelMSE (0.5, 0.01) a pixel, from 1e-5 (black) to 1 (white) on OpenImageIO's "inferno" colours."""
-    check_target(path, overwrite=overwrite)
     truth = _beauty(resolve(open_exr(reference)))
     error = metrics.relmse_map(_fitted(resolve(open_exr(image)), truth, reference), truth).mean(axis=-1)
     grey = ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)
     mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(grey[..., None])), 0, "inferno")
     if mapped.has_error:
         raise MssplError(f"{path}: {mapped.geterror()}")
-    write_png(path, np.asarray(mapped.get_pixels(oiio.FLOAT))[..., :3])
+    write_png(path, np.asarray(mapped.get_pixels(oiio.FLOAT))[..., :3], overwrite=overwrite)
 
 
 def upsample_bicubic(image: Array, width: int, height: int) -> Array:
@@ -67,7 +76,10 @@ def _fitted(file: Resolution, truth: Array, reference: Path) -> Array:
     height, width = truth.shape[:2]
     if image.shape == truth.shape:
         return image
-    if any(image.shape[:2] == (-(-height // s), -(-width // s)) for s in schema.SCALES):
+    if any(
+        image.shape[0] in (height // s, -(-height // s)) and image.shape[1] in (width // s, -(-width // s))
+        for s in schema.SCALES
+    ):
         return upsample_bicubic(image, width, height)
     raise InputError(
         f"{file.name} is {image.shape[1]}x{image.shape[0]}, but {reference} is {width}x{height}; "

@@ -44,7 +44,7 @@ class Contract:
     scale: int
     """Upsampling factor s: 2, 4 or 8."""
     alignment: int = 1
-    """Height and width of the LRHS must be multiples of this, in LRHS pixels."""
+    """Height and width of the LRHS must be multiples of this, in LRHS pixels. This version tiles for 1 alone."""
     overlap: int = 16
     """LRHS pixels that neighbouring tiles share on each side: the network's receptive field, or what of it matters."""
     bytes_per_pixel: int = 1000
@@ -83,6 +83,8 @@ class Contract:
             "lrhs": schema.channel_names(schema.LRHS_FEATURES),
             "hrls": schema.channel_names(schema.HRLS_FEATURES),
             "transforms": current_transforms(),
+            "defaults": schema.DEFAULTS,
+            "alignment": 1,
         }
         for key, value in expected.items():
             if getattr(contract, key) != value:

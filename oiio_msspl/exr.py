@@ -124,25 +124,34 @@ class ExrFile:
             else:
                 rows = self._input.read_scanlines(part.index, 0, y0, y1, 0, first, last, kind)
             if rows is None:
-                raise InputError(
-                    f"{self.path}: part {part.index} ({part.name or 'unnamed'}), rows {y0} to {y1 - 1} can't be read "
-                    f"({self._input.geterror() or 'no reason given'}); the file is damaged or still being written"
-                )
+                raise unreadable(self.path, part, self._input.geterror(), f", rows {y0} to {y1 - 1}")
             yield y0, y1, rows
+
+
+def unreadable(path: Path, part: Part, reason: str, where: str = "") -> InputError:
+    """The error for pixels that can't be decoded."""
+    return InputError(
+        f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read "
+        f"({' '.join(reason.split()) or 'no reason given'}); the file is damaged or still being written"
+    )
 
 
 def open_exr(path: str | Path) -> ExrFile:
     """Read the headers of an EXR file.
 
     Raises:
-        InputError: there is no such file, it is no EXR, it is corrupt, or it holds deep data only.
+        InputError: there is no such file, it is no EXR, or its headers are corrupt.
     """
     path = Path(path)
+    if path.is_dir():
+        raise InputError(f"{path}: is a folder; name a file in it")
     if not path.is_file():
         raise InputError(f"{path}: no such file")
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
-        raise InputError(f"{path}: can't be opened as an EXR ({_last_error()})")
+        reason = _last_error()
+        hint = "; if its channels are subsampled (luminance and chroma), convert it to RGB" if "twice" in reason else ""
+        raise InputError(f"{path}: can't be opened as an EXR ({reason}){hint}")
     if handle.format_name() != "openexr":
         raise InputError(
             f"{path}: is a {handle.format_name()} file; give an EXR, other formats lose what the network needs"

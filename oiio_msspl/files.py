@@ -13,7 +13,7 @@ from oiio_msspl import assemble, preview
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.assemble import WriteOptions
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr import open_exr
 from oiio_msspl.fusion import MAX_MEMORY, fuse
 from oiio_msspl.output import check_target
@@ -48,8 +48,7 @@ class Report:
     warnings: list[str]
     tiles: int
     seconds: dict[str, float]
-    """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` (packing, network and
-    unpacking, a part of ``fuse``), ``write``."""
+    """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -81,7 +80,7 @@ class Report:
 
 
 def resolve_pair(lr_path: str | Path, hr_path: str | Path, inputs: Inputs) -> tuple[Resolution, Resolution]:
-    """Open and map both files. Of the LRHS the network reads the beauty alone, so only ``rgb`` is mapped there.
+    """Open and map both files. Of the LRHS the network reads the beauty alone, so nothing else is looked for there.
 
     Raises:
         InputError: one of the files can't be used, or both are the same.
@@ -92,7 +91,7 @@ def resolve_pair(lr_path: str | Path, hr_path: str | Path, inputs: Inputs) -> tu
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
     rgb_only = {k: v for k, v in inputs.mapping.items() if k == "rgb"}
     return (
-        resolve(lr_file, rgb_only, view=inputs.view, spp=inputs.lr_spp),
+        resolve(lr_file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=()),
         resolve(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp),
     )
 
@@ -159,9 +158,16 @@ def fuse_files(
         tiles=fused.tiles,
         seconds={},
     )
-    report.warnings += assemble.write(output, hr, fused.rgb, fused.alpha, _provenance(report), write)
+    report.warnings += assemble.write(
+        output, hr, fused.rgb, fused.alpha, _provenance(report), write, overwrite=overwrite
+    )
     if preview_path is not None:
-        preview.write(preview_path, fused.rgb, hr.data_window, hr.display_window, view_transform)
+        try:
+            windows = (hr.data_window, hr.display_window)
+            preview.write(preview_path, fused.rgb, *windows, view_transform, overwrite=overwrite)
+        except MssplError as error:  # the frame is there: that is what was asked for
+            report.warnings.append(f"no preview: {error}")
+            report.preview = None
     report.seconds = {
         "read": opened - start,
         "fuse": computed - opened,
@@ -187,7 +193,7 @@ def _spp_warnings(lr: Resolution, hr: Resolution, session: Session) -> list[str]
 
 
 def _provenance(report: Report) -> dict[str, str]:
-    """Attributes of the fused part: enough to make it again."""
+    """Attributes of the fused part: what it was made from."""
     spp = report.spp_avg
     return {
         "msspl/version": __version__,

@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -29,7 +28,7 @@ class Fused:
     rgb: Array
     """Scene linear, (height, width, 3), finite and >= 0."""
     alpha: Array | None
-    """(height, width, 1) in [0, 1], or None if the HRLS has none."""
+    """(height, width, 1), clipped to [0, 1], or None if the HRLS has none."""
     pairing: Pairing
     exposure: float
     """What the scene was scaled by for the network."""
@@ -38,7 +37,7 @@ class Fused:
     warnings: list[str] = field(default_factory=list)
     tiles: int = 1
     seconds: float = 0.0
-    """Of packing, network and unpacking, without reading."""
+    """In the network alone."""
 
 
 def fuse(
@@ -79,28 +78,29 @@ def fuse(
     # What is held of the frame: the result (colour and alpha), and the LRHS as it is and as the network wants it.
     frame_bytes = rgb.nbytes * 4 // 3 + lrhs.nbytes + sum(values.nbytes for values in low.values())
     largest = _largest_tile(session, frame_bytes, max_memory)
-    plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
-    seconds = 0.0
+    plan = list(tiling.tiles(grid, largest, contract.overlap))
+    dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
+    seconds = session.seconds
     for done, tile in enumerate(plan):
         area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
-        target = core.intersect(hr_data)
+        target, inside = core.intersect(hr_data), tile.area.slices(grid)
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
-        start = time.perf_counter()
-        hrls = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
-        values = session.run(np.ascontiguousarray(lrhs[tile.area.slices(grid)]), hrls)
-        rgb[target.slices(hr_data)] = transforms.expand(values[target.slices(area)], exposure)
+        values = session.run(np.ascontiguousarray(lrhs[inside]), tensors.pack(layers, schema.HRLS_FEATURES, exposure))
+        # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
+        empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
+        colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
+        rgb[target.slices(hr_data)] = colour[target.slices(area)]
         if "alpha" in layers:
             if alpha is None:
                 alpha = np.empty((hr_data.height, hr_data.width, 1), dtype=np.float32)
-            low_alpha = low["alpha"][tile.area.slices(grid)] if "alpha" in low else None
+            low_alpha = low["alpha"][inside] if "alpha" in low else None
             alpha[target.slices(hr_data)] = _fuse_alpha(low_alpha, layers, session, scale)[target.slices(area)]
-        seconds += time.perf_counter() - start
         if progress is not None:
             progress(done + 1, len(plan))
     if alpha is not None and "alpha" not in low:
-        warnings.append("the LRHS has no alpha: the HRLS's is passed through as it is")
+        warnings.append("the LRHS has no alpha: that of the HRLS is kept, noise and all")
     repaired = {f"lrhs.{k}": v for k, v in lr_repaired.items()} | {f"hrls.{k}": v for k, v in hr_repaired.items()}
-    return Fused(rgb, alpha, pairing, exposure, repaired, warnings, len(plan), seconds)
+    return Fused(rgb, alpha, pairing, exposure, repaired, warnings, len(plan), session.seconds - seconds)
 
 
 def _read_low(lr: Source, pairing: Pairing, repaired: dict[str, int]) -> dict[str, Array]:
@@ -152,9 +152,9 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
     """
     alpha = np.clip(high["alpha"], 0.0, 1.0)
     if low is None:
-        return high["alpha"]
+        return alpha
     low = np.clip(low, 0.0, 1.0)
-    solid, empty = _settled(low, alpha, scale, 1.0), _settled(low, alpha, scale, 0.0)
+    solid, empty = _settled(low == 1, alpha == 1, scale), _settled(low == 0, alpha == 0, scale)
     if (solid | empty).all():
         return solid.astype(np.float32)
     grey = {name: values for name, values in high.items() if name in (schema.ALBEDO, schema.NORMAL)}
@@ -165,12 +165,12 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 
 
-def _settled(low: Array, high: Array, scale: int, value: float) -> NDArray[np.bool_]:
-    """Where an HRLS pixel and the 3 x 3 LRHS pixels around it all have ``value``."""
-    same = np.pad((low[..., 0] == value), 1, mode="edge")
+def _settled(low: NDArray[np.bool_], high: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:
+    """Where something holds for an HRLS pixel (h, w, 1) and for the 3 x 3 LRHS pixels around it."""
     height, width = low.shape[:2]
+    same = np.pad(low[..., 0], 1, mode="edge")
     around = np.ones((height, width), dtype=bool)
     for dy in range(3):
         for dx in range(3):
             around &= same[dy : dy + height, dx : dx + width]
-    return (np.repeat(np.repeat(around, scale, 0), scale, 1) & (high[..., 0] == value))[..., None]
+    return np.repeat(np.repeat(around, scale, 0), scale, 1)[..., None] & high

@@ -17,6 +17,8 @@ from oiio_msspl.transforms import luminance, srgb
 #: The paper's two conventions of RelMSE, (lambda_1, lambda_2): its BCR data set (after KPCN), and the Gharbi data set.
 RELMSE_BCR = (0.5, 0.01)
 RELMSE_GHARBI = (1.0, 1e-4)
+#: Side of SSIM's Gaussian window.
+SSIM_WINDOW = 11
 
 
 def psnr(image: Array, reference: Array) -> float:
@@ -42,7 +44,7 @@ def ssim(image: Array, reference: Array) -> float:
     Raises:
         ValueError: a side is shorter than the window.
     """
-    if min(image.shape[:2]) < 11:
+    if min(image.shape[:2]) < SSIM_WINDOW:
         raise ValueError(f"SSIM needs at least 11 x 11 pixels, got {image.shape[1]} x {image.shape[0]}")
     x, y = (luminance(srgb(v)).astype(np.float64) for v in (image, reference))
     mx, my = _blur(x), _blur(y)
@@ -56,5 +58,5 @@ def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
     taps = np.exp(-0.5 * np.square(np.arange(-5, 6) / 1.5))
     taps /= taps.sum()
     for axis in (0, 1):
-        values = np.lib.stride_tricks.sliding_window_view(values, 11, axis=axis) @ taps
+        values = np.lib.stride_tricks.sliding_window_view(values, SSIM_WINDOW, axis=axis) @ taps
     return values

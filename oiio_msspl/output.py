@@ -21,7 +21,7 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
     folder = path.parent
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
-    if path.exists() and not overwrite:
+    if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists; pass --overwrite to replace it")
     if not folder.is_dir():
         raise InputError(f"{path}: the folder {folder} does not exist; create it first")
@@ -31,20 +31,43 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
 
 
 @contextmanager
-def replacing(path: Path) -> Iterator[Path]:
+def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     """A temporary file beside ``path`` that takes its place when the block ends well, and vanishes otherwise.
 
+    A link keeps pointing where it points, and a file that is replaced keeps its permissions.
+
     Raises:
+        InputError: without ``overwrite``, somebody else has put a file there meanwhile.
         MssplError: the file system refused (disk full, permissions); ``path`` is as it was.
     """
-    temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
+    target = Path(os.path.realpath(path))
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
     try:
         yield temporary
         # On the disk before it gets its name: a crash must not leave a whole name on half a file.
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
-        os.replace(temporary, path)
+        if overwrite:
+            if target.exists():
+                os.chmod(temporary, target.stat().st_mode & 0o7777)
+            os.replace(temporary, target)
+        else:
+            _name_if_free(temporary, target)
+    except FileExistsError as error:
+        raise InputError(f"{path}: appeared while this was computed; pass --overwrite to replace it") from error
     except OSError as error:
         raise MssplError(f"{path}: can't be written ({error.strerror or error}); the target is as it was") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _name_if_free(temporary: Path, target: Path) -> None:
+    """Give a file its name in one step that fails if there is one: two jobs must not overwrite each other."""
+    try:
+        os.link(temporary, target)
+    except FileExistsError:
+        raise
+    except OSError:  # a file system without hard links
+        if target.exists():
+            raise FileExistsError from None
+        os.replace(temporary, target)

@@ -3,12 +3,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
 
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr import BAND
 from oiio_msspl.output import replacing
 from oiio_msspl.render import Array, Window
 from oiio_msspl.transforms import srgb
@@ -26,7 +28,15 @@ def check_view(view: str) -> None:
         raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
 
 
-def write(path: Path, rgb: Array, data_window: Window, display_window: Window, view: str | None = None) -> None:
+def write(
+    path: Path,
+    rgb: Array,
+    data_window: Window,
+    display_window: Window,
+    view: str | None = None,
+    *,
+    overwrite: bool = False,
+) -> None:
     """Write scene-linear ``rgb`` (height, width, 3) over ``data_window`` as it lies in the display window.
 
     Args:
@@ -35,32 +45,47 @@ def write(path: Path, rgb: Array, data_window: Window, display_window: Window, v
 
     Raises:
         InputError: no such view.
+        MssplError: it can't be written.
     """
-    linear = np.zeros((display_window.height, display_window.width, 3), dtype=np.float32)
-    seen = data_window.intersect(display_window)
-    linear[seen.slices(display_window)] = rgb[seen.slices(data_window)]
-    display = srgb(linear) if view is None else _through_ocio(linear, view)
-    write_png(path, display)
+    if view is not None:
+        check_view(view)
+
+    def rows(start: int, stop: int) -> Array:
+        shown = display_window
+        band = Window(shown.x0, shown.y0 + start, shown.x1, shown.y0 + stop)
+        linear = np.zeros((band.height, band.width, 3), dtype=np.float32)
+        seen = data_window.intersect(band)
+        if seen.width and seen.height:
+            linear[seen.slices(band)] = rgb[seen.slices(data_window)]
+        return srgb(linear) if view is None else _through_ocio(linear, view)
+
+    _write_png(path, display_window.width, display_window.height, rows, overwrite)
 
 
-def write_png(path: Path, display: Array) -> None:
+def write_png(path: Path, display: Array, *, overwrite: bool = False) -> None:
     """Write display values in [0, 1], (height, width, 3), as an 8-bit PNG, atomically."""
-    height, width = display.shape[:2]
-    pixels = (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8)
-    with replacing(path) as temporary:
+    _write_png(path, display.shape[1], display.shape[0], lambda start, stop: display[start:stop], overwrite)
+
+
+def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], Array], overwrite: bool) -> None:
+    """``rows(start, stop)`` gives display values; asked for in bands, so that a large frame needs no second copy."""
+    with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
         if writer is None:
             raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
         spec = oiio.ImageSpec(width, height, 3, "uint8")
         spec.attribute("oiio:ColorSpace", "sRGB")
-        ok = writer.open(str(temporary), spec) and writer.write_image(np.ascontiguousarray(pixels))
+        ok = writer.open(str(temporary), spec)
+        for start in range(0, height, BAND):
+            stop = min(start + BAND, height)
+            pixels = (np.clip(rows(start, stop), 0, 1) * 255 + 0.5).astype(np.uint8)
+            ok = ok and writer.write_scanlines(start, stop, 0, np.ascontiguousarray(pixels))
         ok = writer.close() and ok
         if not ok:
             raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
 
 
 def _through_ocio(linear: Array, view: str) -> Array:
-    check_view(view)
     image = oiio.ImageBuf(np.ascontiguousarray(linear))
     result = oiio.ImageBufAlgo.ociodisplay(
         image, OCIO_DISPLAY, view, fromspace=OCIO_INPUT, unpremult=False, colorconfig=OCIO_CONFIG

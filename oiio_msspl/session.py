@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import logging
+import time
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -99,6 +100,8 @@ class Session:
             raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(path))
         self.path = Path(path)
+        self.seconds = 0.0
+        """Time spent in :meth:`run` so far."""
         self.provider = self._session.get_providers()[0]
         if self.provider != PROVIDERS[device]:
             log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
@@ -118,6 +121,7 @@ class Session:
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
         }
+        start = time.perf_counter()
         try:
             (fused,) = self._session.run(["fused"], feed)
         except Exception as error:
@@ -125,4 +129,5 @@ class Session:
                 f"{self.contract.name} failed on {self.provider} ({str(error).splitlines()[0]}); "
                 "try --max-memory with a smaller value, or --device cpu"
             ) from error
+        self.seconds += time.perf_counter() - start
         return fused[0].transpose(1, 2, 0)

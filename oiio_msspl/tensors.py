@@ -50,12 +50,9 @@ def read(
         counts: repaired values by layer are added here, as far as they lie in ``counted`` (overlaps are read twice).
         features: which layers; all if None.
     """
-    inside = want.intersect(have)
-    if inside.width == 0 or inside.height == 0:
-        # The data window ends before this rectangle begins: its nearest pixel stands in.
-        x = min(max(want.x0, have.x0), have.x1 - 1)
-        y = min(max(want.y0, have.y0), have.y1 - 1)
-        inside = Window(x, y, x + 1, y + 1)
+    rows = np.clip(np.arange(want.y0, want.y1), have.y0, have.y1 - 1)
+    columns = np.clip(np.arange(want.x0, want.x1), have.x0, have.x1 - 1)
+    inside = Window(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
     layers = source.read(inside.shift(source.display_window.x0, source.display_window.y0), features)
     result = {}
     for name, values in layers.items():
@@ -63,11 +60,6 @@ def read(
         if bad is not None and counts is not None and counted is not None:
             changed = int(np.count_nonzero(bad[counted.intersect(inside).slices(inside)]))
             counts[name] = counts.get(name, 0) + changed
-        result[name] = repaired if inside == want else _clamped(repaired, inside, want)
+        repeated = (rows[:, None] - inside.y0, columns[None, :] - inside.x0)
+        result[name] = repaired if inside == want else repaired[repeated]
     return result
-
-
-def _clamped(values: Array, have: Window, want: Window) -> Array:
-    rows = np.clip(np.arange(want.y0, want.y1) - have.y0, 0, have.height - 1)
-    columns = np.clip(np.arange(want.x0, want.x1) - have.x0, 0, have.width - 1)
-    return values[rows[:, None], columns[None, :]]

@@ -25,7 +25,7 @@ class Tile:
     """What the network sees: the core and the overlap, as far as the grid goes."""
 
 
-def tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> Iterator[Tile]:
+def tiles(grid: Window, largest: int, overlap: int) -> Iterator[Tile]:
     """Cover ``grid`` by tiles whose area holds at most ``largest`` LRHS pixels.
 
     The grid's own borders get no overlap: there the network sees the end of the picture, as in training.
@@ -33,16 +33,14 @@ def tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> Itera
     Raises:
         InputError: ``largest`` leaves no room for a core.
     """
-    columns, rows = _split(grid, largest, overlap, alignment)
+    columns, rows = _split(grid, largest, overlap)
     for y0, y1 in rows:
         for x0, x1 in columns:
             core = Window(x0, y0, x1, y1)
             yield Tile(core, Window(x0 - overlap, y0 - overlap, x1 + overlap, y1 + overlap).intersect(grid))
 
 
-def _split(
-    grid: Window, largest: int, overlap: int, alignment: int
-) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def _split(grid: Window, largest: int, overlap: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Fewest cuts that fit, cutting the longer side first so that tiles stay near square."""
     nx = ny = 1
     while True:
@@ -60,10 +58,9 @@ def _split(
             nx += 1
         else:
             ny += 1
-    return _cuts(grid.x0, grid.x1, nx, alignment), _cuts(grid.y0, grid.y1, ny, alignment)
+    return _cuts(grid.x0, grid.x1, nx), _cuts(grid.y0, grid.y1, ny)
 
 
-def _cuts(start: int, end: int, count: int, alignment: int) -> list[tuple[int, int]]:
+def _cuts(start: int, end: int, count: int) -> list[tuple[int, int]]:
     step = -(-(end - start) // count)
-    step = -(-step // alignment) * alignment
     return [(a, min(a + step, end)) for a in range(start, end, step)]

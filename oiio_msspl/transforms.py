@@ -37,13 +37,13 @@ def exposure_of(lrhs_rgb: Array) -> float:
     """Factor that brings a repaired LRHS (H, W, 3) to a log-mean luminance of ``KEY``; 1.0 for a black frame.
 
     Pixels without light carry no exposure and are left out; of the lit ones, the epsilon keeps a few almost black
-    pixels from deciding.
+    pixels from deciding. It comes from the median: a single firefly of any size moves the result by next to nothing.
     """
     y = luminance(lrhs_rgb).astype(np.float64)
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0
-    epsilon = 1e-4 * float(lit.mean())
+    epsilon = 1e-4 * float(np.median(lit))
     return float(KEY / np.exp(np.mean(np.log(lit + epsilon))))
 
 

@@ -1,8 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
+import re
+
 import numpy as np
 import pytest
 
-from oiio_msspl.aovs import parse_map_options, read_map_file, resolve
+from oiio_msspl import schema
+from oiio_msspl.aovs import check_mapping, parse_map_options, read_map_file, renderers, resolve
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr import open_exr
 from tests.conftest import SHARED, needs_shared, rgb, write_exr
@@ -136,6 +139,24 @@ CASES = {
         {},
         {"rgb": "R G B", "albedo": "albedo_aov", "normal": "normal_aov", "alpha": "A"},
     ),
+    "Octane": (
+        layer("", 1) | layer("Denoise albedo", 2) | layer("Denoise normal", 0) | layer("Diffuse", 3),
+        {},
+        {"rgb": "R G B", "albedo": "Denoise albedo", "normal": "Denoise normal", "diffuse": "Diffuse"},
+    ),
+    "Corona": (
+        layer("", 1)
+        | layer("CShading_Albedo", 2)
+        | layer("CGeometry_NormalsShading", 0)
+        | layer("CESSENTIAL_Reflect", 3),
+        {},
+        {
+            "rgb": "R G B",
+            "albedo": "CShading_Albedo",
+            "normal": "CGeometry_NormalsShading",
+            "specular": "CESSENTIAL_Reflect",
+        },
+    ),
     "Unreal": (
         layer("", 1, "RGBA")
         | layer("FinalImageMovieRenderQueue_WorldNormal", 0)
@@ -152,6 +173,50 @@ def test_each_renderers_layers_are_found(tmp_path, renderer):
     resolution = resolved(tmp_path, channels, attributes=attributes)
     assert resolution.renderer == renderer
     assert found(resolution) == expected
+
+
+def test_every_renderer_of_the_table_is_tested():
+    assert {r["name"] for r in renderers()} == CASES.keys() | {"Karma", "LuxCore", "unknown"}
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("albedo = 5", "5 is neither a layer's name nor a table"),
+        ('albedo = ["a", "b"]', "is neither a layer's name nor a table"),
+        ('variance = { halves = ["a"] }', "the two half buffers"),
+        ('albedo = { channels = ["a.R", "a.G"] }', "has 2 channels, not 3"),
+        ('albedo = { channels = "R" }', "channels must be a list of names"),
+        ('normal = { layer = "n", encoding = "foo" }', "encoding 'foo': of a normal, use one of signed"),
+        ('albedo = { layer = "a", kind = "mean" }', "kind 'mean': of a variance"),
+        ('albedo = { lay = "a" }', "has lay; give one of layer, sum"),
+        ('rgb = { sum = ["a", "b"] }', "must be a single layer"),
+        ("albedo =", "can't be read as a mapping"),
+    ],
+)
+def test_mistakes_in_a_mapping_file_are_named(tmp_path, text, message):
+    (tmp_path / "map.toml").write_text(text)
+    with pytest.raises(InputError, match=rf"map\.toml: .*{re.escape(message)}"):
+        read_map_file(tmp_path / "map.toml")
+
+
+def test_the_shipped_table_has_no_mistakes():
+    for renderer in renderers():
+        candidates = [(f, c) for f in schema.HRLS_FEATURES for c in renderer.get(f, [])]
+        assert candidates
+        for feature, candidate in candidates:
+            check_mapping({feature: candidate}, renderer["name"])
+
+
+def test_integers_are_no_light(tmp_path):
+    ids = {c: np.full((H, W), 4000, np.uint32) for c in "RGB"}
+    with pytest.raises(InputError, match="rgb: R, G, B hold integers"):
+        resolved(tmp_path, ids)
+
+
+def test_a_single_unnamed_view_is_the_one_that_is_meant(tmp_path):
+    """--view-layer goes to both files; an LRHS rendered alone may have no view name."""
+    assert resolved(tmp_path, layer("", 1), view="left").view == ""
 
 
 def test_karmas_layers_come_from_part_names_alone(tmp_path):
@@ -286,6 +351,9 @@ def test_a_mapping_file_takes_what_the_table_takes(tmp_path):
     [
         (["albedo"], "write it as feature=layer"),
         (["colour=x"], "'colour' is no feature; use one of rgb, albedo"),
+        (["rgb=a+b"], "must be a single layer"),
+        (["rgb=other.exr"], "must be a layer of the render itself"),
+        (["variance=a+b"], "variances don't add up"),
     ],
 )
 def test_a_wrong_mapping_option_is_explained(options, message):
@@ -295,7 +363,7 @@ def test_a_wrong_mapping_option_is_explained(options, message):
 
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
     channels = layer("", 1) | {"mask.A": plane(1)}
-    with pytest.raises(InputError, match="no layer for --map albedo=nothing"):
+    with pytest.raises(InputError, match="albedo is mapped to nothing, which is not there"):
         resolved(tmp_path, channels, {"albedo": "nothing"})
     with pytest.raises(InputError, match=r"layer 'mask' has channels A, not R, G, B"):
         resolved(tmp_path, channels, {"albedo": "mask"})

@@ -49,7 +49,8 @@ def written(tmp_path, parts, options=None, **attributes):
     fused = np.full((height, width, 3), 0.1, np.float32) + np.arange(3, dtype=np.float32)
     alpha = np.full((height, width, 1), 0.25, np.float32) if hr.alpha else None
     out = tmp_path / "out.exr"
-    assemble.write(out, hr, fused, alpha, {"msspl/model": "test"}, options or WriteOptions())
+    options = options or WriteOptions()
+    assemble.write(out, hr, fused, alpha, {"msspl/model": "test"}, options, overwrite=True)
     return fused, out, read_bits(out)
 
 
@@ -63,19 +64,101 @@ def flat(parts):
     return result
 
 
+def plain(seed):
+    return np.random.default_rng(seed).random((H, W), dtype=np.float32)
+
+
+def karma():
+    """Parts that carry the layer in their name alone."""
+    return [
+        ("C", rgb(picture(H, W)) | {"A": plain(0)}, (0, 0)),
+        ("albedo", rgb(picture(H, W) * 2), (0, 0)),
+        ("crypto00", {c: plain(i) for i, c in enumerate("RGBA")}, (0, 0)),
+        ("depth", {"Z": plain(9)}, (0, 0)),
+    ]
+
+
+def stereo():
+    """Two views in one part, as OpenEXR's multiView convention names them."""
+    return rgb(picture(H, W)) | {
+        "A": plain(0),
+        **{f"left.{c}": plain(i + 1) for i, c in enumerate("RGBA")},
+        "diffuse.right.R": plain(6),
+        "diffuse.left.R": plain(7),
+        "left.Z": plain(8),
+    }
+
+
+def doubles():
+    """Channels that mean the same to us: foo.r and foo.red beside foo.R."""
+    return rgb(picture(H, W)) | {"foo.R": plain(1), "foo.r": plain(2), "foo.red": plain(3)}
+
+
+SOURCES = {"everything": (everything(), {}), "karma": (karma(), {}), "doubles": (doubles(), {})}
+SOURCES["stereo"] = (stereo(), {"multiView": ["right", "left"]})
+
+
+@pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_layers_are_passed_on_bit_for_bit(tmp_path, layout):
-    """Half, float, uint, NaN payloads: every layer but the beauty keeps every bit and its type."""
-    source = everything()
-    _, _, parts = written(tmp_path, source, WriteOptions(layout=layout))
-    after = flat(parts)
-    for name, plane in source.items():
-        if name in "RGBA":
-            continue
-        layer, _, component = name.rpartition(".")
-        # A layer of two pixel types becomes two parts in the nuke layout: albedo and albedo2.
-        candidates = [v for (part, c), v in after.items() if c == component and part.startswith(layer)]
-        assert any(same_bits(plane, v) for v in candidates), name
+def test_layers_are_passed_on_bit_for_bit(tmp_path, layout, source):
+    """Half, float, uint, NaN payloads, views, doubled names: nothing but the beauty changes, nothing is lost."""
+    parts, attributes = SOURCES[source]
+    _, _, after = written(tmp_path, parts, WriteOptions(layout=layout), **attributes)
+    hr = resolve(open_exr(tmp_path / "hr.exr"))
+    replaced = {(c.part, c.name) for c in assemble.fused_channels(hr)}
+
+    def planes(parts, leave=()):
+        return sorted(
+            (str(plane.dtype), plane.tobytes())
+            for index, (_, channels) in enumerate(parts)
+            for name, plane in channels.items()
+            if (index, name) not in leave
+        )
+
+    before = planes(read_bits(tmp_path / "hr.exr"), replaced)
+    result = planes(after)
+    assert len(result) == len(before) + len(replaced)
+    for plane in before:
+        assert plane in result
+        result.remove(plane)
+
+
+def test_tiled_parts_of_mixed_types_are_passed_on(tmp_path):
+    """A renderer's tiled multi-part file, one part of which holds half and float."""
+    tile = OpenEXR.TileDescription()
+    tile.xSize = tile.ySize = 16
+    parts = []
+    for name, channels in (
+        ("rgba", rgb(picture(H, W))),
+        ("mix", {"m.X": plain(1).astype(np.float16), "m.id": plain(2)}),
+    ):
+        header = {"type": OpenEXR.tiledimage, "tiles": tile, "compression": OpenEXR.ZIP_COMPRESSION}
+        parts.append(OpenEXR.Part(header, channels, name))
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "hr.exr"))
+    hr = resolve(open_exr(tmp_path / "hr.exr"))
+    assemble.write(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())
+    after = flat(read_bits(tmp_path / "out.exr"))
+    assert same_bits(after[("m", "X")], plain(1).astype(np.float16))
+    assert same_bits(after[("m", "id")], plain(2))
+
+
+def test_nuke_layout_keeps_views_apart(tmp_path):
+    _, out, _ = written(tmp_path, stereo(), WriteOptions(layout="nuke"), multiView=["right", "left"])
+    views = {part.name: part.view for part in open_exr(out).parts}
+    assert views["diffuse.left"] == "left"
+    assert views["diffuse.right"] == "right"
+
+
+def test_a_damaged_layer_names_the_input(tmp_path):
+    """A truncated HRLS is the input's fault, also when only a passed-on layer is hit."""
+    noise = np.random.default_rng(0).random((300, 64), dtype=np.float32)
+    path = write_exr(tmp_path / "hr.exr", [("rgba", rgb(picture(300, 64)), (0, 0)), ("z", {"z.Z": noise}, (0, 0))])
+    path.write_bytes(path.read_bytes()[:-20000])
+    hr = resolve(open_exr(path))
+    with pytest.raises(InputError, match=r"hr\.exr: part 1 \(z\).* can't be read"):
+        assemble.write(tmp_path / "out.exr", hr, np.ones((300, 64, 3), np.float32), None, {}, WriteOptions())
+    assert not (tmp_path / "out.exr").exists()
 
 
 def test_the_fused_beauty_comes_first(tmp_path):
@@ -232,6 +315,31 @@ def test_a_failing_block_leaves_the_old_file(tmp_path):
     assert os.listdir(tmp_path) == ["out.exr"]
 
 
+def test_two_jobs_do_not_overwrite_each_other(tmp_path):
+    """A file that appears while ours is computed stays, unless overwriting was asked for."""
+    target = tmp_path / "out.exr"
+    with pytest.raises(InputError, match="appeared while this was computed"), replacing(target) as temporary:
+        temporary.write_text("ours")
+        target.write_text("theirs")
+    assert target.read_text() == "theirs"
+    assert os.listdir(tmp_path) == ["out.exr"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX links and modes")
+def test_links_and_permissions_are_kept(tmp_path):
+    (tmp_path / "real.exr").write_text("old")
+    (tmp_path / "real.exr").chmod(0o640)
+    (tmp_path / "link.exr").symlink_to("real.exr")
+    with replacing(tmp_path / "link.exr", overwrite=True) as temporary:
+        temporary.write_text("new")
+    assert (tmp_path / "link.exr").is_symlink()
+    assert (tmp_path / "real.exr").read_text() == "new"
+    assert (tmp_path / "real.exr").stat().st_mode & 0o777 == 0o640
+    (tmp_path / "dangling.exr").symlink_to("nowhere.exr")
+    with pytest.raises(InputError, match="exists; pass --overwrite"):
+        check_target(tmp_path / "dangling.exr", overwrite=False)
+
+
 def test_targets_are_checked_before_any_work(tmp_path):
     (tmp_path / "there.exr").write_text("old")
     with pytest.raises(InputError, match="exists; pass --overwrite"):
@@ -262,7 +370,7 @@ rgb = np.random.default_rng(0).random((hr.data_window.height, hr.data_window.wid
 print("writing", flush=True)
 try:
     for _ in range(int(sys.argv[3])):
-        assemble.write(folder / "out.exr", hr, rgb, None, {}, assemble.WriteOptions())
+        assemble.write(folder / "out.exr", hr, rgb, None, {}, assemble.WriteOptions(), overwrite=True)
 except MssplError as error:
     print(error)
     sys.exit(error.exit_code)

@@ -3,8 +3,10 @@
 
 import json
 import shutil
+import signal
 import subprocess
 import sys
+import time
 
 import numpy as np
 import OpenImageIO as oiio
@@ -103,13 +105,15 @@ def test_nothing_is_overwritten_without_being_told(files, bilinear_models):
         (["hr.exr", "hr.exr"], "given twice"),
         (["lr.exr", "nothing.exr"], "nothing.exr: no such file"),
         (["lr.exr", "text.exr"], "text.exr: can't be opened as an EXR"),
-        (["lr.exr", "hr.exr", "--map", "albedo=nothing"], "no layer for --map albedo=nothing"),
+        (["lr.exr", "hr.exr", "--map", "albedo=nothing"], "albedo is mapped to nothing, which is not there"),
         (["lr.exr", "hr.exr", "--device", "abacus"], "use one of cpu"),
         (["lr.exr", "hr.exr", "--model", "nothing"], "no model 'nothing'"),
         (["lr.exr", "hr.exr", "--layout", "x"], "use one of spec"),
         (["lr.exr", "hr.exr", "--max-memory", "lots"], "write it as 3G or 800M"),
         (["lr.exr", "hr.exr", "--max-memory", "1M"], "allow at least"),
-        (["lr.exr", "hr.exr", "--view-layer", "fg"], "no view or view layer 'fg'"),
+        (["lr.exr", "hr.exr", "-o", "."], "is a folder"),
+        (["lr.exr", "."], "is a folder"),
+        (["lr.exr", "hr.exr", "--compression", "dwaa:x"], "use one of none"),
         (["lr.exr", "hr.exr", "--view", "sepia"], "--view 'sepia'"),
         (["lr.exr", "hr.exr", "-o", "hr.exr", "--overwrite"], "is one of the inputs"),
         (["lr.exr", "hr.exr", "-o", "out.png"], "the result is an EXR"),
@@ -193,7 +197,7 @@ def test_inspect_handles_every_real_file(path):
         "INDIRECT_GLOSSY",
         "NOISE",
     }
-    # The V-Ray file holds headers and no pixels; gaffer's test files are black or constant.
+    # Of the V-Ray file only the headers are there.
     unusable |= {"rgba_z_crypto_diffuse_normals"}
     assert data["usable"] == (path.stem not in unusable), data["problems"]
 
@@ -216,6 +220,20 @@ def test_compare_prints_the_papers_measures(files, bilinear_models):
     assert scores[0]["psnr"] > scores[1]["psnr"]
     assert set(scores[0]) == {"image", "psnr", "relmse", "relmse_gharbi", "ssim"}
     assert oiio.ImageBuf(str(files / "e.png")).spec().width == 128
+
+
+def test_compare_does_not_overwrite_its_reference(files):
+    before = (files / "ref.exr").read_bytes()
+    arguments = [files / "hr.exr", "-r", files / "ref.exr", "--error-map", files / "ref.exr", "--overwrite"]
+    done = run("msspl", "compare", *arguments)
+    assert done.returncode == 2
+    assert "the error map is a PNG" in done.stderr
+    assert (files / "ref.exr").read_bytes() == before
+
+
+def test_compare_of_equal_pictures_is_valid_json(files):
+    done = run("msspl", "compare", files / "ref.exr", "-r", files / "ref.exr", "--json")
+    assert json.loads(done.stdout, parse_constant=pytest.fail)[0]["psnr"] is None
 
 
 def test_compare_refuses_other_sizes(files):
@@ -265,3 +283,21 @@ def test_the_readmes_first_command_shows_a_result(tmp_path):
     assert values.mean() == pytest.approx(low.read(low.data_window)["rgb"].mean(), rel=0.1)
     names = {p.name for p in out.file.parts}
     assert any("CryptoObject00" in n for n in names)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+def test_a_signal_leaves_nothing_half_written(files, bilinear_models, name):
+    """Ended by a farm or by Ctrl-C at any moment: the old file stays and no temporary file is left."""
+    (files / "out.exr").write_text("old")
+    before = sorted(p.name for p in files.iterdir())
+    code = "import sys; from msspl_cli.app import msspl_fuse; print('on', flush=True); msspl_fuse()"
+    for delay in (0.3, 0.6):
+        arguments = [files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4]]
+        command = [sys.executable, "-c", code, *map(str, arguments), "--overwrite", "--no-preview"]
+        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        process.stdout.readline()
+        time.sleep(delay)
+        process.send_signal(getattr(signal, name))
+        process.communicate()
+        assert sorted(p.name for p in files.iterdir()) == before

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import signal
 import sys
 
 import typer
@@ -12,6 +13,8 @@ from oiio_msspl.errors import MssplError
 
 def run(app: typer.Typer) -> None:
     """Run a program and exit. Typer itself answers wrong usage with exit code 2; ``--debug`` lets exceptions pass."""
+    # A farm ends a job with SIGTERM: leave as on an exception, so that temporary files go.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         app()
     except Exception as error:

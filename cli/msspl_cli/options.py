@@ -21,7 +21,7 @@ Map = Annotated[
         "--map",
         metavar="FEATURE=LAYER",
         help="Take a feature (rgb, albedo, normal, diffuse, specular, variance) from this layer, a sum of layers "
-        "(lighting+GI) or another EXR. May be repeated.",
+        "(lighting+GI) or another EXR; rgb takes a single layer. May be repeated.",
     ),
 ]
 MapFile = Annotated[

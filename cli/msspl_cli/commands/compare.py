@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -34,17 +35,21 @@ def compare(
 
     Images smaller than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
-    from oiio_msspl.comparison import compare_files, write_error_map
+    from oiio_msspl.comparison import check_error_map, compare_files, write_error_map
 
+    if error_map is not None:
+        check_error_map(error_map, overwrite=overwrite)
     results = compare_files(images, reference)
     if error_map is not None:
         write_error_map(error_map, images[0], reference, overwrite=overwrite)
     if as_json:
-        print(json.dumps([{"image": str(p), **scores} for p, scores in zip(images, results, strict=True)], indent=2))
+        # JSON has no infinity: equal pictures have no PSNR.
+        rows = [{k: v if math.isfinite(v) else None for k, v in scores.items()} for scores in results]
+        print(json.dumps([{"image": str(p), **row} for p, row in zip(images, rows, strict=True)], indent=2))
         return
-    rows = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
+    table = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
     for path, scores in zip(images, results, strict=True):
-        rows.append(
+        table.append(
             (
                 str(path),
                 f"{scores['psnr']:.2f} dB",
@@ -53,4 +58,4 @@ def compare(
                 f"{scores['ssim']:.4f}",
             )
         )
-    show.table(rows, "")
+    show.table(table, "")

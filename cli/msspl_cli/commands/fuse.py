@@ -41,7 +41,7 @@ def fuse(
     hr_spp: options.HrSpp = None,
     model: Annotated[str | None, typer.Option(help="A shipped model (msspl models) or an ONNX file.")] = None,
     device: Annotated[str, typer.Option(help="cpu, cuda, tensorrt, openvino, coreml or directml.")] = "cpu",
-    threads: Annotated[int, typer.Option(min=0, help="CPU threads; 0: one a core.")] = 0,
+    threads: Annotated[int, typer.Option(min=0, max=1024, help="CPU threads; 0: one a core.")] = 0,
     max_memory: Annotated[str, typer.Option(metavar="SIZE", help="Memory to stay below; tiles shrink to fit.")] = "3G",
     layout: Annotated[str, typer.Option(help="spec, nuke or multilayer.")] = "spec",
     compression: Annotated[
@@ -78,7 +78,7 @@ def fuse(
         device=device,
         threads=threads,
         max_memory=options.parse_bytes(max_memory),
-        preview_path=output.with_suffix(".png") if preview else None,
+        preview_path=output.with_suffix(".png") if preview and output.name else None,
         view_transform=view,
         overwrite=overwrite,
         progress=_bar(quiet),

@@ -71,9 +71,6 @@ def measure_oidn(scale: int, height: int, width: int, repeats: int, threads: int
 
 def measure_files(scale: int, height: int, width: int, max_memory: int) -> dict[str, Any]:
     """A whole job from file to file: half-float EXRs with the layers of a Cycles render."""
-    import numpy as np
-    import OpenEXR
-
     from oiio_msspl import fuse_files
 
     with tempfile.TemporaryDirectory() as folder:
@@ -82,9 +79,10 @@ def measure_files(scale: int, height: int, width: int, max_memory: int) -> dict[
             subprocess.run(
                 [sys.executable, "-m", "benchmarks.runtime", "--write", f"{folder}/{name}.exr", f"{w}x{h}"], check=True
             )
-        del np, OpenEXR
         start = time.perf_counter()
-        report = fuse_files(f"{folder}/lr.exr", f"{folder}/hr.exr", f"{folder}/out.exr", max_memory=max_memory)
+        preview = Path(folder, "out.png")
+        files = [f"{folder}/{name}.exr" for name in ("lr", "hr", "out")]
+        report = fuse_files(*files, max_memory=max_memory, preview_path=preview)
         return {
             "seconds": [time.perf_counter() - start],
             "peak_mb": peak_mb(),

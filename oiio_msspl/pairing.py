@@ -57,8 +57,7 @@ def pair(lr: Source, hr: Source) -> Pairing:
     low, high = lr.display_window, hr.display_window
     scale = _scale(low, high)
     if scale is None:
-        _explain_ratio(lr, hr)
-        raise AssertionError("unreachable")
+        raise _wrong_ratio(lr, hr)
     if abs(lr.pixel_aspect - hr.pixel_aspect) > 1e-3:
         raise InputError(
             f"{lr.name} has pixel aspect {lr.pixel_aspect:g}, {hr.name} has {hr.pixel_aspect:g}; "
@@ -87,10 +86,10 @@ def _scale(low: Window, high: Window) -> int | None:
     return None
 
 
-def _explain_ratio(lr: Source, hr: Source) -> None:
+def _wrong_ratio(lr: Source, hr: Source) -> InputError:
     low, high = lr.display_window, hr.display_window
     if _scale(high, low) is not None:
-        raise InputError(
+        return InputError(
             f"the inputs look swapped: {lr.name} is {low.size} and {hr.name} is {high.size}; "
             "give the low-resolution render first"
         )
@@ -100,4 +99,4 @@ def _explain_ratio(lr: Source, hr: Source) -> None:
         what = f"framing differs: the ratio is {x:.3g} in width and {y:.3g} in height"
     else:
         what = f"a ratio of {x:.3g} is not supported"
-    raise InputError(f"{what} ({lr.name} is {low.size}, {hr.name} is {high.size}); render the LRHS at one of {wanted}")
+    return InputError(f"{what} ({lr.name} is {low.size}, {hr.name} is {high.size}); render the LRHS at one of {wanted}")

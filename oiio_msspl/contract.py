@@ -45,7 +45,7 @@ class Contract:
     """Upsampling factor s: 2, 4 or 8."""
     alignment: int = 1
     """Height and width of the LRHS must be multiples of this, in LRHS pixels. This version tiles for 1 alone."""
-    overlap: int = 16
+    overlap: int = 24
     """LRHS pixels that neighbouring tiles share on each side: the network's receptive field, or what of it matters."""
     bytes_per_pixel: int = 1000
     """Peak memory of a tile for each of its HRLS pixels, rounded up: bounds the tile size."""

@@ -212,7 +212,7 @@ def main() -> None:
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
-    parser.add_argument("--overlap", type=int, default=16, help="LRHS pixels that tiles share on each side")
+    parser.add_argument("--overlap", type=int, default=24, help="LRHS pixels that tiles share on each side")
     parser.add_argument(
         "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on some views"
     )

@@ -127,6 +127,8 @@ class View:
         self.path = path
         self.split: str = meta["split"]
         self.scene: str = str(meta["seed"])
+        self.source: str = f"{meta.get('renderer', 'unknown renderer')}, generator {meta.get('generator', '?')}"
+        """What rendered it, for the provenance of what is trained on it."""
         self.hr, self.lr, self.ref = arrays["hr"], arrays["lr"], arrays["ref"]
         self.lr_spp = np.asarray(arrays["lr_spp"], dtype=np.int64)
         channels = sum(schema.HRLS_FEATURES[name] for name in PASS_FEATURES)

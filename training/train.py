@@ -282,6 +282,7 @@ def train(args: argparse.Namespace) -> None:
                 "seed": args.seed,
                 "views": len(views),
                 "scenes": len({view.scene for view in views}),
+                "sources": sorted({view.source for view in views}),
                 "torch": str(torch.__version__),
                 "validation": {"views": len(validation), "hrls_spp": 1} | scores,
             },

@@ -222,12 +222,12 @@ def test_another_frame_is_noticed(session, scale):
 
 def test_the_shipped_overlap_hides_the_seams(scale):
     """Tiles of the network that ships agree with the whole frame to half-float rounding."""
-    low, high, _ = pair_of(scale, 72 * scale, 72 * scale)
+    low, high, _ = pair_of(scale, 120 * scale, 120 * scale)
     shipped = Session(find_model(scale))
     whole = fuse(low, high, shipped)
-    overlap = shipped.contract.overlap
-    tiled = fuse(low, high, shipped, max_memory=_memory_for_tiles(low, high, shipped, ((40 + overlap) * scale) ** 2))
-    assert tiled.tiles > 1
+    side = 62 + 2 * shipped.contract.overlap
+    tiled = fuse(low, high, shipped, max_memory=_memory_for_tiles(low, high, shipped, (side * scale) ** 2))
+    assert tiled.tiles == 4
     np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=2**-10, atol=1e-4)
 
 

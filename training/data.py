@@ -31,7 +31,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl import schema, transforms
+from oiio_msspl import schema, tensors, transforms
 
 Array = NDArray[np.float32]
 log = logging.getLogger(__name__)
@@ -196,18 +196,6 @@ def split_features(passes: Array) -> dict[str, Array]:
     return features
 
 
-def stack_features(features: dict[str, Array], exposure: float) -> Array:
-    """Named features (H, W, C) to the transformed HRLS stack (H, W, 16); the absent ones become their defaults."""
-    height, width, _ = features[schema.RGB].shape
-    stack = np.empty((height, width, sum(schema.HRLS_FEATURES.values())), dtype=np.float32)
-    start = 0
-    for name, count in schema.HRLS_FEATURES.items():
-        part = stack[..., start : start + count]
-        part[...] = transforms.forward(name, features[name], exposure) if name in features else schema.DEFAULTS[name]
-        start += count
-    return stack
-
-
 def read(values: NDArray, *, signed: bool = False) -> Array:
     """Stored half floats as finite float32; radiance and albedo non-negative."""
     return transforms.repair(values.astype(np.float32), signed=signed)[0]
@@ -274,7 +262,7 @@ def draw(view: View, scale: int, patch: int, rng: np.random.Generator, sampling:
     lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
     pair = {
         "lrhs": transforms.compress(lrhs, exposure),
-        "hrls": stack_features(features, exposure),
+        "hrls": tensors.pack(features, schema.HRLS_FEATURES, exposure),
         "target": transforms.compress(target, exposure),
     }
     return {name: np.rot90(image[:, ::-1] if mirrored else image, turns) for name, image in pair.items()}
@@ -334,7 +322,7 @@ class Evaluation:
         features = split_features(read_hrls(view, [0], rows, columns)[0])
         return cls(
             lrhs=lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale],
-            hrls=stack_features(features, exposure),
+            hrls=tensors.pack(features, schema.HRLS_FEATURES, exposure),
             reference=read(view.ref[rows, columns]),
             exposure=exposure,
         )

@@ -29,7 +29,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from oiio_msspl import transforms
+from oiio_msspl import metrics, transforms
 from training import data, losses
 from training.network import MultiResolutionFusion
 
@@ -96,17 +96,6 @@ def bicubic(lrhs: Tensor, scale: int) -> Tensor:
     return F.interpolate(lrhs, scale_factor=scale, mode="bicubic", align_corners=False).clamp(min=0)
 
 
-def psnr_srgb(output: data.Array, reference: data.Array) -> float:
-    """The paper's PSNR in dB: of the sRGB images, clipped to [0, 1]."""
-    error = np.mean((transforms.srgb(output) - transforms.srgb(reference)) ** 2)
-    return float(-10 * np.log10(max(error, 1e-10)))
-
-
-def rel_mse(output: data.Array, reference: data.Array) -> float:
-    """The paper's RelMSE for its BCR dataset: lambda_1 = 0.5, lambda_2 = 0.01, on linear values."""
-    return float(np.mean(0.5 * (output - reference) ** 2 / (reference**2 + 0.01)))
-
-
 @torch.inference_mode()
 def evaluate(
     network: MultiResolutionFusion, pairs: Iterable[data.Evaluation], device: torch.device
@@ -123,8 +112,8 @@ def evaluate(
         upsampled = bicubic(to_tensor(pair.lrhs[None], torch.device("cpu")), network.scale)[0].permute(1, 2, 0).numpy()
         reference = pair.reference * pair.exposure
         for prefix, image in (("", output), ("bicubic_", upsampled)):
-            scores[prefix + "psnr"].append(psnr_srgb(image * pair.exposure, reference))
-            scores[prefix + "relmse"].append(rel_mse(image * pair.exposure, reference))
+            scores[prefix + "psnr"].append(metrics.psnr(image * pair.exposure, reference))
+            scores[prefix + "relmse"].append(metrics.relmse(image * pair.exposure, reference))
     return {name: float(np.mean(values)) if values else math.nan for name, values in scores.items()}
 
 

@@ -12,6 +12,9 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from oiio_msspl.transforms import luminance as luminance_of
+from oiio_msspl.transforms import srgb
+
 from . import scenes
 from .assets import Assets
 from .trace import MAX_DEPTH, Camera, render_passes
@@ -23,7 +26,6 @@ VIEWS = 3
 _ATTEMPTS, _RENDERS = 12, 2  # cameras tried, and how many of them are rendered at most, per view
 _GOOD_REFERENCE, _WORST_REFERENCE = 27.0, 21.0  # dB, of the reference's own noise
 _BATCH = 16  # samples a pixel per wavefront: bounds the memory
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
 
 
 def split(seed: int) -> str:
@@ -38,7 +40,7 @@ def path_of(out: Path, seed: int, view: int) -> Path:
 def _interest(probe: np.ndarray) -> tuple[bool, str]:
     """Whether a (spp, n, n, 15) probe shows something, and if not, why."""
     mean = probe.mean(0)
-    luminance = mean[..., :3] @ _LUMINANCE
+    luminance = luminance_of(mean[..., :3])
     albedo, normal = mean[..., 3:6], mean[..., 6:9]
 
     def edges(x: np.ndarray, threshold: float) -> float:
@@ -72,15 +74,9 @@ def _distance(scene: mi.Scene, camera: Camera) -> float:
     return float(np.percentile(np.minimum(t, 1e3), 10))
 
 
-def _display(color: np.ndarray, exposure: float) -> np.ndarray:
-    """Linear colour to sRGB 0..1."""
-    x = np.clip(color * exposure, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-
-
 def _log_mean(color: np.ndarray) -> float:
     """The log-mean luminance of linear colour (..., 3)."""
-    luminance = color @ _LUMINANCE
+    luminance = luminance_of(color)
     return float(np.exp(np.log(luminance + 1e-4 * luminance.mean() + 1e-12).mean()))
 
 
@@ -95,7 +91,7 @@ def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[np
     def quality() -> float:
         a, b = halves * (2 / done)
         exposure = 0.18 / _log_mean((a + b) / 2)
-        error = np.square(_display(a, exposure) - _display(b, exposure)).mean() / 4
+        error = np.square(srgb(a * exposure) - srgb(b * exposure)).mean() / 4
         return float(-10 * np.log10(max(error, 1e-12)))
 
     while True:
@@ -130,7 +126,7 @@ def render_view(
     lr = np.stack([g.mean(0) for g in groups])
 
     # Light is linear: scale it now so that half precision holds it, over three decades of brightness.
-    luminance = ref @ _LUMINANCE
+    luminance = luminance_of(ref)
     target = 10 ** rng.uniform(-1.5, 1.3)
     scale = target / _log_mean(ref)
     hr[..., :3] *= scale

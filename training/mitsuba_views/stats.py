@@ -13,7 +13,9 @@ from pathlib import Path
 
 import numpy as np
 
-_LUMINANCE = np.array([0.2126, 0.7152, 0.0722], np.float32)
+from oiio_msspl import metrics
+from oiio_msspl.transforms import luminance as luminance_of
+
 _MEASURES = {
     "psnr": "1-spp PSNR in sRGB [dB]",
     "ref_psnr": "reference's own PSNR [dB]",
@@ -25,23 +27,16 @@ _MEASURES = {
 }
 
 
-def _display(color: np.ndarray) -> np.ndarray:
-    """Linear colour to sRGB 0..1."""
-    x = np.clip(color, 0, 1)
-    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.maximum(x, 1e-9) ** (1 / 2.4) - 0.055)
-
-
 def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dict[str, float]:
     """Numbers of one view from its 1-spp colour, its reference and a clean-ish albedo, each (H, W, 3)."""
-    luminance = np.maximum(reference @ _LUMINANCE, 0)
+    luminance = np.maximum(luminance_of(reference), 0)
     log_mean = np.exp(np.log(luminance + 1e-4 * luminance.mean() + 1e-12).mean())
     exposure = 0.18 / log_mean
-    error = np.square(_display(noisy * exposure) - _display(reference * exposure)).mean()
     low, high = np.percentile(luminance, (1, 99))
     across = np.abs(np.diff(albedo, axis=1)).max(-1)[1:] > 0.08
     down = np.abs(np.diff(albedo, axis=0)).max(-1)[:, 1:] > 0.08
     return {
-        "psnr": float(-10 * np.log10(max(error, 1e-12))),
+        "psnr": metrics.psnr(noisy * exposure, reference * exposure),
         "log_mean": float(np.log10(log_mean)),
         "range": float(np.log10(max(high, 1e-9) / max(low, 1e-6 * high, 1e-9))),
         "black": float((noisy.max(-1) <= 0).mean()),

@@ -594,8 +594,13 @@ def _decide_normal_encoding(resolution: Resolution) -> None:
 
 
 def explain_unused(file: ExrFile, resolution: Resolution) -> list[str]:
-    """Names of the layers that the network does not read: they pass through."""
+    """Names of the layers, or single channels, that the network does not read: they pass through."""
     used = {c for source in resolution.features.values() for c in source.channels} | {resolution.alpha}
-    return [
-        layer.name or " ".join(layer.channels) for layer in layers_of(file) if not used & set(layer.channels.values())
-    ]
+    names = []
+    for layer in layers_of(file):
+        rest = [c for c in layer.channels.values() if c not in used]
+        if len(rest) == len(layer.channels) and layer.name:
+            names.append(layer.name)
+        else:
+            names += [c.name for c in rest]
+    return names

@@ -33,7 +33,7 @@ def files(tmp_path):
     clean = picture(96, 128)
     ones = np.ones((96, 128), np.float16)
     channels = rgb(noisy(clean, 1).astype(np.float16)) | {"A": ones} | rgb((clean > 0.3).astype(np.float16), "albedo.")
-    write_exr(tmp_path / "hr.exr", channels | {"mask.X": ones * 7})
+    write_exr(tmp_path / "hr.exr", channels | {"mask.X": ones * 7, "Z": ones})
     low = noisy(downsample(clean, 4), 16).astype(np.float16)
     write_exr(tmp_path / "lr.exr", rgb(low) | {"A": ones[::4, ::4]})
     write_exr(tmp_path / "ref.exr", rgb(clean))
@@ -165,7 +165,7 @@ def test_inspect_tells_a_person_and_a_machine(files):
     done = run("msspl", "inspect", files / "hr.exr")
     assert done.returncode == 0
     assert "display window 128x96+0+0" in done.stdout
-    assert "passed through: mask" in done.stdout
+    assert "passed through: Z, mask" in done.stdout
     data = json.loads(run("msspl", "inspect", files / "hr.exr", "--json").stdout)
     assert data["usable"]
     assert data["parts"][0]["channels"]["mask.X"] == "half"

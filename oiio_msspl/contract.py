@@ -44,9 +44,10 @@ class Contract:
     scale: int
     """Upsampling factor s: 2, 4 or 8."""
     alignment: int = 1
-    """Height and width of the LRHS must be multiples of this, in LRHS pixels. This version tiles for 1 alone."""
+    """Height and width of the LRHS must be multiples of this, in LRHS pixels."""
     overlap: int = 24
-    """LRHS pixels that neighbouring tiles share on each side: the network's receptive field, or what of it matters."""
+    """LRHS pixels that neighbouring tiles share on each side: the network's receptive field, or what of it matters.
+    A multiple of ``alignment``."""
     bytes_per_pixel: int = 1000
     """Peak memory of a tile for each of its HRLS pixels, rounded up: bounds the tile size."""
     lrhs: list[str] = field(default_factory=lambda: schema.channel_names(schema.LRHS_FEATURES))
@@ -84,13 +85,17 @@ class Contract:
             "hrls": schema.channel_names(schema.HRLS_FEATURES),
             "transforms": current_transforms(),
             "defaults": schema.DEFAULTS,
-            "alignment": 1,
         }
         for key, value in expected.items():
             if getattr(contract, key) != value:
                 raise InputError(
                     f"{source}: made for {key} {getattr(contract, key)}, this version has {value}; export it again"
                 )
+        if contract.overlap % contract.alignment:
+            raise InputError(
+                f"{source}: an overlap of {contract.overlap} is no multiple of its alignment, {contract.alignment}; "
+                "export it again"
+            )
         if contract.scale not in schema.SCALES:
             raise InputError(f"{source}: scale {contract.scale} is none of {schema.SCALES}")
         return contract

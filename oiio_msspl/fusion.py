@@ -63,12 +63,13 @@ def fuse(
     contract = session.contract
     if contract.scale != pairing.scale:
         raise InputError(f"model {contract.name} is for x{contract.scale}, but this pair is x{pairing.scale}")
-    scale, grid = pairing.scale, pairing.grid
+    scale, grid = pairing.scale, tiling.aligned(pairing.grid, contract.alignment)
 
     lr_repaired: dict[str, int] = {}
-    low = _read_low(lr, pairing, lr_repaired)
-    exposure = transforms.exposure_of(low[schema.RGB])
-    warnings = checks.check(low[schema.RGB], hr, pairing, lr.name)
+    low = _read_low(lr, pairing, grid, lr_repaired)
+    frame = low[schema.RGB][pairing.grid.slices(grid)]
+    exposure = transforms.exposure_of(frame)
+    warnings = checks.check(frame, hr, pairing, lr.name)
     lrhs = tensors.pack(low, schema.LRHS_FEATURES, exposure)
 
     hr_data = pairing.hr_data
@@ -78,7 +79,7 @@ def fuse(
     # What is held of the frame: the result (colour and alpha), and the LRHS as it is and as the network wants it.
     frame_bytes = rgb.nbytes * 4 // 3 + lrhs.nbytes + sum(values.nbytes for values in low.values())
     largest = _largest_tile(session, frame_bytes, max_memory)
-    plan = list(tiling.tiles(grid, largest, contract.overlap))
+    plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
     dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
     seconds = session.seconds
     for done, tile in enumerate(plan):
@@ -103,9 +104,8 @@ def fuse(
     return Fused(rgb, alpha, pairing, exposure, repaired, warnings, len(plan), session.seconds - seconds)
 
 
-def _read_low(lr: Source, pairing: Pairing, repaired: dict[str, int]) -> dict[str, Array]:
-    """Colour and alpha of the LRHS over the grid, resampled where an odd size was rounded."""
-    grid = pairing.grid
+def _read_low(lr: Source, pairing: Pairing, grid: Window, repaired: dict[str, int]) -> dict[str, Array]:
+    """Colour and alpha of the LRHS over ``grid``, resampled where an odd size was rounded."""
     names = [schema.RGB, "alpha"]
     if pairing.stretch == (1.0, 1.0):
         return tensors.read(lr, grid, pairing.lr_data, counts=repaired, counted=grid, features=names)

@@ -25,31 +25,41 @@ class Tile:
     """What the network sees: the core and the overlap, as far as the grid goes."""
 
 
-def tiles(grid: Window, largest: int, overlap: int) -> Iterator[Tile]:
+def aligned(grid: Window, alignment: int) -> Window:
+    """``grid`` extended to the right and below until its sides are multiples of ``alignment``."""
+    width, height = (-(-side // alignment) * alignment for side in (grid.width, grid.height))
+    return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
+
+
+def tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> Iterator[Tile]:
     """Cover ``grid`` by tiles whose area holds at most ``largest`` LRHS pixels.
 
-    The grid's own borders get no overlap: there the network sees the end of the picture, as in training.
+    The grid's own borders get no overlap: there the network sees the end of the picture, as in training. ``overlap``
+    and the grid's sides are multiples of ``alignment``, and so are all sides and offsets of the tiles: a network that
+    works on blocks of pixels divides every tile as it would divide the frame.
 
     Raises:
         InputError: ``largest`` leaves no room for a core.
     """
-    columns, rows = _split(grid, largest, overlap)
+    columns, rows = _split(grid, largest, overlap, alignment)
     for y0, y1 in rows:
         for x0, x1 in columns:
             core = Window(x0, y0, x1, y1)
             yield Tile(core, Window(x0 - overlap, y0 - overlap, x1 + overlap, y1 + overlap).intersect(grid))
 
 
-def _split(grid: Window, largest: int, overlap: int) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
+def _split(
+    grid: Window, largest: int, overlap: int, alignment: int
+) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
     """Fewest cuts that fit, cutting the longer side first so that tiles stay near square."""
     nx = ny = 1
     while True:
-        width, height = -(-grid.width // nx), -(-grid.height // ny)
+        width, height = _step(grid.width, nx, alignment), _step(grid.height, ny, alignment)
         area_width = width + (2 * overlap if nx > 1 else 0)
         area_height = height + (2 * overlap if ny > 1 else 0)
         if area_width * area_height <= largest:
             break
-        if min(width, height) < SMALLEST_CORE:
+        if min(width, height) < max(SMALLEST_CORE, alignment + 1):
             raise InputError(
                 f"not enough memory: even a tile of {width}x{height} low-resolution pixels needs more; "
                 "raise --max-memory"
@@ -58,9 +68,13 @@ def _split(grid: Window, largest: int, overlap: int) -> tuple[list[tuple[int, in
             nx += 1
         else:
             ny += 1
-    return _cuts(grid.x0, grid.x1, nx), _cuts(grid.y0, grid.y1, ny)
+    return _cuts(grid.x0, grid.x1, width), _cuts(grid.y0, grid.y1, height)
 
 
-def _cuts(start: int, end: int, count: int) -> list[tuple[int, int]]:
-    step = -(-(end - start) // count)
+def _step(side: int, count: int, alignment: int) -> int:
+    """Smallest multiple of ``alignment`` of which ``count`` make up a side."""
+    return -(-side // (count * alignment)) * alignment
+
+
+def _cuts(start: int, end: int, step: int) -> list[tuple[int, int]]:
     return [(a, min(a + step, end)) for a in range(start, end, step)]

@@ -17,7 +17,8 @@ torch = pytest.importorskip("torch")
 from oiio_msspl import schema  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
 from training import data, losses  # noqa: E402
-from training.network import RDB, MultiResolutionFusion  # noqa: E402
+from training.paper import RDB, MultiResolutionFusion  # noqa: E402
+from training.pyramid import PyramidFusion  # noqa: E402
 
 TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
 SIZE = 64
@@ -224,7 +225,7 @@ def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
             assert process.wait() == 0, "".join(lines)
     assert any("continues at step" in line for line in lines)
     state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
-    assert state["step"] > 0 and state["training_spp"] == {"hrls": [1, 8], "lrhs": [4, 64]}
+    assert state["step"] > 0 and state["training_spp"] == {"2": {"hrls": [1, 8], "lrhs": [4, 64]}}
 
 
 def test_larger_scale_starts_as_the_smaller_one(tiny_network: MultiResolutionFusion, tmp_path: Path) -> None:
@@ -256,10 +257,63 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     contract = Contract(name="tiny-x4", scale=4, overlap=12, training_spp={"hrls": [1, 8], "lrhs": [16, 256]})
     onnx.save(export.to_onnx(tiny_network, contract, half=half), path)
 
-    assert export.parity(tiny_network, path) < (5e-3 if half else 1e-5)
+    assert export.parity(tiny_network, 4, path) < (5e-3 if half else 1e-5)
     kinds = {node.op_type for node in onnx.load(path).graph.node}
     assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
     assert str(Path(__file__).parents[1]).encode() not in path.read_bytes()
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     metadata = session.get_modelmeta().custom_metadata_map
     assert Contract.from_json(metadata[METADATA_KEY], str(path)) == contract
+
+
+# The kernel-predicting network
+
+
+@pytest.fixture
+def tiny_pyramid() -> PyramidFusion:
+    torch.manual_seed(0)
+    return PyramidFusion(channels=(16, 16, 16, 16, 16), own_size=(3, 3, 3, 3, 3)).eval()
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_one_pyramid_serves_every_scale(tiny_pyramid: PyramidFusion, scale: int) -> None:
+    lrhs, hrls = pair(scale, 64 // scale, 96 // scale)
+    fused = tiny_pyramid(lrhs, hrls)
+    assert fused.shape == (2, 3, 64, 96)
+    assert torch.isfinite(fused).all()
+
+
+@torch.inference_mode()
+def test_pyramid_never_leaves_the_range_of_its_inputs(tiny_pyramid: PyramidFusion) -> None:
+    """Even with wild weights, and bright light beside black. An albedo of 1 everywhere leaves averages alone."""
+    for parameter in tiny_pyramid.parameters():
+        parameter.mul_(3.0)
+    lrhs, hrls = pair(4, 16, 24)
+    hrls[:, 3:6] = 1.0
+    hrls[0, :3, 30:34, 40:44] = 4.2
+    lrhs[0, :, :4] = 0.0
+    fused = tiny_pyramid(lrhs, hrls)
+    for low, high, image in zip(lrhs, hrls[:, :3], fused, strict=True):
+        values = torch.cat([low.flatten(), high.flatten()])
+        assert values.min() - 1e-4 <= image.min() and image.max() <= values.max() + 1e-4
+
+
+@torch.inference_mode()
+def test_pyramid_sees_an_even_picture_as_even(tiny_pyramid: PyramidFusion) -> None:
+    """Borders included: what lies beyond the picture has no weight."""
+    lrhs, hrls = torch.full((1, 3, 16, 16), 0.3), torch.full((1, 16, 64, 64), 0.5)
+    hrls[:, :3], hrls[:, 3:6] = 0.3, 1.0
+    torch.testing.assert_close(tiny_pyramid(lrhs, hrls), torch.full((1, 3, 64, 64), 0.3), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_onnx_file_of_a_pyramid_agrees_with_it(tiny_pyramid: PyramidFusion, tmp_path: Path, scale: int) -> None:
+    pytest.importorskip("onnxscript")
+    onnx = pytest.importorskip("onnx")
+    from training import export
+
+    path = tmp_path / "tiny.onnx"
+    contract = Contract(name="tiny", scale=scale, alignment=tiny_pyramid.multiple // scale, overlap=32)
+    onnx.save(export.to_onnx(tiny_pyramid, contract), path)
+    assert export.parity(tiny_pyramid, scale, path) < 1e-4

@@ -4,7 +4,7 @@ import pytest
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.render import Window
-from oiio_msspl.tiling import tiles
+from oiio_msspl.tiling import aligned, tiles
 
 
 @pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
@@ -21,6 +21,22 @@ def test_cores_cover_the_grid_once_and_areas_fit(grid, largest):
             (tile.core.y0, tile.area.y0, grid.y0),
         ):
             assert inner - outer == 8 or outer == border
+    assert (covered == 1).all()
+
+
+@pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
+def test_aligned_tiles_lie_on_the_blocks_of_the_whole_frame(grid):
+    wider = aligned(grid, 8)
+    assert grid.intersect(wider) == grid
+    assert (wider.x0, wider.y0) == (grid.x0, grid.y0)
+    assert wider.width - grid.width < 8 > wider.height - grid.height
+    covered = np.zeros((wider.height, wider.width), int)
+    for tile in tiles(wider, 20000, overlap=24, alignment=8):
+        covered[tile.core.slices(wider)] += 1
+        assert tile.area.width * tile.area.height <= 20000
+        for window in (tile.core, tile.area):
+            sides = window.x0 - grid.x0, window.y0 - grid.y0, window.width, window.height
+            assert not any(side % 8 for side in sides)
     assert (covered == 1).all()
 
 

@@ -337,14 +337,14 @@ class Prefetcher:
     def __init__(
         self,
         folder: Folder,
-        scale: int,
+        scales: tuple[int, ...],
         patch: int,
         batch: int,
         sampling: Sampling,
         seed: int,
         rescan_seconds: float = 120,
     ) -> None:
-        self.folder, self.scale, self.patch, self.batch, self.sampling = folder, scale, patch, batch, sampling
+        self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
         self.waited = 0.0
         """Seconds that :meth:`next` has blocked."""
         self._rescan_seconds = rescan_seconds
@@ -353,7 +353,7 @@ class Prefetcher:
         threading.Thread(target=self._work, daemon=True).start()
 
     def next(self) -> Batch:
-        """``lrhs``, ``hrls`` and ``target`` as (N, H, W, C)."""
+        """``lrhs``, ``hrls`` and ``target`` as (N, H, W, C), all of one of the scales."""
         start = time.monotonic()
         item = self._queue.get()
         self.waited += time.monotonic() - start
@@ -374,5 +374,6 @@ class Prefetcher:
 
     def _draw_batch(self, views: list[View]) -> Batch:
         chosen = self._rng.choice(len(views), self.batch)
-        pairs = [draw(views[i], self.scale, self.patch, self._rng, self.sampling) for i in chosen]
+        scale = int(self._rng.choice(self.scales))
+        pairs = [draw(views[i], scale, self.patch, self._rng, self.sampling) for i in chosen]
         return {name: np.stack([pair[name] for pair in pairs]) for name in pairs[0]}

@@ -3,6 +3,7 @@
 
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
+    python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --half
 
 With ``--half`` the weights are stored as half floats and cast to float32 when the file is loaded: half the size, while
 the computation stays in float32.
@@ -28,7 +29,8 @@ from onnxscript import opset18
 from oiio_msspl import transforms
 from oiio_msspl.contract import METADATA_KEY, Contract
 from training import data
-from training.network import HRLS_CHANNELS, LRHS_CHANNELS, MultiResolutionFusion
+from training.networks import NETWORKS, Network
+from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, MultiResolutionFusion
 
 #: Operators and file format that ONNX Runtime 1.14 and newer understand.
 OPSET, IR_VERSION = 18, 8
@@ -37,22 +39,24 @@ OPSET, IR_VERSION = 18, 8
 HALF_ELEMENTS = 256
 
 
-def load(checkpoint: Path) -> tuple[MultiResolutionFusion, dict[str, Any]]:
+def load(checkpoint: Path) -> tuple[Network, dict[str, Any]]:
     """The network with its averaged weights, and everything that the checkpoint holds."""
     state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    network = MultiResolutionFusion(**state["config"])
+    network = NETWORKS[state["architecture"]](**state["config"])
     network.load_state_dict(state["ema"])
     return network.eval(), state
 
 
-def contract_of(network: MultiResolutionFusion, name: str, overlap: int, state: dict[str, Any]) -> Contract:
-    """Contract of a checkpoint's network."""
+def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
+    """Contract of a checkpoint's network for one of its scales."""
     return Contract(
         name=name,
-        scale=network.scale,
+        scale=scale,
+        alignment=network.multiple // scale,
         overlap=overlap,
-        training_spp=state["training_spp"],
-        provenance=state["provenance"] | {"network": network.config, "date": datetime.date.today().isoformat()},
+        training_spp=state["training_spp"][str(scale)],
+        provenance=state["provenance"]
+        | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()},
     )
 
 
@@ -68,18 +72,19 @@ def example(scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.T
 # Graph
 
 
-def to_onnx(network: MultiResolutionFusion, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
-    """Graph with inputs ``lrhs`` and ``hrls``, output ``fused``, batch of 1, any height and width, and its contract."""
-    scale = network.scale
+def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
+    """Graph with inputs ``lrhs`` and ``hrls``, output ``fused``, batch of 1, any height and width that are multiples of
+    the contract's alignment, and that contract."""
+    scale, alignment = contract.scale, contract.alignment
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
     program = torch.onnx.export(
-        _with_onnx_channel_order(network),
-        example(scale, 16, 24),
+        _with_onnx_channel_order(network) if isinstance(network, MultiResolutionFusion) else network,
+        example(scale, 4 * alignment, 6 * alignment),
         input_names=["lrhs", "hrls"],
         output_names=["fused"],
         opset_version=OPSET,
         dynamo=True,
-        dynamic_shapes=({2: height, 3: width}, {2: scale * height, 3: scale * width}),
+        dynamic_shapes=tuple({2: size * height, 3: size * width} for size in (alignment, scale * alignment)),
         custom_translation_table={torch.ops.aten.pixel_unshuffle.default: _space_to_depth},
         verbose=False,
     )
@@ -136,12 +141,14 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
 # Checks
 
 
-def parity(network: MultiResolutionFusion, path: Path) -> float:
-    """Largest difference of an exported file from the network it was made of, in network values, odd sizes included."""
+def parity(network: Network, scale: int, path: Path) -> float:
+    """Largest difference of an exported file from the network it was made of, in network values."""
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    block = network.multiple // scale
+    block *= -(-6 // block)  # a few pixels, where the network would take any number
     worst = 0.0
-    for height, width in ((24, 24), (17, 31)):
-        lrhs, hrls = example(network.scale, height, width, seed=height)
+    for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
+        lrhs, hrls = example(scale, height, width, seed=height)
         (fused,) = session.run(["fused"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
         with torch.inference_mode():
             expected = network(lrhs, hrls).numpy()
@@ -150,28 +157,29 @@ def parity(network: MultiResolutionFusion, path: Path) -> float:
 
 
 @torch.inference_mode()
-def measure_overlap(network: MultiResolutionFusion, views: list[data.View], tile: int = 16) -> dict[int, float]:
+def measure_overlap(network: Network, scale: int, views: list[data.View], tile: int = 16) -> dict[int, float]:
     """How far the middle of a tile is from the same pixels of the whole image, for some overlaps in LRHS pixels.
 
     The theoretical receptive field, over 60 LRHS pixels each way, is far larger than what trained weights use. Returns
     the largest difference, in network values, of all views together, by overlap.
     """
+    alignment = network.multiple // scale
     differences: dict[int, list[np.ndarray]] = collections.defaultdict(list)
     for view in views:
-        pair = data.Evaluation.centre(view, network.scale, view.ref.shape[0])
+        pair = data.Evaluation.centre(view, scale, view.ref.shape[0])
         lrhs = transforms.compress(pair.lrhs, pair.exposure)
         # Mirrored on all sides, even a small view has room for the largest overlap
         margin = 48
         lrhs, hrls = (
             torch.from_numpy(np.pad(image, ((m, m), (m, m), (0, 0)), "symmetric")).permute(2, 0, 1)[None]
-            for image, m in ((lrhs, margin), (pair.hrls, margin * network.scale))
+            for image, m in ((lrhs, margin), (pair.hrls, margin * scale))
         )
         whole = network(lrhs, hrls)
-        start = (lrhs.shape[-1] - tile) // 2
-        for overlap in (4, 8, 12, 16, 24, 32):
-            part = network(_square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, network.scale))
-            middle = _square(part, overlap, tile, 0, network.scale)
-            difference = middle - _square(whole, start, tile, 0, network.scale)
+        start = (lrhs.shape[-1] - tile) // 2 // alignment * alignment
+        for overlap in (n for n in (4, 8, 12, 16, 24, 32, 48) if n % alignment == 0):
+            part = network(_square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, scale))
+            middle = _square(part, overlap, tile, 0, scale)
+            difference = middle - _square(whole, start, tile, 0, scale)
             differences[overlap].append(difference.abs().numpy().ravel())
     return {overlap: float(np.concatenate(values).max()) for overlap, values in differences.items()}
 
@@ -209,6 +217,7 @@ def describe(path: Path, scale: int) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--scale", type=int, help="which one, of a network that was trained for several")
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
@@ -219,15 +228,18 @@ def main() -> None:
     args = parser.parse_args()
 
     network, state = load(args.checkpoint)
+    scale = args.scale or getattr(network, "scale", None)
+    if scale is None:
+        raise SystemExit("--scale: this network serves several; say which one to export")
     if args.measure_overlap:
         views = data.Folder(args.measure_overlap).split("validation")[:8]
-        for overlap, difference in measure_overlap(network, views).items():
+        for overlap, difference in measure_overlap(network, scale, views).items():
             print(f"overlap {overlap}: {difference:.2g}")
     if args.output:
-        contract = contract_of(network, args.name, args.overlap, state)
+        contract = contract_of(network, scale, args.name, args.overlap, state)
         onnx.save(to_onnx(network, contract, half=args.half), args.output)
-        describe(args.output, network.scale)
-        print(f"largest difference from PyTorch: {parity(network, args.output):.2g}")
+        describe(args.output, scale)
+        print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")
 
 
 if __name__ == "__main__":

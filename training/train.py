@@ -13,6 +13,8 @@ meant to, on any machine. The same command continues an interrupted run from its
 from __future__ import annotations
 
 import argparse
+import collections
+import copy
 import csv
 import logging
 import math
@@ -31,7 +33,9 @@ from torch.nn import functional as F
 
 from oiio_msspl import metrics, transforms
 from training import data, losses
-from training.network import MultiResolutionFusion
+from training.networks import NETWORKS, Network
+from training.paper import MultiResolutionFusion
+from training.pyramid import PyramidFusion
 
 log = logging.getLogger(__name__)
 
@@ -97,24 +101,26 @@ def bicubic(lrhs: Tensor, scale: int) -> Tensor:
 
 
 @torch.inference_mode()
-def evaluate(
-    network: MultiResolutionFusion, pairs: Iterable[data.Evaluation], device: torch.device
-) -> dict[str, float]:
+def evaluate(network: Network, pairs: Iterable[data.Evaluation], device: torch.device) -> dict[str, float]:
     """Mean PSNR and RelMSE of the network and of bicubic upsampling over some pairs.
 
     Views come at any brightness; they are scored at the exposure at which the network sees them, about that of a photo.
     """
-    scores: dict[str, list[float]] = {"psnr": [], "relmse": [], "bicubic_psnr": [], "bicubic_relmse": []}
+    scores: dict[str, list[float]] = collections.defaultdict(list)
     for pair in pairs:
         lrhs = transforms.compress(pair.lrhs, pair.exposure)
         fused = network(to_tensor(lrhs[None], device), to_tensor(pair.hrls[None], device))
         output = transforms.expand(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
-        upsampled = bicubic(to_tensor(pair.lrhs[None], torch.device("cpu")), network.scale)[0].permute(1, 2, 0).numpy()
+        scale = pair.hrls.shape[0] // pair.lrhs.shape[0]
+        upsampled = bicubic(to_tensor(pair.lrhs[None], torch.device("cpu")), scale)[0].permute(1, 2, 0).numpy()
         reference = pair.reference * pair.exposure
         for prefix, image in (("", output), ("bicubic_", upsampled)):
-            scores[prefix + "psnr"].append(metrics.psnr(image * pair.exposure, reference))
+            psnr = metrics.psnr(image * pair.exposure, reference)
+            scores[prefix + "psnr"].append(psnr)
+            if not prefix:
+                scores[f"psnr_x{scale}"].append(psnr)
             scores[prefix + "relmse"].append(metrics.relmse(image * pair.exposure, reference))
-    return {name: float(np.mean(values)) if values else math.nan for name, values in scores.items()}
+    return {name: float(np.mean(values)) for name, values in scores.items()}
 
 
 # State
@@ -132,15 +138,16 @@ def save(state: dict[str, Any], path: Path) -> None:
     os.replace(partial, path)
 
 
-def warm_start(network: MultiResolutionFusion, path: Path) -> None:
+def warm_start(network: Network, path: Path) -> None:
     """Copy what fits from another run's averaged weights: all scales share the trunk, and their stages by position.
 
     Stages that the other network lacks begin as plain resampling of their features, so a network of a larger scale
     begins as the other one followed by bilinear upsampling.
     """
-    for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
-        deshuffle.reset_to_average()
-        shuffle.reset_to_bilinear(network.config["channels"])
+    if isinstance(network, MultiResolutionFusion):
+        for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
+            deshuffle.reset_to_average()
+            shuffle.reset_to_bilinear(network.config["channels"])
     theirs = torch.load(path, map_location="cpu", weights_only=True)["ema"]
     ours = network.state_dict()
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
@@ -151,14 +158,12 @@ def warm_start(network: MultiResolutionFusion, path: Path) -> None:
 class Average:
     """Exponential moving average of a network's weights, in which a short memory grows to a long one."""
 
-    def __init__(self, network: MultiResolutionFusion, decay: float = 0.999) -> None:
-        self.network = MultiResolutionFusion(**network.config).to(network.h_rec.weight.device)
-        self.network.load_state_dict(network.state_dict())
-        self.network.requires_grad_(False).to(memory_format=torch.channels_last)
+    def __init__(self, network: Network, decay: float = 0.999) -> None:
+        self.network = copy.deepcopy(network).requires_grad_(False)
         self.decay = decay
 
     @torch.no_grad()
-    def update(self, network: MultiResolutionFusion, step: int) -> None:
+    def update(self, network: Network, step: int) -> None:
         weight = 1 - min(self.decay, (1 + step) / (10 + step))
         torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
 
@@ -178,7 +183,8 @@ def train(args: argparse.Namespace) -> None:
     """Train until the minutes are over or a signal comes; see :func:`parse` for the arguments."""
     recipe = RECIPES[args.preset]
     batch = args.batch or recipe.batch
-    patch = args.patch or recipe.patch[args.scale]
+    scales = tuple(args.scale)
+    patch = args.patch or max(recipe.patch[scale] for scale in scales)
     peak_lr = args.lr or recipe.lr
     loss_name = args.loss or recipe.loss
     loss_function = losses.LOSSES[loss_name]
@@ -191,10 +197,16 @@ def train(args: argparse.Namespace) -> None:
     folder = data.Folder(args.data)
     if not folder.split("train"):
         raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
-    validation: dict[Path, data.Evaluation] = {}
+    validation: dict[tuple[Path, int], data.Evaluation] = {}
 
     # Network, from the last checkpoint, from another run, or new
-    network = MultiResolutionFusion(args.scale)
+    network: Network
+    if args.network == "pyramid":
+        network = PyramidFusion()
+    elif len(scales) == 1:
+        network = MultiResolutionFusion(scales[0])
+    else:
+        raise SystemExit("--network paper: a network is for one --scale")
     checkpoint_path, best_path = args.out / "checkpoint.pt", args.out / "best.pt"
     state = torch.load(checkpoint_path, map_location="cpu", weights_only=True) if checkpoint_path.exists() else None
     if state is None and args.init:
@@ -213,7 +225,7 @@ def train(args: argparse.Namespace) -> None:
         restore(state)
         step, elapsed, best_gain = state["step"], state["seconds"], state.get("best_gain", -math.inf)
         log.info("continues at step %d, minute %.1f", step, elapsed / 60)
-    prefetcher = data.Prefetcher(folder, args.scale, patch, batch, recipe.sampling, seed=args.seed + step)
+    prefetcher = data.Prefetcher(folder, scales, patch, batch, recipe.sampling, seed=args.seed + step)
 
     stop = False
 
@@ -234,7 +246,8 @@ def train(args: argparse.Namespace) -> None:
         interval = max(time.monotonic() - since["time"], 1e-9)
         if not validation:  # a set that grew would make scores of different times incomparable
             for view in folder.split("validation")[: args.val_views]:
-                validation[view.path] = data.Evaluation.centre(view, args.scale, args.val_patch)
+                for scale in scales:
+                    validation[view.path, scale] = data.Evaluation.centre(view, scale, args.val_patch)
         scores = evaluate(average.network, validation.values(), device)
         row = {
             "step": step,
@@ -245,22 +258,23 @@ def train(args: argparse.Namespace) -> None:
             "samples_per_s": since["steps"] * batch / interval,
             "wait_share": (prefetcher.waited - since["waited"]) / interval,
             "train_views": len(folder.split("train")),
-            "val_views": len(validation),
+            "val_pairs": len(validation),
             **scores,
         }
         write_row(args.out / "log.csv", row)
         log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
         views = folder.split("train")
-        gain = scores["psnr"] - scores["bicubic_psnr"]
+        gain = scores["psnr"] - scores["bicubic_psnr"] if scores else math.nan
         state = {
             "network": network.state_dict(),
             "ema": average.network.state_dict(),
             "optimizer": optimizer.state_dict(),
+            "architecture": args.network,
             "config": network.config,
             "step": step,
             "seconds": elapsed,
             "best_gain": best_gain,
-            "training_spp": data.spp_range(views[0], recipe.sampling, args.scale),
+            "training_spp": {str(scale): data.spp_range(views[0], recipe.sampling, scale) for scale in scales},
             "provenance": {
                 "steps": step,
                 "minutes": round(elapsed / 60, 1),
@@ -273,7 +287,7 @@ def train(args: argparse.Namespace) -> None:
                 "scenes": len({view.scene for view in views}),
                 "sources": sorted({view.source for view in views}),
                 "torch": str(torch.__version__),
-                "validation": {"views": len(validation), "hrls_spp": 1} | scores,
+                "validation": {"pairs": len(validation), "hrls_spp": 1} | scores,
             },
         }
         if gain < best_gain - COLLAPSE:
@@ -332,10 +346,15 @@ def write_row(path: Path, row: dict[str, float]) -> None:
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--scale", type=int, choices=(2, 4, 8), required=True)
+    parser.add_argument(
+        "--scale", type=int, choices=(2, 4, 8), required=True, nargs="+", help="several for a pyramid network"
+    )
     parser.add_argument("--data", type=Path, required=True, help="folder of views (.npz)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
+    parser.add_argument(
+        "--network", choices=NETWORKS, default="paper", help="the paper's, or the kernel-predicting one"
+    )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
     parser.add_argument("--batch", type=int, help="default: the preset's")

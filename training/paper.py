@@ -132,6 +132,8 @@ class MultiResolutionFusion(nn.Module):
             "dense": dense,
         }
         self.scale = scale
+        self.multiple = scale
+        """Height and width of the HRLS are multiples of this."""
         stages = int(math.log2(scale))
         self.h_lrhs = conv3x3(LRHS_CHANNELS, channels)
         self.h_hrls = conv3x3(HRLS_CHANNELS, channels)

@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A leaner network than the paper's: predicted kernels in a pyramid of light, instead of predicted colours.
+
+The paper's network computes every pixel anew. This one decides, pixel by pixel, which of the samples that both renders
+hold are averaged:
+
+1. A U-Net whose finest level is half the HRLS's resolution reads both renders.
+2. Light is told from texture: the HRLS's albedo is filtered by predicted 3x3 kernels, and a predicted share ``gamma``
+   per pixel says how far the colour follows it (not at all for mirrors, glass, emitters and sky).
+3. From coarse to fine, H/16 to H, every level averages its own samples (the downsampled HRLS and, from the LRHS's
+   resolution on, the LRHS) over predicted kernels, together with the coarser level's result around the pixel. Samples
+   also carry predicted weights of their own, so that a firefly is left out wherever it might be read.
+
+The result is a weighted mean of the light that was rendered, times a filtered albedo: it can't invent light, however far
+the input lies from what was trained on. Kernel-predicting denoisers are
+Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of taps are like the splats of Gharbi et al.
+2019.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from itertools import pairwise
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from oiio_msspl import schema, transforms
+from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, conv3x3
+
+#: Levels of the pyramid of light: H, H/2, ... H/16.
+LEVELS = 5
+#: Smallest reflectance that light is divided by.
+MIN_ALBEDO = 0.02
+#: Weights are exponentials of the network's outputs within these bounds.
+MAX_LOGIT = 12.0
+
+_LOG_SCALE = 1.0 / math.log1p(transforms.MU)
+_ALBEDO = slice(schema.HRLS_FEATURES[schema.RGB], schema.HRLS_FEATURES[schema.RGB] + 3)
+
+
+def linear(values: Tensor) -> Tensor:
+    """Network values to exposed radiance, as :func:`oiio_msspl.transforms.expand`."""
+    return torch.expm1(values / _LOG_SCALE) / transforms.MU
+
+
+def logarithmic(radiance: Tensor) -> Tensor:
+    """Exposed radiance to network values, as :func:`oiio_msspl.transforms.compress`."""
+    return torch.log1p(transforms.MU * radiance) * _LOG_SCALE
+
+
+def halve(image: Tensor) -> Tensor:
+    """Mean of 2x2 pixels."""
+    return F.avg_pool2d(image, 2)
+
+
+def double(image: Tensor) -> Tensor:
+    """Every pixel four times."""
+    return F.interpolate(image, scale_factor=2, mode="nearest")
+
+
+def weighted_sum(weights: Tensor, image: Tensor, dilation: int = 1) -> Tensor:
+    """Sum of an image's neighbours with a weight for each tap and pixel.
+
+    Args:
+        weights: (N, k * k, H, W), taps row by row.
+        image: (N, C, H, W); zero beyond its edges, which leaves them out where one channel carries the weights.
+        dilation: pixels between taps.
+    """
+    size = math.isqrt(weights.shape[1])
+    height, width = image.shape[-2:]
+    reach = size // 2 * dilation
+    padded = F.pad(image, (reach,) * 4)
+    corners = ((tap // size * dilation, tap % size * dilation) for tap in range(size * size))
+    return sum(
+        weights[:, tap : tap + 1] * padded[..., y : y + height, x : x + width] for tap, (y, x) in enumerate(corners)
+    )
+
+
+def weighted(image: Tensor, weight: Tensor) -> Tensor:
+    """An image times its weight, and the weight as its last channel: sums of such can be divided in the end."""
+    return torch.cat([image * weight, weight], dim=1)
+
+
+def divided(image: Tensor) -> Tensor:
+    """The image that a sum of :func:`weighted` stands for."""
+    return image[:, :-1] / image[:, -1:].clamp_min(1e-12)
+
+
+def positive(logits: Tensor) -> Tensor:
+    """Weights of logits."""
+    return torch.exp(logits.float().clamp(-MAX_LOGIT, MAX_LOGIT))
+
+
+def pyramid(image: Tensor, first: int, levels: int) -> dict[int, Tensor]:
+    """Means of 2x2 pixels of means of 2x2 pixels ...: the image as level ``first``, up to level ``levels - 1``."""
+    images = {first: image}
+    for level in range(first + 1, levels):
+        images[level] = halve(images[level - 1])
+    return images
+
+
+def level_of(lrhs: Tensor, hrls: Tensor) -> int:
+    """log2 of the scale."""
+    return (hrls.shape[-1] // lrhs.shape[-1]).bit_length() - 1
+
+
+class PyramidFusion(nn.Module):
+    """See the module's docstring. One set of weights serves every scale, which follows from the images' sizes.
+
+    Sizes must be multiples of ``multiple`` HRLS pixels.
+
+    Args:
+        channels: of the U-Net's levels H/2, H/4, H/8, ...
+        own_size: taps across of the kernels over a level's own samples, H, H/2, ... ; odd.
+    """
+
+    def __init__(
+        self, channels: Sequence[int] = (48, 64, 96, 128, 128), own_size: Sequence[int] = (5, 5, 5, 5, 5)
+    ) -> None:
+        super().__init__()
+        self.config = {"channels": list(channels), "own_size": list(own_size)}
+        self.own_size = own_size
+        self.multiple = 2 ** len(channels)
+        finest, *coarser = channels
+
+        # Down: H/2 sees every pixel of the HRLS, the levels below the colours of both renders anew
+        self.stem = nn.Conv2d(HRLS_CHANNELS, finest, 6, stride=2, padding=2)
+        self.stem_low = conv3x3(LRHS_CHANNELS, finest)
+        self.down = nn.ModuleList(nn.Conv2d(above, here, 3, stride=2, padding=1) for above, here in pairwise(channels))
+        self.mix = nn.ModuleList(conv3x3(here + 3 + LRHS_CHANNELS, here) for here in coarser)
+
+        # Up
+        self.skip = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
+        self.up = nn.ModuleList(conv3x3(below, here) for here, below in pairwise(channels))
+        self.refine = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
+
+        # Kernels of every level of the light; those of level 0 are made at H/2, for four pixels each
+        reads = [finest, *channels]
+        self.heads = nn.ModuleList(
+            nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
+        )
+        self.reset_parameters()
+
+    def outputs(self, level: int) -> list[int]:
+        """Channels of a level's head: taps over its own samples, weight of the HRLS's samples, taps over the coarser
+        level, weight of the LRHS's samples, taps over the albedo, share of the albedo."""
+        own = self.own_size[level] ** 2
+        return [own, 1, 9 if level < LEVELS - 1 else 0, 1 if level else 0, 0 if level else 9, 0 if level else 1]
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Every kernel starts close to a plain mean."""
+        for module in self.modules():
+            if isinstance(module, nn.Conv2d):
+                nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
+                nn.init.zeros_(module.bias)
+        for head in self.heads:
+            head.weight.mul_(0.1)
+
+    def logits(self, lrhs: Tensor, hrls: Tensor) -> list[tuple[Tensor, ...]]:
+        """What the heads say, finest level first, each at its own level's resolution and split as :meth:`outputs`."""
+        colours = pyramid(linear(hrls[:, :3]), 0, len(self.mix) + 2)
+        lows = pyramid(linear(lrhs), level_of(lrhs, hrls), len(self.mix) + 2)
+
+        def low(level: int) -> Tensor:
+            """The LRHS at a level, its pixels repeated where that is finer."""
+            first = min(lows)
+            if level >= first:
+                return logarithmic(lows[level])
+            return F.interpolate(lrhs, scale_factor=2 ** (first - level), mode="nearest")
+
+        x = F.relu(self.stem(hrls) + self.stem_low(low(1)))
+        encoded = [x]
+        for level, (down, mix) in enumerate(zip(self.down, self.mix, strict=True), start=2):
+            x = F.relu(mix(torch.cat([F.relu(down(x)), logarithmic(colours[level]), low(level)], dim=1)))
+            encoded.append(x)
+        decoded = [x]
+        for i in reversed(range(len(self.skip))):
+            x = F.relu(self.skip[i](encoded[i]) + double(self.up[i](x)))
+            x = F.relu(self.refine[i](x))
+            decoded.append(x)
+        decoded.reverse()
+        logits = [F.pixel_shuffle(self.heads[0](decoded[0]), 2)]
+        logits += [self.heads[level](decoded[level - 1]) for level in range(1, LEVELS)]
+        return [values.float().split(self.outputs(level), dim=1) for level, values in enumerate(logits)]
+
+    def gather(self, lrhs: Tensor, hrls: Tensor, logits: list[tuple[Tensor, ...]]) -> Tensor:
+        """Apply the kernels: the fused image in network values."""
+        # Albedo, and the part of it that colours the light
+        albedo = hrls[:, _ALBEDO]
+        *_, albedo_taps, gamma = logits[0]
+        filtered = divided(weighted_sum(positive(albedo_taps), weighted(albedo, torch.ones_like(albedo[:, :1]))))
+        share = torch.sigmoid(gamma + 2.0)
+        tint = (share * filtered + (1 - share)).clamp_min(MIN_ALBEDO)
+
+        colours = pyramid(linear(hrls[:, :3]), 0, LEVELS)
+        lows = pyramid(linear(lrhs), level_of(lrhs, hrls), LEVELS)
+        tints = pyramid(tint, 0, LEVELS)
+        light: Tensor | None = None
+        for level in reversed(range(LEVELS)):
+            own, importance, coarser, low_importance, *_ = logits[level]
+            samples = weighted(colours[level] / tints[level], positive(importance))
+            if level in lows:
+                samples = samples + weighted(lows[level] / tints[level], positive(low_importance + 1.0))
+            total = weighted_sum(positive(own), samples)
+            if light is not None:
+                around = double(weighted(light, torch.ones_like(light[:, :1])))
+                total = total + weighted_sum(positive(coarser), around, dilation=2)
+            light = divided(total)
+        assert light is not None
+        return logarithmic(light * tint)
+
+    def forward(self, lrhs: Tensor, hrls: Tensor) -> Tensor:
+        """
+        Args:
+            lrhs: (N, 3, h, w), network values.
+            hrls: (N, 16, s*h, s*w), likewise.
+
+        Returns:
+            (N, 3, s*h, s*w) in network values.
+        """
+        return self.gather(lrhs, hrls, self.logits(lrhs, hrls))

@@ -3,10 +3,11 @@
 
     python -m benchmarks.quality ../shared/renders --json results/quality.json
 
-A scene is a folder with ``ref.exr``, ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``. For 2 and 8 average samples
-(spp_LRHS / s^2 + spp_HRLS) each method gets its files: ours an LRHS and an HRLS; OIDN (if pyoidn is installed) one
-full-resolution render of the same average, with albedo and normal. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per
-scene and mean. Scenes whose own reference is noisy are listed but not averaged.
+A scene is a folder with ``ref.exr``, ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``. For 2, 4 and 8 average samples
+(spp_LRHS / s^2 + spp_HRLS) each method gets its files. From an LRHS and an HRLS: our models; OIDN (if pyoidn is
+installed) on the HRLS with albedo and normal; OIDN on the LRHS, upsampled; and "both": the first brought to the
+second's local brightness. From one full-resolution render of the same average: OIDN. Printed: PSNR in sRGB and RelMSE
+(0.5, 0.01), per scene and mean. Scenes whose own reference is noisy are listed but not averaged.
 """
 
 from __future__ import annotations
@@ -23,11 +24,15 @@ from oiio_msspl import fuse
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.comparison import scores, upsample_bicubic
 from oiio_msspl.exr import open_exr
-from oiio_msspl.session import Session, find_model
+from oiio_msspl.session import Session, find_model, shipped_models
 from oiio_msspl.transforms import repair
 
 #: Average spp -> [(scale, LRHS spp, HRLS spp)].
-CASES = {2: [(2, 4, 1), (4, 16, 1), (8, 64, 1)], 8: [(2, 16, 4), (4, 64, 4), (8, 256, 4)]}
+CASES = {
+    2: [(2, 4, 1), (4, 16, 1), (8, 64, 1)],
+    4: [(2, 8, 2), (4, 32, 2), (8, 128, 2)],
+    8: [(2, 16, 4), (4, 64, 4), (8, 256, 4)],
+}
 #: The reference of this one is full of fireflies.
 NOISY_REFERENCE = {"veach-bidir"}
 
@@ -47,7 +52,15 @@ def oidn(file: Resolution) -> np.ndarray | None:
     return np.asarray(pyoidn.denoise(layers["rgb"], hdr=True, quality="high", **guides))
 
 
-def run_scene(folder: Path, models: dict[int, Session]) -> list[dict[str, Any]]:
+def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
+    """An image times the smooth ratio that gives it the local means of a smaller one."""
+    height, width = detail.shape[:2]
+    scale = height // low.shape[0]
+    means = detail.reshape(height // scale, scale, width // scale, scale, 3).mean(axis=(1, 3))
+    return detail * upsample_bicubic(((low + 1e-3) / (means + 1e-3)).astype(np.float32), width, height)
+
+
+def run_scene(folder: Path, sessions: list[Session]) -> list[dict[str, Any]]:
     """One row a method and case: ``scene, spp, method, psnr, relmse, relmse_gharbi, ssim``."""
 
     def load(name: str) -> Resolution:
@@ -62,15 +75,22 @@ def run_scene(folder: Path, models: dict[int, Session]) -> list[dict[str, Any]]:
             rows.append({"scene": folder.name, "spp": spp, "method": method, **scores(image, truth)})
 
     for spp, cases in CASES.items():
-        for scale, lr_spp, hr_spp in cases:
-            lr, hr = load(f"lr_x{scale}_{lr_spp}spp.exr"), load(f"hr_{hr_spp}spp.exr")
+        hr = load(f"hr_{cases[0][2]}spp.exr")
+        add(spp, "HRLS", beauty(hr))
+        denoised = oidn(hr)
+        add(spp, "OIDN on the HRLS", denoised)
+        for scale, lr_spp, _ in cases:
+            lr = load(f"lr_x{scale}_{lr_spp}spp.exr")
             low = beauty(lr)
             add(spp, f"LRHS x{scale} nearest", low.repeat(scale, 0).repeat(scale, 1))
             add(spp, f"LRHS x{scale} bicubic", upsample_bicubic(low, width, height))
-            if scale in models:
-                add(spp, models[scale].contract.name, fuse(lr, hr, models[scale]).rgb)
-        add(spp, "HRLS", beauty(load(f"hr_{cases[0][2]}spp.exr")))
-        add(spp, "OIDN on the HRLS", oidn(load(f"hr_{cases[0][2]}spp.exr")))
+            denoised_low = oidn(lr)
+            if denoised is not None and denoised_low is not None:
+                add(spp, f"OIDN on the LRHS x{scale}, bicubic", upsample_bicubic(denoised_low, width, height))
+                add(spp, f"OIDN on both x{scale}", brought_to(denoised, denoised_low))
+            for session in sessions:
+                if session.contract.scale == scale:
+                    add(spp, session.contract.name, fuse(lr, hr, session).rgb)
         add(spp, "full resolution", beauty(load(f"hr_{spp}spp.exr")))
         add(spp, "OIDN, same samples", oidn(load(f"hr_{spp}spp.exr")))
     return rows
@@ -97,13 +117,12 @@ def print_tables(rows: list[dict[str, Any]]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("renders", type=Path, help="folder with one folder a scene")
-    parser.add_argument("--model", action="append", default=[], help="ONNX files instead of the shipped paper models")
+    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; all if none")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
-    sessions = [Session(path) for path in args.model] or [Session(find_model(s)) for s in (2, 4, 8)]
-    models = {session.contract.scale: session for session in sessions}
+    sessions = [Session(find_model(0, name)) for name in args.model or shipped_models()]
     folders = sorted(p.parent for p in args.renders.glob("*/ref.exr"))
-    rows = [row for folder in folders for row in run_scene(folder, models)]
+    rows = [row for folder in folders for row in run_scene(folder, sessions)]
     print_tables(rows)
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)

@@ -39,11 +39,12 @@ def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
     }
 
 
-def measure_network(scale: int, height: int, width: int, repeats: int, threads: int) -> dict[str, Any]:
+def measure_model(name: str, height: int, width: int, repeats: int, threads: int) -> dict[str, Any]:
     """Seconds of :func:`oiio_msspl.fuse` on arrays, and the process's peak memory (in this process)."""
     from oiio_msspl import Render, Session, find_model, fuse
 
-    session = Session(find_model(scale), threads=threads)
+    session = Session(find_model(0, name), threads=threads)
+    scale = session.contract.scale
     layers = frame(height, width)
     high = Render.from_arrays("hr", **layers)
     low = Render.from_arrays("lr", rgb=layers["rgb"][::scale, ::scale].copy())
@@ -56,7 +57,7 @@ def measure_network(scale: int, height: int, width: int, repeats: int, threads: 
     return {"seconds": times, "peak_mb": peak_mb()}
 
 
-def measure_oidn(scale: int, height: int, width: int, repeats: int, threads: int) -> dict[str, Any]:
+def measure_oidn(height: int, width: int, repeats: int) -> dict[str, Any]:
     import pyoidn
 
     layers = frame(height, width)
@@ -119,8 +120,9 @@ def peak_mb() -> float:
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def in_process(kind: str, scale: int, size: str, *extra: str) -> dict[str, Any]:
-    command = [sys.executable, "-m", "benchmarks.runtime", "--measure", kind, str(scale), "--size", size, *extra]
+def in_process(kind: str, size: str, *extra: str) -> dict[str, Any]:
+    """``kind``: ``oidn``, ``files`` or a model."""
+    command = [sys.executable, "-m", "benchmarks.runtime", "--measure", kind, "--size", size, *extra]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)
@@ -138,23 +140,24 @@ def main() -> None:
         "--files", type=int, metavar="SCALE", help="measure a whole job from file to file at this scale"
     )
     parser.add_argument("--json", type=Path)
-    parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; all if none")
+    parser.add_argument("--measure", help=argparse.SUPPRESS)
     parser.add_argument("--write", nargs=2, help=argparse.SUPPRESS)
     args = parser.parse_args()
     width, height = (int(v) for v in (args.write[1] if args.write else args.size).split("x"))
     if args.write:
         return write_frame(args.write[0], width, height)
     if args.measure:
-        kind, scale = args.measure[0], int(args.measure[1])
-        if kind == "files":
-            result = measure_files(scale, height, width, args.max_memory)
+        if args.measure == "files":
+            result = measure_files(args.files, height, width, args.max_memory)
+        elif args.measure == "oidn":
+            result = measure_oidn(height, width, args.repeats)
         else:
-            measure = measure_network if kind == "network" else measure_oidn
-            result = measure(scale, height, width, args.repeats, args.threads)
+            result = measure_model(args.measure, height, width, args.repeats, args.threads)
         print(json.dumps(result))
         return None
     if args.files:
-        result = in_process("files", args.files, args.size, "--max-memory", str(args.max_memory))
+        result = in_process("files", args.size, "--files", str(args.files), "--max-memory", str(args.max_memory))
         print(
             f"{args.size} x{args.files}, file to file: {result['seconds'][0]:.1f} s, peak {result['peak_mb']:.0f} MB, "
             f"{result['tiles']} tiles; {result['parts']}"
@@ -171,32 +174,35 @@ def main() -> None:
 
 
 def compare(args: argparse.Namespace) -> dict[str, Any]:
-    """Ours at each scale and OIDN, in turn; prints the table."""
+    """Each model and OIDN, in turn; prints the table."""
+    from oiio_msspl.session import Session, find_model, shipped_models
+
+    scales = {name: Session(find_model(0, name)).contract.scale for name in args.model or shipped_models()}
+    cases = [*scales]
     try:
         import pyoidn  # noqa: F401
 
-        peers = [("oidn", 1)]
+        cases.append("oidn")
     except ImportError:
-        peers = []
-    cases = [*(("network", s) for s in (2, 4, 8)), *peers]
-    seconds: dict[tuple[str, int], list[float]] = {case: [] for case in cases}
-    peak: dict[tuple[str, int], float] = dict.fromkeys(cases, 0.0)
+        pass
+    seconds: dict[str, list[float]] = {case: [] for case in cases}
+    peak: dict[str, float] = dict.fromkeys(cases, 0.0)
     for _ in range(args.rounds):
         for case in cases:
-            result = in_process(*case, args.size, "--repeats", str(args.repeats), "--threads", str(args.threads))
+            result = in_process(case, args.size, "--repeats", str(args.repeats), "--threads", str(args.threads))
             seconds[case] += result["seconds"]
             peak[case] = max(peak[case], result["peak_mb"])
-    reference = statistics.median(seconds[("oidn", 1)]) if peers else None
-    print(f"| {args.size} | median s | of OIDN's time | peak MB | paper, Titan Xp |")
+    reference = statistics.median(seconds["oidn"]) if "oidn" in seconds else None
+    print(f"| {args.size} | median s | of OIDN's time | peak MB | the paper's network, Titan Xp |")
     print("|---|---|---|---|---|")
     table = {}
-    for kind, scale in cases:
-        name = f"paper-x{scale}" if kind == "network" else "OIDN 2.5.1, quality high"
-        median = statistics.median(seconds[(kind, scale)])
+    for case in cases:
+        name = "OIDN 2.5.1, quality high" if case == "oidn" else case
+        median = statistics.median(seconds[case])
         ratio = f"{median / reference:.2f}" if reference else "-"
-        paper = f"{PAPER[scale][0]} s, {PAPER[scale][1]} MB" if kind == "network" else "-"
-        print(f"| {name} | {median:.2f} | {ratio} | {peak[(kind, scale)]:.0f} | {paper} |")
-        table[name] = {"seconds": seconds[(kind, scale)], "peak_mb": peak[(kind, scale)]}
+        paper = "{} s, {} MB".format(*PAPER[scales[case]]) if case in scales else "-"
+        print(f"| {name} | {median:.2f} | {ratio} | {peak[case]:.0f} | {paper} |")
+        table[name] = {"seconds": seconds[case], "peak_mb": peak[case], "scale": scales.get(case)}
     return table
 
 

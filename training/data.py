@@ -67,12 +67,13 @@ class Sampling:
     """Share with shuffled colour channels, albedo included: the same scene with its wavelengths renamed."""
     grey: float = 0.05
     """Share with r = g = b in all radiance; the model also serves single-channel layers."""
-    drop_each: float = 0.25
+    drop_each: float = 0.1
     """Share in which an optional feature is absent, for each on its own."""
-    drop_lobes: float = 0.4
+    drop_lobes: float = 0.5
     """Share without diffuse and specular: many renderers have neither."""
-    drop_variance: float = 0.5
-    drop_all: float = 0.1
+    drop_variance: float = 0.7
+    """Hardly any renderer writes it."""
+    drop_all: float = 0.05
 
 
 #: ``Sampling`` as close to the paper's as its text tells: crops alone, every layer, clipped, nearest-neighbour LRHS.

@@ -14,8 +14,10 @@ hold are averaged:
 4. Two convolutions see that result beside the features and retouch it, within ``MAX_RETOUCH``: samples that hit or miss
    an edge make it jagged, and no mean of samples is as straight as the edge.
 
-But for the retouch the result is a weighted mean of the light that was rendered, times a filtered albedo: it can't
-invent light, however far the input lies from what was trained on. Kernel-predicting denoisers are
+5. No pixel may be darker or brighter than everything around it in both renders.
+
+So the result is nearly a weighted mean of the light that was rendered, times a filtered albedo, and whatever the input,
+it stays within what was rendered. Kernel-predicting denoisers are
 Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of taps are like the splats of Gharbi et al.
 2019.
 """
@@ -110,6 +112,13 @@ def pyramid(image: Tensor, first: int, levels: int) -> dict[int, Tensor]:
 def level_of(lrhs: Tensor, hrls: Tensor) -> int:
     """log2 of the scale."""
     return (hrls.shape[-1] // lrhs.shape[-1]).bit_length() - 1
+
+
+def highest_around(lrhs: Tensor, hrls: Tensor) -> Tensor:
+    """Per HRLS pixel, the largest value of 10x10 HRLS pixels and of 3x3 LRHS pixels around it, channel by channel."""
+    high = F.max_pool2d(F.max_pool2d(hrls, 2), 5, stride=1, padding=2)
+    low = F.max_pool2d(lrhs, 3, stride=1, padding=1)
+    return double(torch.maximum(high, F.interpolate(low, scale_factor=2 ** (level_of(lrhs, hrls) - 1), mode="nearest")))
 
 
 class PyramidFusion(nn.Module):
@@ -235,4 +244,5 @@ class PyramidFusion(nn.Module):
         seen = torch.cat([features[0], F.pixel_unshuffle(fused, 2)], dim=1)
         change = self.retouch[1](F.relu(self.retouch[0](seen)))
         change = MAX_RETOUCH * torch.tanh(F.pixel_shuffle(change, 2).float() / MAX_RETOUCH)
-        return (fused + change).clamp_min(0.0)
+        colour = hrls[:, :3]
+        return torch.clamp(fused + change, -highest_around(-lrhs, -colour), highest_around(lrhs, colour))

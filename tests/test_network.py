@@ -18,7 +18,7 @@ from oiio_msspl import schema  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
 from training import data, losses  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
-from training.pyramid import PyramidFusion  # noqa: E402
+from training.pyramid import PyramidFusion, weighted_sum  # noqa: E402
 
 TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
 SIZE = 64
@@ -297,6 +297,17 @@ def test_pyramid_never_leaves_the_range_of_its_inputs(tiny_pyramid: PyramidFusio
     far = torch.ones(64, 96, dtype=torch.bool)
     far[20:44, 30:54] = False
     assert fused[..., far].max() <= 1.0 < fused.max() <= 4.2
+
+
+@pytest.mark.parametrize("dilation", [1, 2])
+def test_gradient_of_the_weighted_sum(dilation: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(2, 9, 5, 7, generator=generator, dtype=torch.float64, requires_grad=True)
+    image = torch.rand(2, 3, 5, 7, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w, i: weighted_sum(w, i, dilation), (weights, image))
+    with torch.no_grad():
+        plain = weighted_sum(weights, image, dilation)
+    torch.testing.assert_close(weighted_sum(weights, image, dilation).detach(), plain)
 
 
 @torch.inference_mode()

@@ -25,8 +25,9 @@ Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of ta
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -76,14 +77,50 @@ def weighted_sum(weights: Tensor, image: Tensor, dilation: int = 1) -> Tensor:
         image: (N, C, H, W); zero beyond its edges, which leaves them out where one channel carries the weights.
         dilation: pixels between taps.
     """
+    if torch.is_grad_enabled():
+        return _WeightedSum.apply(weights.contiguous(), image.contiguous(), dilation)
+    shifted = _shifted(_pad(image, weights, dilation), weights, dilation)
+    return sum(weights[:, tap : tap + 1] * neighbour for tap, neighbour in enumerate(shifted))
+
+
+def _pad(image: Tensor, weights: Tensor, dilation: int) -> Tensor:
+    return F.pad(image, (math.isqrt(weights.shape[1]) // 2 * dilation,) * 4)
+
+
+def _shifted(padded: Tensor, weights: Tensor, dilation: int) -> Iterator[Tensor]:
+    """A window into a padded image for each tap."""
     size = math.isqrt(weights.shape[1])
-    height, width = image.shape[-2:]
-    reach = size // 2 * dilation
-    padded = F.pad(image, (reach,) * 4)
-    corners = ((tap // size * dilation, tap % size * dilation) for tap in range(size * size))
-    return sum(
-        weights[:, tap : tap + 1] * padded[..., y : y + height, x : x + width] for tap, (y, x) in enumerate(corners)
-    )
+    height, width = weights.shape[-2:]
+    for y in range(0, size * dilation, dilation):
+        for x in range(0, size * dilation, dilation):
+            yield padded[..., y : y + height, x : x + width]
+
+
+class _WeightedSum(torch.autograd.Function):
+    """The same for training: in place, with a gradient that does not allocate an image a tap. A third of a step's time."""
+
+    @staticmethod
+    def forward(ctx: Any, weights: Tensor, image: Tensor, dilation: int) -> Tensor:
+        padded = _pad(image, weights, dilation)
+        total = torch.zeros_like(image)
+        for tap, neighbour in enumerate(_shifted(padded, weights, dilation)):
+            total.addcmul_(neighbour, weights[:, tap : tap + 1])
+        ctx.save_for_backward(weights, padded)
+        ctx.dilation = dilation
+        return total
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
+        weights, padded = ctx.saved_tensors
+        of_weights, of_padded = torch.zeros_like(weights), torch.zeros_like(padded)
+        pairs = zip(*(_shifted(image, weights, ctx.dilation) for image in (padded, of_padded)), strict=True)
+        for tap, (neighbour, of_neighbour) in enumerate(pairs):
+            for channel in range(gradient.shape[1]):
+                of_weights[:, tap].addcmul_(gradient[:, channel], neighbour[:, channel])
+            of_neighbour.addcmul_(gradient, weights[:, tap : tap + 1])
+        reach = (padded.shape[-1] - gradient.shape[-1]) // 2
+        inside = slice(reach, reach + gradient.shape[-2]), slice(reach, reach + gradient.shape[-1])
+        return of_weights, of_padded[..., *inside], None
 
 
 def weighted(image: Tensor, weight: Tensor) -> Tensor:

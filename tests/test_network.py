@@ -14,9 +14,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from oiio_msspl import schema  # noqa: E402
+from oiio_msspl import schema, tensors, transforms  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
-from training import data, losses  # noqa: E402
+from training import batches, data, losses  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
 from training.pyramid import PyramidFusion, weighted_sum  # noqa: E402
 
@@ -141,32 +141,58 @@ def test_hrls_is_the_mean_of_passes(views: Path) -> None:
     np.testing.assert_array_equal(passes.mean(0)[..., :3], expected)
 
 
-def test_variance_is_that_of_the_mean_and_unbiased() -> None:
-    """n passes of unit noise have a mean of variance 1/n, however small n is."""
-    noise = np.random.default_rng(0).standard_normal((3, 400, 400)).astype(np.float32)
-    assert data.variance_of_mean(noise).mean() == pytest.approx(1 / 3, rel=0.01)
-    assert data.variance_of_mean(noise[:2]).mean() == pytest.approx(1 / 2, rel=0.01)
+def drawn(views: Path, scale: int, patch: int, count: int, sampling: data.Sampling, seed: int = 0) -> batches.Batch:
+    pixels = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(views).split("train")]
+    return batches.draw(pixels, scale, patch, count, np.random.default_rng(seed), sampling)
+
+
+def test_variance_is_that_of_the_mean_and_unbiased(views: Path) -> None:
+    """n passes with noise of deviation 0.02 have a mean of variance 0.02^2 / n, however small n is."""
+    for n in (2, 3):
+        only_n = tuple(float(i + 1 == n) for i in range(8))
+        sampling = data.Sampling(
+            hrls_spp=only_n, drop_each=0, drop_variance=0, drop_all=0, exposure_stops=0, gain_stops=0, grey=0
+        )
+        batch = drawn(views, 4, SIZE, 4, sampling)
+        deviation = transforms.expand(batch["hrls"][:, -1].numpy(), 1.0)
+        exposure = transforms.expand(batch["target"].numpy(), 1.0).max()  # the brightest pixel of the views is 1
+        assert np.square(deviation / exposure).mean() == pytest.approx(0.02**2 / n, rel=0.03)
 
 
 def test_sample_shapes_ranges_and_agreement(views: Path) -> None:
     """The parts of a pair show the same pixels: without noise, LRHS and target agree after downsampling."""
-    (view,) = data.Folder(views).split("train")
-    rng = np.random.default_rng(0)
-    for _ in range(20):
-        sample = data.draw(view, 4, 32, rng, data.Sampling())
-        assert sample["lrhs"].shape == (8, 8, 3)
-        assert sample["hrls"].shape == (32, 32, 16)
-        assert sample["target"].shape == (32, 32, 3)
-        assert all(np.isfinite(part).all() for part in sample.values())
-        np.testing.assert_allclose(data.box_downsample(sample["target"], 4), sample["lrhs"], atol=0.01)
+    for seed in range(20):
+        batch = drawn(views, 4, 32, 3, data.Sampling(), seed)
+        assert batch["lrhs"].shape == (3, 3, 8, 8)
+        assert batch["hrls"].shape == (3, 16, 32, 32)
+        assert batch["target"].shape == (3, 3, 32, 32)
+        assert all(part.isfinite().all() for part in batch.values())
+        down = torch.nn.functional.avg_pool2d(batch["target"], 4)
+        torch.testing.assert_close(down, batch["lrhs"], atol=0.01, rtol=0)
 
 
 def test_absent_layers_have_their_defaults(views: Path) -> None:
-    (view,) = data.Folder(views).split("train")
-    sample = data.draw(view, 4, 32, np.random.default_rng(0), data.Sampling(drop_all=1.0))
-    layers = features_of(sample["hrls"])
+    batch = drawn(views, 4, 32, 1, data.Sampling(drop_all=1.0))
+    layers = features_of(batch["hrls"][0].permute(1, 2, 0).numpy())
     assert all((layers[name] == schema.DEFAULTS[name]).all() for name in schema.OPTIONAL_FEATURES)
     assert layers[schema.RGB].std() > 0
+
+
+def test_training_transforms_as_inference_does() -> None:
+    """What batches compute in PyTorch is what the library computes in NumPy."""
+    rng = np.random.default_rng(0)
+    layers = {name: rng.exponential(1.0, (5, 6, n)).astype(np.float32) for name, n in schema.HRLS_FEATURES.items()}
+    layers[schema.NORMAL] -= 1
+    low = rng.exponential(1.0, (7, 9, 3)).astype(np.float32)
+    low[2:4] = 0
+    exposure = batches.exposure_of(torch.from_numpy(low)[None])
+    assert exposure.item() == pytest.approx(transforms.exposure_of(low), rel=1e-3)
+    packed = batches.pack({name: torch.from_numpy(values)[None] for name, values in layers.items()}, exposure)
+    expected = tensors.pack(layers, schema.HRLS_FEATURES, exposure.item())
+    np.testing.assert_allclose(packed[0].numpy(), expected, atol=1e-5)
+    assert batches.exposure_of(torch.zeros(1, 4, 4, 3)).item() == transforms.exposure_of(
+        np.zeros((4, 4, 3), np.float32)
+    )
 
 
 @pytest.mark.parametrize("determinant", [1, -1])
@@ -178,12 +204,11 @@ def test_normals_are_turned_with_the_right_handedness(determinant: int) -> None:
 
 def test_normals_keep_their_lengths_and_angles(views: Path) -> None:
     """The normal turns from one column to the next, before and after all augmentation, by the same angle."""
-    (view,) = data.Folder(views).split("train")
     keep = data.Sampling(drop_each=0, drop_lobes=0, drop_all=0)
-    rng = np.random.default_rng(0)
     step = np.cos(np.pi * 0.8 / (SIZE - 1))
-    for _ in range(8):
-        normal = features_of(data.draw(view, 2, 32, rng, keep)["hrls"])[schema.NORMAL]
+    for seed in range(8):
+        hrls = drawn(views, 2, 32, 1, keep, seed)["hrls"][0].permute(1, 2, 0).numpy()
+        normal = features_of(hrls)[schema.NORMAL]
         np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=2e-3)
         along, across = np.sum(normal[:, 1:] * normal[:, :-1], -1), np.sum(normal[1:] * normal[:-1], -1)
         np.testing.assert_allclose(sorted([along.mean(), across.mean()]), [step, 1], atol=2e-3)

@@ -20,10 +20,7 @@ import json
 import logging
 import math
 import mmap
-import queue
 import struct
-import threading
-import time
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -42,9 +39,6 @@ PAPER_PATCH = {2: 96, 4: 192, 8: 256}
 #: Features that a renderer writes, in the channel order of ``hr``: all but the variance, which comes from the passes.
 PASS_FEATURES = tuple(name for name in schema.HRLS_FEATURES if name != schema.VARIANCE)
 RADIANCE_FEATURES = (schema.RGB, schema.DIFFUSE, schema.SPECULAR)
-
-#: What a sample is made of, by name: (3, h, w), (16, s*h, s*w) and (3, s*h, s*w) once the channels are moved first.
-Batch = dict[str, NDArray[np.float32]]
 
 
 @dataclass(frozen=True)
@@ -102,7 +96,7 @@ def map_npz(path: Path) -> dict[str, NDArray]:
         ValueError, zipfile.BadZipFile: the file is incomplete, or compressed.
     """
     with path.open("rb") as file, zipfile.ZipFile(file) as archive:
-        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_COPY)  # writable in memory, as PyTorch wants it
         arrays = {}
         for member in archive.infolist():
             if member.compress_type != zipfile.ZIP_STORED:
@@ -169,16 +163,6 @@ def box_downsample(image: Array, scale: int) -> Array:
     return rows.reshape(height // scale, width // scale, scale, channels).mean(axis=2)
 
 
-def nearest_downsample(image: Array, scale: int) -> Array:
-    """One pixel of each ``scale`` x ``scale``, the paper's degradation: (H, W, C) to (H/s, W/s, C)."""
-    return image[scale // 2 :: scale, scale // 2 :: scale]
-
-
-def variance_of_mean(luminance: Array) -> Array:
-    """Unbiased variance of the mean of n >= 2 independent passes (n, H, W), as (H, W)."""
-    return luminance.var(axis=0, ddof=1) / len(luminance)
-
-
 def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
     """Uniformly random 3x3 rotation (determinant 1) or rotation with a mirroring (-1)."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
@@ -217,80 +201,6 @@ def read_hrls(view: View, passes: NDArray[np.int64] | list[int], rows: slice, co
     return values
 
 
-def draw(view: View, scale: int, patch: int, rng: np.random.Generator, sampling: Sampling) -> Batch:
-    """One random training pair of ``patch`` x ``patch`` HR pixels: ``lrhs``, ``hrls``, ``target``, (H, W, C) each."""
-    # Renderings: which passes, and which part of the view
-    nearest = rng.random() < sampling.nearest
-    while True:
-        n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
-        k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
-        lr_passes = rng.permutation(len(view.lr_spp))[:k]
-        if view.lr_spp[lr_passes].sum() * (1 if nearest else scale**2) > n:  # high and low spp: as in the paper
-            break
-    height, width, _ = view.ref.shape
-    top = scale * int(rng.integers((height - patch) // scale + 1))
-    left = scale * int(rng.integers((width - patch) // scale + 1))
-    rows, columns = slice(top, top + patch), slice(left, left + patch)
-    lrhs = np.minimum(mean_lrhs(view, lr_passes), sampling.clip)
-    lrhs = (nearest_downsample if nearest else box_downsample)(lrhs, scale)
-    passes = read_hrls(view, rng.permutation(len(view.hr))[:n], rows, columns)
-    target = np.minimum(read(view.ref[rows, columns]), sampling.clip)
-
-    # Light and colour, in linear values; the variance must see the changed light
-    renaming = np.eye(3, dtype=np.float32)[rng.permutation(3) if rng.random() < sampling.permute else range(3)]
-    light = _random_light(rng, sampling) @ renaming
-    features = split_features(passes)
-    for name in RADIANCE_FEATURES:
-        features[name] = np.minimum(features[name], sampling.clip) @ light
-    features[schema.ALBEDO] = features[schema.ALBEDO] @ renaming
-    lrhs, target = lrhs @ light, target @ light
-    variance = variance_of_mean(transforms.luminance(features[schema.RGB])) if n > 1 else None
-    features = {name: values.mean(axis=0) for name, values in features.items()}
-    if variance is not None:
-        features[schema.VARIANCE] = variance[..., None]
-
-    # Mirroring and turning. Normals may be in any space, so any rotation of them is right, as long as its handedness is
-    # that of the image.
-    mirrored, turns = rng.random() < 0.5, int(rng.integers(4))
-    features[schema.NORMAL] = features[schema.NORMAL] @ random_orthogonal(rng, -1 if mirrored else 1)
-
-    # Layers that a renderer did not write
-    for name in _random_absence(rng, sampling):
-        features.pop(name, None)
-
-    # Exposure as inference finds it, from the whole LRHS
-    exposure = transforms.exposure_of(lrhs) * 2.0 ** rng.uniform(-sampling.exposure_stops, sampling.exposure_stops)
-    lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
-    pair = {
-        "lrhs": transforms.compress(lrhs, exposure),
-        "hrls": tensors.pack(features, schema.HRLS_FEATURES, exposure),
-        "target": transforms.compress(target, exposure),
-    }
-    return {name: np.rot90(image[:, ::-1] if mirrored else image, turns) for name, image in pair.items()}
-
-
-def _normalised(weights: tuple[float, ...]) -> NDArray[np.float64]:
-    return np.asarray(weights) / np.sum(weights)
-
-
-def _random_light(rng: np.random.Generator, sampling: Sampling) -> Array:
-    """3x3 matrix L that changes the colour of the light: radiance' = radiance @ L."""
-    if rng.random() < sampling.grey:
-        return np.repeat(np.asarray(schema.LUMINANCE, dtype=np.float32)[:, None], 3, axis=1)
-    return np.diag(2.0 ** rng.uniform(-sampling.gain_stops, sampling.gain_stops, 3)).astype(np.float32)
-
-
-def _random_absence(rng: np.random.Generator, sampling: Sampling) -> set[str]:
-    """Names of optional features to leave out."""
-    if rng.random() < sampling.drop_all:
-        return set(schema.OPTIONAL_FEATURES)
-    share = {name: sampling.drop_each for name in schema.OPTIONAL_FEATURES} | {schema.VARIANCE: sampling.drop_variance}
-    absent = {name for name, probability in share.items() if rng.random() < probability}
-    if rng.random() < sampling.drop_lobes:
-        absent |= {schema.DIFFUSE, schema.SPECULAR}
-    return absent
-
-
 def spp_range(view: View, sampling: Sampling, scale: int) -> dict[str, list[int]]:
     """Lowest and highest spp of the pairs that :func:`draw` makes of a view, for the model's contract."""
     samples = scale**2 if sampling.nearest < 1 else 1
@@ -327,54 +237,3 @@ class Evaluation:
             reference=read(view.ref[rows, columns]),
             exposure=exposure,
         )
-
-
-# Batches
-
-
-class Prefetcher:
-    """Draws batches in a thread of its own, looks for new views, and knows how long training waited for it."""
-
-    def __init__(
-        self,
-        folder: Folder,
-        scales: tuple[int, ...],
-        patch: int,
-        batch: int,
-        sampling: Sampling,
-        seed: int,
-        rescan_seconds: float = 120,
-    ) -> None:
-        self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
-        self.waited = 0.0
-        """Seconds that :meth:`next` has blocked."""
-        self._rescan_seconds = rescan_seconds
-        self._rng = np.random.default_rng(seed)
-        self._queue: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
-        threading.Thread(target=self._work, daemon=True).start()
-
-    def next(self) -> Batch:
-        """``lrhs``, ``hrls`` and ``target`` as (N, H, W, C), all of one of the scales."""
-        start = time.monotonic()
-        item = self._queue.get()
-        self.waited += time.monotonic() - start
-        if isinstance(item, BaseException):
-            raise item
-        return item
-
-    def _work(self) -> None:
-        try:
-            while True:
-                views = self.folder.split("train")
-                deadline = time.monotonic() + self._rescan_seconds
-                while time.monotonic() < deadline:
-                    self._queue.put(self._draw_batch(views))
-                self.folder.scan()
-        except BaseException as error:  # whatever it was, training must end with it instead of waiting for ever
-            self._queue.put(error)
-
-    def _draw_batch(self, views: list[View]) -> Batch:
-        chosen = self._rng.choice(len(views), self.batch)
-        scale = int(self._rng.choice(self.scales))
-        pairs = [draw(views[i], scale, self.patch, self._rng, self.sampling) for i in chosen]
-        return {name: np.stack([pair[name] for pair in pairs]) for name in pairs[0]}

@@ -97,7 +97,7 @@ def _shifted(padded: Tensor, weights: Tensor, dilation: int) -> Iterator[Tensor]
 
 
 class _WeightedSum(torch.autograd.Function):
-    """The same for training: in place, with a gradient that does not allocate an image a tap. A third of a step's time."""
+    """The same for training: in place, its gradient too. Saves a third of a step's time."""
 
     @staticmethod
     def forward(ctx: Any, weights: Tensor, image: Tensor, dilation: int) -> Tensor:

@@ -32,7 +32,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from oiio_msspl import metrics, transforms
-from training import data, losses
+from training import batches, data, losses
 from training.networks import NETWORKS, Network
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
@@ -225,7 +225,7 @@ def train(args: argparse.Namespace) -> None:
         restore(state)
         step, elapsed, best_gain = state["step"], state["seconds"], state.get("best_gain", -math.inf)
         log.info("continues at step %d, minute %.1f", step, elapsed / 60)
-    prefetcher = data.Prefetcher(folder, scales, patch, batch, recipe.sampling, seed=args.seed + step)
+    source = batches.Batches(folder, scales, patch, batch, recipe.sampling, args.seed + step, device)
 
     stop = False
 
@@ -256,7 +256,7 @@ def train(args: argparse.Namespace) -> None:
             "lr": optimizer.param_groups[0]["lr"],
             "skipped_steps": since["skipped"],
             "samples_per_s": since["steps"] * batch / interval,
-            "wait_share": (prefetcher.waited - since["waited"]) / interval,
+            "wait_share": (source.waited - since["waited"]) / interval,
             "train_views": len(folder.split("train")),
             "val_pairs": len(validation),
             **scores,
@@ -299,7 +299,7 @@ def train(args: argparse.Namespace) -> None:
                 best_gain = state["best_gain"] = gain
                 save(state, best_path)
             save(state, checkpoint_path)
-        since.update(time=time.monotonic(), steps=0, skipped=0, loss=0.0, waited=prefetcher.waited)
+        since.update(time=time.monotonic(), steps=0, skipped=0, loss=0.0, waited=source.waited)
 
     checkpoint()
     next_checkpoint = elapsed + args.checkpoint_seconds
@@ -309,7 +309,7 @@ def train(args: argparse.Namespace) -> None:
         step += 1
         for group in optimizer.param_groups:
             group["lr"] = peak_lr * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
-        pair = {name: to_tensor(image, device) for name, image in prefetcher.next().items()}
+        pair = source.next()
         with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
             output = network(pair["lrhs"], pair["hrls"])
         loss = loss_function(output.float(), pair["target"])

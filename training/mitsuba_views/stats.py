@@ -14,7 +14,10 @@ from pathlib import Path
 import numpy as np
 
 from oiio_msspl import metrics
+from oiio_msspl.transforms import KEY
 from oiio_msspl.transforms import luminance as luminance_of
+
+from ..views import log_mean
 
 _MEASURES = {
     "psnr": "1-spp PSNR in sRGB [dB]",
@@ -30,14 +33,14 @@ _MEASURES = {
 def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dict[str, float]:
     """Numbers of one view from its 1-spp colour, its reference and a clean-ish albedo, each (H, W, 3)."""
     luminance = np.maximum(luminance_of(reference), 0)
-    log_mean = np.exp(np.log(luminance + 1e-4 * luminance.mean() + 1e-12).mean())
-    exposure = 0.18 / log_mean
+    mean = log_mean(reference)
+    exposure = KEY / mean
     low, high = np.percentile(luminance, (1, 99))
     across = np.abs(np.diff(albedo, axis=1)).max(-1)[1:] > 0.08
     down = np.abs(np.diff(albedo, axis=0)).max(-1)[:, 1:] > 0.08
     return {
         "psnr": metrics.psnr(noisy * exposure, reference * exposure),
-        "log_mean": float(np.log10(log_mean)),
+        "log_mean": float(np.log10(mean)),
         "range": float(np.log10(max(high, 1e-9) / max(low, 1e-6 * high, 1e-9))),
         "black": float((noisy.max(-1) <= 0).mean()),
         "clipped": float((luminance * exposure > 1).mean()),
@@ -47,7 +50,7 @@ def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dic
 
 def training_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
     """(kind, numbers) of each training file."""
-    for path in sorted(folder.glob("mitsuba-*.npz")):
+    for path in sorted(folder.glob("[!.]*.npz")):
         with np.load(path) as view:
             hr, meta = view["hr"].astype(np.float32), json.loads(str(view["meta"]))
             numbers = measure(hr[0, ..., :3], view["ref"].astype(np.float32), hr[..., 3:6].mean(0))
@@ -81,7 +84,7 @@ def _row(name: str, views: list[dict[str, float]], key: str) -> str:
 
 def main() -> None:
     p = argparse.ArgumentParser(prog="python -m training.mitsuba_views.stats", description=__doc__.split("\n")[0])
-    p.add_argument("folder", type=Path, help="folder of mitsuba-*.npz")
+    p.add_argument("folder", type=Path, help="folder of .npz views")
     p.add_argument("--validation", type=Path, help="folder of <scene>/hr_1spp.exr and ref.exr to set beside it")
     args = p.parse_args()
 

@@ -24,6 +24,7 @@ from oiio_msspl import fuse
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.comparison import scores, upsample_bicubic
 from oiio_msspl.exr import open_exr
+from oiio_msspl.pairing import Source
 from oiio_msspl.session import Session, find_model, shipped_models
 from oiio_msspl.transforms import repair
 
@@ -41,14 +42,16 @@ def beauty(file: Resolution) -> np.ndarray:
     return repair(file.read(file.data_window, ["rgb"])["rgb"])[0]
 
 
-def oidn(file: Resolution) -> np.ndarray | None:
-    """OIDN at quality high with albedo and normal; None without pyoidn."""
+def oidn(file: Source) -> np.ndarray | None:
+    """OIDN at quality high with albedo and normal, if there; None without pyoidn."""
     try:
         import pyoidn
     except ImportError:
         return None
-    layers = {k: np.ascontiguousarray(repair(v, signed=k == "normal")[0]) for k, v in file.load().layers.items()}
-    guides = {k: layers[k] for k in ("albedo", "normal") if k in layers}
+    layers = file.read(file.data_window)
+    layers = {k: np.ascontiguousarray(repair(v, signed=k == "normal")[0]) for k, v in layers.items()}
+    # OIDN takes no normal without an albedo.
+    guides = {k: layers[k] for k in ("albedo", "normal") if k in layers and "albedo" in layers}
     return np.asarray(pyoidn.denoise(layers["rgb"], hdr=True, quality="high", **guides))
 
 

@@ -31,9 +31,11 @@ if TYPE_CHECKING:
     from oiio_msspl.fusion import Fused, fuse
     from oiio_msspl.render import Render, Window
     from oiio_msspl.session import Session, find_model, shipped_models
+    from oiio_msspl.shot import FrameResult, ShotReport, fuse_shot
 
 _HOME = {
     "Contract": "contract",
+    "FrameResult": "shot",
     "Fused": "fusion",
     "InputError": "errors",
     "Inputs": "files",
@@ -42,11 +44,13 @@ _HOME = {
     "Report": "files",
     "Resolution": "aovs",
     "Session": "session",
+    "ShotReport": "shot",
     "Window": "render",
     "WriteOptions": "assemble",
     "find_model": "session",
     "fuse": "fusion",
     "fuse_files": "files",
+    "fuse_shot": "shot",
     "open_exr": "exr",
     "resolve": "aovs",
     "shipped_models": "session",
@@ -54,6 +58,7 @@ _HOME = {
 
 __all__ = [
     "Contract",
+    "FrameResult",
     "Fused",
     "InputError",
     "Inputs",
@@ -62,12 +67,14 @@ __all__ = [
     "Report",
     "Resolution",
     "Session",
+    "ShotReport",
     "Window",
     "WriteOptions",
     "__version__",
     "find_model",
     "fuse",
     "fuse_files",
+    "fuse_shot",
     "open_exr",
     "resolve",
     "shipped_models",

@@ -22,7 +22,7 @@ import numpy as np
 
 from oiio_msspl import schema
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr import Channel, ExrFile, open_exr
+from oiio_msspl.exr import BAND, Channel, ExrFile, open_exr
 from oiio_msspl.render import Array, Render, Window
 from oiio_msspl.transforms import luminance
 
@@ -163,9 +163,17 @@ class Resolution:
         return result
 
     def load(self) -> Render:
-        """The whole render in memory."""
+        """The whole render in memory; read in bands, as decoded channels stand beside the features made of them."""
+        whole = self.data_window
+        layers: dict[str, Array] = {}
+        for y0 in range(whole.y0, whole.y1, 4 * BAND):
+            band = Window(whole.x0, y0, whole.x1, min(y0 + 4 * BAND, whole.y1))
+            for name, rows in self.read(band).items():
+                if name not in layers:
+                    layers[name] = np.empty((whole.height, whole.width, rows.shape[-1]), dtype=np.float32)
+                layers[name][band.slices(whole)] = rows
         return Render(
-            self.read(self.data_window),
+            layers,
             self.data_window,
             self.display_window,
             self.pixel_aspect,

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import Any
 
@@ -48,6 +49,8 @@ class WriteOptions:
     ``zip`` where it is lossy: they must not lose bits a second time."""
     pixel_type: str | None = None
     """``half`` or ``float`` for the fused beauty; None: as the HRLS's."""
+    layers: tuple[str, ...] = ()
+    """Patterns of the layers that are passed on beside the fused beauty, ``none`` for none; empty: all."""
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:
@@ -91,6 +94,7 @@ def write(
         MssplError: the file can't be written; what stood at ``path`` is untouched.
     """
     fused = _Fused(rgb, alpha, _DTYPES[options.pixel_type or _widest_type(fused_channels(hr))])
+    dropped = dropped_channels(hr, options)
     warnings = [
         f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
         for part in hr.file.parts
@@ -98,9 +102,9 @@ def write(
     ]
     with replacing(path, overwrite=overwrite) as temporary:
         if options.layout == "multilayer":
-            _write_single_part(temporary, hr, fused, provenance, options)
+            _write_single_part(temporary, hr, fused, dropped, provenance, options)
         else:
-            _write_parts(temporary, hr, fused, provenance, options)
+            _write_parts(temporary, hr, fused, dropped, provenance, options)
     return warnings
 
 
@@ -131,10 +135,37 @@ def fused_channels(hr: Resolution) -> list[Channel]:
     return [*hr.features[schema.RGB].terms[0], *([hr.alpha] if hr.alpha else [])]
 
 
+def dropped_channels(hr: Resolution, options: WriteOptions) -> set[Channel]:
+    """The channels of the HRLS that ``options.layers`` leaves out; a pattern matches a layer's or a channel's name.
+
+    Raises:
+        InputError: a pattern matches nothing.
+    """
+    if not options.layers:
+        return set()
+    others = {c: layer.name or c.name for layer in layers_of(hr.file) for c in layer.channels.values()}
+    channels = {c for part in hr.file.parts for c in part.channels} - set(fused_channels(hr))
+    kept: set[Channel] = set()
+    for pattern in options.layers:
+        found = {c for c in channels if fnmatchcase(others.get(c, c.name), pattern) or fnmatchcase(c.name, pattern)}
+        if not found and pattern != "none":
+            names = ", ".join(sorted({others.get(c, c.name) for c in channels})) or "no other layer"
+            raise InputError(f"--layers {pattern!r}: {hr.file.path} has no such layer; it has: {names}")
+        kept |= found
+    return channels - kept
+
+
 # ---------------------------------------------------------------------------------------------- several parts
 
 
-def _write_parts(path: Path, hr: Resolution, fused: _Fused, provenance: dict[str, str], options: WriteOptions) -> None:
+def _write_parts(
+    path: Path,
+    hr: Resolution,
+    fused: _Fused,
+    dropped: set[Channel],
+    provenance: dict[str, str],
+    options: WriteOptions,
+) -> None:
     file = hr.file
     beauty = fused_channels(hr)
     home = file.parts[beauty[0].part]
@@ -144,7 +175,7 @@ def _write_parts(path: Path, hr: Resolution, fused: _Fused, provenance: dict[str
     first.attribute("compression", options.compression or _kept_compression(home))
     for key, value in provenance.items():
         first.attribute(key, value)
-    parts = list(_passed_on(file, set(beauty), nuke, first))
+    parts = list(_passed_on(file, set(beauty), dropped, nuke, first))
 
     specs = [first, *(p.spec for p in parts)]
     writer = oiio.ImageOutput.create(str(path))
@@ -165,17 +196,20 @@ def _write_parts(path: Path, hr: Resolution, fused: _Fused, provenance: dict[str
         raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
 
 
-def _passed_on(file: ExrFile, replaced: set[Channel], nuke: bool, first: Any) -> Iterator[_OutPart]:
-    """Everything of the HRLS but the channels that were fused."""
+def _passed_on(
+    file: ExrFile, replaced: set[Channel], dropped: set[Channel], nuke: bool, first: Any
+) -> Iterator[_OutPart]:
+    """Everything of the HRLS but the channels that were fused and those the user leaves out."""
     taken = {str(first.getattribute("oiio:subimagename"))}
     layer_of = {c: layer for layer in layers_of(file) for c in layer.channels.values()}
     for part in file.parts:
         if part.deep:
             continue
         touched = any(c in replaced for c in part.channels)
+        whole = not touched and not any(c in dropped for c in part.channels)
         uniform = len({c.type for c in part.channels}) == 1
         # OpenEXR can't mix scan lines, which the beauty is written as, and tiles in a file of several parts.
-        if not touched and not nuke and (uniform or part.tile == (0, 0)):
+        if whole and not nuke and (uniform or part.tile == (0, 0)):
             spec = oiio.ImageSpec(part.spec)
             _prepare(spec, _unique(part.name or f"part{part.index}", taken), _kept_compression(part))
             if uniform:
@@ -184,7 +218,7 @@ def _passed_on(file: ExrFile, replaced: set[Channel], nuke: bool, first: Any) ->
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
-            if channel not in replaced:
+            if channel not in replaced and channel not in dropped:
                 layer = layer_of.get(channel)
                 # A channel that no layer has doubles another one (foo.r beside foo.R): it stays on its own.
                 key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
@@ -281,7 +315,12 @@ def _unique(name: str, taken: set[str]) -> str:
 
 
 def _write_single_part(
-    path: Path, hr: Resolution, fused: _Fused, provenance: dict[str, str], options: WriteOptions
+    path: Path,
+    hr: Resolution,
+    fused: _Fused,
+    dropped: set[Channel],
+    provenance: dict[str, str],
+    options: WriteOptions,
 ) -> None:
     """One part of mixed pixel types, through OpenEXR's own module: OpenImageIO converts them to a common type.
 
@@ -296,7 +335,7 @@ def _write_single_part(
     channels: dict[str, Any] = {c.name: np.ascontiguousarray(values[..., i]) for i, c in enumerate(beauty)}
     del values
     for part in file.parts:
-        if part.deep:
+        if part.deep or dropped.issuperset(part.channels):
             continue
         if part.data_window != home.data_window:
             raise InputError(
@@ -304,7 +343,7 @@ def _write_single_part(
                 f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
             )
         for channel in part.channels:
-            if channel in beauty:
+            if channel in beauty or channel in dropped:
                 continue
             # A part's name carries the layer where the channel's does not.
             name = channel.name

@@ -196,4 +196,7 @@ def open_exr(path: str | Path) -> ExrFile:
 
 def _last_error() -> str:
     """OpenImageIO's last error on one line: its messages repeat the path and break lines."""
-    return " ".join(str(oiio.geterror()).split()) or "no reason given"
+    try:
+        return " ".join(str(oiio.geterror()).split()) or "no reason given"
+    except UnicodeDecodeError:  # the message quotes the file, and OpenImageIO's binding takes it for UTF-8
+        return "its header is damaged"

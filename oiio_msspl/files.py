@@ -15,7 +15,7 @@ from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.assemble import WriteOptions
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr import open_exr
-from oiio_msspl.fusion import MAX_MEMORY, fuse
+from oiio_msspl.fusion import MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_target
 from oiio_msspl.pairing import pair
 from oiio_msspl.session import Session, find_model
@@ -138,6 +138,7 @@ def fuse_files(
         if view_transform is not None:
             preview.check_view(view_transform)
     lr, hr = resolve_pair(lr_path, hr_path, inputs)
+    assemble.dropped_channels(hr, write)  # a layer that is not there shows before the work, not after
     scale = pair(lr, hr).scale
     session = Session(find_model(scale, model), device, threads)
     opened = time.perf_counter()
@@ -145,10 +146,26 @@ def fuse_files(
     fused = fuse(lr, hr, session, max_memory=max_memory, progress=progress)
     computed = time.perf_counter()
 
-    report = Report(
+    report = report_on(lr, hr, session, fused, output, preview_path)
+    write_frame(report, fused, write, overwrite=overwrite)
+    write_preview(report, fused, view_transform, overwrite=overwrite)
+    report.seconds = {
+        "read": opened - start,
+        "fuse": computed - opened,
+        "network": fused.seconds,
+        "write": time.perf_counter() - computed,
+    }
+    return report
+
+
+def report_on(
+    lr: Resolution, hr: Resolution, session: Session, fused: Fused, output: Path, preview_path: Path | None
+) -> Report:
+    """The report of a frame that is fused and not yet written."""
+    return Report(
         lr=lr,
         hr=hr,
-        scale=scale,
+        scale=fused.pairing.scale,
         model=session.contract.name,
         provider=session.provider,
         output=output,
@@ -158,23 +175,25 @@ def fuse_files(
         tiles=fused.tiles,
         seconds={},
     )
+
+
+def write_frame(report: Report, fused: Fused, options: WriteOptions, *, overwrite: bool) -> None:
+    """Write the EXR that the report names, and add what there is to say about it."""
     report.warnings += assemble.write(
-        output, hr, fused.rgb, fused.alpha, _provenance(report), write, overwrite=overwrite
+        report.output, report.hr, fused.rgb, fused.alpha, _provenance(report), options, overwrite=overwrite
     )
-    if preview_path is not None:
-        try:
-            windows = (hr.data_window, hr.display_window)
-            preview.write(preview_path, fused.rgb, *windows, view_transform, overwrite=overwrite)
-        except MssplError as error:  # the frame is there: that is what was asked for
-            report.warnings.append(f"no preview: {error}")
-            report.preview = None
-    report.seconds = {
-        "read": opened - start,
-        "fuse": computed - opened,
-        "network": fused.seconds,
-        "write": time.perf_counter() - computed,
-    }
-    return report
+
+
+def write_preview(report: Report, fused: Fused, view: str | None, *, overwrite: bool) -> None:
+    """Write the PNG that the report names, if any. A frame without its preview is still a frame: that is a warning."""
+    if report.preview is None:
+        return
+    windows = (report.hr.data_window, report.hr.display_window)
+    try:
+        preview.write(report.preview, fused.rgb, *windows, view, overwrite=overwrite)
+    except MssplError as error:
+        report.warnings.append(f"no preview: {error}")
+        report.preview = None
 
 
 def _spp_warnings(lr: Resolution, hr: Resolution, session: Session) -> list[str]:

@@ -4,8 +4,9 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager
+import re
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
@@ -18,16 +19,21 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
         InputError: it exists and may not be overwritten, or its folder is missing or read-only.
     """
     path = Path(path)
-    folder = path.parent
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists; pass --overwrite to replace it")
+    check_folder(path)
+    return path
+
+
+def check_folder(path: Path) -> None:
+    """Raise InputError if the folder of ``path`` is missing or read-only."""
+    folder = path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: the folder {folder} does not exist; create it first")
     if not os.access(folder, os.W_OK):
         raise InputError(f"{path}: the folder {folder} is not writable")
-    return path
 
 
 @contextmanager
@@ -41,7 +47,7 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         MssplError: the file system refused (disk full, permissions); ``path`` is as it was.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")
+    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")  # known to remove_leftovers
     try:
         yield temporary
         # On the disk before it gets its name: a crash must not leave a whole name on half a file.
@@ -59,6 +65,20 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         raise MssplError(f"{path}: can't be written ({error.strerror or error}); the target is as it was") from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def remove_leftovers(targets: Iterable[Path]) -> None:
+    """Delete the temporary files that killed runs left beside these files.
+
+    Should another process be writing one of them at this moment, it fails and says so.
+    """
+    wanted = {Path(os.path.realpath(target)) if target.is_symlink() else target for target in targets}
+    for folder in {target.parent for target in wanted}:
+        for name in os.listdir(folder) if folder.is_dir() else ():
+            match = re.fullmatch(r"\.(.+)\.\d+\.tmp(\.\w+)", name)
+            if match and folder / (match[1] + match[2]) in wanted:
+                with suppress(OSError):
+                    (folder / name).unlink()
 
 
 def _name_if_free(temporary: Path, target: Path) -> None:

@@ -49,7 +49,8 @@ def pair(lr: Source, hr: Source) -> Pairing:
     """Match an LRHS and an HRLS.
 
     An HRLS of odd size (1921 x 1081) may come with an LRHS rounded up or down (961 x 541 or 960 x 540). Renderers fit
-    the whole frame into either, so its pixels are not exactly s HRLS pixels wide: ``stretch`` says by how much.
+    the whole frame into either, so its pixels are not exactly s HRLS pixels wide: ``stretch`` says by how much. The
+    pixel aspects are the same, or differ by just that, so that both frames have one shape.
 
     Raises:
         InputError: swapped inputs, another pixel aspect, framing or ratio; the message says what was seen.
@@ -58,7 +59,7 @@ def pair(lr: Source, hr: Source) -> Pairing:
     scale = _scale(low, high)
     if scale is None:
         raise _wrong_ratio(lr, hr)
-    if abs(lr.pixel_aspect - hr.pixel_aspect) > 1e-3:
+    if abs(lr.pixel_aspect - hr.pixel_aspect) > 1e-3 and abs(_shape(lr) / _shape(hr) - 1) > 1e-3:
         raise InputError(
             f"{lr.name} has pixel aspect {lr.pixel_aspect:g}, {hr.name} has {hr.pixel_aspect:g}; "
             "render both with the same"
@@ -74,6 +75,11 @@ def pair(lr: Source, hr: Source) -> Pairing:
         )
     stretch = (low.width * scale / high.width, low.height * scale / high.height)
     return Pairing(scale, grid, lr_data, hr_data, stretch)
+
+
+def _shape(render: Source) -> float:
+    """Width by height of the frame as it is seen."""
+    return render.display_window.width * render.pixel_aspect / render.display_window.height
 
 
 def _scale(low: Window, high: Window) -> int | None:

@@ -98,6 +98,27 @@ SOURCES = {"everything": (everything(), {}), "karma": (karma(), {}), "doubles": 
 SOURCES["stereo"] = (stereo(), {"multiView": ["right", "left"]})
 
 
+@pytest.mark.parametrize("source", ["everything", "karma"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_only_the_chosen_layers_are_passed_on(tmp_path, layout, source):
+    """Patterns name layers, whether the file has them in one part or in several; what they keep is whole."""
+    parts, attributes = SOURCES[source]
+    options = WriteOptions(layout=layout, layers=("crypto*",))
+    _, _, after = written(tmp_path, parts, options, **attributes)
+    before, result = flat(read_bits(tmp_path / "hr.exr")), flat(after)
+    chosen = {key: plane for key, plane in before.items() if key[0] == "crypto00"}
+    assert len(result) == 4 + len(chosen)
+    assert all(same_bits(result[key], plane) for key, plane in chosen.items())
+
+
+def test_layers_none_leaves_the_beauty_alone_and_a_misspelt_layer_is_named(tmp_path):
+    _, _, after = written(tmp_path, everything(), WriteOptions(layers=("none",)))
+    assert [list(channels) for _, channels in after] == [["A", "B", "G", "R"]]
+    known = "Z, albedo, crypto00, id, mask"
+    with pytest.raises(InputError, match=rf"--layers 'cripto': .* has no such layer; it has: {known}$"):
+        written(tmp_path, everything(), WriteOptions(layers=("cripto",)))
+
+
 @pytest.mark.parametrize("source", SOURCES)
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_layers_are_passed_on_bit_for_bit(tmp_path, layout, source):

@@ -249,7 +249,7 @@ def test_models_lists_what_ships():
     assert "cpu" in data["devices"]
 
 
-@pytest.mark.parametrize("program", ["msspl_fuse", "msspl"])
+@pytest.mark.parametrize("program", ["msspl_fuse", "msspl_render", "msspl"])
 def test_help_imports_nothing_heavy_and_ends_with_examples(program):
     """--help stays quick because NumPy, OpenImageIO and onnxruntime are not imported for it."""
     code = (

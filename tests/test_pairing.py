@@ -23,6 +23,14 @@ def test_the_scale_follows_from_the_display_windows(scale, size, rounding):
     assert pairing.grid.width * scale >= size[0] > (pairing.grid.width - 1) * scale
 
 
+def test_pixels_may_be_out_of_square_by_what_was_rounded():
+    """2048 x 858 at x4 is 512 x 215: an LRHS whose pixels are 1.0023 wide shows the frame from edge to edge."""
+    aspect = 2048 * 215 / (858 * 512)
+    assert pair(render("lr", 512, 215, aspect=aspect), render("hr", 2048, 858)).scale == 4
+    with pytest.raises(InputError, match="pixel aspect"):
+        pair(render("lr", 512, 215, aspect=1.01), render("hr", 2048, 858))
+
+
 def test_crop_regions_and_overscan_are_mapped_to_low_resolution_pixels():
     """An HRLS region that starts between LRHS pixels needs the whole pixels around it."""
     high = render("hr", 64, 64, Window(-3, 10, 70, 33))

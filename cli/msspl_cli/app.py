@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The two programs. Heavy modules are imported inside the commands, so that ``--help`` answers at once."""
+"""The programs. Heavy modules are imported inside the commands, so that ``--help`` answers at once."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from msspl_cli.commands import compare, fuse, inspect, models
+from msspl_cli.commands import compare, fuse, inspect, models, nuke_install, render, submit
 from msspl_cli.errors import run
 from oiio_msspl import __version__
 
@@ -20,6 +20,9 @@ _SETTINGS: dict[str, Any] = {
 
 fuse_app = typer.Typer(**_SETTINGS)
 fuse_app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
+
+render_app = typer.Typer(**_SETTINGS)
+render_app.command(epilog=render.EXAMPLES)(render.render)
 
 app = typer.Typer(no_args_is_help=True, **_SETTINGS)
 
@@ -36,10 +39,16 @@ app.command(epilog=inspect.EXAMPLES)(inspect.inspect)
 app.command(epilog=models.EXAMPLES)(models.models)
 app.command(epilog=compare.EXAMPLES)(compare.compare)
 app.command(epilog=fuse.EXAMPLES)(fuse.fuse)
+app.command(epilog=submit.EXAMPLES, options_metavar=submit.USAGE, context_settings=submit.SETTINGS)(submit.submit)
+app.command("nuke-install", epilog=nuke_install.EXAMPLES)(nuke_install.nuke_install)
 
 
 def msspl_fuse() -> None:
     run(fuse_app)
+
+
+def msspl_render() -> None:
+    run(render_app)
 
 
 def msspl() -> None:

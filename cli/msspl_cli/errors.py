@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from oiio_msspl.errors import MssplError
+from oiio_msspl.errors import explain
 
 
 def run(app: typer.Typer) -> None:
@@ -20,11 +20,6 @@ def run(app: typer.Typer) -> None:
     except Exception as error:
         if "--debug" in sys.argv:
             raise
-        if isinstance(error, MssplError):
-            message, code = str(error), error.exit_code
-        elif isinstance(error, MemoryError):
-            message, code = "out of memory; try a smaller --max-memory", 1
-        else:
-            message, code = f"unexpected {type(error).__name__}: {error} (--debug shows where)", 1
+        message, code = explain(error)
         print(f"error: {message}", file=sys.stderr)
         sys.exit(code)

@@ -13,6 +13,7 @@ import typer
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
+    from oiio_msspl.assemble import WriteOptions
     from oiio_msspl.files import Inputs
 
 Map = Annotated[
@@ -55,6 +56,12 @@ def make_inputs(
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
     return Inputs(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp)
+
+
+def make_write_options(layout: str, compression: str | None, half: bool | None, layers: list[str]) -> WriteOptions:
+    from oiio_msspl.assemble import WriteOptions
+
+    return WriteOptions(layout, compression, None if half is None else "half" if half else "float", tuple(layers))
 
 
 def parse_bytes(text: str) -> int:

@@ -3,11 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from oiio_msspl.aovs import Resolution
+from collections.abc import Mapping, Sequence
 
 
 def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> None:
@@ -17,13 +13,8 @@ def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> None:
         print((indent + "  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True))).rstrip())
 
 
-def aov_table(resolution: Resolution) -> None:
-    """What each feature is read from."""
-    table(
-        [
-            (r["feature"], r["status"], r["source"] + (f" ({r['note']})" if r["note"] else ""))
-            for r in resolution.table()
-        ]
-    )
-    for note in resolution.notes:
+def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
+    """What each feature is read from: ``table()`` and ``notes`` of a :class:`~oiio_msspl.aovs.Resolution`."""
+    table([(r["feature"], r["status"], r["source"] + (f" ({r['note']})" if r["note"] else "")) for r in rows])
+    for note in notes:
         print(f"  note: {note}")

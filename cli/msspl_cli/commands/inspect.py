@@ -42,7 +42,7 @@ def inspect(
             for line in inspection.facts:
                 print(f"  {line}")
             if inspection.resolution is not None:
-                show.aov_table(inspection.resolution)
+                show.aov_table(inspection.resolution.table(), inspection.resolution.notes)
                 if inspection.passed_through:
                     print(f"  passed through: {', '.join(inspection.passed_through)}")
             for problem in inspection.problems:

@@ -1,0 +1,90 @@
+# SPDX-License-Identifier: Apache-2.0
+from __future__ import annotations
+
+import shutil
+import sysconfig
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+import msspl_cli
+from msspl_cli import options
+from oiio_msspl.errors import InputError
+from oiio_msspl.output import replacing
+
+EXAMPLES = """[bold]Examples[/bold]
+
+  msspl nuke-install
+
+  msspl nuke-install --dir /studio/nuke
+
+  msspl nuke-install --uninstall
+"""
+
+#: Ends the line that is ours in a file that is the user's.
+MARKER = "# added by msspl nuke-install"
+
+
+def nuke_install(
+    folder: Annotated[Path, typer.Option("--dir", metavar="DIR", help="Nuke's folder of the user or the site.")] = Path(
+        "~/.nuke"
+    ),
+    uninstall: Annotated[bool, typer.Option("--uninstall", help="Take the line out again.")] = False,
+    debug: options.Debug = False,
+) -> None:
+    """Put the gizmo MSSPLFuse into Nuke: one line in DIR/init.py, which names its folder and msspl-fuse."""
+    target = folder.expanduser() / "init.py"
+    line = None if uninstall else install_line(gizmo_folder(), find_msspl_fuse())
+    changed = set_line(target, line)
+    if uninstall:
+        print(f"{target}: {'the line is taken out' if changed else 'there was no line of ours'}")
+    else:
+        print(f"{target}: {'added' if changed else 'was already there'}: {line}")
+        print("Start Nuke: the node is in the toolbar under MSSPL.")
+
+
+def gizmo_folder() -> Path:
+    """The folder with the gizmo: in the installed package, or in the source tree of an editable installation."""
+    package = Path(msspl_cli.__file__).resolve().parent
+    installed = package / "nuke_gizmo"
+    return installed if installed.is_dir() else package.parents[1] / "nuke_gizmo"
+
+
+def find_msspl_fuse() -> str | None:
+    """The program beside this Python: Nuke is seldom started where a virtual environment is active."""
+    return shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or shutil.which("msspl-fuse")
+
+
+def install_line(gizmo: Path, program: str | None) -> str:
+    """What goes into init.py. A program that the environment or a knob names still wins."""
+    environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
+    return f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
+
+
+def set_line(path: Path, line: str | None) -> bool:
+    """Make ``line`` the only line of ours in a file, at its end; None takes ours out. All else stays byte for byte.
+
+    Returns:
+        Whether the file changed.
+
+    Raises:
+        InputError: the folder is missing, or the file can't be read.
+    """
+    if not path.parent.parent.is_dir():
+        raise InputError(f"{path.parent}: there is no folder {path.parent.parent}; name Nuke's folder with --dir")
+    try:
+        before = path.read_bytes() if path.exists() else b""
+    except OSError as error:
+        raise InputError(f"{path}: can't be read ({error.strerror}); nothing was changed") from error
+    newline = b"\r\n" if b"\r\n" in before else b"\n"
+    kept = b"".join(each for each in before.splitlines(keepends=True) if not each.rstrip().endswith(MARKER.encode()))
+    after = kept
+    if line is not None:
+        after += (newline if kept and not kept.endswith(b"\n") else b"") + line.encode() + newline
+    if after == before:
+        return False
+    path.parent.mkdir(exist_ok=True)
+    with replacing(path, overwrite=True) as temporary:
+        temporary.write_bytes(after)
+    return True

@@ -50,14 +50,19 @@ def check_error_map(path: Path, *, overwrite: bool) -> None:
 
 
 def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool) -> None:
-    """log10 RelMSE (0.5, 0.01) a pixel, from 1e-5 (black) to 1 (white) on OpenImageIO's "inferno" colours."""
+    """See :func:`error_map`."""
     truth = _beauty(resolve(open_exr(reference)))
-    error = metrics.relmse_map(_fitted(resolve(open_exr(image)), truth, reference), truth).mean(axis=-1)
+    write_png(path, error_map(_fitted(resolve(open_exr(image)), truth, reference), truth), overwrite=overwrite)
+
+
+def error_map(image: Array, truth: Array) -> Array:
+    """log10 RelMSE (0.5, 0.01) a pixel, from 1e-5 (black) to 1 (white) on OpenImageIO's "inferno" colours."""
+    error = metrics.relmse_map(image, truth).mean(axis=-1)
     grey = ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)
     mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(grey[..., None])), 0, "inferno")
     if mapped.has_error:
-        raise MssplError(f"{path}: {mapped.geterror()}")
-    write_png(path, np.asarray(mapped.get_pixels(oiio.FLOAT))[..., :3], overwrite=overwrite)
+        raise MssplError(f"the error map's colours: {mapped.geterror()}")
+    return np.asarray(mapped.get_pixels(oiio.FLOAT), dtype=np.float32)[..., :3]
 
 
 def upsample_bicubic(image: Array, width: int, height: int) -> Array:

@@ -45,7 +45,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
     """
     models = shipped_models()
     if name is None:
-        name = f"paper-x{scale}"
+        name = f"pyramid-x{scale}"
     if name in models:
         return models[name]
     if Path(name).is_file():

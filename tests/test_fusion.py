@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+import re
+
 import numpy as np
 import pytest
 
@@ -199,7 +201,7 @@ def test_two_black_frames_give_a_black_frame(scale):
     assert "black" in fused.warnings[0]
 
 
-@pytest.mark.parametrize(("factor", "noticed"), [(1.0, False), (1.5, False), (2.5, True), (0.4, True)])
+@pytest.mark.parametrize(("factor", "noticed"), [(1.0, False), (1.2, False), (1.5, True), (0.4, True)])
 def test_another_exposure_is_noticed(session, scale, factor, noticed):
     low, high, _ = pair_of(scale, 256, 256)
     other = Render.from_arrays("hr", rgb=high.layers["rgb"] * np.float32(factor))
@@ -220,12 +222,35 @@ def test_another_frame_is_noticed(session, scale):
     assert fuse(low, high, session).warnings == []
 
 
+@pytest.mark.parametrize("shift", [(0, 0), (1, 0), (0, -1), (2, 3)])
+def test_a_shift_of_one_lrhs_pixel_is_noticed(session, scale, shift):
+    """In the direction that is said, under the noise of 1 spp; and none is seen where there is none."""
+    x, y = (n * scale for n in shift)
+    clean = texture(80 * scale)
+    low = Render.from_arrays("lr", rgb=noisy(downsample(clean, scale), 64))
+    high = Render.from_arrays("hr", rgb=noisy(np.roll(clean, (y, x), (0, 1)), 1, seed=1))
+    warnings = fuse(low, high, session).warnings
+    assert len(warnings) == (shift != (0, 0))
+    if warnings:
+        found = re.search(r"([\d.]+) pixels (left|right) of and ([\d.]+) pixels (above|below)", warnings[0])
+        seen = (float(found[1]) * (-1) ** (found[2] == "left"), float(found[3]) * (-1) ** (found[4] == "above"))
+        assert seen == pytest.approx((x, y), abs=0.2 * scale)
+
+
+def texture(size):
+    """A picture with structure of all sizes, (size, size, 3), the same at any size."""
+    y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
+    waves = sum(np.sin(2 * np.pi * (k * x + (4 - k) * y) + k * k) for k in range(-3, 6))
+    return np.repeat(np.exp(0.3 * waves)[..., None], 3, -1).astype(np.float32)
+
+
 def test_the_shipped_overlap_hides_the_seams(scale):
     """Tiles of the network that ships agree with the whole frame to half-float rounding."""
-    low, high, _ = pair_of(scale, 120 * scale, 120 * scale)
     shipped = Session(find_model(scale))
+    frame = 64 + 4 * shipped.contract.overlap
+    low, high, _ = pair_of(scale, frame * scale, frame * scale)
     whole = fuse(low, high, shipped)
-    side = 62 + 2 * shipped.contract.overlap
+    side = frame // 2 + 2 * shipped.contract.overlap
     tiled = fuse(low, high, shipped, max_memory=_memory_for_tiles(low, high, shipped, (side * scale) ** 2))
     assert tiled.tiles == 4
     np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=2**-10, atol=1e-4)

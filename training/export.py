@@ -169,14 +169,14 @@ def measure_overlap(network: Network, scale: int, views: list[data.View], tile: 
         pair = data.Evaluation.centre(view, scale, view.ref.shape[0])
         lrhs = transforms.compress(pair.lrhs, pair.exposure)
         # Mirrored on all sides, even a small view has room for the largest overlap
-        margin = 48
+        margin = 64
         lrhs, hrls = (
             torch.from_numpy(np.pad(image, ((m, m), (m, m), (0, 0)), "symmetric")).permute(2, 0, 1)[None]
             for image, m in ((lrhs, margin), (pair.hrls, margin * scale))
         )
         whole = network(lrhs, hrls)
         start = (lrhs.shape[-1] - tile) // 2 // alignment * alignment
-        for overlap in (n for n in (4, 8, 12, 16, 24, 32, 48) if n % alignment == 0):
+        for overlap in (n for n in (4, 8, 12, 16, 24, 32, 48, 64) if n % alignment == 0):
             part = network(_square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, scale))
             middle = _square(part, overlap, tile, 0, scale)
             difference = middle - _square(whole, start, tile, 0, scale)

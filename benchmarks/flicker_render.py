@@ -1,0 +1,179 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Short sequences of real scenes for `benchmarks.flicker`, rendered with Mitsuba 3.
+
+A folder a scene and camera. ``static``: frames that differ by their noise alone, and one reference. ``moving``: a
+camera that pans and trucks, so that what is nearer moves faster. A frame is::
+
+    hr.####.exr     1 spp                    } albedo, normal, depth, motion
+    full.####.exr   2 spp                    }
+    lr.####.exr     16 spp at a quarter of the resolution
+    ref_a.####.exr, ref_b.####.exr           two halves of the reference, of independent noise
+
+``motion.X``, ``motion.Y`` say where a pixel's surface was in the frame before, in HRLS pixels from here, y downwards:
+the exact reprojection of the positions that were hit. Every file has a seed of its own that follows from its name;
+files that exist are kept.
+"""
+
+from __future__ import annotations
+
+import ctypes.util
+import os
+import time
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.output import replacing
+from oiio_msspl.render import Array
+
+SCALE = 4
+FRAMES = 10
+WIDTH, HEIGHT = 256, 192
+#: Long side of the frame that the sequences are a crop of.
+LONG_SIDE = 1024
+#: Mean motion in HRLS pixels a frame: of everything by the pan, of the median depth by the truck.
+PAN, TRUCK = 0.9, 0.8
+MAX_DEPTH = 8
+#: spp of each half of the reference.
+REFERENCE_HALF = 128
+#: Samples of one launch, so that memory stays small.
+LAUNCH = 2_000_000
+
+CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.T", "motion.X", "motion.Y")
+AOVS = "albedo:albedo,nn:sh_normal,dd:depth,pp:position"
+#: Scene -> centre of the crop, as shares of the frame.
+SCENES = {"staircase2": (0.53, 0.60), "lamp": (0.47, 0.40)}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """A pinhole at ``to_world`` (4 x 4); ``focal`` in pixels, ``centre`` where its axis meets the crop."""
+
+    to_world: np.ndarray
+    focal: float
+    centre: tuple[float, float]
+
+    def project(self, positions: np.ndarray) -> np.ndarray:
+        """World positions (..., 3) to pixels of the crop (..., 2), y downwards. Mitsuba's camera has x to the left."""
+        inverse = np.linalg.inv(self.to_world)
+        seen = positions @ inverse[:3, :3].T + inverse[:3, 3]
+        return np.asarray(self.centre) - self.focal * seen[..., :2] / seen[..., 2:]
+
+
+def render_sequences(folder: Path, scenes: Path, names: list[str]) -> None:
+    """Render what is missing of both sequences of each scene.
+
+    Raises:
+        InputError: no such scene, or no Mitsuba.
+    """
+    try:
+        if "DRJIT_LIBLLVM_PATH" not in os.environ and (llvm := ctypes.util.find_library("LLVM-19")):
+            os.environ["DRJIT_LIBLLVM_PATH"] = llvm
+        import drjit as dr
+        import mitsuba as mi
+    except ImportError as error:
+        raise InputError("rendering needs Mitsuba 3: pip install '.[train]'") from error
+    mi.set_variant("llvm_ad_rgb")
+    dr.set_thread_count(1)
+    for name in names:
+        file = scenes / name / "scene.xml"
+        if name not in SCENES or not file.is_file():
+            raise InputError(f"{file}: no such scene; --scene takes {', '.join(SCENES)}")
+        start = time.perf_counter()
+        _Sequences(mi, file, folder / name).render()
+        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+
+
+class _Sequences:
+    """Both sequences of a scene."""
+
+    def __init__(self, mi: Any, file: Path, folder: Path) -> None:
+        self.mi, self.folder = mi, folder
+        self.scene = mi.load_file(str(file))
+        self.integrator = mi.load_dict(
+            {"type": "aov", "aovs": AOVS, "img": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 4}}
+        )
+        self.sensor = mi.traverse(self.scene.sensors()[0])
+        width, height = self.sensor["film.size"]
+        self.full = [round(v * LONG_SIDE / max(width, height) / SCALE) * SCALE for v in (width, height)]
+        self.offset = [
+            min(max(int((share * size - crop / 2) // SCALE * SCALE), 0), size - crop)
+            for share, size, crop in zip(SCENES[file.parent.name], self.full, (WIDTH, HEIGHT), strict=True)
+        ]
+        self.focal = self.full[0] / 2 / np.tan(np.radians(float(self.sensor["x_fov"][0])) / 2)
+        self.start = np.array(self.sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        self.median_depth = 0.0
+
+    def render(self) -> None:
+        still = self.camera(0.0)
+        self.median_depth = float(np.median(self.shoot(still, 1, 1, seed=1)[..., 9]))
+        middle = (FRAMES - 1) / 2
+        for name, step in (("static", 0.0), ("moving", 1.0)):
+            for frame in range(FRAMES):
+                at = (frame - middle) * step
+                camera, before = self.camera(at), self.camera(at - step * (frame > 0))
+                for kind, spp in (("hr", 1), ("full", 2), ("lr", 16)):
+                    self.write(name, kind, frame, camera, before, spp)
+                if frame == 0 or step:  # a static camera needs one reference for all frames
+                    for kind in ("ref_a", "ref_b"):
+                        self.write(name, kind, frame, camera, before, REFERENCE_HALF)
+
+    def camera(self, at: float) -> Camera:
+        """``at``: frames from the middle of the path."""
+        angle = at * PAN / self.focal
+        c, s = np.cos(angle), np.sin(angle)
+        move = np.array(
+            [[c, 0, s, at * TRUCK * self.median_depth / self.focal], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]]
+        )
+        centre = tuple(size / 2 - offset for size, offset in zip(self.full, self.offset, strict=True))
+        return Camera(self.start @ move, self.focal, centre)
+
+    def write(self, sequence: str, kind: str, frame: int, camera: Camera, before: Camera, spp: int) -> None:
+        path = self.folder / sequence / f"{kind}.{frame + 1:04d}.exr"
+        if path.exists():
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        seed = zlib.crc32(f"{self.folder.name}/{sequence}/{path.name}".encode())
+        image = self.shoot(camera, spp, SCALE if kind == "lr" else 1, seed)
+        positions, image = image[..., 10:13], image[..., :10]
+        if kind in ("hr", "full"):
+            image = np.concatenate([image, before.project(positions) - camera.project(positions)], axis=-1)
+        write_exr(path, image[..., :3] if kind.startswith("ref") else image)
+
+    def shoot(self, camera: Camera, spp: int, scale: int, seed: int) -> np.ndarray:
+        """The crop at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS` to depth, then world positions."""
+        mi, sensor = self.mi, self.sensor
+        sensor["to_world"] = mi.Transform4f(mi.Matrix4f(camera.to_world))
+        sensor["film.size"] = mi.ScalarVector2u(*(v // scale for v in self.full))
+        sensor["film.crop_size"] = mi.ScalarVector2u(WIDTH // scale, HEIGHT // scale)
+        sensor["film.crop_offset"] = mi.ScalarPoint2u(*(v // scale for v in self.offset))
+        sensor.update()
+        launch = max(1, LAUNCH // (WIDTH * HEIGHT // scale**2))
+        total, done = 0.0, 0
+        while done < spp:
+            count = min(launch, spp - done)
+            part_seed = zlib.crc32(f"{seed} {done}".encode())
+            image = np.array(mi.render(self.scene, integrator=self.integrator, spp=count, seed=part_seed), np.float64)
+            total = total + np.where(np.isfinite(image), image, 0) * count
+            done += count
+        return np.asarray(total) / spp
+
+
+def write_exr(path: Path, image: Array) -> None:
+    """Half floats, the first of `CHANNELS`."""
+    height, width, count = image.shape
+    spec = oiio.ImageSpec(width, height, count, "half")
+    spec.channelnames = CHANNELS[:count]
+    spec.attribute("compression", "zip")
+    spec.attribute("Software", "Mitsuba 3")
+    with replacing(path, overwrite=True) as temporary:
+        writer = oiio.ImageOutput.create(str(temporary))
+        ok = writer.open(str(temporary), spec)
+        ok = ok and writer.write_image(np.ascontiguousarray(np.clip(image, -65000, 65000), dtype=np.float32))
+        if not (writer.close() and ok):
+            raise MssplError(f"{path}: can't be written ({writer.geterror()})")

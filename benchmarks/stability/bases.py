@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the suite starts from: pairs with their reference, of analytic scenes or of rendered views."""
+
+from __future__ import annotations
+
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.stability import analytic
+from oiio_msspl import schema, transforms
+from oiio_msspl.render import Array, Render
+from training import data
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """An LRHS, an HRLS and the truth, (H, W, 3)."""
+
+    lr: Render
+    hr: Render
+    reference: Array
+
+    @property
+    def scale(self) -> int:
+        return self.hr.data_window.width // self.lr.data_window.width
+
+
+def seeded(*key: object) -> np.random.Generator:
+    """Independent noise for every key, the same in every run."""
+    return np.random.default_rng(zlib.crc32(repr(key).encode()))
+
+
+class Base:
+    """Something that can be rendered at any scale and spp."""
+
+    name: str
+
+    def __init__(self) -> None:
+        self._made: dict[tuple[int, int, int | None, bool], Pair] = {}
+
+    def pair(self, scale: int, hr_spp: int = 1, lr_spp: int | None = None, *, nearest: bool = False) -> Pair:
+        """The same question gets the same object.
+
+        Args:
+            lr_spp: of the LRHS; by default as many as an LRHS pixel has HRLS pixels.
+            nearest: an LRHS pixel samples one of the HRLS pixels that it spans, instead of all.
+
+        Raises:
+            LookupError: this base has no such pair.
+        """
+        key = (scale, hr_spp, lr_spp, nearest)
+        if key not in self._made:
+            self._made[key] = self.make(scale, hr_spp, lr_spp, nearest=nearest)
+        return self._made[key]
+
+    def make(self, scale: int, hr_spp: int = 1, lr_spp: int | None = None, *, nearest: bool = False) -> Pair:
+        raise NotImplementedError
+
+
+class Analytic(Base):
+    """An analytic scene."""
+
+    def __init__(self, name: str, scene: analytic.Scene) -> None:
+        super().__init__()
+        self.name, self.scene = name, scene
+
+    def make(
+        self,
+        scale: int,
+        hr_spp: int = 1,
+        lr_spp: int | None = None,
+        *,
+        nearest: bool = False,
+        lr_filter: analytic.Footprint | None = None,
+        hr_filter: analytic.Footprint | None = None,
+        lr_scene: analytic.Scene | None = None,
+    ) -> Pair:
+        """As :meth:`pair`; also with other pixel filters, or an LRHS that shows something else."""
+        low = analytic.render(
+            lr_scene or self.scene,
+            lr_spp or scale**2,
+            seeded(self.name, "LRHS", scale),
+            footprint=analytic.point(scale) if nearest else lr_filter,
+            scale=scale,
+        )
+        high = analytic.render(self.scene, hr_spp, seeded(self.name, "HRLS"), footprint=hr_filter)
+        return Pair(low, high, analytic.reference(self.scene, hr_filter))
+
+
+class View(Base):
+    """A rendered view in the format of :mod:`training.data`."""
+
+    def __init__(self, view: data.View) -> None:
+        super().__init__()
+        self.name, self.view = view.path.stem, view
+
+    def make(self, scale: int, hr_spp: int = 1, lr_spp: int | None = None, *, nearest: bool = False) -> Pair:
+        wanted = 1 if lr_spp is None else lr_spp / scale**2
+        found = [p for p, spp in enumerate(self.view.lr_spp) if spp == wanted]
+        if hr_spp > len(self.view.hr) or not found:
+            raise LookupError(f"{self.name} has no HRLS of {hr_spp} spp with an LRHS of {lr_spp}")
+        height, width = (n // scale * scale for n in self.view.ref.shape[:2])
+        low = data.mean_lrhs(self.view, found[:1])[:height, :width]
+        low = low[scale // 2 :: scale, scale // 2 :: scale] if nearest else data.box_downsample(low, scale)
+        samples = data.read_hrls(self.view, list(range(hr_spp)), slice(0, height), slice(0, width))
+        features = data.split_features(samples)
+        layers = {name: values.mean(axis=0) for name, values in features.items()}
+        if hr_spp > 1:
+            grey = transforms.luminance(features[schema.RGB])
+            layers[schema.VARIANCE] = grey.var(axis=0, ddof=1)[..., None] / hr_spp
+        high = Render.from_arrays("HRLS", **layers)
+        return Pair(Render.from_arrays("LRHS", rgb=low), high, data.read(self.view.ref[:height, :width]))
+
+
+def views(folder: Path) -> list[View]:
+    """The first held-out view of every scene in a folder.
+
+    Raises:
+        SystemExit: there is none.
+    """
+    scenes = {view.scene: view for view in reversed(data.Folder(folder).split("test"))}
+    if not scenes:
+        raise SystemExit(f"{folder}: holds no view of the split 'test' (see training/data.py)")
+    return [View(view) for _, view in sorted(scenes.items())]

@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is measured of a result, and the sentence that follows from it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from benchmarks.stability.bases import Pair
+from benchmarks.stability.cases import DISAGREE, Case
+from oiio_msspl import schema, transforms
+from oiio_msspl.metrics import psnr, relmse_map
+from oiio_msspl.render import Array
+
+#: Share of pixels that the trimmed RelMSE leaves out: the worst ones.
+TRIMMED = 1e-4
+#: Neighbourhoods whose range a result should not leave: pixels to each side.
+LRHS_REACH, HRLS_REACH = 1, 4
+#: Values are told apart from this share of mid-grey on: below, ratios say nothing.
+FLOOR = 0.01
+
+#: The verdict's thresholds.
+EXCESS = 1.02
+"""A result leaves its inputs' range where it is that many times beyond it; half floats and curves round."""
+COST = 1.0
+"""dB that a disturbance may cost before the method is said to suffer."""
+DEVIATION = 0.01
+"""Share by which a scaled scene's result may differ from the scaled result."""
+AWAY = 0.02
+"""Share of a pixel's value by which it may change though nothing within ``NEAR`` LRHS pixels has."""
+NEAR = 8
+
+
+def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warnings: list[str]) -> dict[str, Any]:
+    """All figures of one result.
+
+    Args:
+        image: the result, (H, W, 3).
+        clean: the same method's result for ``case.clean``.
+        enlarged: the case's LRHS enlarged, without any method.
+    """
+    pair = case.pair
+    truth = pair.reference
+    grey = np.float32(transforms.exposure_of(truth))  # scores want a picture that is exposed, whatever its units
+    floor = np.float32(FLOOR * transforms.KEY) / grey
+    finite = bool(np.isfinite(image).all())
+    low, high = input_range(pair)
+    beyond = np.maximum((image + floor) / (high + floor), (low + floor) / (np.maximum(image, 0) + floor))
+    brightest = window(truth, HRLS_REACH, np.maximum)
+    errors = relmse_map(image * grey, truth * grey).mean(axis=-1)
+    row: dict[str, Any] = {
+        "finite": finite,
+        "worst_ratio": float(((image + floor) / (brightest + floor)).max()),
+        "worst_error": float(np.abs(image - truth).max()),
+        "relmse": float(errors.mean()),
+        "relmse_trimmed": trimmed(errors),
+        "relmse_enlarged": trimmed(relmse_map(enlarged * grey, truth * grey).mean(axis=-1)),
+        "psnr": psnr(image * grey, truth * grey),
+        "outside": float((beyond > EXCESS).mean()),
+        "excess": float(beyond.max()),
+        "warnings": warnings,
+    }
+    if clean is not None and case.clean is not None:
+        grey = np.float32(transforms.exposure_of(case.clean.reference))
+        row["cost"] = psnr(clean * grey, case.clean.reference * grey) - row["psnr"]
+        change = np.abs(image / case.factor - clean) / (clean + floor / case.factor)
+        if case.factor != 1:
+            row["deviation"] = float(change.max())
+        near = touched(case.clean, pair)
+        if case.factor == 1 and near.mean() < 0.5:
+            row["away"] = float(change[~near].max())
+    return row
+
+
+def verdict(row: dict[str, Any]) -> tuple[str, str]:
+    """(holds, suffers or fails; the sentence) of what :func:`measure` found, with the case's ``group``."""
+    if not row["finite"] or not math.isfinite(row["relmse"]):
+        return "fails", "NaN or Inf comes out."
+    faults = []
+    if row["excess"] > EXCESS:
+        faults.append(
+            f"leaves the inputs' range by up to x{row['excess']:.3g} in {100 * row['outside']:.2g} % of values"
+        )
+    if row.get("deviation", 0) > DEVIATION:
+        faults.append(f"does not scale: off by up to {100 * row['deviation']:.2g} %")
+    if row.get("away", 0) > AWAY:
+        faults.append(f"changes by up to {100 * row['away']:.2g} % far from what changed")
+    if row.get("cost", 0) > COST:
+        faults.append(f"costs {row['cost']:.1f} dB")
+    worse = row["relmse_trimmed"] > row["relmse_enlarged"]
+    if worse:
+        faults.append("worse than the LRHS merely enlarged")
+    silent = row["group"] == DISAGREE and row.get("cost", 0) > COST and not row["warnings"]
+    text = "; ".join(faults) or "within the inputs"
+    if "cost" in row and row["cost"] <= COST:
+        text += f"; costs {max(0.0, row['cost']):.1f} dB"
+    if row["warnings"] or silent:
+        text += "; the tool warns" if row["warnings"] else "; nothing is said"
+    return "fails" if worse or silent else "suffers" if faults else "holds", text[0].upper() + text[1:] + "."
+
+
+def trimmed(errors: NDArray[np.float64]) -> float:
+    """Mean without the worst pixels."""
+    kept = errors.size - max(1, round(TRIMMED * errors.size))
+    return float(np.partition(errors.ravel(), kept - 1)[:kept].mean())
+
+
+def repaired(values: Array) -> Array:
+    return transforms.repair(values)[0]
+
+
+def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) -> Array:
+    """Largest or smallest value within ``reach`` pixels in x and y."""
+    for axis in (0, 1):
+        size = values.shape[axis]
+        padded = np.pad(values, [(reach, reach) if i == axis else (0, 0) for i in range(values.ndim)], mode="edge")
+        views = [padded.take(range(start, start + size), axis) for start in range(2 * reach + 1)]
+        for view in views:
+            values = extreme(values, view)
+    return values
+
+
+def input_range(pair: Pair) -> tuple[Array, Array]:
+    """Smallest and largest value of both renders around every pixel, by channel."""
+    low, high = repaired(pair.lr.layers[schema.RGB]), repaired(pair.hr.layers[schema.RGB])
+    s = pair.scale
+    result = []
+    for extreme in (np.minimum, np.maximum):
+        around = window(low, LRHS_REACH, extreme).repeat(s, 0).repeat(s, 1)
+        result.append(extreme(around, window(high, HRLS_REACH, extreme)))
+    return result[0], result[1]
+
+
+def touched(before: Pair, after: Pair) -> NDArray[np.bool_]:
+    """Where a disturbance is near, (H, W)."""
+    s = after.scale
+    low = _differs(before.lr.layers[schema.RGB], after.lr.layers[schema.RGB])
+    high = np.zeros((low.shape[0] * s, low.shape[1] * s), bool)
+    for name in {*before.hr.layers, *after.hr.layers}:
+        if name not in before.hr.layers or name not in after.hr.layers:
+            return np.ones_like(high)
+        high |= _differs(before.hr.layers[name], after.hr.layers[name])
+    low |= high.reshape(low.shape[0], s, low.shape[1], s).any((1, 3))
+    return window(low, NEAR, np.maximum).repeat(s, 0).repeat(s, 1)
+
+
+def _differs(a: Array, b: Array) -> NDArray[np.bool_]:
+    return ~np.isclose(a, b, rtol=0, atol=0, equal_nan=True).all(axis=-1)

@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import pytest
+
+from benchmarks.stability import analytic, cases, measures, report
+from benchmarks.stability.__main__ import document, enlarged, judged, ours, run
+from benchmarks.stability.bases import Analytic
+from oiio_msspl.session import Session
+from oiio_msspl.transforms import luminance
+from tests.conftest import downsample
+
+SIZE = 32
+
+SCENES = {
+    "room": analytic.room,
+    "lights": lambda size: analytic.small_lights(size, 100.0),
+    "emitters": analytic.emitters,
+    "defocused": analytic.defocused,
+    "moving": analytic.moving,
+    "hairy": analytic.hairy,
+    "glassy": analytic.glassy,
+}
+FOOTPRINTS = {"box": analytic.box(), "Blackman-Harris": analytic.blackman_harris()}
+
+
+@pytest.mark.parametrize("name", SCENES)
+@pytest.mark.parametrize("footprint", FOOTPRINTS)
+def test_renders_converge_to_the_reference(name, footprint):
+    """The mean luminance of many samples is that of the reference, as closely as the render's own variance promises."""
+    scene, used = SCENES[name](SIZE), FOOTPRINTS[footprint]
+    made = analytic.render(scene, 100, np.random.default_rng(1), footprint=used)
+    error = luminance(made.layers["rgb"] - analytic.reference(scene, used))
+    promised = made.layers["variance"][..., 0]
+    assert abs(error.mean()) < 4 * np.sqrt(promised.sum()) / error.size
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_the_lrhs_is_the_box_mean_of_the_frame(scale):
+    scene = analytic.room(SIZE)
+    low = analytic.reference(scene, scale=scale)
+    np.testing.assert_allclose(low, downsample(analytic.reference(scene), scale), rtol=1e-5)
+    point = analytic.reference(scene, analytic.point(scale), scale)
+    centre = slice(scale // 2, None, scale)
+    np.testing.assert_allclose(point, analytic.reference(scene)[centre, centre], rtol=1e-5)
+
+
+def test_a_moved_scene_is_the_moved_picture():
+    scene = analytic.hairy(SIZE)
+    moved = analytic.reference(analytic.moved(scene, 3, 2))
+    np.testing.assert_allclose(moved[2:, 3:], analytic.reference(scene)[:-2, :-3], rtol=1e-5)
+
+
+def test_every_case_runs_and_stays_finite(bilinear_models, tmp_path):
+    """All cases, measures, pictures and tables, with a model that takes nothing but the LRHS."""
+    methods = {report.ENLARGED: enlarged, "bilinear": ours(Session(bilinear_models[4]))}
+    rows = judged(run(None, 4, methods, SIZE, report.Gallery(tmp_path)))
+    assert {row["group"] for row in rows} == {*cases.ANYWHERE, *cases.MADE}
+    for row in rows:
+        figures = [value for value in row.values() if isinstance(value, float)]
+        assert np.isfinite(figures).all(), row
+        assert row["finite"]
+    mine = [row for row in rows if row["method"] == "bilinear"]
+    assert max(row.get("deviation", 0) for row in mine) < 1e-3
+    assert max(row["excess"] for row in mine) < measures.EXCESS
+    text = document(rows, tmp_path, tmp_path)
+    assert all(row["case"] in text for row in rows)
+    assert (tmp_path / "x4-all.png").stat().st_size > 1000
+    assert len(list(tmp_path.glob("x4-*.png"))) == 1 + len(cases.ANYWHERE) + len(cases.MADE)
+
+
+def test_the_verdict_names_what_is_wrong():
+    """A converged result holds; one that rings, glows or drifts does not, and says why."""
+    pair = Analytic("room", analytic.room(SIZE)).pair(4, 64)
+    case = cases.Case("x", pair, pair)
+    small = enlarged(pair)[0]
+
+    clean = pair.hr.layers["rgb"]
+
+    def said(image):
+        row = measures.measure(case, image, clean, small, [])
+        return measures.verdict({**row, "group": "x"})
+
+    assert said(clean)[0] == "holds"
+    bright = clean.copy()
+    bright[8, 8] = 1e4
+    assert "leaves the inputs' range by up to x" in said(bright)[1].lower()
+    assert said(bright * np.nan) == ("fails", "NaN or Inf comes out.")
+    assert "worse than the LRHS merely enlarged" in said(clean * 2)[1]

@@ -27,6 +27,7 @@ from oiio_msspl.exr import open_exr
 from oiio_msspl.pairing import Source
 from oiio_msspl.session import Session, find_model, shipped_models
 from oiio_msspl.transforms import repair
+from training.data import box_downsample
 
 #: Average spp -> [(scale, LRHS spp, HRLS spp)].
 CASES = {
@@ -58,8 +59,7 @@ def oidn(file: Source) -> np.ndarray | None:
 def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
     """An image times the smooth ratio that gives it the local means of a smaller one."""
     height, width = detail.shape[:2]
-    scale = height // low.shape[0]
-    means = detail.reshape(height // scale, scale, width // scale, scale, 3).mean(axis=(1, 3))
+    means = box_downsample(detail, height // low.shape[0])
     return detail * upsample_bicubic(((low + 1e-3) / (means + 1e-3)).astype(np.float32), width, height)
 
 

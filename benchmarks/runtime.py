@@ -120,13 +120,17 @@ def peak_mb() -> float:
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
-def in_process(kind: str, size: str, *extra: str) -> dict[str, Any]:
-    """``kind``: ``oidn``, ``files`` or a model."""
-    command = [sys.executable, "-m", "benchmarks.runtime", "--measure", kind, "--size", size, *extra]
-    done = subprocess.run(command, capture_output=True, text=True)
+def in_process(module: str, *arguments: str) -> dict[str, Any]:
+    """What a module prints as JSON in a process of its own."""
+    done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)
     return json.loads(done.stdout)
+
+
+def measured(kind: str, size: str, *extra: str) -> dict[str, Any]:
+    """``kind``: ``oidn``, ``files`` or a model."""
+    return in_process("benchmarks.runtime", "--measure", kind, "--size", size, *extra)
 
 
 def main() -> None:
@@ -157,7 +161,7 @@ def main() -> None:
         print(json.dumps(result))
         return None
     if args.files:
-        result = in_process("files", args.size, "--files", str(args.files), "--max-memory", str(args.max_memory))
+        result = measured("files", args.size, "--files", str(args.files), "--max-memory", str(args.max_memory))
         print(
             f"{args.size} x{args.files}, file to file: {result['seconds'][0]:.1f} s, peak {result['peak_mb']:.0f} MB, "
             f"{result['tiles']} tiles; {result['parts']}"
@@ -189,7 +193,7 @@ def compare(args: argparse.Namespace) -> dict[str, Any]:
     peak: dict[str, float] = dict.fromkeys(cases, 0.0)
     for _ in range(args.rounds):
         for case in cases:
-            result = in_process(case, args.size, "--repeats", str(args.repeats), "--threads", str(args.threads))
+            result = measured(case, args.size, "--repeats", str(args.repeats), "--threads", str(args.threads))
             seconds[case] += result["seconds"]
             peak[case] = max(peak[case], result["peak_mb"])
     reference = statistics.median(seconds["oidn"]) if "oidn" in seconds else None

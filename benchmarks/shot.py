@@ -18,15 +18,13 @@ import json
 import os
 import platform
 import statistics
-import subprocess
-import sys
 import tempfile
 import time
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.runtime import peak_mb, write_frame
+from benchmarks.runtime import in_process, peak_mb, write_frame
 
 
 def make_shot(folder: Path, count: int, width: int, height: int, scale: int) -> None:
@@ -84,13 +82,9 @@ def present_mb() -> float:
     return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20) if statm.exists() else 0.0
 
 
-def in_process(kind: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
-    command = [sys.executable, "-m", "benchmarks.shot", "--measure", kind, str(folder)]
-    command += ["--device", args.device, "--threads", str(args.threads)]
-    done = subprocess.run(command, capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    return json.loads(done.stdout)
+def measured(kind: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
+    options = "--device", args.device, "--threads", str(args.threads)
+    return in_process("benchmarks.shot", "--measure", kind, str(folder), *options)
 
 
 def main() -> None:
@@ -114,7 +108,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         make_shot(Path(name), args.frames, width, height, args.scale)
         rounds = [
-            (in_process("stages", Path(name), args), in_process("shot", Path(name), args)) for _ in range(args.rounds)
+            (measured("stages", Path(name), args), measured("shot", Path(name), args)) for _ in range(args.rounds)
         ]
     alone = {stage: statistics.median(r[0]["seconds"][stage] for r in rounds) for stage in ("read", "infer", "write")}
     wall = statistics.median(r[1]["seconds"] for r in rounds)

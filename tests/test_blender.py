@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from msspl_cli.commands import render
+from msspl_cli.installed import find_msspl_fuse
 
 from oiio_msspl import __version__, aovs, exr
 from oiio_msspl.errors import InputError
@@ -229,7 +230,7 @@ def results(python, tmp_path_factory):
     folder, resources = tmp_path_factory.mktemp("work"), tmp_path_factory.mktemp("resources")
     environment = {
         **os.environ,
-        "MSSPL_FUSE": render.find_msspl_fuse(),
+        "MSSPL_FUSE": find_msspl_fuse(),
         "BLENDER_USER_RESOURCES": str(resources),
         "PYTHONDONTWRITEBYTECODE": "1",
     }

@@ -13,7 +13,7 @@ import time
 from pathlib import Path
 
 import pytest
-from msspl_cli.commands.nuke_install import find_msspl_fuse
+from msspl_cli.installed import find_msspl_fuse
 
 from tests import fake_nuke
 from tests.conftest import EXAMPLES

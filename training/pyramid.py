@@ -138,7 +138,11 @@ def positive(logits: Tensor) -> Tensor:
     return torch.exp(logits.float().clamp(-MAX_LOGIT, MAX_LOGIT))
 
 
-def pyramid(image: Tensor, first: int, levels: int) -> dict[int, Tensor]:
+#: An image by level.
+Pyramid = dict[int, Tensor]
+
+
+def pyramid(image: Tensor, first: int, levels: int) -> Pyramid:
     """Means of 2x2 pixels of means of 2x2 pixels ...: the image as level ``first``, up to level ``levels - 1``."""
     images = {first: image}
     for level in range(first + 1, levels):
@@ -213,10 +217,8 @@ class PyramidFusion(nn.Module):
             head.weight.mul_(0.1)
         self.retouch[-1].weight.zero_()
 
-    def features(self, lrhs: Tensor, hrls: Tensor) -> list[Tensor]:
+    def features(self, lrhs: Tensor, hrls: Tensor, colours: Pyramid, lows: Pyramid) -> list[Tensor]:
         """What the U-Net makes of both renders: H/2, H/4, ..., with the channels of each level."""
-        colours = pyramid(linear(hrls[:, :3]), 0, len(self.mix) + 2)
-        lows = pyramid(linear(lrhs), level_of(lrhs, hrls), len(self.mix) + 2)
 
         def low(level: int) -> Tensor:
             """The LRHS at a level, its pixels repeated where that is finer."""
@@ -237,7 +239,7 @@ class PyramidFusion(nn.Module):
             decoded.append(x)
         return decoded[::-1]
 
-    def gather(self, lrhs: Tensor, hrls: Tensor, features: list[Tensor]) -> Tensor:
+    def gather(self, hrls: Tensor, colours: Pyramid, lows: Pyramid, features: list[Tensor]) -> Tensor:
         """Make kernels of the features and apply them: the fused image in network values, before its retouch."""
         maps = [F.pixel_shuffle(self.heads[0](features[0]), 2)]
         maps += [self.heads[level](features[level - 1]) for level in range(1, LEVELS)]
@@ -250,8 +252,6 @@ class PyramidFusion(nn.Module):
         share = torch.sigmoid(gamma + 2.0)
         tint = (share * filtered + (1 - share)).clamp_min(MIN_ALBEDO)
 
-        colours = pyramid(linear(hrls[:, :3]), 0, LEVELS)
-        lows = pyramid(linear(lrhs), level_of(lrhs, hrls), LEVELS)
         tints = pyramid(tint, 0, LEVELS)
         light: Tensor | None = None
         for level in reversed(range(LEVELS)):
@@ -276,8 +276,11 @@ class PyramidFusion(nn.Module):
         Returns:
             (N, 3, s*h, s*w) in network values.
         """
-        features = self.features(lrhs, hrls)
-        fused = self.gather(lrhs, hrls, features)
+        deepest = len(self.mix) + 2
+        colours = pyramid(linear(hrls[:, :3]), 0, deepest)
+        lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
+        features = self.features(lrhs, hrls, colours, lows)
+        fused = self.gather(hrls, colours, lows, features)
         seen = torch.cat([features[0], F.pixel_unshuffle(fused, 2)], dim=1)
         change = self.retouch[1](F.relu(self.retouch[0](seen)))
         change = MAX_RETOUCH * torch.tanh(F.pixel_shuffle(change, 2).float() / MAX_RETOUCH)

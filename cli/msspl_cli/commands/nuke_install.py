@@ -1,15 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 from __future__ import annotations
 
-import shutil
-import sysconfig
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-import msspl_cli
 from msspl_cli import options
+from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError
 from oiio_msspl.output import replacing
 
@@ -35,25 +33,13 @@ def nuke_install(
 ) -> None:
     """Put the gizmo MSSPLFuse into Nuke: one line in DIR/init.py, which names its folder and msspl-fuse."""
     target = folder.expanduser() / "init.py"
-    line = None if uninstall else install_line(gizmo_folder(), find_msspl_fuse())
+    line = None if uninstall else install_line(shipped_folder("nuke_gizmo"), find_msspl_fuse())
     changed = set_line(target, line)
     if uninstall:
         print(f"{target}: {'the line is taken out' if changed else 'there was no line of ours'}")
     else:
         print(f"{target}: {'added' if changed else 'was already there'}: {line}")
         print("Start Nuke: the node is in the toolbar under MSSPL.")
-
-
-def gizmo_folder() -> Path:
-    """The folder with the gizmo: in the installed package, or in the source tree of an editable installation."""
-    package = Path(msspl_cli.__file__).resolve().parent
-    installed = package / "nuke_gizmo"
-    return installed if installed.is_dir() else package.parents[1] / "nuke_gizmo"
-
-
-def find_msspl_fuse() -> str | None:
-    """The program beside this Python: Nuke is seldom started where a virtual environment is active."""
-    return shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or shutil.which("msspl-fuse")
 
 
 def install_line(gizmo: Path, program: str | None) -> str:

@@ -17,9 +17,8 @@ from typing import Annotated, Any
 
 import typer
 
-import msspl_cli
 from msspl_cli import options, show
-from msspl_cli.commands.nuke_install import find_msspl_fuse
+from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.output import check_target
 from oiio_msspl.schema import SCALES
@@ -187,17 +186,10 @@ def find_blender(named: str | None) -> str:
 
 def command(program: str, scene: Path, job: Path) -> list[str]:
     """How a Blender, or a Python that has bpy, is told to do a job."""
-    script = str(addon_folder() / "headless.py")
+    script = str(shipped_folder("blender_addon") / "headless.py")
     if Path(program).name.lower().startswith("python"):
         return [program, "-P", script, str(job)]  # -P: what lies beside the script must not hide other modules
     return [program, "--background", str(scene.absolute()), "--python", script, "--", str(job)]
-
-
-def addon_folder() -> Path:
-    """The Blender add-on: in the installed package, or in the source tree of an editable installation."""
-    package = Path(msspl_cli.__file__).resolve().parent
-    installed = package / "blender_addon"
-    return installed if installed.is_dir() else package.parents[1] / "blender_addon"
 
 
 def run_blender(arguments: Sequence[str], *, verbose: bool = False) -> Iterator[dict[str, Any]]:

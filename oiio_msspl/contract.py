@@ -60,6 +60,11 @@ class Contract:
     """Where the weights come from: data, steps, loss, seed, date, code version."""
     format: int = FORMAT
 
+    @property
+    def reads_denoised(self) -> bool:
+        """Whether the HRLS's last channels are its colour by another denoiser."""
+        return len(self.hrls) > len(schema.channel_names(schema.HRLS_FEATURES))
+
     def to_json(self) -> str:
         return json.dumps(asdict(self), sort_keys=True)
 
@@ -80,9 +85,10 @@ class Contract:
             raise InputError(
                 f"{source}: contract format {contract.format}, this version reads {FORMAT}; update one of them"
             )
+        layers = schema.HRLS_FEATURES | (schema.DENOISED_FEATURES if contract.reads_denoised else {})
         expected = {
             "lrhs": schema.channel_names(schema.LRHS_FEATURES),
-            "hrls": schema.channel_names(schema.HRLS_FEATURES),
+            "hrls": schema.channel_names(layers),
             "transforms": current_transforms(),
             "defaults": schema.DEFAULTS,
         }

@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from oiio_msspl import schema, transforms
+from oiio_msspl.denoiser import Denoiser
 from training.data import PASS_FEATURES, RADIANCE_FEATURES, Folder, Sampling, View, random_orthogonal
 from training.pyramid import logarithmic
 
@@ -101,9 +102,18 @@ def nearest_downsample(image: Tensor, scale: int) -> Tensor:
 
 
 def draw(
-    views: Sequence[Pixels], scale: int, patch: int, count: int, rng: np.random.Generator, sampling: Sampling
+    views: Sequence[Pixels],
+    scale: int,
+    patch: int,
+    count: int,
+    rng: np.random.Generator,
+    sampling: Sampling,
+    denoiser: Denoiser | None = None,
 ) -> Batch:
-    """``count`` pairs of ``patch`` x ``patch`` HRLS pixels; spp, footprint, mirroring and turning are the batch's."""
+    """``count`` pairs of ``patch`` x ``patch`` HRLS pixels; spp, footprint, mirroring and turning are the batch's.
+
+    With a denoiser, its result on the HRLS follows the HRLS's own channels.
+    """
     # Renderings: how many samples, and which part of which view
     chosen = [views[i] for i in rng.choice(len(views), count)]
     nearest = rng.random() < sampling.nearest
@@ -164,6 +174,10 @@ def draw(
     # Layers that a renderer did not write
     present = on_device(np.stack([_present(rng, sampling, has_variance=variance is not None) for _ in chosen]))
     hrls = torch.lerp(on_device(_DEFAULTS), hrls, present[:, None, None])
+
+    if denoiser is not None:
+        denoised = np.stack([denoiser(image) for image in hrls.cpu().numpy()])
+        hrls = torch.cat([hrls, on_device(denoised)], dim=-1)
 
     low_areas = [tuple(slice(side.start // scale, side.stop // scale) for side in area) for area in areas]
     lrhs = torch.stack([image[area] for image, area in zip(lrhs, low_areas, strict=True)])
@@ -228,10 +242,11 @@ class Batches:
         sampling: Sampling,
         seed: int,
         device: torch.device,
+        denoiser: Denoiser | None = None,
         rescan_seconds: float = 120,
     ) -> None:
         self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
-        self.device = device
+        self.device, self.denoiser = device, denoiser
         self.waited = 0.0
         """Seconds that :meth:`next` has taken of the training loop."""
         self._rescan_seconds = rescan_seconds
@@ -256,7 +271,7 @@ class Batches:
     @torch.no_grad()
     def _draw(self) -> Batch:
         scale = int(self._rng.choice(self.scales))
-        return draw(self._views, scale, self.patch, self.batch, self._rng, self.sampling)
+        return draw(self._views, scale, self.patch, self.batch, self._rng, self.sampling, self.denoiser)
 
     def _work(self) -> None:
         try:

@@ -29,6 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl import schema, tensors, transforms
+from oiio_msspl.denoiser import Denoiser
 
 Array = NDArray[np.float32]
 log = logging.getLogger(__name__)
@@ -51,7 +52,7 @@ class Sampling:
     """Weight of 1, 2, 3, ... ``lr`` passes in the LRHS."""
     clip: float = math.inf
     """Radiance is clipped here, before anything else. The log curve can do without."""
-    nearest: float = 0.0
+    nearest: float = 0.15
     """Share with the paper's nearest-neighbour LRHS instead of the box average that a renderer's pixel filter makes."""
     exposure_stops: float = 0.5
     """Exposure jitter, plus or minus: inference may estimate the exposure from another crop or frame."""
@@ -217,23 +218,26 @@ class Evaluation:
     lrhs: Array
     """Linear (h, w, 3)."""
     hrls: Array
-    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have."""
+    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have; with a denoiser, its
+    result in three more channels."""
     reference: Array
     """Linear (s*h, s*w, 3)."""
     exposure: float
 
     @classmethod
-    def centre(cls, view: View, scale: int, patch: int) -> Evaluation:
+    def centre(cls, view: View, scale: int, patch: int, denoiser: Denoiser | None = None) -> Evaluation:
         """The middle ``patch`` x ``patch`` pixels of a view."""
         height, width, _ = view.ref.shape
         top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
         rows, columns = slice(top, top + patch), slice(left, left + patch)
         lrhs = box_downsample(mean_lrhs(view, [0]), scale)
         exposure = transforms.exposure_of(lrhs)
-        features = split_features(read_hrls(view, [0], rows, columns)[0])
+        hrls = tensors.pack(split_features(read_hrls(view, [0], rows, columns)[0]), schema.HRLS_FEATURES, exposure)
+        if denoiser is not None:
+            hrls = np.concatenate([hrls, denoiser(hrls)], axis=-1)
         return cls(
             lrhs=lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale],
-            hrls=tensors.pack(features, schema.HRLS_FEATURES, exposure),
+            hrls=hrls,
             reference=read(view.ref[rows, columns]),
             exposure=exposure,
         )

@@ -72,6 +72,7 @@ def example(scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.T
 # Graph
 
 
+@torch.inference_mode()
 def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
     """Graph with inputs ``lrhs`` and ``hrls``, output ``fused``, batch of 1, any height and width that are multiples of
     the contract's alignment, and that contract."""

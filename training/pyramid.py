@@ -24,8 +24,9 @@ Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of ta
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -69,58 +70,123 @@ def double(image: Tensor) -> Tensor:
     return F.interpolate(image, scale_factor=2, mode="nearest")
 
 
+def to_phases(image: Tensor) -> Tensor:
+    """(N, C, H, W) to (N, C, 4, H/2, W/2): the pixels of every 2x2 square one behind the other."""
+    height, width = image.shape[-2] // 2, image.shape[-1] // 2
+    return image.unflatten(3, (width, 2)).unflatten(2, (height, 2)).permute(0, 1, 3, 5, 2, 4).flatten(2, 3)
+
+
+def from_phases(image: Tensor) -> Tensor:
+    """(N, C, 4, H/2, W/2) to (N, C, H, W)."""
+    return image.unflatten(2, (2, 2)).permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3)
+
+
 def weighted_sum(weights: Tensor, image: Tensor, dilation: int = 1) -> Tensor:
     """Sum of an image's neighbours with a weight for each tap and pixel.
 
     Args:
-        weights: (N, k * k, H, W), taps row by row.
-        image: (N, C, H, W); zero beyond its edges, which leaves them out where one channel carries the weights.
-        dilation: pixels between taps.
+        weights: (N, k * k, P, H, W), taps row by row; P is 1, or 4 for an image of (2H, 2W) by :func:`to_phases`.
+        image: (N, C, P, H, W); zero beyond its edges, which leaves them out where one channel carries the weights. Or
+            (N, C, 1, H, W) for all four phases of the weights: an image of half the size, every pixel four times.
+        dilation: pixels between taps; for P = 1.
     """
-    if torch.is_grad_enabled():
-        return _WeightedSum.apply(weights.contiguous(), image.contiguous(), dilation)
-    shifted = _shifted(_pad(image, weights, dilation), weights, dilation)
-    return sum(weights[:, tap : tap + 1] * neighbour for tap, neighbour in enumerate(shifted))
-
-
-def _pad(image: Tensor, weights: Tensor, dilation: int) -> Tensor:
-    return F.pad(image, (math.isqrt(weights.shape[1]) // 2 * dilation,) * 4)
-
-
-def _shifted(padded: Tensor, weights: Tensor, dilation: int) -> Iterator[Tensor]:
-    """A window into a padded image for each tap."""
     size = math.isqrt(weights.shape[1])
+    if weights.shape[2] == 1:
+        reach = size // 2 * dilation
+        reads = [(tap, 0, 0, reach + y * dilation, reach + x * dilation) for tap, (y, x) in enumerate(_offsets(size))]
+    elif image.shape[2] == 1:
+        reach = size // 2
+        reads = [(tap, ALL, 0, reach + y, reach + x) for tap, (y, x) in enumerate(_offsets(size))]
+    else:
+        reach = (size // 2 + 1) // 2
+        reads = [
+            (tap, 2 * v + u, (v + y) % 2 * 2 + (u + x) % 2, reach + (v + y) // 2, reach + (u + x) // 2)
+            for v, u in itertools.product(range(2), repeat=2)
+            for tap, (y, x) in enumerate(_offsets(size))
+        ]
+    padded = F.pad(image, (reach,) * 4)
+    if torch.is_grad_enabled():
+        return _WeightedSum.apply(weights.contiguous(), padded, reads)
     height, width = weights.shape[-2:]
-    for y in range(0, size * dilation, dilation):
-        for x in range(0, size * dilation, dilation):
-            yield padded[..., y : y + height, x : x + width]
+    sums: dict[int, Tensor] = {}
+    for tap, into, source, y, x in reads:
+        of_tap = weights[:, tap : tap + 1, _phase(into)]
+        term = of_tap * padded[:, :, _phase(source), y : y + height, x : x + width]
+        sums[into] = sums[into] + term if into in sums else term
+    return torch.cat([sums[into] for into in sorted(sums)], dim=2) if len(sums) > 1 else sums[reads[0][1]]
+
+
+#: What one product of a weighted sum reads and where it is added: tap, phase it is added to, phase it reads, and the
+#: row and the column of the padded image where reading starts.
+Read = tuple[int, int, int, int, int]
+#: Instead of a phase.
+ALL = -1
+
+
+def _phase(index: int) -> slice:
+    return slice(None) if index == ALL else slice(index, index + 1)
+
+
+def _offsets(size: int) -> list[tuple[int, int]]:
+    """Row and column of each tap, from the middle."""
+    return list(itertools.product(range(-(size // 2), size // 2 + 1), repeat=2))
 
 
 class _WeightedSum(torch.autograd.Function):
-    """The same for training: in place, its gradient too. Saves a third of a step's time."""
+    """The same for training: in place, its gradient too."""
 
     @staticmethod
-    def forward(ctx: Any, weights: Tensor, image: Tensor, dilation: int) -> Tensor:
-        padded = _pad(image, weights, dilation)
-        total = torch.zeros_like(image)
-        for tap, neighbour in enumerate(_shifted(padded, weights, dilation)):
-            total.addcmul_(neighbour, weights[:, tap : tap + 1])
+    def forward(ctx: Any, weights: Tensor, padded: Tensor, reads: list[Read]) -> Tensor:
+        height, width = weights.shape[-2:]
+        total = weights.new_zeros(padded.shape[0], padded.shape[1], *weights.shape[2:])
+        for tap, into, source, y, x in reads:
+            neighbour = padded[:, :, _phase(source), y : y + height, x : x + width]
+            total[:, :, _phase(into)].addcmul_(neighbour, weights[:, tap : tap + 1, _phase(into)])
         ctx.save_for_backward(weights, padded)
-        ctx.dilation = dilation
+        ctx.reads = reads
         return total
 
     @staticmethod
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, Tensor, None]:
         weights, padded = ctx.saved_tensors
+        height, width = weights.shape[-2:]
         of_weights, of_padded = torch.zeros_like(weights), torch.zeros_like(padded)
-        pairs = zip(*(_shifted(image, weights, ctx.dilation) for image in (padded, of_padded)), strict=True)
-        for tap, (neighbour, of_neighbour) in enumerate(pairs):
-            for channel in range(gradient.shape[1]):
-                of_weights[:, tap].addcmul_(gradient[:, channel], neighbour[:, channel])
-            of_neighbour.addcmul_(gradient, weights[:, tap : tap + 1])
-        reach = (padded.shape[-1] - gradient.shape[-1]) // 2
-        inside = slice(reach, reach + gradient.shape[-2]), slice(reach, reach + gradient.shape[-1])
-        return of_weights, of_padded[..., *inside], None
+        for tap, into, source, y, x in ctx.reads:
+            area = slice(y, y + height), slice(x, x + width)
+            for phase in range(weights.shape[2]) if into == ALL else (into,):
+                here = gradient[:, :, phase]
+                neighbour = padded[:, :, source, *area]
+                for channel in range(gradient.shape[1]):
+                    of_weights[:, tap, phase].addcmul_(here[:, channel], neighbour[:, channel])
+                of_padded[:, :, source, *area].addcmul_(here, weights[:, tap : tap + 1, phase])
+        return of_weights, of_padded, None
+
+
+class _Exponential(torch.autograd.Function):
+    """``exp``, within bounds that its gradient does not see: several times faster than through ``clamp``."""
+
+    @staticmethod
+    def forward(ctx: Any, logits: Tensor) -> Tensor:
+        values = logits.clamp(-MAX_LOGIT, MAX_LOGIT).exp_()
+        ctx.save_for_backward(values)
+        return values
+
+    @staticmethod
+    def backward(ctx: Any, gradient: Tensor) -> Tensor:
+        (values,) = ctx.saved_tensors
+        return gradient * values
+
+
+def pointwise(head: nn.Conv2d, features: Tensor) -> Tensor:
+    """A 1x1 convolution that leaves its output plane by plane, as sums of planes read it.
+
+    Convolutions leave theirs pixel by pixel, and to sort the many channels of a head would take longer than to make
+    them.
+    """
+    assert head.bias is not None
+    weight = head.weight.flatten(1).expand(features.shape[0], -1, -1)
+    planes = torch.bmm(weight, features.contiguous().flatten(2)) + head.bias[:, None]
+    return planes.unflatten(2, features.shape[2:])
 
 
 def weighted(image: Tensor, weight: Tensor) -> Tensor:
@@ -135,7 +201,9 @@ def divided(image: Tensor) -> Tensor:
 
 def positive(logits: Tensor) -> Tensor:
     """Weights of logits."""
-    return torch.exp(logits.float().clamp(-MAX_LOGIT, MAX_LOGIT))
+    if torch.is_grad_enabled():
+        return _Exponential.apply(logits)
+    return torch.exp(logits.clamp(-MAX_LOGIT, MAX_LOGIT))
 
 
 #: An image by level.
@@ -156,10 +224,14 @@ def level_of(lrhs: Tensor, hrls: Tensor) -> int:
 
 
 def highest_around(lrhs: Tensor, hrls: Tensor) -> Tensor:
-    """Per HRLS pixel, the largest value of 10x10 HRLS pixels and of 3x3 LRHS pixels around it, channel by channel."""
-    high = F.max_pool2d(F.max_pool2d(hrls, 2), 5, stride=1, padding=2)
-    low = F.max_pool2d(lrhs, 3, stride=1, padding=1)
-    return double(torch.maximum(high, F.interpolate(low, scale_factor=2 ** (level_of(lrhs, hrls) - 1), mode="nearest")))
+    """Per 2x2 HRLS pixels, the largest value of 10x10 HRLS pixels and of 3x3 LRHS pixels around, channel by channel."""
+
+    def around(image: Tensor) -> Tensor:
+        return F.max_pool2d(image, 3, stride=1, padding=1)
+
+    high = around(around(F.max_pool2d(hrls.contiguous(), 2)))
+    low = around(lrhs.contiguous())
+    return torch.maximum(high, F.interpolate(low, scale_factor=2 ** (level_of(lrhs, hrls) - 1), mode="nearest"))
 
 
 class PyramidFusion(nn.Module):
@@ -170,19 +242,25 @@ class PyramidFusion(nn.Module):
     Args:
         channels: of the U-Net's levels H/2, H/4, H/8, ...
         own_size: taps across of the kernels over a level's own samples, H, H/2, ... ; odd.
+        denoised: the HRLS's last three channels are its colour by another denoiser, which a predicted share of every
+            pixel follows.
     """
 
     def __init__(
-        self, channels: Sequence[int] = (48, 64, 96, 128, 128), own_size: Sequence[int] = (5, 5, 5, 5, 5)
+        self,
+        channels: Sequence[int] = (48, 64, 96, 128, 128),
+        own_size: Sequence[int] = (5, 5, 5, 5, 5),
+        denoised: bool = False,
     ) -> None:
         super().__init__()
-        self.config = {"channels": list(channels), "own_size": list(own_size)}
+        self.config = {"channels": list(channels), "own_size": list(own_size), "denoised": denoised}
         self.own_size = own_size
         self.multiple = 2 ** len(channels)
         finest, *coarser = channels
 
         # Down: H/2 sees every pixel of the HRLS, the levels below the colours of both renders anew
-        self.stem = nn.Conv2d(HRLS_CHANNELS, finest, 6, stride=2, padding=2)
+        self.hrls_channels = HRLS_CHANNELS + (3 if denoised else 0)
+        self.stem = nn.Conv2d(self.hrls_channels, finest, 6, stride=2, padding=2)
         self.stem_low = conv3x3(LRHS_CHANNELS, finest)
         self.down = nn.ModuleList(nn.Conv2d(above, here, 3, stride=2, padding=1) for above, here in pairwise(channels))
         self.mix = nn.ModuleList(conv3x3(here + 3 + LRHS_CHANNELS, here) for here in coarser)
@@ -197,6 +275,7 @@ class PyramidFusion(nn.Module):
         self.heads = nn.ModuleList(
             nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
         )
+        self.trust = nn.Conv2d(finest, 4, 1) if denoised else None
         self.retouch = nn.ModuleList([conv3x3(finest + 4 * 3, finest), conv3x3(finest, 4 * 3)])
         self.reset_parameters()
 
@@ -216,6 +295,9 @@ class PyramidFusion(nn.Module):
         for head in self.heads:
             head.weight.mul_(0.1)
         self.retouch[-1].weight.zero_()
+        if self.trust is not None:
+            self.trust.weight.zero_()
+            self.trust.bias.fill_(1.0)
 
     def features(self, lrhs: Tensor, hrls: Tensor, colours: Pyramid, lows: Pyramid) -> list[Tensor]:
         """What the U-Net makes of both renders: H/2, H/4, ..., with the channels of each level."""
@@ -239,29 +321,36 @@ class PyramidFusion(nn.Module):
             decoded.append(x)
         return decoded[::-1]
 
-    def gather(self, hrls: Tensor, colours: Pyramid, lows: Pyramid, features: list[Tensor]) -> Tensor:
-        """Make kernels of the features and apply them: the fused image in network values, before its retouch."""
-        maps = [F.pixel_shuffle(self.heads[0](features[0]), 2)]
-        maps += [self.heads[level](features[level - 1]) for level in range(1, LEVELS)]
-        logits = [values.float().split(self.outputs(level), dim=1) for level, values in enumerate(maps)]
+    def gather(self, colour: Tensor, albedo: Tensor, colours: Pyramid, lows: Pyramid, features: list[Tensor]) -> Tensor:
+        """Make kernels of the features and apply them: the fused image in network values, before its retouch.
+
+        Colour (exposed radiance) and albedo of the HRLS and the result are (N, 3, 4, H/2, W/2); so is all of level 0.
+        """
+        logits = []
+        for level, head in enumerate(self.heads):
+            values = pointwise(head, features[max(level - 1, 0)]).float()
+            logits.append(values.unflatten(1, (sum(self.outputs(level)), -1)).split(self.outputs(level), dim=1))
 
         # Albedo, and the part of it that colours the light
-        albedo = hrls[:, _ALBEDO]
         *_, albedo_taps, gamma = logits[0]
         filtered = divided(weighted_sum(positive(albedo_taps), weighted(albedo, torch.ones_like(albedo[:, :1]))))
         share = torch.sigmoid(gamma + 2.0)
         tint = (share * filtered + (1 - share)).clamp_min(MIN_ALBEDO)
+        tints = {0: tint} | pyramid(tint.mean(dim=2), 1, LEVELS)
 
-        tints = pyramid(tint, 0, LEVELS)
         light: Tensor | None = None
         for level in reversed(range(LEVELS)):
             own, importance, coarser, low_importance, *_ = logits[level]
-            samples = weighted(colours[level] / tints[level], positive(importance))
+            here = colour / tint if level == 0 else (colours[level] / tints[level]).unsqueeze(2)
+            samples = weighted(here, positive(importance))
             if level in lows:
-                samples = samples + weighted(lows[level] / tints[level], positive(low_importance + 1.0))
+                low = (lows[level] / tints[level]).unsqueeze(2)
+                samples = samples + weighted(low, positive(low_importance + 1.0))
             total = weighted_sum(positive(own), samples)
             if light is not None:
-                around = double(weighted(light, torch.ones_like(light[:, :1])))
+                around = weighted(light, torch.ones_like(light[:, :1]))
+                if level > 0:
+                    around = double(around.squeeze(2)).unsqueeze(2)
                 total = total + weighted_sum(positive(coarser), around, dilation=2)
             light = divided(total)
         assert light is not None
@@ -271,18 +360,25 @@ class PyramidFusion(nn.Module):
         """
         Args:
             lrhs: (N, 3, h, w), network values.
-            hrls: (N, 16, s*h, s*w), likewise.
+            hrls: (N, 16, s*h, s*w), or 19 with another denoiser's colour, likewise.
 
         Returns:
             (N, 3, s*h, s*w) in network values.
         """
         deepest = len(self.mix) + 2
-        colours = pyramid(linear(hrls[:, :3]), 0, deepest)
+        values = to_phases(hrls[:, :3])
+        colour = linear(values)
+        colours = pyramid(colour.mean(dim=2), 1, deepest)
         lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
         features = self.features(lrhs, hrls, colours, lows)
-        fused = self.gather(hrls, colours, lows, features)
-        seen = torch.cat([features[0], F.pixel_unshuffle(fused, 2)], dim=1)
-        change = self.retouch[1](F.relu(self.retouch[0](seen)))
-        change = MAX_RETOUCH * torch.tanh(F.pixel_shuffle(change, 2).float() / MAX_RETOUCH)
-        colour = hrls[:, :3]
-        return torch.clamp(fused + change, -highest_around(-lrhs, -colour), highest_around(lrhs, colour))
+        fused = self.gather(colour, to_phases(hrls[:, _ALBEDO]), colours, lows, features)
+        if self.trust is not None:
+            share = torch.sigmoid(pointwise(self.trust, features[0]).float().unsqueeze(1))
+            fused = torch.lerp(fused, to_phases(hrls[:, HRLS_CHANNELS:]), share)
+        seen = torch.cat([features[0], fused.flatten(1, 2)], dim=1)
+        change = self.retouch[1](F.relu(self.retouch[0](seen))).float().unflatten(1, (3, 4))
+        change = MAX_RETOUCH * torch.tanh(change / MAX_RETOUCH)
+        lowest, highest = (
+            (sign * highest_around(sign * lrhs, sign * hrls[:, :3])).unsqueeze(2) for sign in (-1.0, 1.0)
+        )
+        return from_phases(torch.clamp(fused + change, lowest, highest))

@@ -32,6 +32,7 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from oiio_msspl import metrics, transforms
+from oiio_msspl.denoiser import Denoiser
 from training import batches, data, losses
 from training.networks import NETWORKS, Network
 from training.paper import MultiResolutionFusion
@@ -150,6 +151,11 @@ def warm_start(network: Network, path: Path) -> None:
             shuffle.reset_to_bilinear(network.config["channels"])
     theirs = torch.load(path, map_location="cpu", weights_only=True)["ema"]
     ours = network.state_dict()
+    if isinstance(network, PyramidFusion) and ours["stem.weight"].shape != theirs["stem.weight"].shape:
+        # Channels that the other network does not read count for nothing at first
+        stem = torch.zeros_like(ours["stem.weight"])
+        stem[:, : theirs["stem.weight"].shape[1]] = theirs["stem.weight"]
+        theirs["stem.weight"] = stem
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
@@ -201,8 +207,11 @@ def train(args: argparse.Namespace) -> None:
 
     # Network, from the last checkpoint, from another run, or new
     network: Network
+    denoiser = Denoiser(args.threads) if args.denoised else None
     if args.network == "pyramid":
-        network = PyramidFusion()
+        network = PyramidFusion(denoised=args.denoised)
+    elif args.denoised:
+        raise SystemExit("--denoised: for the pyramid network")
     elif len(scales) == 1:
         network = MultiResolutionFusion(scales[0])
     else:
@@ -225,7 +234,7 @@ def train(args: argparse.Namespace) -> None:
         restore(state)
         step, elapsed, best_gain = state["step"], state["seconds"], state.get("best_gain", -math.inf)
         log.info("continues at step %d, minute %.1f", step, elapsed / 60)
-    source = batches.Batches(folder, scales, patch, batch, recipe.sampling, args.seed + step, device)
+    source = batches.Batches(folder, scales, patch, batch, recipe.sampling, args.seed + step, device, denoiser)
 
     stop = False
 
@@ -247,7 +256,7 @@ def train(args: argparse.Namespace) -> None:
         if not validation:  # a set that grew would make scores of different times incomparable
             for view in folder.split("validation")[: args.val_views]:
                 for scale in scales:
-                    validation[view.path, scale] = data.Evaluation.centre(view, scale, args.val_patch)
+                    validation[view.path, scale] = data.Evaluation.centre(view, scale, args.val_patch, denoiser)
         scores = evaluate(average.network, validation.values(), device)
         row = {
             "step": step,
@@ -354,6 +363,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
     parser.add_argument(
         "--network", choices=NETWORKS, default="paper", help="the paper's, or the kernel-predicting one"
+    )
+    parser.add_argument(
+        "--denoised", action="store_true", help="a network that also reads Open Image Denoise's result on the HRLS"
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")

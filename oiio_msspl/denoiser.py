@@ -4,6 +4,7 @@ pyoidn, which is optional."""
 
 from __future__ import annotations
 
+import threading
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -19,7 +20,7 @@ _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.valu
 
 
 class Denoiser:
-    """Open Image Denoise on the CPU, quality high.
+    """Open Image Denoise on the CPU, quality fast: the network that reads the result has better use for the time.
 
     Args:
         threads: 0 for all.
@@ -39,10 +40,11 @@ class Denoiser:
         self._device.set_int("numThreads", threads)
         self._device.set_bool("setAffinity", False)  # other threads of the process want the cores too
         self._device.commit()
+        self._lock = threading.Lock()  # the filter remembers the images of one call at a time
         self._format = pyoidn.OIDN_FORMAT_FLOAT3
         self._filter: pyoidn.Filter = pyoidn.Filter(self._device, pyoidn.OIDN_FILTER_TYPE_RT)
         self._filter.set_bool("hdr", True)
-        self._filter.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+        self._filter.set_quality(pyoidn.OIDN_QUALITY_FAST)
         # Network values are exposed by the LRHS. Left alone, it would expose every tile for itself.
         self._filter.set_float("inputScale", 1.0)
 
@@ -60,22 +62,23 @@ class Denoiser:
         """
         images = {"color": transforms.expand(_feature(hrls, schema.RGB), 1.0)}
         albedo, normal = np.clip(_feature(hrls, schema.ALBEDO), 0, 1), _feature(hrls, schema.NORMAL)
-        # A layer that is absent has its default everywhere; Open Image Denoise takes normals with an albedo alone.
-        if np.ptp(albedo) > 0:
+        # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
+        if normal.any():
+            images |= {"albedo": albedo, "normal": normal}
+        elif (albedo != schema.DEFAULTS[schema.ALBEDO]).any():
             images["albedo"] = albedo
-            if np.ptp(normal) > 0:
-                images["normal"] = normal
         images = {name: np.ascontiguousarray(image) for name, image in images.items()}
         images["output"] = np.empty_like(images["color"])
-        for name in ("color", "albedo", "normal", "output"):
-            if name in images:
-                self._filter.set_image(name, images[name], self._format)
-            else:
-                self._filter.unset_image(name)
-        self._filter.commit()
-        self._filter.execute()
-        if message := self._device.get_error():
-            raise MssplError(f"Open Image Denoise failed: {message}")
+        with self._lock:
+            for name in ("color", "albedo", "normal", "output"):
+                if name in images:
+                    self._filter.set_image(name, images[name], self._format)
+                else:
+                    self._filter.unset_image(name)
+            self._filter.commit()
+            self._filter.execute()
+            if message := self._device.get_error():
+                raise MssplError(f"Open Image Denoise failed: {message}")
         return transforms.compress(np.maximum(images["output"], 0.0), 1.0)
 
 

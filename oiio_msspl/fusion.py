@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -17,6 +18,9 @@ from oiio_msspl.session import Session
 
 #: Memory that a run may use by default.
 MAX_MEMORY = 3 << 30
+#: An HRLS pixel is at most so many times as bright as the brightest of the 3 x 3 LRHS pixels around it: what is beyond
+#: is a firefly. Noise apart the bound is s^2, the LRHS being the mean over s x s pixels.
+BRIGHTEST = 64.0
 #: Interpreter, libraries, weights and buffers that do not grow with the frame.
 FIXED_MEMORY = 350 << 20
 
@@ -86,7 +90,8 @@ def fuse(
         area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
         target, inside = core.intersect(hr_data), tile.area.slices(grid)
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
-        values = session.run(np.ascontiguousarray(lrhs[inside]), tensors.pack(layers, schema.HRLS_FEATURES, exposure))
+        dim = layers | _dimmed(layers, low[schema.RGB][inside], scale)
+        values = session.run(np.ascontiguousarray(lrhs[inside]), tensors.pack(dim, schema.HRLS_FEATURES, exposure))
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
         empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
         colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
@@ -142,6 +147,20 @@ def _largest_tile(session: Session, frame_bytes: int, max_memory: int) -> int:
         needed = (FIXED_MEMORY + frame_bytes) / 2**30
         raise InputError(f"--max-memory: this frame alone takes {needed:.1f} GiB; allow at least {needed + 0.5:.1f}G")
     return int(pixels) // contract.scale**2
+
+
+def _dimmed(layers: dict[str, Array], low: Array, scale: int) -> dict[str, Array]:
+    """The radiance layers of an HRLS, without fireflies: no brighter than the LRHS around them, (h, w, 3), allows."""
+    height, width = low.shape[:2]
+    padded = np.pad(low, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    highest = low
+    for y, x in itertools.product(range(3), repeat=2):
+        highest = np.maximum(highest, padded[y : y + height, x : x + width])
+    with np.errstate(over="ignore"):  # no ceiling, then; nor where the LRHS has no light at all
+        ceiling = np.where(highest > 0, highest * np.float32(BRIGHTEST), np.float32(np.inf))
+    ceiling = ceiling.repeat(scale, axis=0).repeat(scale, axis=1)
+    radiance = (schema.RGB, schema.DIFFUSE, schema.SPECULAR)
+    return {name: np.minimum(layers[name], ceiling) for name in radiance if name in layers}
 
 
 def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, scale: int) -> Array:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models and the runtime that evaluates them: the only module that imports onnxruntime."""
+"""Models and the runtime that evaluates them: the only module of the package that imports onnxruntime."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from oiio_msspl.contract import METADATA_KEY, Contract
+from oiio_msspl.denoiser import Denoiser
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.render import Array
 
@@ -70,7 +71,8 @@ class Session:
         threads: CPU threads; 0 lets onnxruntime use one a core.
 
     Raises:
-        InputError: no model, no contract, or a device that this onnxruntime was not built for.
+        InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that reads
+            another denoiser's result, and that is not installed.
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
@@ -85,9 +87,9 @@ class Session:
             )
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = threads
-        # The arena keeps the largest tile's buffers for good; without it memory returns after every tile, and
-        # convolutions are so long that allocation does not show.
-        options.enable_cpu_mem_arena = False
+        # With a memory pattern, every size of tile gets a block of its own, which holds all its buffers side by side.
+        # The arena alone reuses them within a run: less memory, and no pages that the system clears for every tile.
+        options.enable_mem_pattern = False
         options.log_severity_level = 3
         try:
             self._session: onnxruntime.InferenceSession = onnxruntime.InferenceSession(
@@ -99,9 +101,10 @@ class Session:
         if METADATA_KEY not in metadata:
             raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
         self.contract = Contract.from_json(metadata[METADATA_KEY], str(path))
+        self._denoiser = Denoiser(threads) if self.contract.reads_denoised else None
         self.path = Path(path)
         self.seconds = 0.0
-        """Time spent in :meth:`run` so far."""
+        """Time spent in :meth:`run` so far, the denoiser's included."""
         self.provider = self._session.get_providers()[0]
         if self.provider != PROVIDERS[device]:
             log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
@@ -112,16 +115,19 @@ class Session:
 
         Args:
             lrhs: (h, w, C_l), transformed, channels as in the contract.
-            hrls: (s*h, s*w, C_h), likewise.
+            hrls: (s*h, s*w, 16), channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`; what else the contract lists
+                is made here.
 
         Returns:
             (s*h, s*w, 3), transformed.
         """
+        start = time.perf_counter()
+        if self._denoiser is not None:
+            hrls = np.concatenate([hrls, self._denoiser(hrls)], axis=-1)
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
         }
-        start = time.perf_counter()
         try:
             (fused,) = self._session.run(["fused"], feed)
         except Exception as error:

@@ -17,6 +17,8 @@ Array = NDArray[np.float32]
 
 #: Log-mean luminance to which a scene is exposed: photographic mid-grey.
 KEY = 0.18
+#: Light below this share of a frame's bright parts is none: 33 stops.
+TRACE = 1e-10
 #: Slope parameter of the log curve. 16 puts mid-grey at 0.48 and white at 1, close to the sRGB curve below white.
 MU = 16.0
 #: Largest exposed radiance that is told apart (log value 4.87); about what half floats hold.
@@ -36,13 +38,15 @@ def luminance(rgb: Array) -> Array:
 def exposure_of(lrhs_rgb: Array) -> float:
     """Factor that brings a repaired LRHS (H, W, 3) to a log-mean luminance of ``KEY``; 1.0 for a black frame.
 
-    Pixels without light carry no exposure and are left out; of the lit ones, the epsilon keeps a few almost black
-    pixels from deciding. It comes from the median: a single firefly of any size moves the result by next to nothing.
+    Pixels without light carry no exposure and are left out, and so are traces: what a filter or a float left of light
+    elsewhere. Of the lit ones, the epsilon keeps a few almost black pixels from deciding. It comes from the median: a
+    single firefly of any size moves the result by next to nothing.
     """
     y = luminance(lrhs_rgb).astype(np.float64)
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0
+    lit = lit[lit >= TRACE * np.quantile(lit, 0.99)]
     epsilon = 1e-4 * float(np.median(lit))
     return float(KEY / np.exp(np.mean(np.log(lit + epsilon))))
 

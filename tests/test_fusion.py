@@ -90,6 +90,17 @@ def test_a_firefly_of_any_size_stays_where_it_is(session, scale, value):
     np.testing.assert_allclose(fused[far, far], expected[far, far], rtol=0.05)
 
 
+def test_a_pixel_that_the_lrhs_rules_out_is_dimmed_before_it_is_fused(session, scale):
+    """A firefly of the HRLS alone changes the result no more than the brightest light that the LRHS allows."""
+    low, high, _ = pair_of(scale, 32 * scale, 32 * scale)
+    around = low.layers["rgb"][1:4, 1:4].max((0, 1))
+    results = []
+    for value in (64 * around, np.float32(1e9)):
+        high.layers["rgb"][2 * scale, 2 * scale] = value
+        results.append(fuse(low, high, session).rgb)
+    np.testing.assert_array_equal(*results)
+
+
 def test_crop_regions_with_negative_origins(session, scale):
     """A region fused alone equals that region of the fused frame, away from its borders."""
     low, high, _ = pair_of(scale, 160, 160)

@@ -28,6 +28,13 @@ def test_exposure_brings_the_log_mean_to_mid_grey():
     assert transforms.exposure_of(scene) == pytest.approx(9.0, rel=1e-3)
 
 
+def test_traces_of_light_do_not_decide_the_exposure():
+    """What a pixel filter or a float leaves between small lights is no light."""
+    scene = np.full((8, 8, 3), 1e-40, np.float32)
+    scene[:2] = 0.02
+    assert transforms.exposure_of(scene) == pytest.approx(9.0, rel=1e-3)
+
+
 def test_exposure_of_black_is_one():
     assert transforms.exposure_of(np.zeros((4, 4, 3), np.float32)) == 1.0
 

@@ -3,10 +3,10 @@
 
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
-    python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --half
+    python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --int8 VIEWS --overlap 64
 
 With ``--half`` the weights are stored as half floats and cast to float32 when the file is loaded: half the size, while
-the computation stays in float32.
+the computation stays in float32. With ``--int8`` convolutions are computed in 8 bits (:mod:`training.quantize`).
 """
 
 from __future__ import annotations
@@ -26,14 +26,19 @@ import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
 
-from oiio_msspl import transforms
+from oiio_msspl import schema, transforms
 from oiio_msspl.contract import METADATA_KEY, Contract
 from training import data
 from training.networks import NETWORKS, Network
 from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, MultiResolutionFusion
+from training.quantize import quantise
 
 #: Operators and file format that ONNX Runtime 1.14 and newer understand.
 OPSET, IR_VERSION = 18, 8
+
+#: Bytes that a tile takes for each of its HRLS pixels, measured with ``benchmarks.runtime`` and rounded up; and what it
+#: takes together with Open Image Denoise, which keeps its buffers.
+MEMORY, MEMORY_WITH_DENOISER = 1000, 1900
 
 #: Smallest tensor that is worth a half float: biases are small, and precise at no cost.
 HALF_ELEMENTS = 256
@@ -49,7 +54,10 @@ def load(checkpoint: Path) -> tuple[Network, dict[str, Any]]:
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """Contract of a checkpoint's network for one of its scales."""
+    denoised = network.hrls_channels > HRLS_CHANNELS
     return Contract(
+        hrls=schema.channel_names(schema.HRLS_FEATURES | (schema.DENOISED_FEATURES if denoised else {})),
+        bytes_per_pixel=MEMORY_WITH_DENOISER if denoised else MEMORY,
         name=name,
         scale=scale,
         alignment=network.multiple // scale,
@@ -60,12 +68,12 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
     )
 
 
-def example(scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+def example(network: Network, scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     """Random ``lrhs`` and ``hrls`` for an LRHS of some size."""
     generator = torch.Generator().manual_seed(seed)
     return (
         torch.rand(1, LRHS_CHANNELS, height, width, generator=generator),
-        torch.rand(1, HRLS_CHANNELS, height * scale, width * scale, generator=generator),
+        torch.rand(1, network.hrls_channels, height * scale, width * scale, generator=generator),
     )
 
 
@@ -80,7 +88,7 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
     program = torch.onnx.export(
         _with_onnx_channel_order(network) if isinstance(network, MultiResolutionFusion) else network,
-        example(scale, 4 * alignment, 6 * alignment),
+        example(network, scale, 4 * alignment, 6 * alignment),
         input_names=["lrhs", "hrls"],
         output_names=["fused"],
         opset_version=OPSET,
@@ -149,7 +157,7 @@ def parity(network: Network, scale: int, path: Path) -> float:
     block *= -(-6 // block)  # a few pixels, where the network would take any number
     worst = 0.0
     for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
-        lrhs, hrls = example(scale, height, width, seed=height)
+        lrhs, hrls = example(network, scale, height, width, seed=height)
         (fused,) = session.run(["fused"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
         with torch.inference_mode():
             expected = network(lrhs, hrls).numpy()
@@ -191,7 +199,7 @@ def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int 
     return image[..., part, part]
 
 
-def describe(path: Path, scale: int) -> None:
+def describe(network: Network, scale: int, path: Path) -> None:
     """Print what the file contains, what ONNX Runtime makes of it and how long it takes."""
     model = onnx.load(path)
     counts = collections.Counter(node.op_type for node in model.graph.node)
@@ -210,7 +218,7 @@ def describe(path: Path, scale: int) -> None:
         )
 
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
-    lrhs, hrls = (image.numpy() for image in example(scale, 64, 64))
+    lrhs, hrls = (image.numpy() for image in example(network, scale, 64, 64))
     seconds = min(timeit.repeat(lambda: session.run(None, {"lrhs": lrhs, "hrls": hrls}), number=1, repeat=3))
     print(f"64x64 LRHS pixels: {seconds:.2f} s")
 
@@ -222,6 +230,9 @@ def main() -> None:
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
+    parser.add_argument(
+        "--int8", type=Path, metavar="VIEWS", help="run convolutions in 8 bits, with ranges learnt from some views"
+    )
     parser.add_argument("--overlap", type=int, default=24, help="LRHS pixels that tiles share on each side")
     parser.add_argument(
         "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on some views"
@@ -238,8 +249,11 @@ def main() -> None:
             print(f"overlap {overlap}: {difference:.2g}")
     if args.output:
         contract = contract_of(network, scale, args.name, args.overlap, state)
-        onnx.save(to_onnx(network, contract, half=args.half), args.output)
-        describe(args.output, scale)
+        model = to_onnx(network, contract, half=args.half and not args.int8)
+        if args.int8:
+            model = quantise(model, network, scale, args.int8)
+        onnx.save(model, args.output)
+        describe(network, scale, args.output)
         print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")
 
 

@@ -111,6 +111,8 @@ class RDG(nn.Module):
 class MultiResolutionFusion(nn.Module):
     """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, all in the network values of :mod:`oiio_msspl.transforms`."""
 
+    hrls_channels = HRLS_CHANNELS
+
     def __init__(
         self,
         scale: int,  #        s: upsampling factor, a power of two; D = log2(s) deshuffle and shuffle layers

@@ -107,11 +107,11 @@ def weighted_sum(weights: Tensor, image: Tensor, dilation: int = 1) -> Tensor:
     padded = F.pad(image, (reach,) * 4)
     if torch.is_grad_enabled():
         return _WeightedSum.apply(weights.contiguous(), padded, reads)
-    height, width = weights.shape[-2:]
     sums: dict[int, Tensor] = {}
     for tap, into, source, y, x in reads:
-        of_tap = weights[:, tap : tap + 1, _phase(into)]
-        term = of_tap * padded[:, :, _phase(source), y : y + height, x : x + width]
+        # Ends are counted from behind, which makes them constants of the exported graph
+        rows, columns = (slice(start, start - 2 * reach or None) for start in (y, x))
+        term = weights[:, tap : tap + 1, _phase(into)] * padded[:, :, _phase(source), rows, columns]
         sums[into] = sums[into] + term if into in sums else term
     return torch.cat([sums[into] for into in sorted(sums)], dim=2) if len(sums) > 1 else sums[reads[0][1]]
 

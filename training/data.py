@@ -114,6 +114,11 @@ def map_npz(path: Path) -> dict[str, NDArray]:
     return arrays
 
 
+def clean_reference(path: Path) -> Path:
+    """Where :mod:`training.references` puts the denoised reference of a view's file."""
+    return path.with_suffix(".ref.npy")
+
+
 class View:
     """One rendered view; its arrays stay on disk."""
 
@@ -126,6 +131,8 @@ class View:
         self.source: str = f"{meta.get('renderer', 'unknown renderer')}, generator {meta.get('generator', '?')}"
         """What rendered it, for the provenance of what is trained on it."""
         self.hr, self.lr, self.ref = arrays["hr"], arrays["lr"], arrays["ref"]
+        if clean_reference(path).exists():
+            self.ref = np.load(clean_reference(path), mmap_mode="c")
         self.lr_spp = np.asarray(arrays["lr_spp"], dtype=np.int64)
         channels = sum(schema.HRLS_FEATURES[name] for name in PASS_FEATURES)
         if self.hr.ndim != 4 or self.hr.shape[-1] != channels or self.lr.shape[0] != len(self.lr_spp):

@@ -91,7 +91,7 @@ def fuse(
         target, inside = core.intersect(hr_data), tile.area.slices(grid)
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
         dim = layers | _dimmed(layers, low[schema.RGB][inside], scale)
-        values = session.run(np.ascontiguousarray(lrhs[inside]), tensors.pack(dim, schema.HRLS_FEATURES, exposure))
+        values = session.run(lrhs[inside], tensors.pack(dim, schema.HRLS_FEATURES, exposure))
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
         empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
         colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))

@@ -62,6 +62,36 @@ def usable_devices() -> list[str]:
     return [device for device, provider in PROVIDERS.items() if provider in available]
 
 
+def _load(path: str | Path, options: onnxruntime.SessionOptions, providers: list[str]) -> onnxruntime.InferenceSession:
+    import onnxruntime
+
+    options.log_severity_level = 3
+    try:
+        return onnxruntime.InferenceSession(str(path), options, providers=providers)
+    except Exception as error:
+        raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
+
+
+def _contract(session: onnxruntime.InferenceSession, path: str | Path) -> Contract:
+    metadata = session.get_modelmeta().custom_metadata_map
+    if METADATA_KEY not in metadata:
+        raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
+    return Contract.from_json(metadata[METADATA_KEY], str(path))
+
+
+def read_contract(path: str | Path) -> Contract:
+    """A model's contract alone; what the model needs to run need not be there.
+
+    Raises:
+        InputError: no model, or no contract.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
+    return _contract(_load(path, options, [PROVIDERS["cpu"]]), path)
+
+
 class Session:
     """A loaded model on a device, with its contract.
 
@@ -90,17 +120,9 @@ class Session:
         # With a memory pattern, every size of tile gets a block of its own, which holds all its buffers side by side.
         # The arena alone reuses them within a run: less memory, and no pages that the system clears for every tile.
         options.enable_mem_pattern = False
-        options.log_severity_level = 3
-        try:
-            self._session: onnxruntime.InferenceSession = onnxruntime.InferenceSession(
-                str(path), options, providers=list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
-            )
-        except Exception as error:
-            raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        if METADATA_KEY not in metadata:
-            raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
-        self.contract = Contract.from_json(metadata[METADATA_KEY], str(path))
+        providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
+        self._session = _load(path, options, providers)
+        self.contract = _contract(self._session, path)
         self._denoiser = Denoiser(threads) if self.contract.reads_denoised else None
         self.path = Path(path)
         self.seconds = 0.0
@@ -122,11 +144,12 @@ class Session:
             (s*h, s*w, 3), transformed.
         """
         start = time.perf_counter()
+        layers = hrls.transpose(2, 0, 1)
         if self._denoiser is not None:
-            hrls = np.concatenate([hrls, self._denoiser(hrls)], axis=-1)
+            layers = np.concatenate([layers, self._denoiser(hrls).transpose(2, 0, 1)])
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
-            "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
+            "hrls": np.ascontiguousarray(layers[None]),
         }
         try:
             (fused,) = self._session.run(["fused"], feed)

@@ -19,10 +19,10 @@ def pack(layers: dict[str, Array], features: dict[str, int], exposure: float) ->
     """Stack repaired features (h, w, c) in the order of the schema, transformed; absent ones at their default.
 
     Returns:
-        float32 (h, w, sum of channels).
+        float32 (h, w, sum of channels), one channel after the other in memory, as the network wants them.
     """
     height, width = layers[schema.RGB].shape[:2]
-    stack = np.empty((height, width, sum(features.values())), dtype=np.float32)
+    stack = np.empty((sum(features.values()), height, width), dtype=np.float32).transpose(1, 2, 0)
     position = 0
     for name, channels in features.items():
         target = stack[..., position : position + channels]

@@ -16,16 +16,17 @@ EXAMPLES = """[bold]Examples[/bold]
 
 def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
     """List the models inside the package, and the devices that can run them."""
-    from oiio_msspl.session import PROVIDERS, Session, shipped_models, usable_devices
+    from oiio_msspl.session import PROVIDERS, read_contract, shipped_models, usable_devices
 
     rows: list[dict[str, Any]] = []
     for name, path in shipped_models().items():
-        contract = Session(path).contract
+        contract = read_contract(path)
         rows.append(
             {
                 "name": name,
                 "scale": contract.scale,
                 "size_mb": round(path.stat().st_size / 1e6, 1),
+                "needs": "pyoidn" if contract.reads_denoised else None,
                 "training_spp": contract.training_spp,
                 "provenance": contract.provenance,
             }
@@ -34,10 +35,16 @@ def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
     if as_json:
         print(json.dumps({"models": rows, "devices": devices}, indent=2))
         return
-    header = ("model", "scale", "size", "trained at LRHS spp", "HRLS spp")
+    header = ("model", "scale", "size", "trained at LRHS spp", "HRLS spp", "needs")
     spans = [["{}-{}".format(*row["training_spp"].get(key, ("?", "?"))) for key in ("lrhs", "hrls")] for row in rows]
     show.table(
-        [header, *((r["name"], f"x{r['scale']}", f"{r['size_mb']} MB", *s) for r, s in zip(rows, spans, strict=True))],
+        [
+            header,
+            *(
+                (r["name"], f"x{r['scale']}", f"{r['size_mb']} MB", *s, r["needs"] or "")
+                for r, s in zip(rows, spans, strict=True)
+            ),
+        ],
         "",
     )
     print(f"devices: {', '.join(devices)} (of {', '.join(PROVIDERS)})")

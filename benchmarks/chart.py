@@ -22,10 +22,13 @@ import matplotlib.pyplot as plt
 
 from benchmarks.quality import NOISY_REFERENCE
 
-#: What a peer of `benchmarks.quality` runs, as `benchmarks.runtime` names it.
-OIDN = "OIDN 2.5.1, quality high"
-#: Peer -> marker. Of a family of models, only the colour differs.
-PEERS = {"OIDN, same samples": "*", "OIDN on the HRLS": "D"}
+#: Peer of `benchmarks.quality` -> marker, and what it runs as `benchmarks.runtime` names it. Families of models
+#: differ in colour.
+PEERS = {
+    "OIDN, same samples": ("*", "OIDN 2.5.1, quality high"),
+    "OIDN on the HRLS": ("D", "OIDN 2.5.1, quality high"),
+    "OIDN fast on the HRLS": ("d", "OIDN 2.5.1, quality fast"),
+}
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
 MEASURES = {"psnr": "PSNR (sRGB, dB)", "relmse": "RelMSE (0.5, 0.01)"}
 
@@ -58,10 +61,10 @@ def draw(rows: list[dict[str, Any]], runtimes: dict[str, Any], scene: str | None
                 axis.plot(*zip(*points, strict=True), "-o", color=colour, label=family, linewidth=1)
                 for name, point in zip(members, points, strict=True):
                     axis.annotate(name.rpartition("-")[2], point, (4, 4), textcoords="offset points", fontsize=8)
-            for peer, marker in PEERS.items():
-                if OIDN in seconds:
+            for peer, (marker, run) in PEERS.items():
+                if run in seconds:
                     value = mean(rows, peer, spp, measure, scene)
-                    axis.plot(seconds[OIDN], value, marker, color="black", markersize=8, label=peer, linestyle="none")
+                    axis.plot(seconds[run], value, marker, color="black", markersize=8, label=peer, linestyle="none")
             axis.set_xscale("log")
             axis.grid(True, which="both", alpha=0.25)
             if measure == "psnr":

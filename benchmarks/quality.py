@@ -5,9 +5,9 @@
 
 A scene is a folder with ``ref.exr``, ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``. For 2, 4 and 8 average samples
 (spp_LRHS / s^2 + spp_HRLS) each method gets its files. From an LRHS and an HRLS: our models; OIDN (if pyoidn is
-installed) on the HRLS with albedo and normal; OIDN on the LRHS, upsampled; and "both": the first brought to the
-second's local brightness. From one full-resolution render of the same average: OIDN. Printed: PSNR in sRGB and RelMSE
-(0.5, 0.01), per scene and mean. Scenes whose own reference is noisy are listed but not averaged.
+installed) on the HRLS with albedo and normal, at quality high and fast; OIDN on the LRHS, upsampled; and "both": the
+first brought to the second's local brightness. From one full-resolution render of the same average: OIDN. Printed: PSNR
+in sRGB and RelMSE (0.5, 0.01), per scene and mean. Scenes whose own reference is noisy are listed but not averaged.
 """
 
 from __future__ import annotations
@@ -43,8 +43,8 @@ def beauty(file: Resolution) -> np.ndarray:
     return repair(file.read(file.data_window, ["rgb"])["rgb"])[0]
 
 
-def oidn(file: Source) -> np.ndarray | None:
-    """OIDN at quality high with albedo and normal, if there; None without pyoidn."""
+def oidn(file: Source, quality: str = "high") -> np.ndarray | None:
+    """OIDN with albedo and normal, if there; None without pyoidn."""
     try:
         import pyoidn
     except ImportError:
@@ -53,7 +53,7 @@ def oidn(file: Source) -> np.ndarray | None:
     layers = {k: np.ascontiguousarray(repair(v, signed=k == "normal")[0]) for k, v in layers.items()}
     # OIDN takes no normal without an albedo.
     guides = {k: layers[k] for k in ("albedo", "normal") if k in layers and "albedo" in layers}
-    return np.asarray(pyoidn.denoise(layers["rgb"], hdr=True, quality="high", **guides))
+    return np.asarray(pyoidn.denoise(layers["rgb"], hdr=True, quality=quality, **guides))
 
 
 def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
@@ -82,6 +82,7 @@ def run_scene(folder: Path, sessions: list[Session]) -> list[dict[str, Any]]:
         add(spp, "HRLS", beauty(hr))
         denoised = oidn(hr)
         add(spp, "OIDN on the HRLS", denoised)
+        add(spp, "OIDN fast on the HRLS", oidn(hr, "fast"))
         for scale, lr_spp, _ in cases:
             lr = load(f"lr_x{scale}_{lr_spp}spp.exr")
             low = beauty(lr)

@@ -11,8 +11,9 @@ hold are averaged:
    resolution on, the LRHS) over predicted kernels, together with the coarser level's result around the pixel. Samples
    also carry predicted weights of their own, so that a firefly is left out wherever it might be read.
 
-4. Two convolutions see that result beside the features and retouch it, within ``MAX_RETOUCH``: samples that hit or miss
-   an edge make it jagged, and no mean of samples is as straight as the edge.
+4. Two convolutions see that result beside the features, and colour, albedo and normal pixel by pixel, and retouch it,
+   within ``MAX_RETOUCH``: samples that hit or miss an edge make it jagged, and no mean of samples is as straight as the
+   edge.
 
 5. No pixel may be darker or brighter than everything around it in both renders.
 
@@ -46,6 +47,8 @@ MAX_RETOUCH = 0.5
 #: Weights are exponentials of the network's outputs within these bounds.
 MAX_LOGIT = 12.0
 
+#: Of the HRLS's channels, those that the retouch sees pixel by pixel: colour, albedo and normal.
+_DETAILS = 9
 _LOG_SCALE = 1.0 / math.log1p(transforms.MU)
 _ALBEDO = slice(schema.HRLS_FEATURES[schema.RGB], schema.HRLS_FEATURES[schema.RGB] + 3)
 
@@ -276,7 +279,8 @@ class PyramidFusion(nn.Module):
             nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
         )
         self.trust = nn.Conv2d(finest, 4, 1) if denoised else None
-        self.retouch = nn.ModuleList([conv3x3(finest + 4 * 3, finest), conv3x3(finest, 4 * 3)])
+        seen = 4 * (3 + _DETAILS + (3 if denoised else 0))
+        self.retouch = nn.ModuleList([conv3x3(finest + seen, finest), conv3x3(finest, 4 * 3)])
         self.reset_parameters()
 
     def outputs(self, level: int) -> list[int]:
@@ -366,17 +370,20 @@ class PyramidFusion(nn.Module):
             (N, 3, s*h, s*w) in network values.
         """
         deepest = len(self.mix) + 2
-        values = to_phases(hrls[:, :3])
-        colour = linear(values)
+        details = to_phases(hrls[:, :_DETAILS])
+        colour = linear(details[:, :3])
         colours = pyramid(colour.mean(dim=2), 1, deepest)
         lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
         features = self.features(lrhs, hrls, colours, lows)
-        fused = self.gather(colour, to_phases(hrls[:, _ALBEDO]), colours, lows, features)
+        fused = self.gather(colour, details[:, _ALBEDO], colours, lows, features)
+        seen = [features[0], details.flatten(1, 2)]
         if self.trust is not None:
             share = torch.sigmoid(pointwise(self.trust, features[0]).float().unsqueeze(1))
-            fused = torch.lerp(fused, to_phases(hrls[:, HRLS_CHANNELS:]), share)
-        seen = torch.cat([features[0], fused.flatten(1, 2)], dim=1)
-        change = self.retouch[1](F.relu(self.retouch[0](seen))).float().unflatten(1, (3, 4))
+            denoised = to_phases(hrls[:, HRLS_CHANNELS:])
+            fused = torch.lerp(fused, denoised, share)
+            seen.append(denoised.flatten(1, 2))
+        seen.insert(1, fused.flatten(1, 2))
+        change = self.retouch[1](F.relu(self.retouch[0](torch.cat(seen, dim=1)))).float().unflatten(1, (3, 4))
         change = MAX_RETOUCH * torch.tanh(change / MAX_RETOUCH)
         lowest, highest = (
             (sign * highest_around(sign * lrhs, sign * hrls[:, :3])).unsqueeze(2) for sign in (-1.0, 1.0)

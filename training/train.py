@@ -151,11 +151,11 @@ def warm_start(network: Network, path: Path) -> None:
             shuffle.reset_to_bilinear(network.config["channels"])
     theirs = torch.load(path, map_location="cpu", weights_only=True)["ema"]
     ours = network.state_dict()
-    if isinstance(network, PyramidFusion) and ours["stem.weight"].shape != theirs["stem.weight"].shape:
-        # Channels that the other network does not read count for nothing at first
-        stem = torch.zeros_like(ours["stem.weight"])
-        stem[:, : theirs["stem.weight"].shape[1]] = theirs["stem.weight"]
-        theirs["stem.weight"] = stem
+    for name, value in theirs.items():
+        # What a convolution reads beyond the other's inputs counts for nothing at first
+        if name in ours and value.ndim == 4 and value.shape[1] < ours[name].shape[1]:
+            theirs[name] = torch.zeros_like(ours[name])
+            theirs[name][:, : value.shape[1]] = value
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)

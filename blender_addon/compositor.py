@@ -46,7 +46,7 @@ def _tree(scene):
         if fresh:
             scene.compositing_node_group = bpy.data.node_groups.new("Compositing", "CompositorNodeTree")
         return scene.compositing_node_group, fresh
-    fresh = not scene.use_nodes
+    fresh = scene.node_tree is None  # nodes that are turned off are still the user's
     scene.use_nodes = True
     return scene.node_tree, fresh
 

@@ -62,13 +62,14 @@ class Report:
         )
 
 
-def make(scene, options, output, work, program, *, overwrite=False):
+def make(scene, options, output, work, program, *, overwrite=False, window=False):
     """Render and fuse a frame, as steps that yield ``(what is being done, what part of all is done)``.
 
     Args:
         output: EXR to write.
         work: folder for ``lr.exr`` and ``hr.exr``, which stay there.
         program: msspl-fuse.
+        window: Blender goes on while it renders; the caller then takes a step now and then, and does not wait.
 
     Returns:
         A :class:`Report`.
@@ -81,13 +82,20 @@ def make(scene, options, output, work, program, *, overwrite=False):
     lrhs = Take("LRHS", render.low_size(scene, options.scale), options.low_spp, str(Path(work, "lr.exr")))
     hrls = Take("HRLS", render.high_size(scene), options.hr_spp, str(Path(work, "hr.exr")))
     values = render.low(scene, options), render.high(scene, options)
+    identity, moment = (scene.name, scene.session_uid), (scene.frame_current, scene.frame_subframe)
     # The scene is loaded once for both renders.
     with render.settings(scene, {"render.use_persistent_data": True}):
         for part, take in enumerate((lrhs, hrls)):
             yield str(take), part / 3
+            scene = render.find_scene(*identity)
+            if (scene.frame_current, scene.frame_subframe) != moment:
+                raise Failure(
+                    f"frame {moment[0]} was left for {scene.frame_current} while it was rendered; do it again"
+                )
             start = time.perf_counter()
-            with render.settings(scene, values[part] | {"render.filepath": take.file}):
-                for _ in render.render(scene):
+            with render.settings(scene, values[part] | {"render.filepath": render.literal(take.file)}):
+                render.check_animation(scene, values[part])
+                for _ in render.render(scene, take.file, window=window):
                     yield str(take), part / 3
             take.seconds = time.perf_counter() - start
     start = time.perf_counter()

@@ -47,26 +47,35 @@ def run(program, low, high, output, work, overwrite, threads):
     command += ["--threads", threads] if threads else []
     # Its own Python must not inherit what was set for Blender's.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    environment["PYTHONUTF8"] = "1"  # so that names are read here as they are written there
     report, log = Path(work, "fuse.json"), Path(work, "fuse.log")
     with report.open("wb") as out, log.open("wb") as err:
-        process = subprocess.Popen(
-            [str(part) for part in command],
-            stdin=subprocess.DEVNULL,
-            stdout=out,
-            stderr=err,
-            env=environment,
-            creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
-        )
+        try:
+            process = subprocess.Popen(
+                [str(part) for part in command],
+                stdin=subprocess.DEVNULL,
+                stdout=out,
+                stderr=err,
+                env=environment,
+                creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
+            )
+        except OSError as error:
+            raise Failure(f"{program}: can't be started ({error.strerror}); is it msspl-fuse?") from error
         try:
             while process.poll() is None:
-                tiles = _TILE.findall(log.read_text(errors="replace"))
+                tiles = _TILE.findall(_read(log))
                 yield "fuse", (2 + (int(tiles[-1][0]) / int(tiles[-1][1]) if tiles else 0)) / 3
         finally:
             _end(process)
     if process.returncode:
-        lines = log.read_text(errors="replace").strip().splitlines() or [f"it ended with code {process.returncode}"]
-        raise Failure(f"msspl-fuse: {lines[-1].removeprefix('error: ')}", 2 if process.returncode == 2 else 1)
-    return json.loads(report.read_text())
+        lines = _read(log).strip().splitlines() or [f"it ended with code {process.returncode}"]
+        said = next((line for line in lines if line.startswith("error: ")), lines[-1])
+        raise Failure(f"msspl-fuse: {said.removeprefix('error: ')}", 2 if process.returncode == 2 else 1)
+    return json.loads(_read(report))
+
+
+def _read(path):
+    return path.read_text(encoding="utf-8", errors="replace")
 
 
 def _end(process):

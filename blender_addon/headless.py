@@ -55,6 +55,7 @@ def _frame(scene, options, job, number, output):
     def told(step, fraction):
         tell(frame=number, step=step, fraction=fraction)
 
+    told("start", 0.0)
     steps = frame.make(scene, options, output, job["work"], job["program"], overwrite=job["overwrite"])
     report = frame.finish(steps, told)
     result = {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
@@ -87,8 +88,10 @@ def _same_time(scene, options, report, told, work):
         told(f"plain rendering and OIDN, {spp} spp", 1.0)
         start = time.perf_counter()
         file = work / f"oidn{spp}.exr"
-        with render.settings(scene, render.plain(scene, options, spp) | {"render.filepath": str(file)}):
-            list(render.render(scene))
+        values = render.plain(scene, options, spp)
+        with render.settings(scene, values | {"render.filepath": render.literal(str(file))}):
+            render.check_animation(scene, values)
+            list(render.render(scene, str(file)))
         tries[spp] = {"spp": spp, "seconds": time.perf_counter() - start, "file": str(file)}
         ratio = report.seconds / tries[spp]["seconds"]
         if 0.9 < ratio < 1.1:

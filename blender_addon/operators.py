@@ -7,10 +7,12 @@ import time
 
 import bpy
 
-from . import compositor, frame, fuse
+from . import compositor, frame, fuse, render
 from .errors import Cancelled, Failure
+from .panel import status
 
 _MORE = {"PASS_THROUGH"}
+_SWALLOWED = {"RUNNING_MODAL"}
 
 
 class MSSPL_OT_fuse(bpy.types.Operator):
@@ -22,26 +24,38 @@ class MSSPL_OT_fuse(bpy.types.Operator):
 
     @classmethod
     def poll(cls, context):
-        return not context.window_manager.msspl.text
+        return not status.text
 
     def execute(self, context):
+        status.text = "starting"  # at once: there is one job at a time
         self._steps = self._job(context)
-        while (result := self._step()) == _MORE:
-            time.sleep(0.02)
+        try:
+            while (result := self._step()) == _MORE:
+                time.sleep(0.02)
+        finally:
+            self._end()
         return result
 
     def invoke(self, context, event):
-        self._steps = self._job(context)
-        self._timer = context.window_manager.event_timer_add(0.1, window=context.window)
-        context.window_manager.modal_handler_add(self)
+        status.text = "starting"
+        self._steps, self._timer = self._job(context, window=True), None
+        try:
+            self._timer = context.window_manager.event_timer_add(0.1, window=context.window)
+            context.window_manager.modal_handler_add(self)
+        except BaseException:
+            self.cancel(context)
+            raise
         return {"RUNNING_MODAL"}
 
     def modal(self, context, event):
-        if event.type == "ESC" and not bpy.app.is_job_running("RENDER"):  # a render is cancelled by Blender itself
+        if event.type == "ESC":
+            if bpy.app.is_job_running("RENDER"):  # Blender itself cancels a render
+                return _MORE
             self.cancel(context)
             return {"CANCELLED"}
         if event.type != "TIMER":
-            return _MORE
+            # The scene has settings of ours: nothing is to be changed, undone or saved now.
+            return _MORE if event.type.startswith("TIMER") else _SWALLOWED
         result = {"CANCELLED"}
         try:
             result = self._step()
@@ -49,7 +63,6 @@ class MSSPL_OT_fuse(bpy.types.Operator):
             if result != _MORE:
                 self.cancel(context)
         if result == _MORE:
-            status = context.window_manager.msspl
             status.text, status.fraction = self._doing
             context.workspace.status_text_set(f"MSSPL Fuse: {status.text} (Esc cancels)")
             for area in context.screen.areas:
@@ -58,10 +71,18 @@ class MSSPL_OT_fuse(bpy.types.Operator):
 
     def cancel(self, context):
         """End the job where it stands; Blender calls this too, when another file is opened."""
-        self._steps.close()
-        context.window_manager.event_timer_remove(self._timer)
-        context.window_manager.msspl.text = ""
-        context.workspace.status_text_set(None)
+        try:
+            if self._timer is not None:
+                context.window_manager.event_timer_remove(self._timer)
+            context.workspace.status_text_set(None)
+        finally:
+            self._end()
+
+    def _end(self):
+        try:
+            self._steps.close()
+        finally:
+            status.text = ""
 
     def _step(self):
         """Go on to the next step; the operator's result if there is none."""
@@ -77,18 +98,21 @@ class MSSPL_OT_fuse(bpy.types.Operator):
             return {"CANCELLED"}
         return _MORE
 
-    def _job(self, context):
+    def _job(self, context, window=False):
         scene, settings = context.scene, context.scene.msspl
+        identity, overwrite = (scene.name, scene.session_uid), scene.render.use_overwrite
         addon = context.preferences.addons.get(__package__)
         program = fuse.find_program(bpy.path.abspath(addon.preferences.program) if addon else "")
         options = settings.options(context.view_layer.name)
-        path = re.sub("#+", lambda signs: f"{scene.frame_current:0{len(signs[0])}d}", settings.output)
+        # In the name alone: a folder may be called so.
+        path = re.sub(r"#+(?=[^/\\]*$)", lambda signs: f"{scene.frame_current:0{len(signs[0])}d}", settings.output)
         if path.startswith("//") and not bpy.data.filepath:
             raise Failure(f"{path}: save the .blend first, or give a full path")
         with tempfile.TemporaryDirectory(prefix="msspl-") as work:
             output = bpy.path.abspath(path)
-            report = yield from frame.make(scene, options, output, work, program, overwrite=scene.render.use_overwrite)
-        compositor.show(scene, path, settings.connect)
+            report = yield from frame.make(scene, options, output, work, program, overwrite=overwrite, window=window)
+        scene = render.find_scene(*identity)
+        compositor.show(scene, path, scene.msspl.connect)
         for warning in report.warnings:
             self.report({"WARNING"}, warning)
         self.report({"INFO"}, f"{path}: {report}")
@@ -96,7 +120,13 @@ class MSSPL_OT_fuse(bpy.types.Operator):
 
 def register():
     bpy.utils.register_class(MSSPL_OT_fuse)
+    bpy.app.handlers.save_pre.append(render.put_back)
+    for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
+        after.append(render.set_again)
 
 
 def unregister():
+    bpy.app.handlers.save_pre.remove(render.put_back)
+    for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
+        after.remove(render.set_again)
     bpy.utils.unregister_class(MSSPL_OT_fuse)

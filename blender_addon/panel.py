@@ -1,10 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """What the user sets and sees: Render Properties > MSSPL Fuse, and the add-on's preferences."""
 
+from dataclasses import dataclass
+
 import bpy
-from bpy.props import BoolProperty, EnumProperty, FloatProperty, IntProperty, PointerProperty, StringProperty
+from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
 from .render import Options, high_size, low_size
+
+
+@dataclass
+class Status:
+    """What a running job does now; the text is empty when none runs. No property: that would be saved in files."""
+
+    text: str = ""
+    fraction: float = 0.0
+
+
+status = Status()
 
 
 class MSSPLSettings(bpy.types.PropertyGroup):
@@ -69,7 +82,7 @@ class MSSPL_PT_fuse(bpy.types.Panel):
         return context.engine in cls.COMPAT_ENGINES
 
     def draw(self, context):
-        layout, scene, status = self.layout, context.scene, context.window_manager.msspl
+        layout, scene = self.layout, context.scene
         settings = scene.msspl
         layout.use_property_split = True
         for name in ("scale", "hr_spp", "lr_spp", "filter", "output", "connect"):
@@ -85,24 +98,16 @@ class MSSPL_PT_fuse(bpy.types.Panel):
             layout.operator("msspl.fuse", icon="RENDER_STILL")
 
 
-class MSSPLStatus(bpy.types.PropertyGroup):
-    """What a running job does now; the text is empty when none runs."""
-
-    text: StringProperty()
-    fraction: FloatProperty()
-
-
-CLASSES = (MSSPLSettings, MSSPLStatus, MSSPLPreferences, MSSPL_PT_fuse)
+CLASSES = (MSSPLSettings, MSSPLPreferences, MSSPL_PT_fuse)
 
 
 def register():
     for each in CLASSES:
         bpy.utils.register_class(each)
     bpy.types.Scene.msspl = PointerProperty(type=MSSPLSettings)
-    bpy.types.WindowManager.msspl = PointerProperty(type=MSSPLStatus)
 
 
 def unregister():
-    del bpy.types.WindowManager.msspl, bpy.types.Scene.msspl
+    del bpy.types.Scene.msspl
     for each in reversed(CLASSES):
         bpy.utils.unregister_class(each)

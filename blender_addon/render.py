@@ -6,7 +6,7 @@ Settings are dictionaries of a scene's data paths: they can be added, read back 
 
 import os
 import re
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 
 import bpy
@@ -27,6 +27,7 @@ PASSES = (
     "use_pass_glossy_color",
     "cycles.denoising_store_passes",
 )
+_held = []  #: what :func:`settings` holds now: (scene's name and session_uid, values, the user's)
 LR_SEED = 1009  #: added to the scene's seed: with the same one, the LRHS would repeat the HRLS's samples
 
 
@@ -193,15 +194,73 @@ def plain(scene, options, spp):
 @contextmanager
 def settings(scene, values):
     """Set ``{data path: value}`` on a scene for a while; what was there comes back, however the block ends."""
-    name = scene.name  # not the scene: undo makes a new one
+    identity = scene.name, scene.session_uid
     old = {path: getattr(*_owner(scene, path)) for path in values}
+    held = identity, values, old
+    _held.append(held)
     try:
         _apply(scene, values)
         yield
     finally:
-        if name in bpy.data.scenes:
+        _held.remove(held)
+        with suppress(Failure):
             # In the same order: a file format is only known once its media type is set.
-            _apply(bpy.data.scenes[name], old)
+            _apply(find_scene(*identity), old)
+
+
+@bpy.app.handlers.persistent
+def put_back(*_):
+    """Before a file is saved: it gets the user's settings."""
+    for identity, _, old in reversed(_held):
+        with suppress(Failure):
+            _apply(find_scene(*identity), old)
+
+
+@bpy.app.handlers.persistent
+def set_again(*_):
+    """After a file is saved."""
+    for identity, values, _ in _held:
+        with suppress(Failure):
+            _apply(find_scene(*identity), values)
+
+
+def find_scene(name, uid):
+    """The scene that had this ``session_uid``: undo makes another object of it, and no reference lives through that.
+
+    Raises:
+        Failure: there is none any more.
+    """
+    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+    if found is None:
+        raise Failure(f"scene '{name}' was removed while it was rendered; bring it back and do it again")
+    return found
+
+
+def literal(path):
+    """A path for ``render.filepath``, where ``{name}`` would be the value of a variable."""
+    return path.replace("{", "{{").replace("}", "}}")
+
+
+def check_animation(scene, values):
+    """Refuse settings that keyframes or drivers take back when the frame is rendered.
+
+    Args:
+        values: what :func:`settings` has just set.
+
+    Raises:
+        Failure: one has another value now.
+    """
+    if scene.animation_data is None:
+        return
+    wanted = {path: getattr(*_owner(scene, path)) for path in values}  # as it is stored: single precision
+    one = next(each for each in scene.view_layers if each.use)
+    scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
+    # Not everything that is animated shows in the scene itself. The copy that is rendered has one view layer only.
+    copy = scene.evaluated_get(one.depsgraph)
+    for path, value in wanted.items():
+        here = [scene] if path.startswith("view_layers[") and not path.startswith(_path(one)) else [scene, copy]
+        if any(getattr(*_owner(each, path)) != value for each in here):
+            raise Failure(f"scene '{scene.name}': {path} is animated; remove its keyframes or driver")
 
 
 def _owner(scene, path):
@@ -214,19 +273,25 @@ def _apply(scene, values):
         setattr(*_owner(scene, path), value)
 
 
-def render(scene):
-    """Render the scene as it is set, as steps: in a window Blender goes on meanwhile.
+def render(scene, file, *, window=False):
+    """Render the scene as it is set, to the file that it names, as steps.
+
+    Args:
+        window: Blender goes on meanwhile. Only for a caller that lets it: the render begins when Blender is back at its
+            own events.
 
     Raises:
         Cancelled: the user pressed Esc.
         Failure: Blender could not render or write.
     """
-    mode = "EXEC_DEFAULT" if bpy.app.background else "INVOKE_DEFAULT"
+    mode = "INVOKE_DEFAULT" if window and not bpy.app.background else "EXEC_DEFAULT"
     try:
         bpy.ops.render.render(mode, write_still=True, scene=scene.name)
     except RuntimeError as error:
         raise Failure(re.sub(r"\s*\n?Error: ", " ", str(error)).strip(), 1) from error
     while bpy.app.is_job_running("RENDER"):
         yield
-    if not os.path.isfile(scene.render.filepath):
+    if not os.path.isfile(file):
+        if bpy.app.background:
+            raise Failure(f"{file}: Blender wrote no file", 1)
         raise Cancelled

@@ -171,7 +171,7 @@ def build_command(
     elif span is not None:
         command.append("--skip-existing")
     try:
-        return command + shlex.split(settings.options)
+        return command + shlex.split(_slashes(settings.options))  # as of paths, or a shell's rules would eat them
     except ValueError as error:
         raise Problem(f"options {settings.options!r}: {error}; write them as in a shell") from error
 

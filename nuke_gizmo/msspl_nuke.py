@@ -229,7 +229,7 @@ def _show(job: _Job, warnings: list[str]) -> None:
     with parent:
         made = [n for n in nuke.allNodes("Read") if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name]
         read = made[0] if made else _new_read(job.node, node_name)
-    first, last = job.span or (job.out.number or 1,) * 2
+    first, last = job.span or (1 if job.out.number is None else job.out.number,) * 2
     if read["file"].value() == job.out.pattern:  # frame by frame, the range grows
         first, last = min(first, int(read["first"].value())), max(last, int(read["last"].value()))
     read["file"].setValue(job.out.pattern)

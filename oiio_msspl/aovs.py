@@ -272,6 +272,8 @@ def renderers() -> list[dict[str, Any]]:
 def read_map_file(path: str | Path) -> dict[str, Any]:
     """A user's mapping: a TOML file with ``feature = candidate`` lines, as in the table.
 
+    A full name in it (``file:masks/albedo.exr``) begins at the TOML file's own folder.
+
     Raises:
         InputError: unreadable, or an entry that is no candidate.
     """
@@ -279,7 +281,8 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
         mapping = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
         raise InputError(f"{path}: can't be read as a mapping ({error})") from error
-    return check_mapping(mapping, str(path))
+    folder = Path(path).absolute().parent
+    return {name: _full_paths(each, folder) for name, each in check_mapping(mapping, str(path)).items()}
 
 
 def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
@@ -294,10 +297,20 @@ def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
         if not equals or not layer:
             raise InputError(f"--map {option!r}: write it as feature=layer, e.g. --map albedo=my_albedo")
         if layer.lower().endswith(".exr"):
-            mapping[feature] = "file:" + layer
+            mapping[feature] = f"file:{Path(layer).absolute()}"  # a farm's worker reads it in another folder
         else:
             mapping[feature] = {"sum": layer.split("+")} if "+" in layer else layer
     return check_mapping(mapping, "--map")
+
+
+def _full_paths(candidate: Any, folder: Path) -> Any:
+    """A candidate whose EXRs are named from a folder, with their full paths."""
+    if isinstance(candidate, dict):
+        return {key: _full_paths(value, folder) for key, value in candidate.items()}
+    if isinstance(candidate, list):
+        return [_full_paths(each, folder) for each in candidate]
+    is_exr = isinstance(candidate, str) and candidate.startswith("file:") and candidate.lower().endswith(".exr")
+    return f"file:{folder / candidate.removeprefix('file:')}" if is_exr else candidate
 
 
 #: Keys of a candidate, and whether their value is a list of names.

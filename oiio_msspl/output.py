@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import os
 import re
+import secrets
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -47,7 +48,9 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         MssplError: the file system refused (disk full, permissions); ``path`` is as it was.
     """
     target = Path(os.path.realpath(path))
-    temporary = target.with_name(f".{target.stem}.{os.getpid()}.tmp{target.suffix}")  # known to remove_leftovers
+    # As remove_leftovers knows it. Processes on two machines may have one number.
+    unique = f"{os.getpid()}{secrets.randbelow(10**9):09d}"
+    temporary = target.with_name(f".{target.stem}.{unique}.tmp{target.suffix}")
     try:
         yield temporary
         # On the disk before it gets its name: a crash must not leave a whole name on half a file.

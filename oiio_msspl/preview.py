@@ -21,6 +21,21 @@ OCIO_DISPLAY = "sRGB - Display"
 OCIO_INPUT = "lin_rec709"
 
 
+#: What tells our pictures from others' of the same name.
+SOFTWARE = "oiio_msspl"
+
+
+def is_ours(path: Path) -> bool:
+    """Is this a picture that was written here?"""
+    file = oiio.ImageInput.open(str(path))
+    if file is None:
+        oiio.geterror()  # or OpenImageIO says it at its end
+        return False
+    ours: bool = file.spec().get_string_attribute("Software") == SOFTWARE
+    file.close()
+    return ours
+
+
 def check_view(view: str) -> None:
     """Raise InputError if OpenColorIO's configuration has no such view."""
     views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
@@ -75,6 +90,7 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], A
             raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
         spec = oiio.ImageSpec(width, height, 3, "uint8")
         spec.attribute("oiio:ColorSpace", "sRGB")
+        spec.attribute("Software", SOFTWARE)
         ok = writer.open(str(temporary), spec)
         for start in range(0, height, BAND):
             stop = min(start + BAND, height)

@@ -201,4 +201,5 @@ def _output_pattern(output: Path, hr: Pattern) -> Pattern:
         return pattern
     if output.suffix.lower() == ".exr" and not output.is_dir():
         raise InputError(f"{output}: one name for many frames; write {output.stem}.####.exr or name a folder")
-    return Pattern(output, hr.head, hr.width, hr.tail)
+    # The HRLS may be named hr.exr.####; what is written must be known for an EXR.
+    return Pattern(output, hr.head, hr.width, hr.tail if hr.tail.lower().endswith(".exr") else f"{hr.tail}.exr")

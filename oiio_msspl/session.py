@@ -31,6 +31,9 @@ PROVIDERS = {
     "directml": "DmlExecutionProvider",
 }
 
+#: The family that is used where no other is asked for.
+DEFAULT_FAMILY = "pyramid"
+
 
 def shipped_models() -> dict[str, Path]:
     """Name -> file of the models inside the package."""
@@ -39,19 +42,20 @@ def shipped_models() -> dict[str, Path]:
 
 
 def find_model(scale: int, name: str | None = None) -> Path:
-    """The shipped model for a scale, or the one that ``name`` (a shipped name or a file) means.
+    """The shipped model for a scale, or the one that ``name`` means: a shipped model, a family of them, or a file.
 
     Raises:
         InputError: there is no such model.
     """
     models = shipped_models()
-    if name is None:
-        name = f"pyramid-x{scale}"
-    if name in models:
-        return models[name]
+    name = name or DEFAULT_FAMILY
+    for known in (name, f"{name}-x{scale}"):
+        if known in models:
+            return models[known]
     if Path(name).is_file():
         return Path(name)
-    raise InputError(f"no model {name!r}: neither a file nor one of {', '.join(models) or '(none shipped)'}")
+    families = dict.fromkeys(known.rpartition("-x")[0] for known in models)
+    raise InputError(f"no model {name!r}: neither a file nor one of {', '.join([*families, *models])}")
 
 
 def usable_devices() -> list[str]:

@@ -24,6 +24,7 @@ from oiio_msspl import preview, schema
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution
 from oiio_msspl.assemble import WriteOptions
+from oiio_msspl.choice import AUTO, choose
 from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.files import Inputs, Report, report_on, resolve_pair, write_frame, write_preview
 from oiio_msspl.fusion import FIXED_MEMORY, MAX_MEMORY, Fused, fuse
@@ -195,6 +196,11 @@ def _prepare_output(shot: Shot) -> None:
         check_folder(folder)
         folder.mkdir(exist_ok=True)
     check_folder(shot.output.path(0))
+    check_no_input(shot)
+
+
+def check_no_input(shot: Shot) -> None:
+    """Raise InputError if a frame would be written over what it is made from."""
     for frame in shot.frames:
         for source in (frame.lr, frame.hr):
             if source is not None and source.exists() and frame.output.exists() and frame.output.samefile(source):
@@ -214,11 +220,16 @@ def _known_before(frame: Frame, shot: Shot, previews: bool, overwrite: bool, ski
     try:
         check_target(frame.output, overwrite=overwrite)
         if previews:
-            # Beside an EXR that is not there, a preview is what a killed run left.
-            check_target(frame.output.with_suffix(".png"), overwrite=overwrite or skip_existing)
+            png = frame.output.with_suffix(".png")
+            check_target(png, overwrite=overwrite or (skip_existing and _is_left_over(png)))
     except InputError as error:
         return _result(frame, FAILED, str(error), error.exit_code)
     return None
+
+
+def _is_left_over(png: Path) -> bool:
+    """Beside an EXR that is not there: is this the preview that a killed run left, and not somebody else's picture?"""
+    return png.is_file() and preview.is_ours(png)
 
 
 def _result(frame: Frame, status: str, message: str = "", exit_code: int = 0, **more: Any) -> FrameResult:
@@ -238,6 +249,8 @@ class Pair:
     hr: Resolution
     sources: tuple[Source, Source]
     """The same two with their pixels in memory, or the files themselves where there is no room for that."""
+    model: Path | None
+    """Which was chosen; None where one was asked for."""
     seconds: float
 
 
@@ -256,19 +269,23 @@ class Stages:
     overwrite: bool = False
     skip_existing: bool = False
     sessions: dict[Path, Session] = field(default_factory=dict)
+    chosen: dict[int, Path] = field(default_factory=dict)
+    """Model for a scale, where none was asked for: that of its first frame, lest a shot change its look."""
 
     def read(self, frame: Frame) -> Pair:
         start = time.perf_counter()
         assert frame.lr is not None and frame.hr is not None
         lr, hr = resolve_pair(frame.lr, frame.hr, self.inputs)
-        pair(lr, hr)  # before pixels are read for nothing
+        scale = pair(lr, hr).scale  # before pixels are read for nothing
         fits = 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= (self.max_memory - FIXED_MEMORY) // 2
         sources: tuple[Source, Source] = (lr.load(), hr.load()) if fits else (lr, hr)
-        return Pair(frame, lr, hr, sources, time.perf_counter() - start)
+        if self.model in (None, AUTO) and scale not in self.chosen:
+            self.chosen[scale], _ = choose(*sources)
+        return Pair(frame, lr, hr, sources, self.chosen.get(scale), time.perf_counter() - start)
 
     def session(self, ready: Pair) -> Session:
         """The model, loaded once for each scale that occurs."""
-        path = find_model(pair(*ready.sources).scale, self.model)
+        path = ready.model or find_model(pair(*ready.sources).scale, self.model)
         if path not in self.sessions:
             self.sessions[path] = Session(path, self.device, self.threads)
         return self.sessions[path]
@@ -287,14 +304,24 @@ class Stages:
 
     def write(self, report: Report, fused: Fused) -> None:
         start = time.perf_counter()
-        write_preview(report, fused, self.view_transform, overwrite=self.overwrite or self.skip_existing)
+        if self.overwrite and report.output.exists():
+            # If it can't be replaced, the old frame keeps its preview.
+            write_frame(report, fused, self.options, overwrite=True)
+            write_preview(report, fused, self.view_transform, overwrite=True)
+        else:
+            self._write_new(report, fused)
+        report.seconds["write"] = time.perf_counter() - start
+
+    def _write_new(self, report: Report, fused: Fused) -> None:
+        replaces = self.skip_existing and report.preview is not None and _is_left_over(report.preview)
+        write_preview(report, fused, self.view_transform, overwrite=self.overwrite or replaces)
         try:
             write_frame(report, fused, self.options, overwrite=self.overwrite)
         except BaseException:
-            if report.preview is not None:
+            # Should another run have put the frame there meanwhile, the preview is its own.
+            if report.preview is not None and not report.output.exists():
                 report.preview.unlink(missing_ok=True)
             raise
-        report.seconds["write"] = time.perf_counter() - start
 
 
 def _pixel_bytes(render: Resolution) -> int:

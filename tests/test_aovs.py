@@ -346,6 +346,17 @@ def test_a_mapping_file_takes_what_the_table_takes(tmp_path):
     assert resolution.read(resolution.data_window)["diffuse"][0, 0, 0] == 20
 
 
+def test_files_that_a_mapping_names_do_not_depend_on_the_working_directory(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert parse_map_options(["albedo=a/b.exr"]) == {"albedo": f"file:{tmp_path}/a/b.exr"}
+    (tmp_path / "maps").mkdir()
+    (tmp_path / "maps/map.toml").write_text('albedo = "file:b.exr"\ndiffuse = { sum = ["file:DIRECT", "file:/c.exr"] }')
+    assert read_map_file("maps/map.toml") == {
+        "albedo": f"file:{tmp_path}/maps/b.exr",
+        "diffuse": {"sum": ["file:DIRECT", "file:/c.exr"]},
+    }
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -105,13 +105,13 @@ def farm(tmp_path):
     """Runs msspl-render with a stand-in for Blender that does ``code`` while it renders."""
     (tmp_path / "scene.blend").write_text("")
 
-    def start(*arguments, code="pass"):
+    def start(*arguments, code="pass", stderr=subprocess.PIPE):
         blender = tmp_path / "blender"
         blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}")
         blender.chmod(0o755)
         main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
         command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "--blender", str(blender), *arguments]
-        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=stderr, text=True)
 
     def run(*arguments, code="pass"):
         with start(*arguments, code=code) as process:
@@ -160,6 +160,8 @@ def test_a_shot_and_a_report_for_machines(farm):
         (["-o", "x.png"], "", 2, "x.png: the result is an EXR"),
         (["-o", "nowhere/x.exr"], "", 2, "the folder nowhere does not exist"),
         (["-o", "out.##.exr"], "", 2, "name the frames with --frames"),
+        (["-o", "no/where/x.##.exr", "--frames", "1"], "", 2, "the folder no does not exist"),
+        (["--overwrite", "--skip-existing"], "", 2, "exclude each other"),
         (["--blender", "nothing"], "", 2, "--blender nothing: no such program"),
     ],
 )
@@ -169,6 +171,42 @@ def test_what_goes_wrong_is_one_sentence_and_a_code(farm, arguments, code, statu
     assert (returned, left) == (status, [])
     assert err.count("\n") == 1
     assert re.search(message, err), err
+
+
+@posix
+def test_a_shot_that_fails_midway_says_where_and_is_resumed(farm):
+    _, run, folder = farm
+    arguments = ["-o", "new/out.##.exr", "--frames", "1-3", "--json"]
+    code, out, err, left = run(*arguments, code="if number == 2: tell(error='disk full', code=1); sys.exit(1)")
+    assert (code, left) == (1, ["new"])
+    assert err.splitlines()[-1] == "error: frame 2: disk full"
+    assert [report["frame"] for report in json.loads(out)] == [1]
+    assert [path.name for path in (folder / "new").iterdir()] == ["out.01.exr"]
+    assert "out.01.exr: exists" in run(*arguments)[2]
+    code, out, _, _ = run(*arguments, "--skip-existing")
+    assert (code, [report["frame"] for report in json.loads(out)]) == (0, [2, 3])
+    assert run(*arguments[:-1], "--skip-existing")[:3] == (0, "new/out.##.exr: all is there\n", "")
+
+
+@posix
+def test_the_status_line_is_wiped_before_an_error(farm):
+    start, _, _ = farm
+    reader, terminal = os.openpty()
+    with start(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
+        process.wait()
+        said = os.read(reader, 10000).decode()
+    assert "frame None: LRHS" in said
+    assert said.endswith("\r\033[Kerror: disk full\r\n")
+
+
+@posix
+def test_a_program_that_cannot_be_started(farm):
+    _, run, folder = farm
+    (folder / "no-program").write_text("text")
+    (folder / "no-program").chmod(0o755)
+    code, _, err, _ = run("--blender", str(folder / "no-program"))
+    assert code == 2
+    assert re.fullmatch(r"error: .*no-program: can't be started \(.*\); name Blender.* --blender or .*\n", err), err
 
 
 @posix
@@ -279,7 +317,7 @@ def msspl_render(*arguments):
 @posix
 def test_msspl_render_from_scene_to_frame(python, results, tmp_path):
     """With a stand-in for Blender's program that reads the command line as Blender does."""
-    (tmp_path / "out").mkdir()
+    out = tmp_path / "out {frame}"  # Blender has variables of such names
     blender = tmp_path / "blender"
     blender.write_text(
         f"#!{python}\nimport bpy, runpy, sys\n"
@@ -289,7 +327,7 @@ def test_msspl_render_from_scene_to_frame(python, results, tmp_path):
     )
     blender.chmod(0o755)
     options = ["-s", "2", "--lr-spp", "8", "--view-layer", "ViewLayer", "--keep", "--compare", "--json"]
-    frames = ["--frames", "3-4", "-o", tmp_path / "out" / "out.##.exr"]
+    frames = ["--frames", "3-4", "-o", out / "out.##.exr"]
     done = msspl_render(results / "scene.blend", "--blender", blender, *options, *frames)
     assert done.returncode == 0, done.stderr
     reports = json.loads(done.stdout)
@@ -302,14 +340,11 @@ def test_msspl_render_from_scene_to_frame(python, results, tmp_path):
         assert report["plain_spp"] > 3
         assert report["oidn"]["spp"] >= 1
     names = [f"out.{n}{suffix}.exr" for n in ("03", "04") for suffix in ("", "_hr", "_lr", "_oidn")]
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == sorted(names)
+    assert sorted(p.name for p in out.iterdir()) == sorted(names)
     for name, components in (("CryptoObject00", "rgba"), ("Mist", "Z"), ("Combined_key", "RGB"), ("Matte", "RGB")):
-        both = [layer(tmp_path / "out" / f"out.03{s}.exr", f"ViewLayer.{name}.", components) for s in ("", "_hr")]
+        both = [layer(out / f"out.03{s}.exr", f"ViewLayer.{name}.", components) for s in ("", "_hr")]
         np.testing.assert_array_equal(*both)
-    means = [
-        layer(tmp_path / "out" / f"out.03{suffix}.exr", "ViewLayer.Combined.", "RGB").mean()
-        for suffix in ("", "_lr", "_oidn")
-    ]
+    means = [layer(out / f"out.03{suffix}.exr", "ViewLayer.Combined.", "RGB").mean() for suffix in ("", "_lr", "_oidn")]
     assert means == pytest.approx([means[2]] * 3, rel=0.05)
 
 

@@ -10,10 +10,12 @@ import subprocess
 import sysconfig
 import time
 from functools import partial
+from pathlib import Path
 
+import numpy as np
 import pytest
 
-from oiio_msspl import InputError, cluster, fuse_shot, shot
+from oiio_msspl import InputError, cluster, fuse_shot, preview, shot
 from tests.conftest import write_exr
 from tests.test_cli import fuse, run
 from tests.test_shot import contents, layers, low_layers
@@ -57,7 +59,9 @@ def test_the_bundle_is_a_valid_job_of_both_forms(tmp_path, bilinear_models):
     model = pytest.importorskip("openjd.model")
     make_shot(tmp_path, 6)
     (tmp_path / "hr/beauty.1004.exr").unlink()
-    done = submit(tmp_path, "--model", bilinear_models[4], "--chunk", 3, "--timeout", 60, "--layers", "a b", "--half")
+    elsewhere = ("--map", "albedo=a.exr", "--device", "cuda")  # which need not be usable here
+    more = ("--chunk", 3, "--timeout", 60, "--layers", "a b", "--half")
+    done = submit(tmp_path, "--model", bilinear_models[4], *elsewhere, *more)
     assert done.returncode == 0, done.stderr
     assert "beauty.####.exr lacks 1004" in done.stderr and "6 frames" in done.stdout
     data = json.loads((tmp_path / "job/template.json").read_text())
@@ -74,6 +78,7 @@ def test_the_bundle_is_a_valid_job_of_both_forms(tmp_path, bilinear_models):
     assert action["timeout"] == 180
     assert action["cancelation"]["mode"] == "NOTIFY_THEN_TERMINATE"
     assert action["args"][-3:] == ["--layers", "a b", "--half"]
+    assert action["args"][action["args"].index("--map") + 1] == f"albedo={Path('a.exr').absolute()}"
     assert values["Model"] == str(bilinear_models[4])
     kinds = {p["name"]: (p.get("objectType"), p.get("dataFlow")) for p in data["parameterDefinitions"]}
     assert kinds["HRFolder"] == ("DIRECTORY", "IN")
@@ -146,6 +151,11 @@ def test_a_canceled_job_ends_with_whole_frames(tmp_path, bilinear_models):
         (["lr", "hr", "-o", "out", "--json"], "--json has no meaning in a job"),
         (["lr", "hr", "-o", "out", "--layout", "x"], "--layout 'x': use one of"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
+        (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: onnxruntime can't load it"),
+        (["lr", "hr", "-o", "out", "--device", "abacus"], "--device 'abacus': use one of cpu"),
+        (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
+        (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
+        (["lr", "hr", "-o", "text.onnx/out"], "the folder text.onnx does not exist"),
         (["lr", "hr", "-o", "out", "--layers", "{{a}}"], "for the start of a parameter"),
         (["lr", "hr", "-o", "out", "--frames", "5-7"], "no frame is in both"),
         (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "out.exr"], "a job is for a shot"),
@@ -157,11 +167,22 @@ def test_a_canceled_job_ends_with_whole_frames(tmp_path, bilinear_models):
 )
 def test_what_no_task_could_do_is_said_at_submission(tmp_path, monkeypatch, arguments, message):
     make_shot(tmp_path, 1)
+    (tmp_path / "text.onnx").write_text("no model")
     monkeypatch.chdir(tmp_path)
     done = run("msspl", "submit", "--bundle", "job", *arguments)
     assert done.returncode == 2
     assert message in done.stderr
     assert not (tmp_path / "job").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "model"), [([], "pyramid"), (["--model", "auto"], "pyramid"), (["--model", "paper-x4"], "paper-x4")]
+)
+def test_a_shipped_model_goes_by_its_name_and_is_the_same_for_all_tasks(tmp_path, given, model):
+    make_shot(tmp_path, 1)
+    assert submit(tmp_path, *given).returncode == 0
+    action = json.loads((tmp_path / "job/template.json").read_text())["steps"][0]["script"]["actions"]["onRun"]
+    assert action["args"][-2:] == ["--model", model]
 
 
 # ------------------------------------------------------------------------------------------------ Dask
@@ -195,7 +216,7 @@ def hang_in_writing(marker):
     """In a worker: leave what there is in the middle of writing a frame, tell, and go no further."""
 
     def write(self, report, fused):
-        report.preview.write_bytes(b"of a frame that is not there")
+        preview.write_png(report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
         report.output.with_name(f".{report.output.stem}.{os.getpid()}.tmp.exr").write_bytes(b"half")
         marker.touch()
         time.sleep(1000)

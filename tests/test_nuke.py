@@ -232,6 +232,14 @@ def test_a_knob_that_makes_no_sense_is_named(bridge, knobs, sentence):
         bridge.build_command("msspl-fuse", clip, clip, clip, bridge.Settings(**knobs))
 
 
+def test_backslashes_of_windows_survive_the_options(bridge, monkeypatch):
+    monkeypatch.setattr(os, "sep", "\\")
+    clip = bridge.Clip("/a.exr")
+    settings = bridge.Settings(options=r'--map-file C:\maps\a.toml --report "C:\my reports\r.json"')
+    command = bridge.build_command("msspl-fuse", clip, clip, clip, settings)
+    assert command[-4:] == ["--map-file", "C:/maps/a.toml", "--report", "C:/my reports/r.json"]
+
+
 @posix
 def test_the_program_is_the_chosen_one_then_the_environments_then_the_paths(bridge, tmp_path):
     def program(name):
@@ -384,6 +392,17 @@ def test_a_frame_is_fused_and_comes_back_as_a_read(host, tmp_path):
     assert len(names) == 2
     assert "Crypto" in names[1]
     assert host.gizmo.name() not in importlib.import_module("msspl_nuke")._running
+
+
+def test_frame_0_is_a_frame(host, tmp_path):
+    for read, name in zip(host.reads, ("lr", "hr"), strict=True):
+        shutil.copy(EXAMPLES / f"{name}.exr", tmp_path / f"{name}.0000.exr")
+        read["first"].setValue(0)
+    host.frame_number = 0
+    host.press(host.gizmo, "fuse_frame")
+    host.wait()
+    assert host.messages == []
+    assert [results(host)[0][k].value() for k in ("first", "last", "origfirst", "origlast")] == [0] * 4
 
 
 def test_a_second_frame_updates_the_same_read(host):

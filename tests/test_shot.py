@@ -16,7 +16,8 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl import InputError, fuse_files, fuse_shot, session, shot
+from oiio_msspl import InputError, MssplError, fuse_files, fuse_shot, preview, session, shot
+from oiio_msspl.output import remove_leftovers, replacing
 from oiio_msspl.sequence import find_shot, format_frames
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.test_cli import fuse
@@ -97,6 +98,12 @@ def test_of_several_sequences_those_of_one_name_are_paired(tmp_path):
     touch(tmp_path / "hr", "beauty.0001.exr", "beauty.0002.exr", "crypto.0001.exr", "beauty.0001.id.exr")
     found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
     assert (found.lr.pattern.name, found.hr.pattern.name) == ("beauty_####.exr", "beauty.####.exr")
+
+
+def test_results_are_named_exr_whatever_the_hrls_is_named(tmp_path):
+    touch(tmp_path, "hr.exr.0001", "hr.exr.0002")
+    found = find_shot(tmp_path / "hr.exr.####", tmp_path / "hr.exr.####", tmp_path / "out")
+    assert [frame.output.name for frame in found.frames] == ["hr.exr.0001.exr", "hr.exr.0002.exr"]
 
 
 @pytest.mark.parametrize(
@@ -477,6 +484,45 @@ def test_a_fault_of_the_program_in_one_frame_does_not_stop_the_others(make, bili
     assert report.exit_code == 1
 
 
+def test_a_picture_that_is_no_preview_of_ours_is_left_alone(make, bilinear_models):
+    folder = make(2)
+    (folder / "out").mkdir()
+    mine = folder / "out/beauty.1001.png"
+    oiio.ImageBuf(oiio.ImageSpec(4, 4, 3, "uint8")).write(str(mine))
+    before = mine.read_bytes()
+    preview.write_png(folder / "out/beauty.1002.png", np.zeros((2, 2, 3)))  # of a run that was killed
+    report = run(folder, bilinear_models[4], previews=True, skip_existing=True)
+    assert [report.results[n].status for n in (1001, 1002)] == ["failed", "fused"]
+    assert "beauty.1001.png: exists; pass --overwrite" in report.results[1001].message
+    assert mine.read_bytes() == before
+    assert oiio.ImageBuf(str(folder / "out/beauty.1002.png")).spec().width == WIDTH
+
+
+def test_a_frame_that_stays_keeps_its_preview(make, bilinear_models, monkeypatch):
+    """An old frame that can't be replaced, and one that another run puts there meanwhile."""
+    folder = make(1)
+    assert run(folder, bilinear_models[4], previews=True).exit_code == 0
+    before, real = contents(folder / "out"), shot.write_frame
+
+    def full_disk(*arguments, **more):
+        raise MssplError("disk full")
+
+    def too_late(report, *arguments, **more):
+        report.output.write_text("theirs")
+        real(report, *arguments, **more)
+
+    write_exr(folder / "lr/lr.1001.exr", {c: values / 2 for c, values in low_layers(1).items()})
+    monkeypatch.setattr(shot, "write_frame", full_disk)
+    assert run(folder, bilinear_models[4], previews=True, overwrite=True).results[1001].message == "disk full"
+    assert contents(folder / "out") == before
+    (folder / "out/beauty.1001.exr").unlink()
+    assert run(folder, bilinear_models[4], previews=True, skip_existing=True).results[1001].message == "disk full"
+    assert contents(folder / "out") == {}
+    monkeypatch.setattr(shot, "write_frame", too_late)
+    assert "appeared while" in run(folder, bilinear_models[4], previews=True).results[1001].message
+    assert (folder / "out/beauty.1001.png").exists()
+
+
 def test_what_is_done_is_skipped_and_its_report_kept(make, bilinear_models):
     folder = make(3)
     not_finite(np.nan)(None, folder / "hr/beauty.1001.exr")
@@ -536,7 +582,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(make, bilinear_models):
             assert not json.loads((folder / "r.json").read_text())["finished"]
     # What a kill in the middle of writing leaves, should the three moments have missed it.
     (folder / "out/.beauty.1100.99999.tmp.exr").write_bytes(b"half")
-    (folder / "out/beauty.1100.png").write_bytes(b"of a frame that is not there")
+    preview.write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
 
     last = start(folder, bilinear_models[4])
     last.communicate()
@@ -562,6 +608,20 @@ def test_ctrl_c_ends_with_the_table_and_whole_frames(make, bilinear_models, name
     assert 5 <= len(files) < 100 and not report["finished"]
     assert f"  fused     {len(files)} " in out and "run again with --skip-existing" in out
     read_bits(folder / "out" / files[-1])
+
+
+def test_temporary_files_of_two_machines_have_two_names(tmp_path, monkeypatch):
+    """Where both have a process of one number; either is known as a leftover."""
+    monkeypatch.setattr(os, "getpid", lambda: 7)
+    target = tmp_path / "a.1001.exr"
+    with replacing(target, overwrite=True) as one, replacing(target) as other:
+        for path in (one, other):
+            path.touch()
+        assert len(list(tmp_path.iterdir())) == 2
+        remove_leftovers([target])
+        assert list(tmp_path.iterdir()) == []
+        for path in (one, other):
+            path.touch()
 
 
 def test_frames_are_shown_as_ranges():

@@ -112,6 +112,10 @@ def check_button(scene):
     assert blur.inputs[0].links[0].from_node == node
     assert output.inputs[0].links[0].from_node == blur
     assert node.image.filepath == "//fused_012.exr"
+    if not V5:  # nodes that are turned off are still the user's
+        scene.use_nodes = False
+        module("compositor").show(scene, "//fused_012.exr", False)
+        assert output.inputs[0].links[0].from_node == blur
     scene.msspl.connect = True
     assert bpy.ops.msspl.fuse() == {"FINISHED"}
     assert output.inputs[0].links[0].from_node == node
@@ -143,7 +147,7 @@ def check_sentences(scene):
     assert "turn Stereoscopy off" in sentence(**{"render.use_multiview": True})
     assert "turn Freestyle off" in sentence(**{"render.use_freestyle": True})
     assert "101x9 is too small for x4" in sentence(**{"render.resolution_y": 18})
-    assert "the folder" in sentence(**{"msspl.output": "//nowhere/fused.exr"})
+    assert "nowhere#1 does not exist" in sentence(**{"msspl.output": "//nowhere#1/fused_#.exr"})
     assert "name it .exr" in sentence(**{"msspl.output": "//fused.png"})
     assert "exists; allow overwriting" in sentence(**{"render.use_overwrite": False})
     camera, scene.camera = scene.camera, None
@@ -163,9 +167,92 @@ def check_sentences(scene):
     preferences.program = program
     assert bpy.ops.msspl.fuse() == {"FINISHED"}  # the preference wins
     preferences.program = ""
-    os.environ["MSSPL_FUSE"] = str(fake_fuse("print('error: framing differs', file=sys.stderr); sys.exit(2)"))
-    assert "msspl-fuse: framing differs" in sentence()
+    said = "print('error: é differs', file=sys.stderr); print('more', file=sys.stderr); sys.exit(2)"
+    os.environ["MSSPL_FUSE"] = str(fake_fuse(f"assert os.environ['PYTHONUTF8'] == '1'; {said}"))
+    assert "msspl-fuse: é differs" in sentence()
+    (WORK / "fake-fuse").write_text("no program")
+    assert "can't be started" in sentence()
     os.environ["MSSPL_FUSE"] = program
+
+
+def check_animated(scene):
+    """A setting of ours that the scene's keyframes or a driver would win over is named."""
+    before = snapshot(scene)
+    scene.driver_add("cycles.seed").driver.expression = "frame"
+    scene.frame_set(1)
+    assert "cycles.seed is animated; remove its keyframes or driver" in sentence()
+    scene.driver_remove("cycles.seed")
+    scene.cycles.seed = 7
+    scene.view_layers[0].keyframe_insert("samples")  # nothing that we set
+    scene.keyframe_insert("cycles.samples")
+    assert "cycles.samples is animated" in sentence()
+    scene.keyframe_delete("cycles.samples")
+    assert snapshot(scene) == before
+
+
+def check_changes(scene):
+    """What a user may do while a frame is rendered, in another window."""
+    frame, render, failure = module("frame"), module("render"), module("errors").Failure
+    options = render.Options(view_layer="ViewLayer")
+
+    def said(scene, meanwhile):
+        steps = frame.make(scene, options, WORK / "new.exr", WORK, "msspl-fuse")
+        next(steps)
+        meanwhile()
+        try:
+            next(steps)
+        except failure as error:
+            return str(error)
+
+    before = snapshot(scene)
+    assert "frame 1 was left for 2" in said(scene, lambda: scene.frame_set(2))
+    scene.frame_set(1)
+    assert snapshot(scene) == before
+    copy = scene.copy()
+    assert "was removed while it was rendered" in said(copy, lambda: bpy.data.scenes.remove(copy))
+
+    # A file that is saved has the user's settings; the render goes on with ours.
+    with render.settings(scene, render.low(scene, options)):
+        ours = snapshot(scene)
+        bpy.ops.wm.save_as_mainfile(filepath=str(WORK / "saved.blend"), copy=True)
+        assert snapshot(scene) == ours != before
+    with bpy.data.libraries.load(str(WORK / "saved.blend")) as (there, here):
+        here.scenes = there.scenes
+    assert repr(snapshot(here.scenes[0])).replace(here.scenes[0].name, scene.name) == repr(before)
+    bpy.data.scenes.remove(here.scenes[0])
+    (WORK / "saved.blend").unlink()
+
+
+def check_modes(scene):
+    """A script waits for its render, and a window does not; a render that wrote nothing was cancelled in a window."""
+    render, errors = module("render"), module("errors")
+    modes = []
+    fake = SimpleNamespace(
+        app=SimpleNamespace(background=False, is_job_running=lambda kind: False),
+        ops=SimpleNamespace(render=SimpleNamespace(render=lambda mode, **_: modes.append(mode))),
+    )
+    render.bpy = fake
+    for window, fake.app.background, error in (
+        (True, False, errors.Cancelled),
+        (False, False, errors.Cancelled),
+        (False, True, errors.Failure),
+    ):
+        try:
+            list(render.render(scene, "/nothing.exr", window=window))
+            raise AssertionError("there is no file")
+        except error:
+            pass
+    render.bpy = bpy
+    assert modes == ["INVOKE_DEFAULT", "EXEC_DEFAULT", "EXEC_DEFAULT"]
+
+    def make(*_, window, **__):
+        modes.append(window)
+        raise errors.Failure("no more")
+
+    module("frame").make, real = make, module("frame").make
+    assert "no more" in sentence()
+    module("frame").make = real
+    assert modes[3:] == [False]
 
 
 def fake_fuse(code):
@@ -193,22 +280,24 @@ def check_cancel(scene):
         window=None,
         workspace=SimpleNamespace(status_text_set=lambda text: said.append(text)),
         window_manager=SimpleNamespace(
-            msspl=SimpleNamespace(text="", fraction=0.0),
             event_timer_add=lambda *_, **__: "timer",
             event_timer_remove=lambda timer: said.append(f"{timer} removed"),
             modal_handler_add=lambda operator: None,
         ),
     )
     said = []
-    methods = {name: getattr(button, name) for name in ("modal", "cancel", "invoke", "_job", "_step")}
+    methods = {name: getattr(button, name) for name in ("modal", "cancel", "invoke", "_end", "_job", "_step")}
     operator = type("Operator", (), {**methods, "report": lambda self, kind, text: said.append(text)})()
-    timer, escape, other = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "MOUSEMOVE"))
+    timer, escape, other, report = (SimpleNamespace(type=kind) for kind in ("TIMER", "ESC", "Z", "TIMER_REPORT"))
 
+    status, fractions = module("panel").status, []
+    assert button.poll(context)
     assert operator.invoke(context, None) == {"RUNNING_MODAL"}
-    status, fractions = context.window_manager.msspl, []
+    assert not button.poll(context)
     deadline = time.monotonic() + 60
     while status.fraction != 2.25 / 3:  # a tile of four in the last of three steps
-        assert operator.modal(context, timer) == operator.modal(context, other) == {"PASS_THROUGH"}
+        assert operator.modal(context, timer) == operator.modal(context, report) == {"PASS_THROUGH"}
+        assert operator.modal(context, other) == {"RUNNING_MODAL"}  # nothing else sees it
         fractions.append(status.fraction)
         assert time.monotonic() < deadline, said
         time.sleep(0.02)
@@ -266,8 +355,9 @@ def check_framing():
         scene.render.resolution_x, scene.render.resolution_y = size
         scene.render.pixel_aspect_x, scene.render.pixel_aspect_y = aspect
         for kind, values in (("lr", render.low(scene, options)), ("hr", render.high(scene, options))):
-            with render.settings(scene, values | {"render.filepath": str(WORK / f"{name}_{kind}.exr")}):
-                list(render.render(scene))
+            file = str(WORK / f"{name}_{kind}.exr")
+            with render.settings(scene, values | {"render.filepath": file}):
+                list(render.render(scene, file))
 
 
 if __name__ == "__main__":
@@ -277,6 +367,9 @@ if __name__ == "__main__":
     check_button(scene)
     scene = build_scene()
     check_sentences(scene)
+    check_animated(scene)
+    check_changes(scene)
+    check_modes(scene)
     check_cancel(scene)
     check_framing()
     bpy.ops.preferences.addon_disable(module=MODULE)

@@ -65,7 +65,9 @@ def fuse(
     view_layer: options.ViewLayer = None,
     lr_spp: options.LrSpp = None,
     hr_spp: options.HrSpp = None,
-    model: Annotated[str | None, typer.Option(help="A shipped model (msspl models) or an ONNX file.")] = None,
+    model: Annotated[
+        str, typer.Option(help="auto, a family (paper), a shipped model (msspl models) or an ONNX file.")
+    ] = "auto",
     device: Annotated[str, typer.Option(help="cpu, cuda, tensorrt, openvino, coreml or directml.")] = "cpu",
     threads: Annotated[int, typer.Option(min=0, max=1024, help="CPU threads; 0: one a core.")] = 0,
     max_memory: Annotated[str, typer.Option(metavar="SIZE", help="Memory to stay below; tiles shrink to fit.")] = "3G",
@@ -214,5 +216,7 @@ def _print(report: Report, seconds: float) -> None:
         print(f"repaired values that were NaN, infinite or negative: {what}")
     tiles = f", {report.tiles} tiles" if report.tiles > 1 else ""
     network = report.seconds["network"]
-    print(f"{report.model} on {report.provider}{tiles}: {seconds:.1f} s, of which {network:.1f} s in the network")
+    chosen = f" ({report.chosen})" if report.chosen else ""
+    where = f"{report.model}{chosen} on {report.provider}{tiles}"
+    print(f"{where}: {seconds:.1f} s, of which {network:.1f} s in the network")
     print(f"wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))

@@ -20,14 +20,16 @@ import typer
 from msspl_cli import options, show
 from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.output import check_target
+from oiio_msspl.output import check_folder, check_target
 from oiio_msspl.schema import SCALES
 
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl-render scene.blend -s 4 --lr-spp 16 --hr-spp 1 -o frame.exr
 
-  msspl-render scene.blend -o shot/frame.####.exr --frames 1001-1100 --blender /opt/blender-5.0/blender
+  msspl-render scene.blend -o shot/frame.####.exr --frames 1001-1100 --skip-existing
+
+  msspl-render scene.blend -o frame.exr --blender /opt/blender-5.0/blender
 
   msspl-render scene.blend -o frame.exr --keep --compare --json > times.json
 """
@@ -79,6 +81,9 @@ def render(
     ] = None,
     threads: Annotated[int, typer.Option(min=0, max=1024, help="CPU threads; 0: the scene's, one a core.")] = 0,
     overwrite: options.Overwrite = False,
+    skip_existing: Annotated[
+        bool, typer.Option("--skip-existing", help="Leave frames alone whose OUT is there; resumes a shot.")
+    ] = False,
     verbose: options.Verbose = 0,
     quiet: options.Quiet = False,
     as_json: options.Json = False,
@@ -99,11 +104,20 @@ def render(
     fuse = find_msspl_fuse()
     if fuse is None:
         raise MssplError("msspl-fuse is not installed beside this program; install oiio-msspl again")
+    if overwrite and skip_existing:
+        raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
     targets = name_targets(output, frames)
+    folder = output.parent
+    makes_folder = is_pattern(output) and not folder.exists()
+    if makes_folder:
+        check_folder(folder)
     suffixes = ["", *(["_lr", "_hr"] if keep else []), *(["_oidn"] if compare else [])]
     for _, target in targets:
         if target.suffix.lower() != ".exr":
             raise InputError(f"{target}: the result is an EXR; name it .exr")
+    if skip_existing:
+        targets = [(number, target) for number, target in targets if not target.exists()]
+    for _, target in [] if makes_folder else targets:
         for suffix in suffixes:
             check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
     job = {
@@ -122,26 +136,68 @@ def render(
         "keep": keep,
         "compare": compare,
     }
-    reports = []
+    if makes_folder:
+        folder.mkdir(exist_ok=True)
+    reports: list[dict[str, Any]] = []
     status = _Status(on=not quiet and not verbose and sys.stderr.isatty())
+    try:
+        if targets:
+            _render(program, scene, job, folder, reports, status, verbose=bool(verbose), quiet=quiet)
+    finally:
+        # Of a shot that failed or was ended, too: its frames are there.
+        status.clear()
+        if as_json:
+            print(json.dumps(reports, indent=2))
+        elif reports and not quiet:
+            _print(reports)
+    if not (targets or as_json or quiet):
+        print(f"{output}: all is there")
+
+
+def _render(
+    program: str,
+    scene: Path,
+    job: dict[str, Any],
+    folder: Path,
+    reports: list[dict[str, Any]],
+    status: _Status,
+    *,
+    verbose: bool,
+    quiet: bool,
+) -> None:
+    """Have a job done; ``reports`` gets a frame's as soon as it ends.
+
+    Raises:
+        InputError, MssplError: a frame failed, which the sentence names if there are several.
+    """
+    count, number = len(job["frames"]), None
     # Beside the results, so that what is kept only has to be renamed.
-    with tempfile.TemporaryDirectory(prefix=".msspl-", dir=output.absolute().parent) as work:
+    with tempfile.TemporaryDirectory(prefix=".msspl-", dir=folder.absolute()) as work:
         path = Path(work, "job.json")
         path.write_text(json.dumps({**job, "work": work}), encoding="utf-8")
-        for event in run_blender(command(program, scene, path), verbose=bool(verbose)):
-            if "report" in event:
-                reports.append(event["report"])
-                status.clear()
-                for warning in [] if quiet else reports[-1]["warnings"]:
-                    print(f"warning: frame {reports[-1]['frame']}: {warning}", file=sys.stderr)
-            else:
-                status.show(event)
-    if len(reports) < len(targets):
-        raise MssplError(f"{program}: ended after {len(reports)} of {len(targets)} frames (-v shows what it says)")
-    if as_json:
-        print(json.dumps(reports, indent=2))
-    elif not quiet:
-        _print(reports)
+        try:
+            for event in run_blender(command(program, scene, path), verbose=verbose):
+                number = event.get("frame", number)
+                if "report" in event:
+                    reports.append(event["report"])
+                    number = None
+                    status.clear()
+                    for warning in [] if quiet else reports[-1]["warnings"]:
+                        print(f"warning: frame {reports[-1]['frame']}: {warning}", file=sys.stderr)
+                else:
+                    status.show(event)
+        except MssplError as error:
+            if number is None or count == 1:
+                raise
+            raise type(error)(f"frame {number}: {error}") from error
+    if len(reports) < count:
+        raise MssplError(f"{program}: ended after {len(reports)} of {count} frames (-v shows what it says)")
+
+
+def is_pattern(output: Path) -> bool:
+    from oiio_msspl.sequence import is_sequence
+
+    return is_sequence(output) and not output.is_dir()
 
 
 def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Path]]:
@@ -150,10 +206,10 @@ def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Pat
     Raises:
         InputError: one name for several frames, or a pattern without frames.
     """
-    from oiio_msspl.sequence import is_sequence, parse_frames, parse_pattern
+    from oiio_msspl.sequence import parse_frames, parse_pattern
 
     numbers = [] if frames is None else parse_frames(frames)
-    if is_sequence(output) and not output.is_dir():
+    if is_pattern(output):
         if not numbers:
             raise InputError(f"{output}: is a pattern; name the frames with --frames")
         pattern = parse_pattern(output)
@@ -199,15 +255,22 @@ def run_blender(arguments: Sequence[str], *, verbose: bool = False) -> Iterator[
         InputError, MssplError: the job failed; the sentence is Blender's or msspl-fuse's.
     """
     posix = os.name == "posix"
-    with subprocess.Popen(
-        arguments,
-        stdin=subprocess.DEVNULL,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        errors="replace",
-        start_new_session=posix,  # a group of its own, which can be ended as a whole
-    ) as process:
+    try:
+        started = subprocess.Popen(
+            arguments,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=posix,  # a group of its own, which can be ended as a whole
+        )
+    except OSError as refused:
+        raise InputError(
+            f"{arguments[0]}: can't be started ({refused.strerror}); name Blender, or a Python that has bpy, with "
+            "--blender or MSSPL_BLENDER"
+        ) from refused
+    with started as process:
         assert process.stdout is not None
         last: deque[str] = deque(maxlen=5)
         error = None

@@ -50,8 +50,11 @@ def submit(
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl import preview
     from oiio_msspl.bundle import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
+    from oiio_msspl.choice import AUTO
+    from oiio_msspl.schema import SCALES
     from oiio_msspl.sequence import find_shot, format_frames, is_sequence
-    from oiio_msspl.session import find_model, shipped_models
+    from oiio_msspl.session import DEFAULT_FAMILY, PROVIDERS, find_model, read_contract, shipped_models
+    from oiio_msspl.shot import check_no_input
 
     # What is wrong for every frame is said here, not by every task.
     options.make_inputs(*(given[name] for name in ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp")))
@@ -59,11 +62,16 @@ def submit(
     options.parse_bytes(given["max_memory"])
     if given["view"] is not None:
         preview.check_view(given["view"])
+    if given["device"] not in PROVIDERS:  # what is usable here need not be there, nor the other way round
+        raise InputError(f"--device {given['device']!r}: use one of {', '.join(PROVIDERS)}")
     files = {"--map-file": given["map_file"]} if given["map_file"] else {}
-    if given["model"] in shipped_models():
-        passed_on += ["--model", given["model"]]
-    elif given["model"] is not None:
-        files["--model"] = find_model(0, given["model"])
+    # Tasks must not choose for themselves, each on its machine.
+    model = DEFAULT_FAMILY if given["model"] in (None, AUTO) else given["model"]
+    if shipped_models().keys() & {model, *(f"{model}-x{scale}" for scale in SCALES)}:
+        passed_on += ["--model", model]
+    else:
+        files["--model"] = find_model(0, model)
+        read_contract(files["--model"])
 
     paths = given["lr"], given["hr"], given["output"]
     if not any(map(is_sequence, paths[:2])):
@@ -72,6 +80,10 @@ def submit(
     lacking = {name: [f.number for f in shot.frames if getattr(f, name) is None] for name in ("lr", "hr")}
     if not any(frame.lr and frame.hr for frame in shot.frames):
         raise InputError(f"no frame is in both {shot.lr.pattern} and {shot.hr.pattern}; nothing to submit")
+    check_no_input(shot)
+    folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{given['output']}: the folder {folder} does not exist; create it first")
     write_bundle(bundle, *make_job(*paths, shot, options=passed_on, files=files, chunk=chunk, timeout=timeout))
     for name, sequence in (("lr", shot.lr), ("hr", shot.hr)):
         if lacking[name]:
@@ -110,7 +122,13 @@ def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
             passed_on += [parameter.opts[0]] * value
         else:
             for each in value if isinstance(value, list | tuple) else [value]:
-                passed_on += [parameter.opts[0], str(each)]
+                passed_on += [parameter.opts[0], _full_path(each) if name == "mapping" else str(each)]
     # Some versions of typer make paths only when they call the command.
     paths = {name: Path(context.params[name]) for name in _PATHS if context.params[name] is not None}
     return context.params | paths, passed_on
+
+
+def _full_path(mapping: str) -> str:
+    """A ``--map`` that names an EXR, for tasks that run in other folders."""
+    feature, equals, layer = mapping.partition("=")
+    return f"{feature}{equals}{Path(layer).absolute()}" if layer.lower().endswith(".exr") else mapping

@@ -15,10 +15,9 @@ from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from oiio_msspl.choice import AUTO
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.sequence import Frame
-from oiio_msspl.session import DEFAULT_FAMILY, Session, find_model
+from oiio_msspl.session import ALWAYS, AUTO, Session, find_model
 from oiio_msspl.shot import Stages
 
 if TYPE_CHECKING:
@@ -64,7 +63,7 @@ def fuse_frames(
 
     neighbours = _most_on_a_machine(client)
     if stages.model in (None, AUTO):
-        stages = replace(stages, model=DEFAULT_FAMILY)  # the same for all frames and machines, whatever is installed
+        stages = replace(stages, model=ALWAYS)  # the same for all frames and machines, whatever is installed
     elif Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))
     find_model(2, stages.model)  # if there is no such model, it is said here

@@ -13,12 +13,12 @@ from oiio_msspl import assemble, preview
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.assemble import WriteOptions
-from oiio_msspl.choice import choose
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr import open_exr
 from oiio_msspl.fusion import MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_target
-from oiio_msspl.session import Session
+from oiio_msspl.pairing import pair
+from oiio_msspl.session import Session, find_model
 
 
 @dataclass(frozen=True)
@@ -49,8 +49,6 @@ class Report:
     tiles: int
     seconds: dict[str, float]
     """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
-    chosen: str = ""
-    """Why the model was chosen, if there is something to say."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -70,7 +68,6 @@ class Report:
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
-            "chosen": self.chosen,
             "provider": self.provider,
             "aovs": self.hr.table(),
             "notes": self.hr.notes,
@@ -121,8 +118,8 @@ def fuse_files(
         lr_path, hr_path: the low-resolution, high-spp render and the high-resolution, low-spp render of one frame.
         output: EXR to write.
         inputs, write: how files are understood and stored.
-        model: name of a shipped model, a family of them (``paper``) or an ONNX file; None or ``auto`` for the smallest
-            one that is enough (:mod:`oiio_msspl.choice`).
+        model: name of a shipped model, a family of them (``paper``) or an ONNX file; None or ``auto``: see
+            :func:`oiio_msspl.session.find_model`.
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the paper's sRGB curve.
         overwrite: replace existing files.
@@ -143,15 +140,13 @@ def fuse_files(
             preview.check_view(view_transform)
     lr, hr = resolve_pair(lr_path, hr_path, inputs)
     assemble.dropped_channels(hr, write)  # a layer that is not there shows before the work, not after
-    path, reason = choose(lr, hr, model)
-    session = Session(path, device, threads)
+    session = Session(find_model(pair(lr, hr).scale, model), device, threads)
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, max_memory=max_memory, progress=progress)
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
-    report.chosen = reason
     write_frame(report, fused, write, overwrite=overwrite)
     write_preview(report, fused, view_transform, overwrite=overwrite)
     report.seconds = {

@@ -24,7 +24,6 @@ from oiio_msspl import preview, schema
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution
 from oiio_msspl.assemble import WriteOptions
-from oiio_msspl.choice import AUTO, choose
 from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.files import Inputs, Report, report_on, resolve_pair, write_frame, write_preview
 from oiio_msspl.fusion import FIXED_MEMORY, MAX_MEMORY, Fused, fuse
@@ -249,8 +248,6 @@ class Pair:
     hr: Resolution
     sources: tuple[Source, Source]
     """The same two with their pixels in memory, or the files themselves where there is no room for that."""
-    model: Path | None
-    """Which was chosen; None where one was asked for."""
     seconds: float
 
 
@@ -269,23 +266,19 @@ class Stages:
     overwrite: bool = False
     skip_existing: bool = False
     sessions: dict[Path, Session] = field(default_factory=dict)
-    chosen: dict[int, Path] = field(default_factory=dict)
-    """Model for a scale, where none was asked for: that of its first frame, lest a shot change its look."""
 
     def read(self, frame: Frame) -> Pair:
         start = time.perf_counter()
         assert frame.lr is not None and frame.hr is not None
         lr, hr = resolve_pair(frame.lr, frame.hr, self.inputs)
-        scale = pair(lr, hr).scale  # before pixels are read for nothing
+        pair(lr, hr)  # before pixels are read for nothing
         fits = 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= (self.max_memory - FIXED_MEMORY) // 2
         sources: tuple[Source, Source] = (lr.load(), hr.load()) if fits else (lr, hr)
-        if self.model in (None, AUTO) and scale not in self.chosen:
-            self.chosen[scale], _ = choose(*sources)
-        return Pair(frame, lr, hr, sources, self.chosen.get(scale), time.perf_counter() - start)
+        return Pair(frame, lr, hr, sources, time.perf_counter() - start)
 
     def session(self, ready: Pair) -> Session:
         """The model, loaded once for each scale that occurs."""
-        path = ready.model or find_model(pair(*ready.sources).scale, self.model)
+        path = find_model(pair(*ready.sources).scale, self.model)
         if path not in self.sessions:
             self.sessions[path] = Session(path, self.device, self.threads)
         return self.sessions[path]

@@ -190,7 +190,7 @@ def test_nothing_glows_where_neither_render_has_light(scale):
     low, high, _ = pair_of(scale)
     low.layers["rgb"][:, : 64 // scale] = 0
     high.layers["rgb"][:, :64] = 0
-    fused = fuse(low, high, Session(find_model(scale))).rgb
+    fused = fuse(low, high, Session(find_model(scale, "pyramid"))).rgb
     assert not fused[:, : 64 - scale].any()
     assert fused[:, 64:].mean() > 0.1
 
@@ -207,7 +207,7 @@ def test_two_black_frames_give_a_black_frame(scale):
     low, high, _ = pair_of(scale)
     low.layers["rgb"][:] = 0
     high.layers["rgb"][:] = 0
-    fused = fuse(low, high, Session(find_model(scale)))
+    fused = fuse(low, high, Session(find_model(scale, "pyramid")))
     assert not fused.rgb.any()
     assert "black" in fused.warnings[0]
 
@@ -256,15 +256,19 @@ def texture(size):
 
 
 def test_the_shipped_overlap_hides_the_seams(scale):
-    """Tiles of the network that ships agree with the whole frame to half-float rounding."""
-    shipped = Session(find_model(scale))
+    """Tiles of the network that ships agree with the whole frame as far as 8-bit convolutions can: what differs by
+    rounding may fall on the other side of a step. Nine pixels in ten are equal to half-float rounding."""
+    shipped = Session(find_model(scale, "pyramid"))
     frame = 64 + 4 * shipped.contract.overlap
     low, high, _ = pair_of(scale, frame * scale, frame * scale)
     whole = fuse(low, high, shipped)
     side = frame // 2 + 2 * shipped.contract.overlap
     tiled = fuse(low, high, shipped, max_memory=_memory_for_tiles(low, high, shipped, (side * scale) ** 2))
     assert tiled.tiles == 4
-    np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=2**-10, atol=1e-4)
+    difference = np.abs(tiled.rgb - whole.rgb) / (whole.rgb + 0.01)
+    assert np.quantile(difference, 0.9) < 2**-11
+    assert np.quantile(difference, 0.999) < 0.01
+    assert difference.max() < 0.15
 
 
 def test_a_model_of_another_scale_is_refused(bilinear_models):

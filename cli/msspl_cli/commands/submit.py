@@ -50,10 +50,9 @@ def submit(
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl import preview
     from oiio_msspl.bundle import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
-    from oiio_msspl.choice import AUTO
     from oiio_msspl.schema import SCALES
     from oiio_msspl.sequence import find_shot, format_frames, is_sequence
-    from oiio_msspl.session import DEFAULT_FAMILY, PROVIDERS, find_model, read_contract, shipped_models
+    from oiio_msspl.session import ALWAYS, AUTO, PROVIDERS, find_model, read_contract, shipped_models
     from oiio_msspl.shot import check_no_input
 
     # What is wrong for every frame is said here, not by every task.
@@ -66,7 +65,7 @@ def submit(
         raise InputError(f"--device {given['device']!r}: use one of {', '.join(PROVIDERS)}")
     files = {"--map-file": given["map_file"]} if given["map_file"] else {}
     # Tasks must not choose for themselves, each on its machine.
-    model = DEFAULT_FAMILY if given["model"] in (None, AUTO) else given["model"]
+    model = ALWAYS if given["model"] in (None, AUTO) else given["model"]
     if shipped_models().keys() & {model, *(f"{model}-x{scale}" for scale in SCALES)}:
         passed_on += ["--model", model]
     else:

@@ -19,6 +19,7 @@ import matplotlib
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.ticker import LogLocator
 
 from benchmarks.quality import NOISY_REFERENCE
 
@@ -66,6 +67,9 @@ def draw(rows: list[dict[str, Any]], runtimes: dict[str, Any], scene: str | None
                     value = mean(rows, peer, spp, measure, scene)
                     axis.plot(seconds[run], value, marker, color="black", markersize=8, label=peer, linestyle="none")
             axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter("")
             axis.grid(True, which="both", alpha=0.25)
             if measure == "psnr":
                 axis.set_title(f"{spp} spp on average")
@@ -74,9 +78,10 @@ def draw(rows: list[dict[str, Any]], runtimes: dict[str, Any], scene: str | None
                 axis.set_xlabel("seconds for 1024 x 1024")
         line[0].set_ylabel(label)
     axes[1][0].invert_yaxis()
-    axes[0][0].legend(fontsize=8, loc="lower left")
     figure.suptitle(f"Accuracy against time: {scene or 'mean of the scenes'} (left and up is better)")
-    figure.tight_layout()
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9)
+    figure.tight_layout(rect=(0, 0.04, 1, 1))
     return figure
 
 

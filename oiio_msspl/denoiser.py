@@ -32,7 +32,7 @@ class Denoiser:
     def __init__(self, threads: int = 0) -> None:
         try:
             import pyoidn
-        except ImportError as error:
+        except (ImportError, OSError) as error:  # not installed, or without its library
             raise InputError(
                 "this model reads Open Image Denoise's result: pip install pyoidn, or choose another --model"
             ) from error

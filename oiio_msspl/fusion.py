@@ -4,8 +4,10 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
+from functools import reduce
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,16 +153,11 @@ def _largest_tile(session: Session, frame_bytes: int, max_memory: int) -> int:
 
 def _dimmed(layers: dict[str, Array], low: Array, scale: int) -> dict[str, Array]:
     """The radiance layers of an HRLS, without fireflies: no brighter than the LRHS around them, (h, w, 3), allows."""
-    height, width = low.shape[:2]
-    padded = np.pad(low, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    highest = low
-    for y, x in itertools.product(range(3), repeat=2):
-        highest = np.maximum(highest, padded[y : y + height, x : x + width])
+    highest = reduce(np.maximum, _around(low))
     with np.errstate(over="ignore"):  # no ceiling, then; nor where the LRHS has no light at all
         ceiling = np.where(highest > 0, highest * np.float32(BRIGHTEST), np.float32(np.inf))
     ceiling = ceiling.repeat(scale, axis=0).repeat(scale, axis=1)
-    radiance = (schema.RGB, schema.DIFFUSE, schema.SPECULAR)
-    return {name: np.minimum(layers[name], ceiling) for name in radiance if name in layers}
+    return {name: np.minimum(layers[name], ceiling) for name in schema.RADIANCE_FEATURES if name in layers}
 
 
 def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, scale: int) -> Array:
@@ -186,10 +183,13 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
 
 def _settled(low: NDArray[np.bool_], high: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:
     """Where something holds for an HRLS pixel (h, w, 1) and for the 3 x 3 LRHS pixels around it."""
-    height, width = low.shape[:2]
-    same = np.pad(low[..., 0], 1, mode="edge")
-    around = np.ones((height, width), dtype=bool)
-    for dy in range(3):
-        for dx in range(3):
-            around &= same[dy : dy + height, dx : dx + width]
-    return np.repeat(np.repeat(around, scale, 0), scale, 1)[..., None] & high
+    around = reduce(np.logical_and, _around(low))
+    return around.repeat(scale, axis=0).repeat(scale, axis=1) & high
+
+
+def _around(values: NDArray[Any]) -> Iterator[NDArray[Any]]:
+    """The 3 x 3 neighbours of every pixel (h, w, c), one (h, w, c) each; the edge goes on."""
+    height, width = values.shape[:2]
+    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    for y, x in itertools.product(range(3), repeat=2):
+        yield padded[y : y + height, x : x + width]

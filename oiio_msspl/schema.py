@@ -21,6 +21,8 @@ VARIANCE = "variance"
 #: Feature -> number of channels, in the order in which the network's HRLS branch stacks them.
 HRLS_FEATURES: dict[str, int] = {RGB: 3, ALBEDO: 3, NORMAL: 3, DIFFUSE: 3, SPECULAR: 3, VARIANCE: 1}
 LRHS_FEATURES: dict[str, int] = {RGB: 3}
+#: Those that are light, and scale with the scene.
+RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
 #: What some models read after ``HRLS_FEATURES``: the HRLS's colour by another denoiser (:mod:`oiio_msspl.denoiser`).
 DENOISED_FEATURES: dict[str, int] = {"denoised": 3}
 

@@ -66,7 +66,7 @@ def expand(values: Array, exposure: float) -> Array:
 
 def forward(feature: str, values: Array, exposure: float) -> Array:
     """Values of one feature of :mod:`oiio_msspl.schema`, (..., C), to network values of the same shape."""
-    if feature in (schema.RGB, schema.DIFFUSE, schema.SPECULAR):
+    if feature in schema.RADIANCE_FEATURES:
         return compress(values, exposure)
     if feature == schema.VARIANCE:
         # A standard deviation is a radiance: it goes through the same exposure and the same curve.

@@ -204,6 +204,15 @@ def test_training_transforms_as_inference_does() -> None:
     )
 
 
+def test_exposure_of_training_is_that_of_inference() -> None:
+    """Also of frames with black pixels, with traces of light, and of black ones."""
+    rng = np.random.default_rng(0)
+    frames = rng.gamma(1.0, 0.3, (4, 12, 16, 3)).astype(np.float32)
+    frames[1, :4], frames[2, 4:], frames[3] = 0, 1e-20, 0
+    expected = [transforms.exposure_of(frame) for frame in frames]
+    np.testing.assert_allclose(batches.exposure_of(torch.from_numpy(frames)), expected, rtol=1e-4)
+
+
 @pytest.mark.parametrize("determinant", [1, -1])
 def test_normals_are_turned_with_the_right_handedness(determinant: int) -> None:
     turned = data.random_orthogonal(np.random.default_rng(0), determinant)

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from oiio_msspl import schema, transforms
 from oiio_msspl.denoiser import Denoiser
-from training.data import PASS_FEATURES, RADIANCE_FEATURES, Folder, Sampling, View, random_orthogonal
+from training.data import PASS_FEATURES, Folder, Sampling, View, random_orthogonal
 from training.pyramid import logarithmic
 
 #: What a batch is made of, by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w); all
@@ -61,6 +61,7 @@ def exposure_of(lrhs: Tensor) -> Tensor:
     """As :func:`oiio_msspl.transforms.exposure_of`, for each image of a batch (N, h, w, 3): (N,)."""
     y = luminance(lrhs).flatten(1)
     y = torch.where(y > 0, y, torch.nan)
+    y = torch.where(y >= transforms.TRACE * y.nanquantile(0.99, dim=1, keepdim=True), y, torch.nan)
     epsilon = 1e-4 * y.nanmedian(dim=1, keepdim=True).values
     return torch.nan_to_num(transforms.KEY / torch.exp(torch.log(y + epsilon).nanmean(dim=1)), nan=1.0)
 
@@ -75,7 +76,7 @@ def pack(features: dict[str, Tensor], exposure: Tensor) -> Tensor:
     stack = []
     for name in schema.HRLS_FEATURES:
         values = features[name]
-        if name in RADIANCE_FEATURES:
+        if name in schema.RADIANCE_FEATURES:
             values = compress(values, exposure)
         elif name == schema.VARIANCE:
             values = compress(values.clamp_min(0.0).sqrt(), exposure)
@@ -150,11 +151,11 @@ def draw(
         [np.eye(3)[rng.permutation(3) if rng.random() < sampling.permute else range(3)] for _ in chosen]
     )
     light = on_device(np.stack([_random_light(rng, sampling) for _ in chosen]) @ renaming)[:, None]
-    for name in RADIANCE_FEATURES:
+    for name in schema.RADIANCE_FEATURES:
         features[name] = features[name].clamp(0.0, sampling.clip)
     variance = luminance(features[schema.RGB] @ light[:, None]).var(dim=1) / n if n > 1 else None
     features = {name: values.mean(dim=1) for name, values in features.items()}
-    for name in RADIANCE_FEATURES:
+    for name in schema.RADIANCE_FEATURES:
         features[name] = features[name] @ light
     features[schema.ALBEDO] = features[schema.ALBEDO].clamp_min(0.0) @ on_device(renaming)[:, None]
     lrhs, target = lrhs @ light, target @ light

@@ -39,7 +39,6 @@ PAPER_PATCH = {2: 96, 4: 192, 8: 256}
 
 #: Features that a renderer writes, in the channel order of ``hr``: all but the variance, which comes from the passes.
 PASS_FEATURES = tuple(name for name in schema.HRLS_FEATURES if name != schema.VARIANCE)
-RADIANCE_FEATURES = (schema.RGB, schema.DIFFUSE, schema.SPECULAR)
 
 
 @dataclass(frozen=True)

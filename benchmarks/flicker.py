@@ -28,7 +28,8 @@ import numpy as np
 import OpenImageIO as oiio
 
 from benchmarks.flicker_render import SCALE, SCENES, render_sequences
-from benchmarks.quality import beauty, oidn
+from benchmarks.quality import oidn
+from benchmarks.scenes import beauty
 from benchmarks.temporal import LENGTH, Layers, Motion, accumulate
 from oiio_msspl import Render, Session, find_model, fuse, open_exr, resolve, shipped_models
 from oiio_msspl.errors import InputError, MssplError

@@ -2,12 +2,14 @@
 """Accuracy on scenes that nothing was trained on, at equal average samples.
 
     python -m benchmarks.quality ../shared/renders --json results/quality.json
+    python -m benchmarks.quality VIEWS --json results/quality_cycles.json
 
-A scene is a folder with ``ref.exr``, ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``. For 2, 4 and 8 average samples
-(spp_LRHS / s^2 + spp_HRLS) each method gets its files. From an LRHS and an HRLS: our models; OIDN (if pyoidn is
-installed) on the HRLS with albedo and normal, at quality high and fast; OIDN on the LRHS, upsampled; and "both": the
-first brought to the second's local brightness. From one full-resolution render of the same average: OIDN. Printed: PSNR
-in sRGB and RelMSE (0.5, 0.01), per scene and mean. Scenes whose own reference is noisy are listed but not averaged.
+Folders are those of :mod:`benchmarks.scenes`. For 2, 4 and 8 average samples (spp_LRHS / s^2 + spp_HRLS) each method
+gets its renders. From an LRHS and an HRLS: our models; OIDN (if pyoidn is installed) on the HRLS with albedo and
+normal, at quality high and fast; OIDN on the LRHS, upsampled; "OIDN on both": the first brought to the second's local
+brightness; and "together": to that of both renders denoised as :mod:`oiio_msspl.denoiser` does. From one
+full-resolution render of the same average: OIDN. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean.
+Scenes whose own reference is noisy are listed but not averaged.
 """
 
 from __future__ import annotations
@@ -20,27 +22,18 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl import fuse
-from oiio_msspl.aovs import Resolution, resolve
+from benchmarks import scenes
+from benchmarks.scenes import NOISY_REFERENCE, beauty
+from oiio_msspl import fuse, schema, tensors, transforms
 from oiio_msspl.comparison import scores, upsample_bicubic
-from oiio_msspl.exr import open_exr
+from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import Source
 from oiio_msspl.session import Session, find_model, shipped_models
-from oiio_msspl.transforms import repair
-from training.data import box_downsample
+from oiio_msspl.transforms import box_downsample, repair
 
-#: Average spp -> [(scale, LRHS spp, HRLS spp)].
-CASES = {
-    2: [(2, 4, 1), (4, 16, 1), (8, 64, 1)],
-    4: [(2, 8, 2), (4, 32, 2), (8, 128, 2)],
-    8: [(2, 16, 4), (4, 64, 4), (8, 256, 4)],
-}
-#: The reference of this one is full of fireflies.
-NOISY_REFERENCE = {"veach-bidir"}
-
-
-def beauty(file: Resolution) -> np.ndarray:
-    return repair(file.read(file.data_window, ["rgb"])["rgb"])[0]
+#: Average spp; half of it is in the HRLS, half in the LRHS, as in the paper's tables.
+AVERAGES = (2, 4, 8)
 
 
 def oidn(file: Source, quality: str = "high") -> np.ndarray | None:
@@ -63,70 +56,80 @@ def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
     return detail * upsample_bicubic(((low + 1e-3) / (means + 1e-3)).astype(np.float32), width, height)
 
 
-def run_scene(folder: Path, sessions: list[Session]) -> list[dict[str, Any]]:
+def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
+    """Both renders, denoised together at the LRHS's resolution; None without pyoidn."""
+    try:
+        denoiser = Denoiser(mode="low")
+    except InputError:
+        return None
+    low = beauty(lrhs)
+    exposure = transforms.exposure_of(low)
+    layers = tensors.read(hrls, hrls.data_window, hrls.data_window)
+    packed = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
+    return transforms.expand(denoiser(transforms.compress(low, exposure), packed)[0][..., 3:], exposure)
+
+
+def run_scene(scene: scenes.Scene, sessions: list[Session]) -> list[dict[str, Any]]:
     """One row a method and case: ``scene, spp, method, psnr, relmse, relmse_gharbi, ssim``."""
-
-    def load(name: str) -> Resolution:
-        return resolve(open_exr(folder / name))
-
-    truth = beauty(load("ref.exr"))
-    height, width = truth.shape[:2]
+    height, width = scene.reference.shape[:2]
     rows = []
 
     def add(spp: int, method: str, image: np.ndarray | None) -> None:
         if image is not None:
-            rows.append({"scene": folder.name, "spp": spp, "method": method, **scores(image, truth)})
+            rows.append({"scene": scene.name, "spp": spp, "method": method, **scores(image, scene.reference)})
 
-    for spp, cases in CASES.items():
-        hr = load(f"hr_{cases[0][2]}spp.exr")
+    for spp in AVERAGES:
+        hr = scene.hrls(spp // 2)
         add(spp, "HRLS", beauty(hr))
         denoised = oidn(hr)
         add(spp, "OIDN on the HRLS", denoised)
         add(spp, "OIDN fast on the HRLS", oidn(hr, "fast"))
-        for scale, lr_spp, _ in cases:
-            lr = load(f"lr_x{scale}_{lr_spp}spp.exr")
+        for scale in schema.SCALES:
+            lr = scene.lrhs(scale, spp // 2)
             low = beauty(lr)
             add(spp, f"LRHS x{scale} nearest", low.repeat(scale, 0).repeat(scale, 1))
             add(spp, f"LRHS x{scale} bicubic", upsample_bicubic(low, width, height))
-            denoised_low = oidn(lr)
-            if denoised is not None and denoised_low is not None:
+            denoised_low, together = oidn(lr), denoised_together(lr, hr)
+            if denoised is not None and denoised_low is not None and together is not None:
                 add(spp, f"OIDN on the LRHS x{scale}, bicubic", upsample_bicubic(denoised_low, width, height))
                 add(spp, f"OIDN on both x{scale}", brought_to(denoised, denoised_low))
+                add(spp, f"OIDN on both x{scale}, together", brought_to(denoised, together))
             for session in sessions:
                 if session.contract.scale == scale:
                     add(spp, session.contract.name, fuse(lr, hr, session).rgb)
-        add(spp, "full resolution", beauty(load(f"hr_{spp}spp.exr")))
-        add(spp, "OIDN, same samples", oidn(load(f"hr_{spp}spp.exr")))
+        full = scene.hrls(spp)
+        add(spp, "full resolution", beauty(full))
+        add(spp, "OIDN, same samples", oidn(full))
     return rows
 
 
 def print_tables(rows: list[dict[str, Any]]) -> None:
     """A table a measure and average spp: methods down, scenes across."""
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    names = list(dict.fromkeys(row["scene"] for row in rows))
     for spp in dict.fromkeys(row["spp"] for row in rows):
         for measure, form in (("psnr", "{:.2f}"), ("relmse", "{:.4f}")):
             unit = "PSNR (sRGB, dB)" if measure == "psnr" else "RelMSE (0.5, 0.01)"
             print(f"\n### {unit} at {spp} spp on average\n")
-            print("| method | mean | " + " | ".join(f"{s}{'*' if s in NOISY_REFERENCE else ''}" for s in scenes) + " |")
-            print("|---|" + "---|" * (len(scenes) + 1))
+            print("| method | mean | " + " | ".join(f"{s}{'*' if s in NOISY_REFERENCE else ''}" for s in names) + " |")
+            print("|---|" + "---|" * (len(names) + 1))
             for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
-                values = {r["scene"]: r[measure] for r in rows if r["spp"] == spp and r["method"] == method}
+                here = [row for row in rows if row["spp"] == spp and row["method"] == method]
+                values = {s: np.mean([row[measure] for row in here if row["scene"] == s]) for s in names}
                 mean = np.mean([v for s, v in values.items() if s not in NOISY_REFERENCE])
-                cells = [form.format(v) for v in (mean, *(values[s] for s in scenes))]
+                cells = [form.format(v) for v in (mean, *values.values())]
                 print(f"| {method} | " + " | ".join(cells) + " |")
-    if NOISY_REFERENCE & set(scenes):
+    if NOISY_REFERENCE & set(names):
         print("\n\\* noisy reference, not in the mean")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("renders", type=Path, help="folder with one folder a scene")
+    parser.add_argument("folder", type=Path, help="renders or views")
     parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; all if none")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
     sessions = [Session(find_model(0, name)) for name in args.model or shipped_models()]
-    folders = sorted(p.parent for p in args.renders.glob("*/ref.exr"))
-    rows = [row for folder in folders for row in run_scene(folder, sessions)]
+    rows = [row for scene in scenes.load(args.folder) for row in run_scene(scene, sessions)]
     print_tables(rows)
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)

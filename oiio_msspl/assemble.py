@@ -7,7 +7,7 @@ travels a band of rows at a time in its own pixel type.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
@@ -32,6 +32,9 @@ LOSSLESS = ("none", "rle", "zip", "zips", "piz")
 COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab")
 DEFAULT_COMPRESSION = "zip"
 
+#: Name of the layer that holds the predicted error.
+ERROR = "error"
+
 #: OpenImageIO's attributes that describe how the source was stored; they are set anew or have no meaning in the copy.
 _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
 #: Attributes that must be the same in all parts of a file, and those that describe one part.
@@ -51,6 +54,8 @@ class WriteOptions:
     """``half`` or ``float`` for the fused beauty; None: as the HRLS's."""
     layers: tuple[str, ...] = ()
     """Patterns of the layers that are passed on beside the fused beauty, ``none`` for none; empty: all."""
+    error_layer: bool = False
+    """Add a layer ``error``: what the model expects the beauty to be off by."""
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:
@@ -77,6 +82,7 @@ def write(
     provenance: dict[str, str],
     options: WriteOptions,
     *,
+    error: Array | None = None,
     overwrite: bool = False,
 ) -> list[str]:
     """Write the fused frame to ``path``, atomically.
@@ -85,6 +91,7 @@ def write(
         rgb: (height, width, 3) over the HRLS's data window.
         alpha: (height, width, 1) if the HRLS has one, otherwise None.
         provenance: attributes added to the beauty's part.
+        error: (height, width, 1), becomes the layer ``error``.
 
     Returns:
         Warnings, one sentence each.
@@ -93,7 +100,7 @@ def write(
         InputError: the layout can't hold these parts, or a passed-on layer can't be read.
         MssplError: the file can't be written; what stood at ``path`` is untouched.
     """
-    fused = _Fused(rgb, alpha, _DTYPES[options.pixel_type or _widest_type(fused_channels(hr))])
+    fused = _Fused(rgb, alpha, error, _DTYPES[options.pixel_type or _widest_type(fused_channels(hr))])
     dropped = dropped_channels(hr, options)
     warnings = [
         f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
@@ -114,13 +121,22 @@ class _Fused:
 
     rgb: Array
     alpha: Array | None
+    error: Array | None
     dtype: Any
 
     def rows(self, start: int, stop: int) -> Any:
-        """Rows in the stored type, (stop - start, width, 3 or 4)."""
+        """Rows of the beauty in the stored type, (stop - start, width, 3 or 4)."""
         values = self.rgb[start:stop]
         if self.alpha is not None:
             values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
+        return self._stored(values)
+
+    def error_rows(self, start: int, stop: int) -> Any:
+        """Rows of the error in the stored type, (stop - start, width, 1)."""
+        assert self.error is not None
+        return self._stored(self.error[start:stop])
+
+    def _stored(self, values: Array) -> Any:
         if self.dtype == np.float16:
             values = np.minimum(values, np.float32(65504.0))
         return np.ascontiguousarray(values, dtype=self.dtype)
@@ -176,16 +192,20 @@ def _write_parts(
     for key, value in provenance.items():
         first.attribute(key, value)
     parts = list(_passed_on(file, set(beauty), dropped, nuke, first))
-
     specs = [first, *(p.spec for p in parts)]
+    if fused.error is not None:
+        name = _unique(ERROR, {str(spec.getattribute("oiio:subimagename")) for spec in specs})
+        specs.insert(1, _spec(home, name, ["Y" if nuke else f"{ERROR}.Y"], fused.dtype))
+        _keep_shared_attributes(specs[1])
+        specs[1].attribute("compression", options.compression or _kept_compression(home))
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:
         raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
     ok = writer.open(str(path), specs) if len(specs) > 1 else writer.open(str(path), first)
-    height = first.height
-    for start in range(0, height, BAND):
-        stop = min(start + BAND, height)
-        ok = ok and writer.write_scanlines(first.y + start, first.y + stop, 0, fused.rows(start, stop))
+    ok = ok and _write_rows(writer, first, fused.rows)
+    if fused.error is not None:
+        ok = ok and writer.open(str(path), specs[1], "AppendSubimage")
+        ok = ok and _write_rows(writer, specs[1], fused.error_rows)
     for part in parts:
         ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
         ok = ok and _copy(file, part, writer)
@@ -194,6 +214,15 @@ def _write_parts(
     if not ok or writer.has_error:
         reason = " ".join(writer.geterror().split()) or "disk full?"
         raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
+
+
+def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], Any]) -> bool:
+    """Write the part that is open, a band at a time."""
+    for start in range(0, spec.height, BAND):
+        stop = min(start + BAND, spec.height)
+        if not writer.write_scanlines(spec.y + start, spec.y + stop, 0, rows(start, stop)):
+            return False
+    return True
 
 
 def _passed_on(
@@ -334,6 +363,8 @@ def _write_single_part(
     values = fused.rows(0, fused.rgb.shape[0])
     channels: dict[str, Any] = {c.name: np.ascontiguousarray(values[..., i]) for i, c in enumerate(beauty)}
     del values
+    if fused.error is not None:
+        channels[f"{ERROR}.Y"] = np.ascontiguousarray(fused.error_rows(0, fused.rgb.shape[0])[..., 0])
     for part in file.parts:
         if part.deep or dropped.issuperset(part.channels):
             continue

@@ -36,7 +36,8 @@ class Contract:
     """Everything that inference must know about a model.
 
     ONNX inputs: ``lrhs`` (1, C_l, h, w) and ``hrls`` (1, C_h, s*h, s*w), float32, transformed;
-    output: ``fused`` (1, 3, s*h, s*w), transformed RGB.
+    output: ``fused`` (1, 3, s*h, s*w), transformed RGB; of some models also ``log_error`` (1, 1, s*h, s*w), the
+    logarithm of its expected absolute error, mean of the channels, in the same values.
     """
 
     name: str
@@ -54,16 +55,13 @@ class Contract:
     hrls: list[str] = field(default_factory=lambda: schema.channel_names(schema.HRLS_FEATURES))
     transforms: dict[str, Any] = field(default_factory=current_transforms)
     defaults: dict[str, float] = field(default_factory=lambda: dict(schema.DEFAULTS))
+    denoiser: str = ""
+    """What Open Image Denoise does for the model, a key of :data:`oiio_msspl.denoiser.MODES`; empty: nothing."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp seen in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where the weights come from: data, steps, loss, seed, date, code version."""
     format: int = FORMAT
-
-    @property
-    def reads_denoised(self) -> bool:
-        """Whether the HRLS's last channels are its colour by another denoiser."""
-        return len(self.hrls) > len(schema.channel_names(schema.HRLS_FEATURES))
 
     def to_json(self) -> str:
         return json.dumps(asdict(self), sort_keys=True)
@@ -85,10 +83,10 @@ class Contract:
             raise InputError(
                 f"{source}: contract format {contract.format}, this version reads {FORMAT}; update one of them"
             )
-        layers = schema.HRLS_FEATURES | (schema.DENOISED_FEATURES if contract.reads_denoised else {})
+        lrhs, hrls = schema.inputs(contract.denoiser)
         expected = {
-            "lrhs": schema.channel_names(schema.LRHS_FEATURES),
-            "hrls": schema.channel_names(layers),
+            "lrhs": schema.channel_names(lrhs),
+            "hrls": schema.channel_names(hrls),
             "transforms": current_transforms(),
             "defaults": schema.DEFAULTS,
         }

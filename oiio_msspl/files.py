@@ -143,7 +143,7 @@ def fuse_files(
     session = Session(find_model(pair(lr, hr).scale, model), device, threads)
     opened = time.perf_counter()
 
-    fused = fuse(lr, hr, session, max_memory=max_memory, progress=progress)
+    fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
@@ -180,7 +180,14 @@ def report_on(
 def write_frame(report: Report, fused: Fused, options: WriteOptions, *, overwrite: bool) -> None:
     """Write the EXR that the report names, and add what there is to say about it."""
     report.warnings += assemble.write(
-        report.output, report.hr, fused.rgb, fused.alpha, _provenance(report), options, overwrite=overwrite
+        report.output,
+        report.hr,
+        fused.rgb,
+        fused.alpha,
+        _provenance(report),
+        options,
+        error=fused.error,
+        overwrite=overwrite,
     )
 
 

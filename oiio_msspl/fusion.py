@@ -35,6 +35,9 @@ class Fused:
     """Scene linear, (height, width, 3), finite and >= 0."""
     alpha: Array | None
     """(height, width, 1), clipped to [0, 1], or None if the HRLS has none."""
+    error: Array | None
+    """(height, width, 1): how far the result is expected to be from the frame of many samples, scene linear, mean of
+    the channels; None unless asked for."""
     pairing: Pairing
     exposure: float
     """What the scene was scaled by for the network."""
@@ -51,6 +54,7 @@ def fuse(
     hr: Source,
     session: Session,
     *,
+    error: bool = False,
     max_memory: int = MAX_MEMORY,
     progress: Callable[[int, int], None] | None = None,
 ) -> Fused:
@@ -59,14 +63,17 @@ def fuse(
     Args:
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.resolve`) or renders in memory.
         session: a model for the pair's scale.
+        error: also predict the result's error.
         max_memory: bytes that the whole process should stay below.
         progress: called with (tiles done, tiles in all).
 
     Raises:
-        InputError: the pair does not fit, or the model is for another scale.
+        InputError: the pair does not fit, or the model is for another scale or does not predict its error.
     """
     pairing = pair(lr, hr)
     contract = session.contract
+    if error and not session.predicts_error:
+        raise InputError(f"model {contract.name} does not predict its error; choose another --model")
     if contract.scale != pairing.scale:
         raise InputError(f"model {contract.name} is for x{contract.scale}, but this pair is x{pairing.scale}")
     scale, grid = pairing.scale, tiling.aligned(pairing.grid, contract.alignment)
@@ -79,11 +86,12 @@ def fuse(
     lrhs = tensors.pack(low, schema.LRHS_FEATURES, exposure)
 
     hr_data = pairing.hr_data
-    rgb = np.empty((hr_data.height, hr_data.width, 3), dtype=np.float32)
+    rgb = np.zeros((hr_data.height, hr_data.width, 3), dtype=np.float32)
     alpha: Array | None = None
+    errors = np.zeros((hr_data.height, hr_data.width, 1), dtype=np.float32) if error else None
     hr_repaired: dict[str, int] = {}
-    # What is held of the frame: the result (colour and alpha), and the LRHS as it is and as the network wants it.
-    frame_bytes = rgb.nbytes * 4 // 3 + lrhs.nbytes + sum(values.nbytes for values in low.values())
+    # What is held of the frame: the result (colour, alpha, error), and the LRHS as it is and as the network wants it.
+    frame_bytes = rgb.nbytes * (5 if error else 4) // 3 + lrhs.nbytes + sum(values.nbytes for values in low.values())
     largest = _largest_tile(session, frame_bytes, max_memory)
     plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
     dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
@@ -92,12 +100,16 @@ def fuse(
         area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
         target, inside = core.intersect(hr_data), tile.area.slices(grid)
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
-        dim = layers | _dimmed(layers, low[schema.RGB][inside], scale)
-        values = session.run(lrhs[inside], tensors.pack(dim, schema.HRLS_FEATURES, exposure))
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
         empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
-        colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
-        rgb[target.slices(hr_data)] = colour[target.slices(area)]
+        if not empty.all():
+            dim = layers | _dimmed(layers, low[schema.RGB][inside], scale)
+            values, deviation = session.run(lrhs[inside], tensors.pack(dim, schema.HRLS_FEATURES, exposure))
+            colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
+            rgb[target.slices(hr_data)] = colour[target.slices(area)]
+            if errors is not None and deviation is not None:
+                linear = np.where(empty, np.float32(0), _linear_error(values, deviation, exposure))
+                errors[target.slices(hr_data)] = linear[target.slices(area)]
         if "alpha" in layers:
             if alpha is None:
                 alpha = np.empty((hr_data.height, hr_data.width, 1), dtype=np.float32)
@@ -108,7 +120,13 @@ def fuse(
     if alpha is not None and "alpha" not in low:
         warnings.append("the LRHS has no alpha: that of the HRLS is kept, noise and all")
     repaired = {f"lrhs.{k}": v for k, v in lr_repaired.items()} | {f"hrls.{k}": v for k, v in hr_repaired.items()}
-    return Fused(rgb, alpha, pairing, exposure, repaired, warnings, len(plan), session.seconds - seconds)
+    return Fused(rgb, alpha, errors, pairing, exposure, repaired, warnings, len(plan), session.seconds - seconds)
+
+
+def _linear_error(values: Array, deviation: Array, exposure: float) -> Array:
+    """An error of network values (h, w, 3) as scene-linear radiance, (h, w, 1)."""
+    middle = values.mean(axis=-1, keepdims=True)
+    return transforms.expand(middle + deviation, exposure) - transforms.expand(middle, exposure)
 
 
 def _read_low(lr: Source, pairing: Pairing, grid: Window, repaired: dict[str, int]) -> dict[str, Array]:
@@ -176,7 +194,7 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
     grey = {name: values for name, values in high.items() if name in (schema.ALBEDO, schema.NORMAL)}
     grey[schema.RGB] = np.repeat(alpha, 3, axis=-1)
     lrhs = tensors.pack({schema.RGB: np.repeat(low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0)
-    values = session.run(lrhs, tensors.pack(grey, schema.HRLS_FEATURES, 1.0))
+    values, _ = session.run(lrhs, tensors.pack(grey, schema.HRLS_FEATURES, 1.0))
     fused = np.clip(transforms.expand(values, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 

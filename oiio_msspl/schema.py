@@ -23,7 +23,7 @@ HRLS_FEATURES: dict[str, int] = {RGB: 3, ALBEDO: 3, NORMAL: 3, DIFFUSE: 3, SPECU
 LRHS_FEATURES: dict[str, int] = {RGB: 3}
 #: Those that are light, and scale with the scene.
 RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
-#: What some models read after ``HRLS_FEATURES``: the HRLS's colour by another denoiser (:mod:`oiio_msspl.denoiser`).
+#: What some models read after both of the above: another denoiser's results (:mod:`oiio_msspl.denoiser`).
 DENOISED_FEATURES: dict[str, int] = {"denoised": 3}
 
 #: Features that a render may lack; each then has the default below, in the network's own (transformed) values.
@@ -43,3 +43,10 @@ def channel_names(features: dict[str, int]) -> list[str]:
     """Flat channel names (``rgb.R``, ``normal.X``, ``variance.Y``) of a stack of features, in order."""
     suffixes = {1: "Y", 3: "RGB"}
     return [f"{name}.{c}" for name, count in features.items() for c in ("XYZ" if name == NORMAL else suffixes[count])]
+
+
+def inputs(denoiser: str) -> tuple[dict[str, int], dict[str, int]]:
+    """What a model reads of the LRHS and of the HRLS, with a denoiser of :data:`oiio_msspl.denoiser.MODES` or none."""
+    low = DENOISED_FEATURES if denoiser else {}
+    high = DENOISED_FEATURES if denoiser not in ("", "low") else {}
+    return LRHS_FEATURES | low, HRLS_FEATURES | high

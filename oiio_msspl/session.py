@@ -130,7 +130,8 @@ class Session:
         providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
         self._session = _load(path, options, providers)
         self.contract = _contract(self._session, path)
-        self._denoiser = Denoiser(threads) if self.contract.reads_denoised else None
+        self._denoiser = Denoiser(threads, self.contract.denoiser) if self.contract.denoiser else None
+        self._outputs = [output.name for output in self._session.get_outputs()]
         self.path = Path(path)
         self.seconds = 0.0
         """Time spent in :meth:`run` so far, the denoiser's included."""
@@ -139,31 +140,37 @@ class Session:
             log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
         log.info("model %s on %s", self.contract.name, self.provider)
 
-    def run(self, lrhs: Array, hrls: Array) -> Array:
+    @property
+    def predicts_error(self) -> bool:
+        """Whether :meth:`run` returns an error."""
+        return "log_error" in self._outputs
+
+    def run(self, lrhs: Array, hrls: Array) -> tuple[Array, Array | None]:
         """Evaluate the network.
 
         Args:
-            lrhs: (h, w, C_l), transformed, channels as in the contract.
-            hrls: (s*h, s*w, 16), channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`; what else the contract lists
-                is made here.
+            lrhs: (h, w, 3), transformed.
+            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`. What else the
+                contract lists for either is made here.
 
         Returns:
-            (s*h, s*w, 3), transformed.
+            The fused image (s*h, s*w, 3), transformed; and of models that predict it its expected absolute error,
+            mean of the channels, (s*h, s*w, 1), in the same values.
         """
         start = time.perf_counter()
-        layers = hrls.transpose(2, 0, 1)
         if self._denoiser is not None:
-            layers = np.concatenate([layers, self._denoiser(hrls).transpose(2, 0, 1)])
+            lrhs, hrls = self._denoiser(lrhs, hrls)
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
-            "hrls": np.ascontiguousarray(layers[None]),
+            "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
         }
         try:
-            (fused,) = self._session.run(["fused"], feed)
+            results = dict(zip(self._outputs, self._session.run(self._outputs, feed), strict=True))
         except Exception as error:
             raise MssplError(
                 f"{self.contract.name} failed on {self.provider} ({str(error).splitlines()[0]}); "
                 "try --max-memory with a smaller value, or --device cpu"
             ) from error
         self.seconds += time.perf_counter() - start
-        return fused[0].transpose(1, 2, 0)
+        images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}
+        return images["fused"], np.exp(images["log_error"]) if self.predicts_error else None

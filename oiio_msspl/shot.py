@@ -289,7 +289,7 @@ class Stages:
         beside = ready.hr.data_window.width * ready.hr.data_window.height * 4 * 4
         if ready.sources[1] is not ready.hr:
             beside += 2 * (_pixel_bytes(ready.lr) + _pixel_bytes(ready.hr))
-        fused = fuse(*ready.sources, session, max_memory=self.max_memory - beside)
+        fused = fuse(*ready.sources, session, error=self.options.error_layer, max_memory=self.max_memory - beside)
         preview_path = ready.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(ready.lr, ready.hr, session, fused, ready.frame.output, preview_path)
         report.seconds = {"read": ready.seconds, "fuse": time.perf_counter() - start, "network": fused.seconds}

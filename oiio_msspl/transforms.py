@@ -99,3 +99,10 @@ def srgb(linear: Array) -> Array:
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-12), 1 / 2.4) - 0.055).astype(
         np.float32
     )
+
+
+def box_downsample(image: Array, scale: int) -> Array:
+    """Mean over ``scale`` x ``scale`` pixels: (H, W, C) to (H/s, W/s, C)."""
+    height, width, channels = image.shape
+    rows = image.reshape(height // scale, scale, width * channels).mean(axis=1)  # in two steps: several times faster
+    return rows.reshape(height // scale, width // scale, scale, channels).mean(axis=2)

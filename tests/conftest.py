@@ -88,7 +88,8 @@ def downsample(values, scale):
 
 @pytest.fixture(scope="session")
 def bilinear_models(tmp_path_factory):
-    """{scale: ONNX file} of models that upsample the LRHS bilinearly and ignore the HRLS: exact, local, no weights."""
+    """{scale: ONNX file} of models that upsample the LRHS bilinearly and ignore the HRLS: exact, local, no weights.
+    They expect to be off by 0.1 everywhere."""
     onnx = pytest.importorskip("onnx")
     from onnx import TensorProto, helper
 
@@ -102,6 +103,8 @@ def bilinear_models(tmp_path_factory):
             helper.make_node("Slice", ["hrls", "zero", "three", "one"], ["head"]),
             helper.make_node("Mul", ["head", "nothing"], ["none"]),
             helper.make_node("Add", ["up", "none"], ["fused"]),
+            helper.make_node("Slice", ["none", "zero", "one", "one"], ["plane"]),
+            helper.make_node("Add", ["plane", "error"], ["log_error"]),
         ]
         constants = [
             helper.make_tensor("scales", TensorProto.FLOAT, [4], [1, 1, scale, scale]),
@@ -109,6 +112,7 @@ def bilinear_models(tmp_path_factory):
             helper.make_tensor("three", TensorProto.INT64, [1], [3]),
             helper.make_tensor("one", TensorProto.INT64, [1], [1]),
             helper.make_tensor("nothing", TensorProto.FLOAT, [], [0.0]),
+            helper.make_tensor("error", TensorProto.FLOAT, [], [np.log(0.1)]),
         ]
         graph = helper.make_graph(
             nodes,
@@ -117,7 +121,10 @@ def bilinear_models(tmp_path_factory):
                 helper.make_tensor_value_info("lrhs", TensorProto.FLOAT, [1, 3, "h", "w"]),
                 helper.make_tensor_value_info("hrls", TensorProto.FLOAT, [1, 16, "H", "W"]),
             ],
-            [helper.make_tensor_value_info("fused", TensorProto.FLOAT, [1, 3, "H", "W"])],
+            [
+                helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, "H", "W"])
+                for name, channels in (("fused", 3), ("log_error", 1))
+            ],
             constants,
         )
         model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=8)

@@ -54,6 +54,28 @@ def written(tmp_path, parts, options=None, **attributes):
     return fused, out, read_bits(out)
 
 
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
+    path = write_exr(tmp_path / "hr.exr", everything())
+    error = np.arange(H * W, dtype=np.float32).reshape(H, W, 1)
+    image = np.ones((H, W, 4), np.float32)
+    assemble.write(
+        tmp_path / "out.exr",
+        resolve(open_exr(path)),
+        image[..., :3],
+        image[..., 3:],
+        {},
+        WriteOptions(layout, pixel_type="float"),
+        error=error,
+    )
+    parts = read_bits(tmp_path / "out.exr")
+    layers = flat(parts)
+    assert same_bits(layers["error", "Y"], error[..., 0])
+    if layout != "multilayer":
+        assert parts[1][0] == "error"
+    assert len(layers) == len(everything()) + 1
+
+
 def flat(parts):
     """{(layer, channel's last name): plane} whatever part it lies in."""
     result = {}

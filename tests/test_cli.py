@@ -57,6 +57,13 @@ def test_the_main_job(files, bilinear_models):
     assert (preview.spec().width, preview.spec().height, preview.spec().nchannels) == (128, 96, 3)
 
 
+def test_the_predicted_error_can_be_asked_for(files, bilinear_models):
+    options = ("--model", bilinear_models[4], "--error-layer", "--no-preview")
+    assert fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", *options).returncode == 0
+    part = open_exr(files / "out.exr").parts[1]
+    assert (part.name, [channel.name for channel in part.channels]) == ("error", ["error.Y"])
+
+
 def test_the_report_for_machines(files, bilinear_models):
     done = fuse(
         files / "lr.exr",

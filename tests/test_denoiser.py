@@ -5,15 +5,21 @@ import numpy as np
 import pytest
 
 from oiio_msspl import schema, tensors, transforms
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.denoiser import Denoiser, lrhs_share
 from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
 
 
-def packed(size=96, **layers):
-    """An HRLS as the network sees it, and the clean picture."""
+def packed(size=96, spp=4, **layers):
+    """A pair of scale 2 with equal noise as the network sees it, and the clean picture."""
     clean = picture(size, size)
-    return tensors.pack({schema.RGB: noisy(clean, 4)} | layers, schema.HRLS_FEATURES, 1.0), clean
+    hrls = tensors.pack({schema.RGB: noisy(clean, spp)} | layers, schema.HRLS_FEATURES, 1.0)
+    return small(noisy(clean, spp, seed=1)), hrls, clean
+
+
+def small(image):
+    """An image as an LRHS of scale 2."""
+    return transforms.compress(transforms.box_downsample(image, 2), 1.0)
 
 
 def error(values, clean):
@@ -26,36 +32,69 @@ def denoiser():
     return Denoiser(threads=1)
 
 
-def test_it_denoises(denoiser):
-    hrls, clean = packed()
-    assert error(denoiser(hrls), clean) < 0.5 * error(hrls[..., :3], clean)
+def test_it_denoises_the_hrls_and_both_together(denoiser):
+    lrhs, hrls, clean = packed(192)
+    low, high = (image[..., -3:] for image in denoiser(lrhs, hrls))
+    assert error(high, clean) < 0.5 * error(hrls[..., :3], clean)
+    # At the LRHS's resolution, both renders tell more than either alone
+    expected = small(clean)
+    assert np.abs(low - expected).mean() < 0.9 * np.abs(small(transforms.expand(high, 1.0)) - expected).mean()
+    assert np.abs(low - expected).mean() < 0.5 * np.abs(lrhs - expected).mean()
 
 
 def test_it_sees_albedo_and_normal_where_they_are(denoiser):
     """Layers that show an edge keep it sharp; one call's layers do not linger in the next."""
-    stripes = np.repeat((np.arange(96) % 8 < 4)[None, :, None], 96, 0)
+    stripes = np.repeat((np.arange(96) % 16 < 8)[None, :, None], 96, 0)
     albedo = np.broadcast_to(np.where(stripes, 0.2, 0.6), (96, 96, 3)).astype(np.float32)
     normal = np.broadcast_to(np.where(stripes, (0, 0, 1), (0, 1, 0)), (96, 96, 3)).astype(np.float32)
     dim = noisy(albedo, 1)
-    plain = tensors.pack({schema.RGB: dim}, schema.HRLS_FEATURES, 1.0)
-    before = denoiser(plain)
-    for layers in ({schema.ALBEDO: albedo}, {schema.NORMAL: normal}, {schema.ALBEDO: albedo, schema.NORMAL: normal}):
+    lrhs = small(noisy(albedo, 1, seed=1))
+
+    def denoised(**layers):
         hrls = tensors.pack({schema.RGB: dim} | layers, schema.HRLS_FEATURES, 1.0)
-        assert error(denoiser(hrls), albedo) < 0.95 * error(before, albedo)
-    np.testing.assert_allclose(denoiser(plain), before, atol=1e-5)
+        return [image[..., -3:] for image in denoiser(lrhs, hrls)]
+
+    before = denoised()
+    for layers in ({schema.ALBEDO: albedo}, {schema.NORMAL: normal}, {schema.ALBEDO: albedo, schema.NORMAL: normal}):
+        low, high = denoised(**layers)
+        assert error(high, albedo) < 0.95 * error(before[1], albedo)
+        assert np.abs(low - small(albedo)).mean() < 0.95 * np.abs(before[0] - small(albedo)).mean()
+    np.testing.assert_allclose(denoised()[1], before[1], atol=1e-5)
 
 
 def test_sizes_may_change_between_calls(denoiser):
     for size in (96, 64, 128):
-        assert denoiser(packed(size)[0]).shape == (size, size, 3)
+        low, high = denoiser(*packed(size)[:2])
+        assert (low.shape, high.shape) == ((size // 2, size // 2, 6), (size, size, 19))
 
 
 def test_its_exposure_is_the_frames_not_the_tiles(denoiser):
     """A dark corner beside a bright one comes out alike, whether the bright one is in the tile or not."""
-    hrls, _ = packed(256)
+    lrhs, hrls, _ = packed(256)
     hrls[:, 160:, :3] += 2.0
-    part = denoiser(np.ascontiguousarray(hrls[:, :128]))
-    np.testing.assert_allclose(part[:, :40], denoiser(hrls)[:, :40], atol=0.01)
+    _, part = denoiser(lrhs[:, :64], np.ascontiguousarray(hrls[:, :128]))
+    _, whole = denoiser(lrhs, hrls)
+    np.testing.assert_allclose(part[:, :40], whole[:, :40], atol=0.01)
+
+
+def test_it_may_leave_the_hrls_alone(denoiser):
+    lrhs, hrls, _ = packed()
+    low, high = Denoiser(threads=1, mode="low")(lrhs, hrls)
+    np.testing.assert_array_equal(low, denoiser(lrhs, hrls)[0])
+    assert high is hrls
+
+
+@pytest.mark.parametrize(("spp", "expected"), [((4, 4), 0.5), ((12, 4), 0.75), ((4, 12), 0.25)])
+def test_the_less_noisy_render_counts_more(spp, expected):
+    """As much as the best mean of both wants: by their samples, if noise is all that they differ by."""
+    clean = 0.5 + 0.3 * picture(192, 192)
+    lrhs, hrls = (transforms.compress(noisy(clean, n, seed), 1.0) for seed, n in enumerate(spp))
+    assert lrhs_share(lrhs, hrls) == pytest.approx(expected, abs=0.07)
+
+
+def test_without_noise_both_renders_count_alike():
+    image = transforms.compress(picture(64, 64), 1.0)
+    assert lrhs_share(image, image) == 0.5
 
 
 def test_without_the_package_the_way_out_is_named(monkeypatch):

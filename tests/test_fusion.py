@@ -4,7 +4,7 @@ import re
 import numpy as np
 import pytest
 
-from oiio_msspl import find_model, fuse
+from oiio_msspl import find_model, fuse, transforms
 from oiio_msspl.errors import InputError
 from oiio_msspl.render import Render, Window
 from oiio_msspl.session import Session
@@ -283,3 +283,34 @@ def test_progress_counts_tiles(session, scale):
     memory = _memory_for_tiles(low, high, session, (36 * scale) ** 2)
     fused = fuse(low, high, session, max_memory=memory, progress=lambda done, count: seen.append((done, count)))
     assert seen == [(i + 1, fused.tiles) for i in range(fused.tiles)]
+
+
+def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
+    """Half of the frame is an empty film: the tiles there cost nothing, the others are as ever."""
+    low, high, _ = pair_of(scale, width=512)
+    low.layers["rgb"][:, : low.layers["rgb"].shape[1] // 2] = 0
+    high.layers["rgb"][:, : high.layers["rgb"].shape[1] // 2] = 0
+    whole = fuse(low, high, session)
+    calls = []
+    run = session.run
+    monkeypatch.setattr(session, "run", lambda *arrays: calls.append(arrays) or run(*arrays))
+    tiled = fuse(low, high, session, max_memory=_memory_for_tiles(low, high, session, (24 * scale) ** 2))
+    assert 0 < len(calls) < tiled.tiles
+    np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=1e-5, atol=1e-6)
+
+
+def test_the_error_is_told_as_radiance_where_asked_for(bilinear_models):
+    """The models expect 0.1 in network values."""
+    low, high, _ = pair_of(4)
+    session = Session(bilinear_models[4])
+    assert fuse(low, high, session).error is None
+    fused = fuse(low, high, session, error=True)
+    middle = transforms.compress(fused.rgb, fused.exposure).mean(-1, keepdims=True)
+    brighter = transforms.expand(middle + 0.1, fused.exposure)
+    np.testing.assert_allclose(fused.error, brighter - transforms.expand(middle, fused.exposure), rtol=1e-3)
+
+
+def test_a_model_that_predicts_no_error_says_so():
+    low, high, _ = pair_of(4)
+    with pytest.raises(InputError, match="paper-x4 does not predict its error; choose another --model"):
+        fuse(low, high, Session(find_model(4, "paper")), error=True)

@@ -16,9 +16,18 @@ torch = pytest.importorskip("torch")
 
 from oiio_msspl import schema, tensors, transforms  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
-from training import batches, data, losses  # noqa: E402
+from training import batches, data, losses, train  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
-from training.pyramid import PyramidFusion, from_phases, to_phases, weighted_sum  # noqa: E402
+from training.pyramid import (  # noqa: E402
+    CANDIDATES,
+    LEVELS,
+    PyramidFusion,
+    from_phases,
+    linear,
+    logarithmic,
+    to_phases,
+    weighted_sum,
+)
 
 TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
 SIZE = 64
@@ -322,8 +331,8 @@ def tiny_pyramid() -> PyramidFusion:
 @pytest.mark.parametrize("scale", schema.SCALES)
 def test_one_pyramid_serves_every_scale(tiny_pyramid: PyramidFusion, scale: int) -> None:
     lrhs, hrls = pair(scale, 64 // scale, 96 // scale)
-    fused = tiny_pyramid(lrhs, hrls)
-    assert fused.shape == (2, 3, 64, 96)
+    fused, log_error = tiny_pyramid(lrhs, hrls)
+    assert (fused.shape, log_error.shape) == ((2, 3, 64, 96), (2, 1, 64, 96))
     assert torch.isfinite(fused).all()
 
 
@@ -335,7 +344,7 @@ def test_pyramid_never_leaves_the_range_of_its_inputs(tiny_pyramid: PyramidFusio
     lrhs, hrls = pair(4, 16, 24)
     hrls[:, :3, 30:34, 40:44] = 4.2
     lrhs[:, :, :8], hrls[:, :3, :32] = 0.1, 0.2
-    fused = tiny_pyramid(lrhs, hrls)
+    fused, _ = tiny_pyramid(lrhs, hrls)
     assert fused[:, :, :20].min() >= 0.1 and fused[:, :, :20].max() <= 0.2
     far = torch.ones(64, 96, dtype=torch.bool)
     far[20:44, 30:54] = False
@@ -378,15 +387,58 @@ def test_weighted_sum_of_phases_is_that_of_the_picture(size: int) -> None:
 
 
 @torch.inference_mode()
-def test_a_pyramid_may_follow_another_denoiser() -> None:
-    """Pixel by pixel as far as it trusts it: all the way, its result is the other's within the renders' range."""
-    network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5, denoised=True).eval()
-    lrhs, hrls = pair(4, 16, 24)
-    denoised = torch.full((2, 3, 64, 96), 0.5)
-    network.trust.bias.fill_(50.0)
-    torch.testing.assert_close(network(lrhs, torch.cat([hrls, denoised], 1)), denoised)
-    network.trust.bias.fill_(-50.0)
-    assert (network(lrhs, torch.cat([hrls, denoised], 1)) - denoised).abs().mean() > 0.01
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_a_pyramid_may_follow_another_denoiser(scale: int) -> None:
+    """Pixel by pixel as far as it trusts it, but for ``MIN_SHARE``: its result can be the other's, or that brought to
+    the brightness that both renders together have at the LRHS's resolution."""
+    network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5, denoiser="high").eval()
+    height, width = 128 // scale, 64 // scale
+    lrhs, hrls = torch.rand(1, 3, height, width), torch.rand(1, 16, 128, 64)
+    pattern = 0.3 + 0.1 * (torch.arange(64) % 2).expand(1, 3, 128, 64)
+    together = logarithmic(1.5 * torch.nn.functional.avg_pool2d(linear(pattern), scale))
+    inputs = torch.cat([lrhs, together], 1), torch.cat([hrls, pattern], 1)
+
+    def prefer(level: int, candidate: int) -> None:
+        bias = network.heads[level].bias.unflatten(0, (-1, 1 if level else 4))[-len(CANDIDATES) :]
+        bias.fill_(-50.0)
+        bias[candidate] = 50.0
+
+    filtered, guided, denoised, low = range(len(CANDIDATES))
+    for level in range(LEVELS):
+        network.heads[level].weight.zero_()
+        prefer(level, low if 2**level >= scale else guided)
+    brighter = logarithmic(1.5 * linear(pattern))
+    torch.testing.assert_close(network(*inputs)[0], brighter, atol=0.03, rtol=0)
+    prefer(0, denoised)
+    torch.testing.assert_close(network(*inputs)[0], pattern, atol=0.02, rtol=0)
+    prefer(0, filtered)
+    assert (network(*inputs)[0] - pattern).abs().mean() > 0.05
+
+
+def test_a_predicted_error_is_that_of_the_output_in_the_mean() -> None:
+    """The loss of the prediction is least at the mean error; the output learns nothing from it."""
+    output, reference = torch.rand(1, 3, 8, 8), torch.rand(1, 3, 8, 8)
+    mean = (output - reference).abs().mean().log().expand(1, 1, 8, 8)
+    least = losses.of_error(mean, output, reference)
+    assert least < min(losses.of_error(mean + change, output, reference) for change in (-0.1, 0.1))
+    network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5)
+    fused, log_error = network(torch.rand(1, 3, 16, 16), torch.rand(1, 16, 64, 64))
+    losses.of_error(log_error, fused.detach(), torch.rand(1, 3, 64, 64)).backward()
+    assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}
+
+
+def test_a_network_starts_from_one_with_fewer_inputs_and_outputs(tmp_path: Path) -> None:
+    """What is new counts for nothing at first, or begins as in a new network."""
+    small = {"channels": (16,) * 5, "own_size": (3,) * 5}
+    plain = PyramidFusion(**small)
+    torch.save({"ema": plain.state_dict()}, tmp_path / "plain.pt")
+    larger = PyramidFusion(**small, denoiser="high")
+    train.warm_start(larger, tmp_path / "plain.pt")
+    assert torch.equal(larger.stem.weight[:, :16], plain.stem.weight)
+    assert not larger.stem.weight[:, 16:].any()
+    taps = len(plain.heads[1].weight)
+    assert torch.equal(larger.heads[1].weight[:taps], plain.heads[1].weight)
+    torch.testing.assert_close(larger.heads[1].bias[taps:], torch.tensor(CANDIDATES))
 
 
 @torch.inference_mode()
@@ -394,7 +446,7 @@ def test_pyramid_sees_an_even_picture_as_even(tiny_pyramid: PyramidFusion) -> No
     """Borders included: what lies beyond the picture has no weight."""
     lrhs, hrls = torch.full((1, 3, 16, 16), 0.3), torch.full((1, 16, 64, 64), 0.5)
     hrls[:, :3], hrls[:, 3:6] = 0.3, 1.0
-    torch.testing.assert_close(tiny_pyramid(lrhs, hrls), torch.full((1, 3, 64, 64), 0.3), atol=1e-5, rtol=0)
+    torch.testing.assert_close(tiny_pyramid(lrhs, hrls)[0], torch.full((1, 3, 64, 64), 0.3), atol=1e-5, rtol=0)
 
 
 def test_onnx_file_of_a_pyramid_agrees_with_it(
@@ -412,7 +464,7 @@ def test_onnx_file_of_a_pyramid_agrees_with_it(
     assert export.parity(tiny_pyramid, 4, path) < 1e-4
 
     monkeypatch.setattr(quantize, "PATCH", SIZE)
-    quantised = quantize.quantise(plain, tiny_pyramid, 4, views)
+    quantised = quantize.quantise(plain, contract, views)
     assert quantised.ByteSize() < plain.ByteSize()
     assert {entry.key: entry.value for entry in quantised.metadata_props} == {METADATA_KEY: contract.to_json()}
     onnx.save(quantised, path)

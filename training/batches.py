@@ -24,7 +24,7 @@ from training.data import PASS_FEATURES, Folder, Sampling, View, random_orthogon
 from training.pyramid import logarithmic
 
 #: What a batch is made of, by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w); all
-#: in network values, and channels-last in memory.
+#: in network values, and channels-last in memory. With a denoiser, the first two have three channels more.
 Batch = dict[str, Tensor]
 
 
@@ -113,7 +113,7 @@ def draw(
 ) -> Batch:
     """``count`` pairs of ``patch`` x ``patch`` HRLS pixels; spp, footprint, mirroring and turning are the batch's.
 
-    With a denoiser, its result on the HRLS follows the HRLS's own channels.
+    With a denoiser, its results follow the renders' own channels.
     """
     # Renderings: how many samples, and which part of which view
     chosen = [views[i] for i in rng.choice(len(views), count)]
@@ -176,13 +176,12 @@ def draw(
     present = on_device(np.stack([_present(rng, sampling, has_variance=variance is not None) for _ in chosen]))
     hrls = torch.lerp(on_device(_DEFAULTS), hrls, present[:, None, None])
 
-    if denoiser is not None:
-        denoised = np.stack([denoiser(image) for image in hrls.cpu().numpy()])
-        hrls = torch.cat([hrls, on_device(denoised)], dim=-1)
-
     low_areas = [tuple(slice(side.start // scale, side.stop // scale) for side in area) for area in areas]
-    lrhs = torch.stack([image[area] for image, area in zip(lrhs, low_areas, strict=True)])
-    pair = {"lrhs": compress(lrhs, exposure), "hrls": hrls, "target": compress(target, exposure)}
+    lrhs = compress(torch.stack([image[area] for image, area in zip(lrhs, low_areas, strict=True)]), exposure)
+    if denoiser is not None:
+        denoised = [denoiser(*images) for images in zip(lrhs.cpu().numpy(), hrls.cpu().numpy(), strict=True)]
+        lrhs, hrls = (on_device(np.stack(images)) for images in zip(*denoised, strict=True))
+    pair = {"lrhs": lrhs, "hrls": hrls, "target": compress(target, exposure)}
     return {
         name: torch.rot90(image.flip(2) if mirrored else image, turns, (1, 2)).contiguous().permute(0, 3, 1, 2)
         for name, image in pair.items()

@@ -24,6 +24,7 @@ import struct
 import zipfile
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -125,6 +126,7 @@ class View:
         arrays = map_npz(path)
         meta = json.loads(str(arrays["meta"]))
         self.path = path
+        self.meta: dict[str, Any] = meta
         self.split: str = meta["split"]
         self.scene: str = str(meta["seed"])
         self.source: str = f"{meta.get('renderer', 'unknown renderer')}, generator {meta.get('generator', '?')}"
@@ -161,13 +163,6 @@ class Folder:
 
 
 # One pair
-
-
-def box_downsample(image: Array, scale: int) -> Array:
-    """Mean over ``scale`` x ``scale`` pixels: (H, W, C) to (H/s, W/s, C)."""
-    height, width, channels = image.shape
-    rows = image.reshape(height // scale, scale, width * channels).mean(axis=1)  # in two steps: several times faster
-    return rows.reshape(height // scale, width // scale, scale, channels).mean(axis=2)
 
 
 def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
@@ -222,10 +217,9 @@ class Evaluation:
     """A fixed pair for validation: the paper's (s^2 - 1), one sample per HR pixel in LRHS and HRLS each."""
 
     lrhs: Array
-    """Linear (h, w, 3)."""
+    """Transformed (h, w, 3), or 6 with a denoiser's result."""
     hrls: Array
-    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have; with a denoiser, its
-    result in three more channels."""
+    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have; or 19, likewise."""
     reference: Array
     """Linear (s*h, s*w, 3)."""
     exposure: float
@@ -236,13 +230,15 @@ class Evaluation:
         height, width, _ = view.ref.shape
         top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
         rows, columns = slice(top, top + patch), slice(left, left + patch)
-        lrhs = box_downsample(mean_lrhs(view, [0]), scale)
+        lrhs = transforms.box_downsample(mean_lrhs(view, [0]), scale)
         exposure = transforms.exposure_of(lrhs)
         hrls = tensors.pack(split_features(read_hrls(view, [0], rows, columns)[0]), schema.HRLS_FEATURES, exposure)
+        lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
+        lrhs = transforms.compress(lrhs, exposure)
         if denoiser is not None:
-            hrls = np.concatenate([hrls, denoiser(hrls)], axis=-1)
+            lrhs, hrls = denoiser(lrhs, hrls)
         return cls(
-            lrhs=lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale],
+            lrhs=lrhs,
             hrls=hrls,
             reference=read(view.ref[rows, columns]),
             exposure=exposure,

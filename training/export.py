@@ -26,11 +26,11 @@ import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
 
-from oiio_msspl import schema, transforms
+from oiio_msspl import schema
 from oiio_msspl.contract import METADATA_KEY, Contract
 from training import data
-from training.networks import NETWORKS, Network
-from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, MultiResolutionFusion
+from training.networks import NETWORKS, Network, run
+from training.paper import MultiResolutionFusion
 from training.quantize import quantise
 
 #: Operators and file format that ONNX Runtime 1.14 and newer understand.
@@ -54,10 +54,13 @@ def load(checkpoint: Path) -> tuple[Network, dict[str, Any]]:
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """Contract of a checkpoint's network for one of its scales."""
-    denoised = network.hrls_channels > HRLS_CHANNELS
+    denoiser = state.get("denoiser") or ""
+    lrhs, hrls = schema.inputs(denoiser)
     return Contract(
-        hrls=schema.channel_names(schema.HRLS_FEATURES | (schema.DENOISED_FEATURES if denoised else {})),
-        bytes_per_pixel=MEMORY_WITH_DENOISER if denoised else MEMORY,
+        lrhs=schema.channel_names(lrhs),
+        hrls=schema.channel_names(hrls),
+        denoiser=denoiser,
+        bytes_per_pixel=MEMORY_WITH_DENOISER if denoiser else MEMORY,
         name=name,
         scale=scale,
         alignment=network.multiple // scale,
@@ -72,7 +75,7 @@ def example(network: Network, scale: int, height: int, width: int, seed: int = 0
     """Random ``lrhs`` and ``hrls`` for an LRHS of some size."""
     generator = torch.Generator().manual_seed(seed)
     return (
-        torch.rand(1, LRHS_CHANNELS, height, width, generator=generator),
+        torch.rand(1, network.lrhs_channels, height, width, generator=generator),
         torch.rand(1, network.hrls_channels, height * scale, width * scale, generator=generator),
     )
 
@@ -82,15 +85,15 @@ def example(network: Network, scale: int, height: int, width: int, seed: int = 0
 
 @torch.inference_mode()
 def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
-    """Graph with inputs ``lrhs`` and ``hrls``, output ``fused``, batch of 1, any height and width that are multiples of
-    the contract's alignment, and that contract."""
+    """Graph with inputs ``lrhs`` and ``hrls``, output ``fused`` (a pyramid's ``log_error`` too), batch of 1, any height
+    and width that are multiples of the contract's alignment, and that contract."""
     scale, alignment = contract.scale, contract.alignment
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
     program = torch.onnx.export(
         _with_onnx_channel_order(network) if isinstance(network, MultiResolutionFusion) else network,
         example(network, scale, 4 * alignment, 6 * alignment),
         input_names=["lrhs", "hrls"],
-        output_names=["fused"],
+        output_names=["fused"] if isinstance(network, MultiResolutionFusion) else ["fused", "log_error"],
         opset_version=OPSET,
         dynamo=True,
         dynamic_shapes=tuple({2: size * height, 3: size * width} for size in (alignment, scale * alignment)),
@@ -160,7 +163,7 @@ def parity(network: Network, scale: int, path: Path) -> float:
         lrhs, hrls = example(network, scale, height, width, seed=height)
         (fused,) = session.run(["fused"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
         with torch.inference_mode():
-            expected = network(lrhs, hrls).numpy()
+            expected = run(network, lrhs, hrls)[0].numpy()
         worst = max(worst, float(np.abs(fused - expected).max()))
     return worst
 
@@ -176,17 +179,17 @@ def measure_overlap(network: Network, scale: int, views: list[data.View], tile: 
     differences: dict[int, list[np.ndarray]] = collections.defaultdict(list)
     for view in views:
         pair = data.Evaluation.centre(view, scale, view.ref.shape[0])
-        lrhs = transforms.compress(pair.lrhs, pair.exposure)
+        lrhs = pair.lrhs
         # Mirrored on all sides, even a small view has room for the largest overlap
         margin = 64
         lrhs, hrls = (
             torch.from_numpy(np.pad(image, ((m, m), (m, m), (0, 0)), "symmetric")).permute(2, 0, 1)[None]
             for image, m in ((lrhs, margin), (pair.hrls, margin * scale))
         )
-        whole = network(lrhs, hrls)
+        whole, _ = run(network, lrhs, hrls)
         start = (lrhs.shape[-1] - tile) // 2 // alignment * alignment
         for overlap in (n for n in (4, 8, 12, 16, 24, 32, 48, 64) if n % alignment == 0):
-            part = network(_square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, scale))
+            part, _ = run(network, _square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, scale))
             middle = _square(part, overlap, tile, 0, scale)
             difference = middle - _square(whole, start, tile, 0, scale)
             differences[overlap].append(difference.abs().numpy().ravel())
@@ -251,7 +254,7 @@ def main() -> None:
         contract = contract_of(network, scale, args.name, args.overlap, state)
         model = to_onnx(network, contract, half=args.half and not args.int8)
         if args.int8:
-            model = quantise(model, network, scale, args.int8)
+            model = quantise(model, contract, args.int8)
         onnx.save(model, args.output)
         describe(network, scale, args.output)
         print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")

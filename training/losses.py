@@ -38,6 +38,13 @@ def display(output: Tensor, reference: Tensor) -> Tensor:
     return 10.0 * squared + 0.3 * l1(output, reference)
 
 
+def of_error(log_error: Tensor, output: Tensor, reference: Tensor) -> Tensor:
+    """Of a prediction (N, 1, H, W) of the logarithm of the absolute error, mean of the channels: the negative
+    log-likelihood of errors that are distributed exponentially, which is least where the prediction is their mean."""
+    error = (output - reference).abs().mean(dim=1, keepdim=True)
+    return (error * torch.exp(-log_error) + log_error).mean()
+
+
 def srgb(exposed: Tensor) -> Tensor:
     """Exposed radiance to sRGB values in [0, 1]."""
     exposed = exposed.clamp(0.0, 1.0)

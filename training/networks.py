@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The networks by name, as ``--network`` and checkpoints name them."""
+"""The networks by name, as ``--network`` and checkpoints name them, and one way to run any of them."""
 
 from __future__ import annotations
+
+from torch import Tensor
 
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
@@ -11,3 +13,9 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion]] = {
     "paper": MultiResolutionFusion,
     "pyramid": PyramidFusion,
 }
+
+
+def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:
+    """The fused image and, from a network that predicts it, the logarithm of its error: what ``forward`` returns."""
+    result = network(lrhs, hrls)
+    return result if isinstance(result, tuple) else (result, None)

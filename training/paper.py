@@ -111,6 +111,7 @@ class RDG(nn.Module):
 class MultiResolutionFusion(nn.Module):
     """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, all in the network values of :mod:`oiio_msspl.transforms`."""
 
+    lrhs_channels = LRHS_CHANNELS
     hrls_channels = HRLS_CHANNELS
 
     def __init__(

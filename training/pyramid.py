@@ -17,6 +17,8 @@ hold are averaged:
 
 5. No pixel may be darker or brighter than everything around it in both renders.
 
+6. A last convolution predicts how far each pixel is still off.
+
 So the result is nearly a weighted mean of the light that was rendered, times a filtered albedo, and whatever the input,
 it stays within what was rendered. Kernel-predicting denoisers are
 Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of taps are like the splats of Gharbi et al.
@@ -25,6 +27,7 @@ Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of ta
 
 from __future__ import annotations
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -46,6 +49,10 @@ MIN_ALBEDO = 0.02
 MAX_RETOUCH = 0.5
 #: Weights are exponentials of the network's outputs within these bounds.
 MAX_LOGIT = 12.0
+#: Largest factor by which a level's light is told to differ from the denoised HRLS, and its inverse the smallest.
+MAX_RATIO = 8.0
+#: Added to both sides of that ratio, in exposed radiance: black is no light to compare with.
+RATIO_FLOOR = 1e-3
 
 #: Of the HRLS's channels, those that the retouch sees pixel by pixel: colour, albedo and normal.
 _DETAILS = 9
@@ -212,6 +219,13 @@ def positive(logits: Tensor) -> Tensor:
 #: An image by level.
 Pyramid = dict[int, Tensor]
 
+#: What a level of the light is mixed of beside another denoiser's results, with the logits that training starts from:
+#: the level's weighted means; the denoised HRLS, as much brighter or darker as the coarser level has become; the
+#: denoised HRLS as it is; both renders denoised together, from the LRHS's resolution on.
+CANDIDATES = (0.0, 1.0, 0.0, 2.0)
+#: Every candidate's smallest share: what makes it keeps learning, however good another one is.
+MIN_SHARE = 0.01
+
 
 def pyramid(image: Tensor, first: int, levels: int) -> Pyramid:
     """Means of 2x2 pixels of means of 2x2 pixels ...: the image as level ``first``, up to level ``levels - 1``."""
@@ -219,6 +233,30 @@ def pyramid(image: Tensor, first: int, levels: int) -> Pyramid:
     for level in range(first + 1, levels):
         images[level] = halve(images[level - 1])
     return images
+
+
+def from_finest(phases: Tensor, levels: int) -> Pyramid:
+    """The same of an image (N, C, 4, H/2, W/2), which stays level 0."""
+    return {0: phases} | pyramid(phases.mean(dim=2), 1, levels)
+
+
+def chosen(logits: Tensor, candidates: list[Tensor | None], tint: Tensor | None) -> Tensor:
+    """The mean of those candidates that are there, weighted by the softmax of their logits and at least ``MIN_SHARE``.
+
+    Args:
+        logits: (N, len(candidates), P, H, W).
+        candidates: light (N, 3, P, H, W).
+        tint: makes light colour; then colours are averaged, and returned, in network values, where no outlier rules.
+    """
+    present = {i: image for i, image in enumerate(candidates) if image is not None}
+    if tint is not None:
+        present = {i: logarithmic(image * tint) for i, image in present.items()}
+    if len(present) == 1:
+        return next(iter(present.values()))
+    weights = torch.softmax(torch.cat([logits[:, i : i + 1] for i in present], dim=1), dim=1)
+    weights = MIN_SHARE + (1 - len(present) * MIN_SHARE) * weights
+    terms = (weights[:, k : k + 1] * image for k, image in enumerate(present.values()))
+    return functools.reduce(torch.add, terms)
 
 
 def level_of(lrhs: Tensor, hrls: Tensor) -> int:
@@ -245,28 +283,28 @@ class PyramidFusion(nn.Module):
     Args:
         channels: of the U-Net's levels H/2, H/4, H/8, ...
         own_size: taps across of the kernels over a level's own samples, H, H/2, ... ; odd.
-        denoised: the HRLS's last three channels are its colour by another denoiser, which a predicted share of every
-            pixel follows.
+        denoiser: what another denoiser adds to the inputs' channels, see :func:`oiio_msspl.schema.inputs`.
     """
 
     def __init__(
         self,
         channels: Sequence[int] = (48, 64, 96, 128, 128),
         own_size: Sequence[int] = (5, 5, 5, 5, 5),
-        denoised: bool = False,
+        denoiser: str = "",
     ) -> None:
         super().__init__()
-        self.config = {"channels": list(channels), "own_size": list(own_size), "denoised": denoised}
+        self.config = {"channels": list(channels), "own_size": list(own_size), "denoiser": denoiser}
         self.own_size = own_size
         self.multiple = 2 ** len(channels)
         finest, *coarser = channels
 
         # Down: H/2 sees every pixel of the HRLS, the levels below the colours of both renders anew
-        self.hrls_channels = HRLS_CHANNELS + (3 if denoised else 0)
+        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in schema.inputs(denoiser))
+        self.denoised = self.lrhs_channels > LRHS_CHANNELS
         self.stem = nn.Conv2d(self.hrls_channels, finest, 6, stride=2, padding=2)
-        self.stem_low = conv3x3(LRHS_CHANNELS, finest)
+        self.stem_low = conv3x3(self.lrhs_channels, finest)
         self.down = nn.ModuleList(nn.Conv2d(above, here, 3, stride=2, padding=1) for above, here in pairwise(channels))
-        self.mix = nn.ModuleList(conv3x3(here + 3 + LRHS_CHANNELS, here) for here in coarser)
+        self.mix = nn.ModuleList(conv3x3(here + 3 + self.lrhs_channels, here) for here in coarser)
 
         # Up
         self.skip = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
@@ -278,16 +316,17 @@ class PyramidFusion(nn.Module):
         self.heads = nn.ModuleList(
             nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
         )
-        self.trust = nn.Conv2d(finest, 4, 1) if denoised else None
-        seen = 4 * (3 + _DETAILS + (3 if denoised else 0))
+        seen = 4 * (3 + _DETAILS + self.hrls_channels - HRLS_CHANNELS)
         self.retouch = nn.ModuleList([conv3x3(finest + seen, finest), conv3x3(finest, 4 * 3)])
+        self.error = nn.Conv2d(finest, 4, 1)
         self.reset_parameters()
 
     def outputs(self, level: int) -> list[int]:
         """Channels of a level's head: taps over its own samples, weight of the HRLS's samples, taps over the coarser
-        level, weight of the LRHS's samples, taps over the albedo, share of the albedo."""
-        own = self.own_size[level] ** 2
-        return [own, 1, 9 if level < LEVELS - 1 else 0, 1 if level else 0, 0 if level else 9, 0 if level else 1]
+        level, weight of the LRHS's samples, taps over the albedo, share of the albedo, choice among CANDIDATES."""
+        own, coarser = self.own_size[level] ** 2, 9 if level < LEVELS - 1 else 0
+        choice = len(CANDIDATES) if self.denoised else 0
+        return [own, 1, coarser, 1, 0, 0, choice] if level else [own, 1, coarser, 0, 9, 1, choice]
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
@@ -299,9 +338,16 @@ class PyramidFusion(nn.Module):
         for head in self.heads:
             head.weight.mul_(0.1)
         self.retouch[-1].weight.zero_()
-        if self.trust is not None:
-            self.trust.weight.zero_()
-            self.trust.bias.fill_(1.0)
+        self.error.weight.zero_()
+        self.error.bias.fill_(math.log(0.05))
+        if self.denoised:
+            for level, head in enumerate(self.heads):
+                weight, bias = (
+                    parameter.unflatten(0, (-1, 1 if level else 4))[-len(CANDIDATES) :]
+                    for parameter in (head.weight, head.bias)
+                )
+                weight.zero_()
+                bias.copy_(torch.tensor(CANDIDATES)[:, None].expand_as(bias))
 
     def features(self, lrhs: Tensor, hrls: Tensor, colours: Pyramid, lows: Pyramid) -> list[Tensor]:
         """What the U-Net makes of both renders: H/2, H/4, ..., with the channels of each level."""
@@ -325,10 +371,19 @@ class PyramidFusion(nn.Module):
             decoded.append(x)
         return decoded[::-1]
 
-    def gather(self, colour: Tensor, albedo: Tensor, colours: Pyramid, lows: Pyramid, features: list[Tensor]) -> Tensor:
+    def gather(
+        self,
+        albedo: Tensor,
+        colours: Pyramid,
+        lows: Pyramid,
+        features: list[Tensor],
+        denoised: Pyramid,
+        denoised_lows: Pyramid,
+    ) -> Tensor:
         """Make kernels of the features and apply them: the fused image in network values, before its retouch.
 
-        Colour (exposed radiance) and albedo of the HRLS and the result are (N, 3, 4, H/2, W/2); so is all of level 0.
+        Albedo of the HRLS and the result are (N, 3, 4, H/2, W/2); so is level 0 of all. Other denoisers' results are
+        empty without them.
         """
         logits = []
         for level, head in enumerate(self.heads):
@@ -336,56 +391,83 @@ class PyramidFusion(nn.Module):
             logits.append(values.unflatten(1, (sum(self.outputs(level)), -1)).split(self.outputs(level), dim=1))
 
         # Albedo, and the part of it that colours the light
-        *_, albedo_taps, gamma = logits[0]
+        *_, albedo_taps, gamma, _ = logits[0]
         filtered = divided(weighted_sum(positive(albedo_taps), weighted(albedo, torch.ones_like(albedo[:, :1]))))
         share = torch.sigmoid(gamma + 2.0)
         tint = (share * filtered + (1 - share)).clamp_min(MIN_ALBEDO)
         tints = {0: tint} | pyramid(tint.mean(dim=2), 1, LEVELS)
 
+        def as_light(images: Pyramid, level: int) -> Tensor:
+            return images[level] / tints[level] if level == 0 else (images[level] / tints[level]).unsqueeze(2)
+
         light: Tensor | None = None
+        guide: Tensor | None = None  # the denoised HRLS's light
         for level in reversed(range(LEVELS)):
-            own, importance, coarser, low_importance, *_ = logits[level]
-            here = colour / tint if level == 0 else (colours[level] / tints[level]).unsqueeze(2)
-            samples = weighted(here, positive(importance))
+            own, importance, coarser, low_importance, _, _, choice = logits[level]
+            samples = weighted(as_light(colours, level), positive(importance))
             if level in lows:
-                low = (lows[level] / tints[level]).unsqueeze(2)
-                samples = samples + weighted(low, positive(low_importance + 1.0))
+                samples = samples + weighted(as_light(lows, level), positive(low_importance + 1.0))
             total = weighted_sum(positive(own), samples)
+            ratio: Tensor | None = None
             if light is not None:
-                around = weighted(light, torch.ones_like(light[:, :1]))
+                planes = [light, torch.ones_like(light[:, :1])]
+                around = torch.cat(planes if guide is None else [*planes, guide], dim=1)
                 if level > 0:
                     around = double(around.squeeze(2)).unsqueeze(2)
-                total = total + weighted_sum(positive(coarser), around, dilation=2)
+                gathered = weighted_sum(positive(coarser), around, dilation=2)
+                total = total + gathered[:, :4]
+                if guide is not None:
+                    # Of the means, not the mean of ratios: where it is dark, that would be noise
+                    light, guide = (
+                        part / gathered[:, 3:4].clamp_min(1e-12) for part in (gathered[:, :3], gathered[:, 4:])
+                    )
+                    ratio = ((light + RATIO_FLOOR) / (guide + RATIO_FLOOR)).clamp(1 / MAX_RATIO, MAX_RATIO)
             light = divided(total)
+            guide = as_light(denoised, level) if denoised else None
+            candidates = [
+                light,
+                # Of no influence on what is coarser: training through a chain of ratios made the features explode
+                (guide * ratio).detach() if guide is not None and ratio is not None else None,
+                guide,
+                as_light(denoised_lows, level) if level in denoised_lows else None,
+            ]
+            light = chosen(choice, candidates, tint if level == 0 else None)
         assert light is not None
-        return logarithmic(light * tint)
+        return light
 
-    def forward(self, lrhs: Tensor, hrls: Tensor) -> Tensor:
+    def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
         """
         Args:
-            lrhs: (N, 3, h, w), network values.
-            hrls: (N, 16, s*h, s*w), or 19 with another denoiser's colour, likewise.
+            lrhs: (N, 3, h, w), network values; or (N, 6, h, w) with another denoiser's result.
+            hrls: (N, 16, s*h, s*w), or 19, likewise.
 
         Returns:
-            (N, 3, s*h, s*w) in network values.
+            The fused image (N, 3, s*h, s*w) in network values, and the logarithm of its expected absolute error
+            (N, 1, s*h, s*w), mean of the channels, in network values too. Nothing else learns from the latter.
         """
         deepest = len(self.mix) + 2
         details = to_phases(hrls[:, :_DETAILS])
-        colour = linear(details[:, :3])
-        colours = pyramid(colour.mean(dim=2), 1, deepest)
+        colours = from_finest(linear(details[:, :3]), deepest)
         lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
         features = self.features(lrhs, hrls, colours, lows)
-        fused = self.gather(colour, details[:, _ALBEDO], colours, lows, features)
         seen = [features[0], details.flatten(1, 2)]
-        if self.trust is not None:
-            share = torch.sigmoid(pointwise(self.trust, features[0]).float().unsqueeze(1))
-            denoised = to_phases(hrls[:, HRLS_CHANNELS:])
-            fused = torch.lerp(fused, denoised, share)
-            seen.append(denoised.flatten(1, 2))
+        denoised: Pyramid = {}
+        denoised_lows: Pyramid = {}
+        if self.hrls_channels > HRLS_CHANNELS:
+            result = to_phases(hrls[:, HRLS_CHANNELS:])
+            denoised = from_finest(linear(result), LEVELS)
+            seen.append(result.flatten(1, 2))
+        if self.denoised:
+            denoised_lows = {level: low[:, LRHS_CHANNELS:] for level, low in lows.items()}
+            lows = {level: low[:, :LRHS_CHANNELS] for level, low in lows.items()}
+        fused = self.gather(details[:, _ALBEDO], colours, lows, features, denoised, denoised_lows)
         seen.insert(1, fused.flatten(1, 2))
-        change = self.retouch[1](F.relu(self.retouch[0](torch.cat(seen, dim=1)))).float().unflatten(1, (3, 4))
+        hidden = F.relu(self.retouch[0](torch.cat(seen, dim=1)))
+        change = self.retouch[1](hidden).float().unflatten(1, (3, 4))
         change = MAX_RETOUCH * torch.tanh(change / MAX_RETOUCH)
         lowest, highest = (
-            (sign * highest_around(sign * lrhs, sign * hrls[:, :3])).unsqueeze(2) for sign in (-1.0, 1.0)
+            (sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * hrls[:, :3])).unsqueeze(2)
+            for sign in (-1.0, 1.0)
         )
-        return from_phases(torch.clamp(fused + change, lowest, highest))
+        error = pointwise(self.error, hidden.detach()).float().unsqueeze(1)
+        return from_phases(torch.clamp(fused + change, lowest, highest)), from_phases(error)

@@ -18,22 +18,21 @@ import torch
 from onnx import helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
+from oiio_msspl.contract import Contract
 from oiio_msspl.denoiser import Denoiser
 from training import batches, data
-from training.networks import Network
-from training.paper import HRLS_CHANNELS
 
 #: Batches that the ranges of values are learnt from: as training draws them, with layers left out and colours changed.
 BATCHES, BATCH, PATCH = 12, 2, 192
 
 
-def quantise(model: onnx.ModelProto, network: Network, scale: int, views: Path) -> onnx.ModelProto:
-    """A copy of ``model``, an export of ``network`` in float32, whose convolutions run in 8 bits.
+def quantise(model: onnx.ModelProto, contract: Contract, views: Path) -> onnx.ModelProto:
+    """A copy of ``model``, an export in float32, whose convolutions run in 8 bits.
 
     Weights have 7 bits: processors without VNNI instructions add two products in 16 bits.
 
     Args:
-        scale: of the export.
+        contract: of the export.
         views: folder of training views that the ranges of values are learnt from.
     """
     with tempfile.TemporaryDirectory() as folder:
@@ -43,7 +42,7 @@ def quantise(model: onnx.ModelProto, network: Network, scale: int, views: Path) 
         quantize_static(
             plain,
             quantised,
-            _Samples(network, scale, views),
+            _Samples(contract, views),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
             nodes_to_exclude=[last],
@@ -79,20 +78,20 @@ def _with_inputs_of_their_own(model: onnx.ModelProto) -> onnx.ModelProto:
 
 
 class _Samples(CalibrationDataReader):
-    def __init__(self, network: Network, scale: int, views: Path) -> None:
-        self._feeds = self._draw(network, scale, data.Folder(views))
+    def __init__(self, contract: Contract, views: Path) -> None:
+        self._feeds = self._draw(contract, data.Folder(views))
 
     def get_next(self) -> dict[str, np.ndarray] | None:
         return next(self._feeds, None)
 
     @staticmethod
-    def _draw(network: Network, scale: int, folder: data.Folder) -> Iterator[dict[str, np.ndarray]]:
-        denoiser = Denoiser() if network.hrls_channels > HRLS_CHANNELS else None
+    def _draw(contract: Contract, folder: data.Folder) -> Iterator[dict[str, np.ndarray]]:
+        denoiser = Denoiser(mode=contract.denoiser) if contract.denoiser else None
         rng = np.random.default_rng(0)
         cpu = torch.device("cpu")
         views = [batches.Pixels.of(view, cpu) for view in folder.split("train")]
         for _ in range(BATCHES):
             with torch.no_grad():
-                batch = batches.draw(views, scale, PATCH, BATCH, rng, data.Sampling(), denoiser)
+                batch = batches.draw(views, contract.scale, PATCH, BATCH, rng, data.Sampling(), denoiser)
             for lrhs, hrls in zip(batch["lrhs"], batch["hrls"], strict=True):
                 yield {"lrhs": lrhs[None].contiguous().numpy(), "hrls": hrls[None].contiguous().numpy()}

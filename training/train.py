@@ -32,9 +32,9 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from oiio_msspl import metrics, transforms
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.denoiser import MODES, Denoiser
 from training import batches, data, losses
-from training.networks import NETWORKS, Network
+from training.networks import NETWORKS, Network, run
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
 
@@ -46,6 +46,9 @@ SPIKE = 4.0
 #: A run that falls so many dB behind its own best goes back to it, at half the learning rate.
 COLLAPSE = 2.0
 
+#: Of the loss of the predicted error: little, because gradients are clipped together. Adam makes up for it.
+ERROR_WEIGHT = 0.01
+
 #: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
 WARM_UP, FINAL = 0.03, 0.01
 
@@ -55,6 +58,7 @@ class Recipe:
     """How to optimise."""
 
     optimizer: type[torch.optim.Optimizer]
+    options: dict[str, Any]
     lr: float
     loss: str
     batch: int
@@ -71,6 +75,9 @@ RECIPES = {
     # For a CPU and an hour: there, more and smaller steps beat fewer and larger ones.
     "ours": Recipe(
         optimizer=torch.optim.AdamW,
+        # Larger than the default: where a softmax is decided and hardly any gradient is left, Adam would still take
+        # steps of full length, all in one direction, until the features explode.
+        options={"eps": 1e-6},
         lr=4e-4,
         loss="l1",
         batch=4,
@@ -82,6 +89,7 @@ RECIPES = {
     # As in the paper, whose 500 epochs took a week on a GPU; the input transform alone is ours.
     "paper": Recipe(
         optimizer=torch.optim.SGD,
+        options={},
         lr=1e-4,
         loss="robust",
         batch=16,
@@ -109,11 +117,11 @@ def evaluate(network: Network, pairs: Iterable[data.Evaluation], device: torch.d
     """
     scores: dict[str, list[float]] = collections.defaultdict(list)
     for pair in pairs:
-        lrhs = transforms.compress(pair.lrhs, pair.exposure)
-        fused = network(to_tensor(lrhs[None], device), to_tensor(pair.hrls[None], device))
+        fused, _ = run(network, to_tensor(pair.lrhs[None], device), to_tensor(pair.hrls[None], device))
         output = transforms.expand(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
         scale = pair.hrls.shape[0] // pair.lrhs.shape[0]
-        upsampled = bicubic(to_tensor(pair.lrhs[None], torch.device("cpu")), scale)[0].permute(1, 2, 0).numpy()
+        lrhs = transforms.expand(pair.lrhs[None, ..., :3], pair.exposure)
+        upsampled = bicubic(to_tensor(lrhs, torch.device("cpu")), scale)[0].permute(1, 2, 0).numpy()
         reference = pair.reference * pair.exposure
         for prefix, image in (("", output), ("bicubic_", upsampled)):
             psnr = metrics.psnr(image * pair.exposure, reference)
@@ -152,10 +160,13 @@ def warm_start(network: Network, path: Path) -> None:
     theirs = torch.load(path, map_location="cpu", weights_only=True)["ema"]
     ours = network.state_dict()
     for name, value in theirs.items():
-        # What a convolution reads beyond the other's inputs counts for nothing at first
-        if name in ours and value.ndim == 4 and value.shape[1] < ours[name].shape[1]:
-            theirs[name] = torch.zeros_like(ours[name])
-            theirs[name][:, : value.shape[1]] = value
+        # What a convolution reads beyond the other's inputs counts for nothing at first; what it makes beyond the
+        # other's outputs begins as in a new network
+        larger = ours[name].shape if name in ours else ()
+        if value.ndim == len(larger) and all(size <= limit for size, limit in zip(value.shape, larger, strict=True)):
+            theirs[name] = ours[name].clone()
+            theirs[name][: len(value)] = 0
+            theirs[name][tuple(slice(size) for size in value.shape)] = value
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
@@ -207,11 +218,12 @@ def train(args: argparse.Namespace) -> None:
 
     # Network, from the last checkpoint, from another run, or new
     network: Network
-    denoiser = Denoiser(args.threads) if args.denoised else None
+    denoiser = Denoiser(args.threads, args.denoiser) if args.denoiser else None
     if args.network == "pyramid":
-        network = PyramidFusion(denoised=args.denoised)
-    elif args.denoised:
-        raise SystemExit("--denoised: for the pyramid network")
+        own_size = (args.finest_kernel, 5, 5, 5, 5)
+        network = PyramidFusion(channels=args.channels, own_size=own_size, denoiser=args.denoiser)
+    elif args.denoiser:
+        raise SystemExit("--denoiser: for the pyramid network")
     elif len(scales) == 1:
         network = MultiResolutionFusion(scales[0])
     else:
@@ -222,7 +234,7 @@ def train(args: argparse.Namespace) -> None:
         warm_start(network, args.init)
     network.to(device, memory_format=torch.channels_last)
     average = Average(network)
-    optimizer = recipe.optimizer(network.parameters(), lr=peak_lr)
+    optimizer = recipe.optimizer(network.parameters(), lr=peak_lr, **recipe.options)
     step, elapsed, best_gain = 0, 0.0, -math.inf
 
     def restore(state: dict[str, Any]) -> None:
@@ -280,6 +292,7 @@ def train(args: argparse.Namespace) -> None:
             "optimizer": optimizer.state_dict(),
             "architecture": args.network,
             "config": network.config,
+            "denoiser": args.denoiser,
             "step": step,
             "seconds": elapsed,
             "best_gain": best_gain,
@@ -320,10 +333,13 @@ def train(args: argparse.Namespace) -> None:
             group["lr"] = peak_lr * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
         pair = source.next()
         with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
-            output = network(pair["lrhs"], pair["hrls"])
+            output, log_error = run(network, pair["lrhs"], pair["hrls"])
         loss = loss_function(output.float(), pair["target"])
+        total = loss
+        if log_error is not None:
+            total = loss + ERROR_WEIGHT * losses.of_error(log_error, output.detach().float(), pair["target"])
         optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        total.backward()
         length = float(torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_gradient))
         if math.isfinite(length) and length < SPIKE * usual:
             optimizer.step()
@@ -365,7 +381,21 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--network", choices=NETWORKS, default="paper", help="the paper's, or the kernel-predicting one"
     )
     parser.add_argument(
-        "--denoised", action="store_true", help="a network that also reads Open Image Denoise's result on the HRLS"
+        "--denoiser",
+        choices=MODES,
+        default="",
+        help="a network that also reads what Open Image Denoise makes of both renders together (low), and of the HRLS "
+        "in some quality",
+    )
+    parser.add_argument(
+        "--channels",
+        type=int,
+        nargs="+",
+        default=(48, 64, 96, 128, 128),
+        help="of the levels H/2, H/4, ... of a pyramid network",
+    )
+    parser.add_argument(
+        "--finest-kernel", type=int, default=5, help="taps across at a pyramid network's full resolution"
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")

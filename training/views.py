@@ -30,6 +30,9 @@ VIEWS = 3
 """Of each scene."""
 
 
+SPLITS = ("train", "validation", "test")
+
+
 def split(seed: int) -> str:
     """Whole scenes are held out, never single views of one."""
     return {0: "validation", 1: "test"}.get(seed % 20, "train")

@@ -58,10 +58,13 @@ def make_inputs(
     return Inputs(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp)
 
 
-def make_write_options(layout: str, compression: str | None, half: bool | None, layers: list[str]) -> WriteOptions:
+def make_write_options(
+    layout: str, compression: str | None, half: bool | None, layers: list[str], error_layer: bool
+) -> WriteOptions:
     from oiio_msspl.assemble import WriteOptions
 
-    return WriteOptions(layout, compression, None if half is None else "half" if half else "float", tuple(layers))
+    pixel_type = None if half is None else "half" if half else "float"
+    return WriteOptions(layout, compression, pixel_type, tuple(layers), error_layer)
 
 
 def parse_bytes(text: str) -> int:

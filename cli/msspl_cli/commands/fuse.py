@@ -78,6 +78,9 @@ def fuse(
             metavar="PATTERN", help="Pass on only these layers of HR (crypto*), or none. May be repeated. [all]"
         ),
     ] = [],  # noqa: B006
+    error_layer: Annotated[
+        bool, typer.Option("--error-layer", help="Add a layer 'error': how far off the model expects to be.")
+    ] = False,
     compression: Annotated[
         str | None, typer.Option(help="Of the fused layer: zip, zips, piz, dwaa, ... [as the HR]")
     ] = None,
@@ -123,7 +126,7 @@ def fuse(
 
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp),
-        "write": options.make_write_options(layout, compression, half, layers),
+        "write": options.make_write_options(layout, compression, half, layers, error_layer),
         "model": model,
         "device": device,
         "threads": threads,

@@ -26,7 +26,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
                 "name": name,
                 "scale": contract.scale,
                 "size_mb": round(path.stat().st_size / 1e6, 1),
-                "needs": "pyoidn" if contract.reads_denoised else None,
+                "needs": "pyoidn" if contract.denoiser else None,
                 "training_spp": contract.training_spp,
                 "provenance": contract.provenance,
             }

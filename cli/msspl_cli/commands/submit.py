@@ -57,7 +57,7 @@ def submit(
 
     # What is wrong for every frame is said here, not by every task.
     options.make_inputs(*(given[name] for name in ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp")))
-    options.make_write_options(*(given[name] for name in ("layout", "compression", "half", "layers")))
+    options.make_write_options(*(given[name] for name in ("layout", "compression", "half", "layers", "error_layer")))
     options.parse_bytes(given["max_memory"])
     if given["view"] is not None:
         preview.check_view(given["view"])

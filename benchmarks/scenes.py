@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What models are judged by: pairs of renders with a reference, of scenes that nothing was trained on.
+
+Two kinds, by what a folder holds. **Renders**: a folder a scene, with ``ref.exr``, ``hr_<n>spp.exr`` and
+``lr_x<s>_<n>spp.exr``. **Views** of :mod:`training.views`: those of the split ``test``.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import schema, transforms
+from oiio_msspl.aovs import resolve
+from oiio_msspl.exr import open_exr
+from oiio_msspl.pairing import Source
+from oiio_msspl.render import Array, Render
+from training import data
+
+#: The reference of this one is full of fireflies.
+NOISY_REFERENCE = {"veach-bidir"}
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A frame. Sources of the same arguments are the same pixels; of different ones, independent samples."""
+
+    name: str
+    """Of the scene; some have several views, and then several of these."""
+    reference: Array
+    """(H, W, 3), linear, exposed for display."""
+    hrls: Callable[[int], Source]
+    """Of a number of spp."""
+    lrhs: Callable[[int, int], Source]
+    """Of a scale s and an average of n samples a pixel of the HRLS, which is ``s^2 n`` spp."""
+
+
+def load(folder: Path) -> list[Scene]:
+    """All scenes of a folder of either kind.
+
+    Raises:
+        SystemExit: there are none.
+    """
+    if references := sorted(folder.glob("*/ref.exr")):
+        return [_render(reference.parent) for reference in references]
+    if views := data.Folder(folder).split("test"):
+        return [_view(view) for view in views]
+    raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing")
+
+
+def beauty(source: Source) -> Array:
+    """Repaired colour of all of a source."""
+    return transforms.repair(source.read(source.data_window, ["rgb"])["rgb"])[0]
+
+
+def _render(folder: Path) -> Scene:
+    def file(name: str) -> Source:
+        return resolve(open_exr(folder / name))
+
+    return Scene(
+        name=folder.name,
+        reference=beauty(file("ref.exr")),
+        hrls=lambda spp: file(f"hr_{spp}spp.exr"),
+        lrhs=lambda scale, spp: file(f"lr_x{scale}_{scale**2 * spp}spp.exr"),
+    )
+
+
+def _view(view: data.View) -> Scene:
+    reference = data.read(view.ref)
+    exposure = np.float32(transforms.exposure_of(reference))
+    whole = slice(None)
+
+    def hrls(spp: int) -> Source:
+        passes = data.read_hrls(view, list(range(spp)), whole, whole).mean(axis=0)
+        layers = data.split_features(passes)
+        for name in layers.keys() & set(schema.RADIANCE_FEATURES):
+            layers[name] = layers[name] * exposure
+        return Render.from_arrays(f"{view.path.name}, {spp} spp", **layers)
+
+    def lrhs(scale: int, spp: int) -> Source:
+        chosen = np.flatnonzero(view.lr_spp == spp)[:1]
+        image = transforms.box_downsample(data.mean_lrhs(view, chosen) * exposure, scale)
+        return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image)
+
+    return Scene(view.scene, reference * exposure, hrls, lrhs)

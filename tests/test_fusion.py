@@ -287,14 +287,14 @@ def test_progress_counts_tiles(session, scale):
 
 def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
     """Half of the frame is an empty film: the tiles there cost nothing, the others are as ever."""
-    low, high, _ = pair_of(scale, width=512)
+    low, high, _ = pair_of(scale, width=1024)
     low.layers["rgb"][:, : low.layers["rgb"].shape[1] // 2] = 0
     high.layers["rgb"][:, : high.layers["rgb"].shape[1] // 2] = 0
     whole = fuse(low, high, session)
     calls = []
     run = session.run
     monkeypatch.setattr(session, "run", lambda *arrays: calls.append(arrays) or run(*arrays))
-    tiled = fuse(low, high, session, max_memory=_memory_for_tiles(low, high, session, (24 * scale) ** 2))
+    tiled = fuse(low, high, session, max_memory=_memory_for_tiles(low, high, session, (36 * scale) ** 2))
     assert 0 < len(calls) < tiled.tiles
     np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=1e-5, atol=1e-6)
 

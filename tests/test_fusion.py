@@ -287,7 +287,7 @@ def test_progress_counts_tiles(session, scale):
 
 def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
     """Half of the frame is an empty film: the tiles there cost nothing, the others are as ever."""
-    low, high, _ = pair_of(scale, width=1024)
+    low, high, _ = pair_of(scale, 32 * scale, 128 * scale)
     low.layers["rgb"][:, : low.layers["rgb"].shape[1] // 2] = 0
     high.layers["rgb"][:, : high.layers["rgb"].shape[1] // 2] = 0
     whole = fuse(low, high, session)

@@ -285,6 +285,22 @@ def test_progress_counts_tiles(session, scale):
     assert seen == [(i + 1, fused.tiles) for i in range(fused.tiles)]
 
 
+def test_another_frames_albedo_is_noticed(session, scale):
+    """Not the right one, though light and shadow have edges that it lacks."""
+    rng = np.random.default_rng(0)
+    albedo = np.repeat(rng.random((16, 16, 1), np.float32), 3, -1).repeat(4 * scale, 0).repeat(4 * scale, 1)
+    shadow = np.where(np.arange(64 * scale)[:, None] > 40 * scale, 0.2, 1.0)[..., None]
+    clean = (albedo * shadow).astype(np.float32)
+    low = Render.from_arrays("lr", rgb=noisy(downsample(clean, scale), 16))
+
+    def warnings(layer):
+        high = Render.from_arrays("hr", rgb=noisy(clean, 1, seed=1), albedo=np.ascontiguousarray(layer))
+        return [w for w in fuse(low, high, session).warnings if "albedo" in w]
+
+    assert warnings(albedo) == warnings(np.full_like(albedo, 0.5)) == []
+    assert len(warnings(albedo[:, ::-1])) == 1
+
+
 def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
     """Half of the frame is an empty film: the tiles there cost nothing, the others are as ever."""
     low, high, _ = pair_of(scale, 32 * scale, 128 * scale)

@@ -20,8 +20,9 @@ from oiio_msspl.session import Session
 
 #: Memory that a run may use by default.
 MAX_MEMORY = 3 << 30
-#: An HRLS pixel is at most so many times as bright as the brightest of the 3 x 3 LRHS pixels around it: what is beyond
-#: is a firefly. Noise apart the bound is s^2, the LRHS being the mean over s x s pixels.
+#: A pixel of one render is at most so many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the
+#: other one: what is beyond is a firefly. Noise apart the bound is s^2 for the HRLS, whose mean over s x s pixels the
+#: LRHS is, and 1 for the LRHS.
 BRIGHTEST = 64.0
 #: Interpreter, libraries, weights and buffers that do not grow with the frame.
 FIXED_MEMORY = 350 << 20
@@ -83,15 +84,13 @@ def fuse(
     frame = low[schema.RGB][pairing.grid.slices(grid)]
     exposure = transforms.exposure_of(frame)
     warnings = checks.check(frame, hr, pairing, lr.name)
-    lrhs = tensors.pack(low, schema.LRHS_FEATURES, exposure)
-
     hr_data = pairing.hr_data
     rgb = np.zeros((hr_data.height, hr_data.width, 3), dtype=np.float32)
     alpha: Array | None = None
     errors = np.zeros((hr_data.height, hr_data.width, 1), dtype=np.float32) if error else None
     hr_repaired: dict[str, int] = {}
-    # What is held of the frame: the result (colour, alpha, error), and the LRHS as it is and as the network wants it.
-    frame_bytes = rgb.nbytes * (5 if error else 4) // 3 + lrhs.nbytes + sum(values.nbytes for values in low.values())
+    # What is held of the frame: the result (colour, alpha, error) and the LRHS.
+    frame_bytes = rgb.nbytes * (5 if error else 4) // 3 + sum(values.nbytes for values in low.values())
     largest = _largest_tile(session, frame_bytes, max_memory)
     plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
     dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
@@ -103,8 +102,10 @@ def fuse(
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
         empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
         if not empty.all():
-            dim = layers | _dimmed(layers, low[schema.RGB][inside], scale)
-            values, deviation = session.run(lrhs[inside], tensors.pack(dim, schema.HRLS_FEATURES, exposure))
+            lrhs, hrls = _without_fireflies(low[schema.RGB][inside], layers, scale)
+            values, deviation = session.run(
+                tensors.pack(lrhs, schema.LRHS_FEATURES, exposure), tensors.pack(hrls, schema.HRLS_FEATURES, exposure)
+            )
             colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
             rgb[target.slices(hr_data)] = colour[target.slices(area)]
             if errors is not None and deviation is not None:
@@ -169,13 +170,19 @@ def _largest_tile(session: Session, frame_bytes: int, max_memory: int) -> int:
     return int(pixels) // contract.scale**2
 
 
-def _dimmed(layers: dict[str, Array], low: Array, scale: int) -> dict[str, Array]:
-    """The radiance layers of an HRLS, without fireflies: no brighter than the LRHS around them, (h, w, 3), allows."""
+def _without_fireflies(low: Array, layers: dict[str, Array], scale: int) -> tuple[dict[str, Array], dict[str, Array]]:
+    """The LRHS's colour, (h, w, 3), and the HRLS's layers, none brighter than the other render around it allows."""
+    over_high = _ceiling(low).repeat(scale, axis=0).repeat(scale, axis=1)
+    over_low = _ceiling(transforms.box_downsample(layers[schema.RGB], scale))
+    lights = {name: np.minimum(layers[name], over_high) for name in schema.RADIANCE_FEATURES if name in layers}
+    return {schema.RGB: np.minimum(low, over_low)}, layers | lights
+
+
+def _ceiling(low: Array) -> Array:
+    """The brightest that one render may be, given the other at the LRHS's resolution, (h, w, 3)."""
     highest = reduce(np.maximum, _around(low))
-    with np.errstate(over="ignore"):  # no ceiling, then; nor where the LRHS has no light at all
-        ceiling = np.where(highest > 0, highest * np.float32(BRIGHTEST), np.float32(np.inf))
-    ceiling = ceiling.repeat(scale, axis=0).repeat(scale, axis=1)
-    return {name: np.minimum(layers[name], ceiling) for name in schema.RADIANCE_FEATURES if name in layers}
+    with np.errstate(over="ignore"):  # no ceiling, then; nor where there is no light at all
+        return np.where(highest > 0, highest * np.float32(BRIGHTEST), np.float32(np.inf))
 
 
 def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, scale: int) -> Array:

@@ -9,7 +9,8 @@ hold are averaged:
    per pixel says how far the colour follows it (not at all for mirrors, glass, emitters and sky).
 3. From coarse to fine, H/16 to H, every level averages its own samples (the downsampled HRLS and, from the LRHS's
    resolution on, the LRHS) over predicted kernels, together with the coarser level's result around the pixel. Samples
-   also carry predicted weights of their own, so that a firefly is left out wherever it might be read.
+   also carry predicted weights of their own, so that a firefly is left out wherever it might be read. Where another
+   denoiser's results are there, every level then mixes them in by predicted shares: see ``CANDIDATES``.
 
 4. Two convolutions see that result beside the features, and colour, albedo and normal pixel by pixel, and retouch it,
    within ``MAX_RETOUCH``: samples that hit or miss an edge make it jagged, and no mean of samples is as straight as the
@@ -20,9 +21,8 @@ hold are averaged:
 6. A last convolution predicts how far each pixel is still off.
 
 So the result is nearly a weighted mean of the light that was rendered, times a filtered albedo, and whatever the input,
-it stays within what was rendered. Kernel-predicting denoisers are
-Bako et al. 2017 and Vogels et al. 2018; weights of samples beside weights of taps are like the splats of Gharbi et al.
-2019.
+it stays within what was rendered. Kernel-predicting denoisers are Bako et al. 2017 and Vogels et al. 2018; weights of
+samples beside weights of taps are like the splats of Gharbi et al. 2019.
 """
 
 from __future__ import annotations
@@ -338,8 +338,7 @@ class PyramidFusion(nn.Module):
         for head in self.heads:
             head.weight.mul_(0.1)
         self.retouch[-1].weight.zero_()
-        self.error.weight.zero_()
-        self.error.bias.fill_(math.log(0.05))
+        self.reset_error()
         if self.denoised:
             for level, head in enumerate(self.heads):
                 weight, bias = (
@@ -348,6 +347,12 @@ class PyramidFusion(nn.Module):
                 )
                 weight.zero_()
                 bias.copy_(torch.tensor(CANDIDATES)[:, None].expand_as(bias))
+
+    @torch.no_grad()
+    def reset_error(self) -> None:
+        """The predicted error starts alike everywhere. :mod:`training.error` teaches it."""
+        self.error.weight.zero_()
+        self.error.bias.fill_(math.log(0.05))
 
     def features(self, lrhs: Tensor, hrls: Tensor, colours: Pyramid, lows: Pyramid) -> list[Tensor]:
         """What the U-Net makes of both renders: H/2, H/4, ..., with the channels of each level."""
@@ -462,12 +467,11 @@ class PyramidFusion(nn.Module):
             lows = {level: low[:, :LRHS_CHANNELS] for level, low in lows.items()}
         fused = self.gather(details[:, _ALBEDO], colours, lows, features, denoised, denoised_lows)
         seen.insert(1, fused.flatten(1, 2))
-        hidden = F.relu(self.retouch[0](torch.cat(seen, dim=1)))
-        change = self.retouch[1](hidden).float().unflatten(1, (3, 4))
+        change = self.retouch[1](F.relu(self.retouch[0](torch.cat(seen, dim=1)))).float().unflatten(1, (3, 4))
         change = MAX_RETOUCH * torch.tanh(change / MAX_RETOUCH)
         lowest, highest = (
             (sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * hrls[:, :3])).unsqueeze(2)
             for sign in (-1.0, 1.0)
         )
-        error = pointwise(self.error, hidden.detach()).float().unsqueeze(1)
+        error = pointwise(self.error, features[0].detach()).float().unsqueeze(1)
         return from_phases(torch.clamp(fused + change, lowest, highest)), from_phases(error)

@@ -46,9 +46,6 @@ SPIKE = 4.0
 #: A run that falls so many dB behind its own best goes back to it, at half the learning rate.
 COLLAPSE = 2.0
 
-#: Of the loss of the predicted error: little, because gradients are clipped together. Adam makes up for it.
-ERROR_WEIGHT = 0.01
-
 #: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
 WARM_UP, FINAL = 0.03, 0.01
 
@@ -333,13 +330,10 @@ def train(args: argparse.Namespace) -> None:
             group["lr"] = peak_lr * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
         pair = source.next()
         with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
-            output, log_error = run(network, pair["lrhs"], pair["hrls"])
+            output, _ = run(network, pair["lrhs"], pair["hrls"])
         loss = loss_function(output.float(), pair["target"])
-        total = loss
-        if log_error is not None:
-            total = loss + ERROR_WEIGHT * losses.of_error(log_error, output.detach().float(), pair["target"])
         optimizer.zero_grad(set_to_none=True)
-        total.backward()
+        loss.backward()
         length = float(torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_gradient))
         if math.isfinite(length) and length < SPIKE * usual:
             optimizer.step()

@@ -345,11 +345,11 @@ def _run(
             return
         frame, made, future = writing
         error = future.exception()
-        writing = None
         if error is None:
             done(_fused_result(frame, made.as_dict(), report))
         else:
             failed(frame, error)
+        writing = None  # only now: a signal may come anywhere above, and the frame is recorded on the way out
 
     with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
         ahead = [reader.submit(stages.read, frame) for frame in frames[:1]]

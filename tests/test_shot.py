@@ -593,6 +593,23 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(make, bilinear_models):
     assert [path.name for path in folder.iterdir() if path.name.startswith(".")] == []
 
 
+def test_a_signal_between_writing_and_recording_loses_no_frame(make, bilinear_models, monkeypatch):
+    folder, recorded = make(4), shot._fused_result
+    moments = iter([None, KeyboardInterrupt])
+
+    def interrupted(*arguments):
+        if moment := next(moments, None):
+            raise moment
+        return recorded(*arguments)
+
+    monkeypatch.setattr(shot, "_fused_result", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, bilinear_models[4], report_path=folder / "r.json", previews=False)
+    report = json.loads((folder / "r.json").read_text())
+    files = sorted(path.name for path in (folder / "out").iterdir())
+    assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]] != []
+
+
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_ctrl_c_ends_with_the_table_and_whole_frames(make, bilinear_models, name, code):
     folder = make(100)

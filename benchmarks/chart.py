@@ -123,7 +123,8 @@ def page(rows: list[dict[str, Any]], timings: Timings) -> str:
                 figure = draw(rows, timings, name, total=total)
                 figure.savefig(text, format="svg", metadata={"Date": None})
                 plt.close(figure)
-            parts.append(text.getvalue().partition("<svg")[1] + text.getvalue().partition("<svg")[2])
+            svg = text.getvalue()
+            parts.append(svg[svg.index("<svg") :])  # without the XML declaration
     return "\n".join(parts) + "\n"
 
 

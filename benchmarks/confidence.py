@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from benchmarks import scenes
+from benchmarks.quality import AVERAGES
 from oiio_msspl import fuse, transforms
 from oiio_msspl.render import Array
 from oiio_msspl.schema import SCALES
 from oiio_msspl.session import Session, find_model
 
-AVERAGES = (2, 4, 8)
 BINS, SQUARE = 20, 8
 
 

@@ -47,6 +47,9 @@ LEVELS = 5
 MIN_ALBEDO = 0.02
 #: Largest change of the last step, in network values: from mid-grey, about two stops.
 MAX_RETOUCH = 0.5
+#: The retouch reads the features times this, for they grow to a mean of about 5: unscaled, one step of Adam could shift
+#: a sum over hundreds of them by more than its spread, and nearly all channels of the retouch ended in ReLU's zero.
+RETOUCH_SCALE = 1 / 8
 #: Weights are exponentials of the network's outputs within these bounds.
 MAX_LOGIT = 12.0
 #: Largest factor by which a level's light is told to differ from the denoised HRLS, and its inverse the smallest.
@@ -193,10 +196,20 @@ def pointwise(head: nn.Conv2d, features: Tensor) -> Tensor:
     Convolutions leave theirs pixel by pixel, and to sort the many channels of a head would take longer than to make
     them.
     """
+    (planes,) = pointwise_split(head, features, [head.out_channels])
+    return planes
+
+
+def pointwise_split(head: nn.Conv2d, features: Tensor, sizes: list[int]) -> list[Tensor]:
+    """The same in parts of so many channels. Its weights are split instead of the result, which would be copied."""
     assert head.bias is not None
-    weight = head.weight.flatten(1).expand(features.shape[0], -1, -1)
-    planes = torch.bmm(weight, features.contiguous().flatten(2)) + head.bias[:, None]
-    return planes.unflatten(2, features.shape[2:])
+    flat = features.contiguous().flatten(2)
+    # A product and a sum in one, which ONNX has for matrices alone
+    planes = (
+        torch.stack([torch.addmm(bias[:, None], weight, image) for image in flat]) if len(weight) else flat[:, :0]
+        for weight, bias in zip(head.weight.flatten(1).split(sizes), head.bias.split(sizes), strict=True)
+    )
+    return [part.unflatten(2, features.shape[2:]) for part in planes]
 
 
 def weighted(image: Tensor, weight: Tensor) -> Tensor:
@@ -392,8 +405,10 @@ class PyramidFusion(nn.Module):
         """
         logits = []
         for level, head in enumerate(self.heads):
-            values = pointwise(head, features[max(level - 1, 0)]).float()
-            logits.append(values.unflatten(1, (sum(self.outputs(level)), -1)).split(self.outputs(level), dim=1))
+            phases = 1 if level else 4
+            sizes = [size * phases for size in self.outputs(level)]
+            parts = pointwise_split(head, features[max(level - 1, 0)], sizes)
+            logits.append([part.float().unflatten(1, (-1, phases)) for part in parts])
 
         # Albedo, and the part of it that colours the light
         *_, albedo_taps, gamma, _ = logits[0]
@@ -455,7 +470,7 @@ class PyramidFusion(nn.Module):
         colours = from_finest(linear(details[:, :3]), deepest)
         lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
         features = self.features(lrhs, hrls, colours, lows)
-        seen = [features[0], details.flatten(1, 2)]
+        seen = [features[0] * RETOUCH_SCALE, details.flatten(1, 2)]
         denoised: Pyramid = {}
         denoised_lows: Pyramid = {}
         if self.hrls_channels > HRLS_CHANNELS:

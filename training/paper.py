@@ -111,9 +111,6 @@ class RDG(nn.Module):
 class MultiResolutionFusion(nn.Module):
     """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, all in the network values of :mod:`oiio_msspl.transforms`."""
 
-    lrhs_channels = LRHS_CHANNELS
-    hrls_channels = HRLS_CHANNELS
-
     def __init__(
         self,
         scale: int,  #        s: upsampling factor, a power of two; D = log2(s) deshuffle and shuffle layers
@@ -122,6 +119,7 @@ class MultiResolutionFusion(nn.Module):
         groups: int = 3,  #   G: RDGs
         blocks: int = 5,  #   B: RDBs in an RDG
         dense: int = 3,  #    dense convolutions in an RDB, before its last one: 4 convolutional layers
+        lrhs_channels: int = LRHS_CHANNELS,  # beyond the colour: layers of an LRHS, for ablations
     ) -> None:
         super().__init__()
         if scale not in schema.SCALES:
@@ -133,12 +131,14 @@ class MultiResolutionFusion(nn.Module):
             "groups": groups,
             "blocks": blocks,
             "dense": dense,
+            "lrhs_channels": lrhs_channels,
         }
+        self.lrhs_channels, self.hrls_channels = lrhs_channels, HRLS_CHANNELS
         self.scale = scale
         self.multiple = scale
         """Height and width of the HRLS are multiples of this."""
         stages = int(math.log2(scale))
-        self.h_lrhs = conv3x3(LRHS_CHANNELS, channels)
+        self.h_lrhs = conv3x3(lrhs_channels, channels)
         self.h_hrls = conv3x3(HRLS_CHANNELS, channels)
         self.deshuffle = nn.Sequential(*(Deshuffle(channels) for _ in range(stages)))
         self.fuse = nn.Conv2d(2 * channels, channels, kernel_size=1)

@@ -12,7 +12,7 @@ hold are averaged:
    also carry predicted weights of their own, so that a firefly is left out wherever it might be read. Where another
    denoiser's results are there, every level then mixes them in by predicted shares: see ``CANDIDATES``.
 
-4. Two convolutions see that result beside the features, and colour, albedo and normal pixel by pixel, and retouch it,
+4. Three convolutions see that result beside the features, and colour, albedo and normal pixel by pixel, and retouch it,
    within ``MAX_RETOUCH``: samples that hit or miss an edge make it jagged, and no mean of samples is as straight as the
    edge.
 
@@ -330,7 +330,9 @@ class PyramidFusion(nn.Module):
             nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
         )
         seen = 4 * (3 + _DETAILS + self.hrls_channels - HRLS_CHANNELS)
-        self.retouch = nn.ModuleList([conv3x3(finest + seen, finest), conv3x3(finest, 4 * 3)])
+        self.retouch = nn.Sequential(
+            conv3x3(finest + seen, finest), nn.ReLU(), conv3x3(finest, finest), nn.ReLU(), conv3x3(finest, 4 * 3)
+        )
         self.error = nn.Conv2d(finest, 4, 1)
         self.reset_parameters()
 
@@ -482,7 +484,7 @@ class PyramidFusion(nn.Module):
             lows = {level: low[:, :LRHS_CHANNELS] for level, low in lows.items()}
         fused = self.gather(details[:, _ALBEDO], colours, lows, features, denoised, denoised_lows)
         seen.insert(1, fused.flatten(1, 2))
-        change = self.retouch[1](F.relu(self.retouch[0](torch.cat(seen, dim=1)))).float().unflatten(1, (3, 4))
+        change = self.retouch(torch.cat(seen, dim=1)).float().unflatten(1, (3, 4))
         change = MAX_RETOUCH * torch.tanh(change / MAX_RETOUCH)
         lowest, highest = (
             (sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * hrls[:, :3])).unsqueeze(2)

@@ -1,0 +1,200 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's ablations: what each branch reads, the loss, and super-resolution without an HRLS.
+
+    python -m training.ablations VIEWS --json benchmarks/results/ablations.json
+
+As in the paper: an HRLS of 1 spp, an LRHS of far more (all 16 samples a pixel of a view's ``lr`` passes, 256 spp at
+x4), and the branch that is not examined reads colour alone. A reduced network of the paper's shape is trained anew for
+every row, for the same few minutes, on the same batches, and scored on the held-out views; so rows can be compared with
+each other, not with what ships. An LRHS with layers has those of the ``hr`` passes that are not in the HRLS. Rows that
+the JSON file has already are kept; run on one idle core, because the clock ends a row.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import itertools
+import json
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from oiio_msspl import metrics, schema, tensors, transforms
+from oiio_msspl.comparison import upsample_bicubic
+from training import data, losses
+from training.paper import HRLS_CHANNELS, MultiResolutionFusion
+from training.pyramid import linear
+from training.train import to_tensor
+
+REDUCED = {"channels": 32, "growth": 16, "groups": 2, "blocks": 3}
+BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
+#: Batches drawn for a scale, which every row then goes through again and again.
+POOL = 400
+#: Layers by what the tables call them; each has those before it, too.
+LAYERS = {
+    "RGB": [schema.RGB],
+    "and albedo": [schema.ALBEDO],
+    "and normal": [schema.NORMAL],
+    "and diffuse, specular": [schema.DIFFUSE, schema.SPECULAR],
+}
+NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
+#: The paper clips radiance here.
+CLIP = 100.0
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row."""
+
+    name: str
+    scale: int = 4
+    lrhs: str = RGB
+    hrls: str = RGB
+    loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
+
+
+def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda output, reference: loss(*(linear(values).clamp(0.0, CLIP) for values in (output, reference)))
+
+
+def _robust(beta: float) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda output, reference: losses.robust(output, reference, beta)
+
+
+VARIANTS = [
+    Variant("both RGB, l1"),
+    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != RGB),
+    *(Variant(f"LRHS: {name}", lrhs=name) for name in (NONE, ALL)),
+    *(Variant(f"robust loss, beta {beta:g}", loss=_robust(beta)) for beta in (0.01, 0.1, 1.0)),
+    Variant("l1 of linear radiance", loss=_in_linear(losses.l1)),
+    Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
+    *(Variant(f"x{scale}, HRLS: {name}", scale, hrls=name) for scale in (2, 8) for name in (NONE, ALL)),
+]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One crop of one view, transformed; layers as :data:`oiio_msspl.schema.HRLS_FEATURES` has them."""
+
+    lrhs: np.ndarray
+    """(h, w, 16)"""
+    hrls: np.ndarray
+    """(s*h, s*w, 16)"""
+    target: np.ndarray
+    """(s*h, s*w, 3), linear"""
+    exposure: float
+
+
+def pair_of(view: data.View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
+    """A crop whose HRLS is the pass ``chosen``."""
+    rows, columns = slice(top, top + patch), slice(left, left + patch)
+    colour = transforms.box_downsample(data.mean_lrhs(view, list(range(len(view.lr)))), scale)
+    exposure = transforms.exposure_of(colour)
+    low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
+
+    def packed(passes: np.ndarray) -> np.ndarray:
+        return tensors.pack(data.split_features(passes), schema.HRLS_FEATURES, exposure)
+
+    others = [p for p in range(len(view.hr)) if p != chosen]
+    low = transforms.box_downsample(data.read_hrls(view, others, rows, columns).mean(axis=0), scale)
+    low[..., :3] = colour[low_rows, low_columns]
+    high = data.read_hrls(view, [chosen], rows, columns)[0]
+    return Pair(packed(low), packed(high), data.read(view.ref[rows, columns]), exposure)
+
+
+def channels_of(name: str) -> Tensor:
+    """1 for the channels that a branch reads, 0 for the others: (1, 16, 1, 1)."""
+    names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
+    read = {feature for layers in names for feature in LAYERS[layers]}
+    return torch.cat([torch.full((n,), float(f in read)) for f, n in schema.HRLS_FEATURES.items()])[None, :, None, None]
+
+
+@functools.cache
+def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Batches of ``lrhs``, ``hrls`` and target, in network values."""
+    rng = np.random.default_rng(0)
+    batches = []
+    for _ in range(POOL):
+        pairs = []
+        for view in (views[i] for i in rng.integers(len(views), size=BATCH)):
+            top, left = 8 * rng.integers((view.ref.shape[0] - PATCH) // 8 + 1, size=2)
+            pairs.append(pair_of(view, scale, int(top), int(left), PATCH, int(rng.integers(len(view.hr)))))
+        stacks = (
+            [pair.lrhs for pair in pairs],
+            [pair.hrls for pair in pairs],
+            [transforms.compress(pair.target, pair.exposure) for pair in pairs],
+        )
+        lrhs, hrls, target = (to_tensor(np.stack(images), torch.device("cpu")) for images in stacks)
+        batches.append((lrhs, hrls, target))
+    return batches
+
+
+def train(variant: Variant, views: tuple[data.View, ...], minutes: float) -> tuple[MultiResolutionFusion, int]:
+    """A network after so many minutes, and its steps."""
+    torch.manual_seed(0)
+    network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
+    network.to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
+    low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
+    batches = itertools.cycle(pool(views, variant.scale))
+    start, steps = time.monotonic(), 0
+    while (elapsed := (time.monotonic() - start) / (60 * minutes)) < 1:
+        for group in optimizer.param_groups:
+            group["lr"] = LEARNING_RATE * min(1.0, 2 * (1 - elapsed))  # constant, then to zero
+        lrhs, hrls, target = (torch.rot90(image, steps // POOL % 4, (2, 3)) for image in next(batches))
+        with torch.autocast("cpu", torch.bfloat16):
+            output = network(lrhs * low_mask, hrls * high_mask)
+        optimizer.zero_grad(set_to_none=True)
+        variant.loss(output.float(), target).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        steps += 1
+    return network, steps
+
+
+@torch.inference_mode()
+def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[data.View, ...]) -> dict[str, float]:
+    """Mean PSNR and RelMSE, and those of bicubic upsampling."""
+    found = []
+    for view in views:
+        height, width = view.ref.shape[:2]
+        pair = pair_of(view, variant.scale, 0, 0, height, 0)
+        lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
+        fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
+        reference = pair.target * pair.exposure
+        bicubic = upsample_bicubic(transforms.expand(pair.lrhs[..., :3], 1.0), width, height)
+        images = (transforms.expand(fused.numpy(), 1.0), bicubic)
+        found.append([measure(i, reference) for i in images for measure in (metrics.psnr, metrics.relmse)])
+    return dict(zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(found, axis=0).tolist(), strict=True))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("views", type=Path)
+    parser.add_argument("--json", type=Path, required=True)
+    parser.add_argument("--minutes", type=float, default=2.5, help="for each row")
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    result: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {"rows": []}
+    folder = data.Folder(args.views)
+    views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
+    result |= {"minutes": args.minutes, "network": REDUCED, "train_views": len(views), "held_out_views": len(held_out)}
+    done = {row["name"] for row in result["rows"]}
+    for variant in VARIANTS:
+        if variant.name not in done:
+            network, steps = train(variant, views, args.minutes)
+            row = {"name": variant.name, "scale": variant.scale, "steps": steps, **evaluate(network, variant, held_out)}
+            print(row, flush=True)
+            result["rows"].append(row)
+            args.json.write_text(json.dumps(result, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    main()

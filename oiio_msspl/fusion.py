@@ -73,8 +73,8 @@ def fuse(
     """
     pairing = pair(lr, hr)
     contract = session.contract
-    if error and not session.predicts_error:
-        raise InputError(f"model {contract.name} does not predict its error; choose another --model")
+    if error:
+        session.require_error()
     if contract.scale != pairing.scale:
         raise InputError(f"model {contract.name} is for x{contract.scale}, but this pair is x{pairing.scale}")
     scale, grid = pairing.scale, tiling.aligned(pairing.grid, contract.alignment)
@@ -104,7 +104,9 @@ def fuse(
         if not empty.all():
             lrhs, hrls = _without_fireflies(low[schema.RGB][inside], layers, scale)
             values, deviation = session.run(
-                tensors.pack(lrhs, schema.LRHS_FEATURES, exposure), tensors.pack(hrls, schema.HRLS_FEATURES, exposure)
+                tensors.pack(lrhs, schema.LRHS_FEATURES, exposure),
+                tensors.pack(hrls, schema.HRLS_FEATURES, exposure),
+                error=error,
             )
             colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
             rgb[target.slices(hr_data)] = colour[target.slices(area)]

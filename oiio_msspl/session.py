@@ -140,22 +140,23 @@ class Session:
             log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
         log.info("model %s on %s", self.contract.name, self.provider)
 
-    @property
-    def predicts_error(self) -> bool:
-        """Whether :meth:`run` returns an error."""
-        return "log_error" in self._outputs
+    def require_error(self) -> None:
+        """Raise InputError if the model does not predict its error."""
+        if "log_error" not in self._outputs:
+            raise InputError(f"model {self.contract.name} does not predict its error; choose another --model")
 
-    def run(self, lrhs: Array, hrls: Array) -> tuple[Array, Array | None]:
+    def run(self, lrhs: Array, hrls: Array, *, error: bool = False) -> tuple[Array, Array | None]:
         """Evaluate the network.
 
         Args:
             lrhs: (h, w, 3), transformed.
             hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`. What else the
                 contract lists for either is made here.
+            error: also return the error, of a model that predicts it.
 
         Returns:
-            The fused image (s*h, s*w, 3), transformed; and of models that predict it its expected absolute error,
-            mean of the channels, (s*h, s*w, 1), in the same values.
+            The fused image (s*h, s*w, 3), transformed; and, if asked for, its expected absolute error, mean of the
+            channels, (s*h, s*w, 1), in the same values.
         """
         start = time.perf_counter()
         if self._denoiser is not None:
@@ -166,11 +167,11 @@ class Session:
         }
         try:
             results = dict(zip(self._outputs, self._session.run(self._outputs, feed), strict=True))
-        except Exception as error:
+        except Exception as cause:
             raise MssplError(
-                f"{self.contract.name} failed on {self.provider} ({str(error).splitlines()[0]}); "
+                f"{self.contract.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "
                 "try --max-memory with a smaller value, or --device cpu"
-            ) from error
+            ) from cause
         self.seconds += time.perf_counter() - start
         images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}
-        return images["fused"], np.exp(images["log_error"]) if self.predicts_error else None
+        return images["fused"], np.exp(images["log_error"]) if error else None

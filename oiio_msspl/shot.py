@@ -281,12 +281,15 @@ class Stages:
         path = find_model(pair(*ready.sources).scale, self.model)
         if path not in self.sessions:
             self.sessions[path] = Session(path, self.device, self.threads)
+        if self.options.error_layer:
+            self.sessions[path].require_error()
         return self.sessions[path]
 
     def fuse(self, ready: Pair, session: Session) -> tuple[Report, Fused]:
         start = time.perf_counter()
         # Beside this frame there are the pixels of the next one, and the result of the one before.
-        beside = ready.hr.data_window.width * ready.hr.data_window.height * 4 * 4
+        held = 5 if self.options.error_layer else 4
+        beside = ready.hr.data_window.width * ready.hr.data_window.height * held * 4
         if ready.sources[1] is not ready.hr:
             beside += 2 * (_pixel_bytes(ready.lr) + _pixel_bytes(ready.hr))
         fused = fuse(*ready.sources, session, error=self.options.error_layer, max_memory=self.max_memory - beside)

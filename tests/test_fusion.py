@@ -318,7 +318,7 @@ def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
     whole = fuse(low, high, session)
     calls = []
     run = session.run
-    monkeypatch.setattr(session, "run", lambda *arrays: calls.append(arrays) or run(*arrays))
+    monkeypatch.setattr(session, "run", lambda *arrays, **more: calls.append(arrays) or run(*arrays, **more))
     tiled = fuse(low, high, session, max_memory=_memory_for_tiles(low, high, session, (36 * scale) ** 2))
     assert 0 < len(calls) < tiled.tiles
     np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=1e-5, atol=1e-6)

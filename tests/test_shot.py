@@ -158,6 +158,7 @@ def test_ranges_are_taken_in_their_order(tmp_path, frames, numbers):
         (["lr", "hr", "-o", "out", "--report", "no/r.json"], "does not exist; create it first"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
         (["lr", "hr", "-o", "out", "--view", "x"], "--view 'x'"),
+        (["lr", "hr", "-o", "out", "--model", "paper", "--error-layer"], "paper-x4 does not predict its error"),
         (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "o.exr", "--skip-existing"], "--skip-existing is for shots"),
     ],
 )

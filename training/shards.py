@@ -70,7 +70,7 @@ def grouped(views: list[data.View], limit: int) -> Iterator[list[data.View]]:
 
 
 def pack(views: Path, shards: Path, limit: int = LIMIT) -> None:
-    """Write all views of a folder as shards, and the manifest last."""
+    """Write all views of a folder as shards, and the manifest last; shards of an earlier pack are replaced."""
     folder = data.Folder(views)
     shards.mkdir(parents=True, exist_ok=True)
     entries = []
@@ -86,6 +86,8 @@ def pack(views: Path, shards: Path, limit: int = LIMIT) -> None:
         entries += [{"shard": name} | describe(view) for view in group]
     with replacing(shards / MANIFEST, overwrite=True) as temporary:
         temporary.write_text(json.dumps({"views": entries}, indent=1) + "\n")
+    for left_over in set(shards.glob("views-*.zip")) - {shards / entry["shard"] for entry in entries}:
+        left_over.unlink()
     scenes = len({entry["scene"] for entry in entries})
     print(f"{len(entries)} views of {scenes} scenes in {len(groups)} shards")
 

@@ -1,15 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """Accuracy on scenes that nothing was trained on, at equal average samples.
 
-    python -m benchmarks.quality ../shared/renders --json results/quality.json
-    python -m benchmarks.quality VIEWS --json results/quality_cycles.json
+    python -m benchmarks.quality RENDERS --flip --json results/quality.json
+    python -m benchmarks.quality VIEWS --flip --json results/quality_cycles.json
 
 Folders are those of :mod:`benchmarks.scenes`. For 2, 4 and 8 average samples (spp_LRHS / s^2 + spp_HRLS) each method
 gets its renders. From an LRHS and an HRLS: our models; OIDN (if pyoidn is installed) on the HRLS with albedo and
 normal, at quality high and fast; OIDN on the LRHS, upsampled; "OIDN on both": the first brought to the second's local
 brightness; and "together": to that of both renders denoised as :mod:`oiio_msspl.denoiser` does. From one
-full-resolution render of the same average: OIDN. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean.
-Scenes whose own reference is noisy are listed but not averaged.
+full-resolution render of the same average: OIDN. "Nearest" marks the paper's LRHS, of every s x s pixels one; others
+are averages of s x s pixels, as renderers make them. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean; and
+the mean of these, RelMSE (1, 1e-4), SSIM and FLIP. Scenes whose own reference is noisy are listed but not averaged.
 """
 
 from __future__ import annotations
@@ -30,10 +31,18 @@ from oiio_msspl.denoiser import Denoiser
 from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import Source
 from oiio_msspl.session import Session, find_model, shipped_models
-from oiio_msspl.transforms import box_downsample, repair
+from oiio_msspl.transforms import box_downsample, repair, srgb
 
 #: Average spp; half of it is in the HRLS, half in the LRHS, as in the paper's tables.
 AVERAGES = (2, 4, 8)
+#: Key of a row -> what it is called, and how it is printed.
+MEASURES = {
+    "psnr": ("PSNR (sRGB, dB)", "{:.2f}"),
+    "relmse": ("RelMSE (0.5, 0.01)", "{:.4f}"),
+    "relmse_gharbi": ("RelMSE (1, 1e-4)", "{:.3f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "flip": ("FLIP", "{:.4f}"),
+}
 
 
 def oidn(file: Source, quality: str = "high") -> np.ndarray | None:
@@ -69,14 +78,22 @@ def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
     return transforms.expand(denoiser(transforms.compress(low, exposure), packed)[0][..., 3:], exposure)
 
 
-def run_scene(scene: scenes.Scene, sessions: list[Session]) -> list[dict[str, Any]]:
-    """One row a method and case: ``scene, spp, method, psnr, relmse, relmse_gharbi, ssim``."""
+def flip_of(image: np.ndarray, reference: np.ndarray) -> float:
+    """Mean FLIP of two pictures in sRGB, seen from where a degree has 67 pixels."""
+    import flip_evaluator
+
+    return float(flip_evaluator.evaluate(srgb(reference), srgb(image), "LDR", applyMagma=False)[1])
+
+
+def run_scene(scene: scenes.Scene, sessions: list[Session], flip: bool = False) -> list[dict[str, Any]]:
+    """One row a method and case: ``scene, spp, method, psnr, relmse, relmse_gharbi, ssim``, and ``flip`` if asked."""
     height, width = scene.reference.shape[:2]
     rows = []
 
     def add(spp: int, method: str, image: np.ndarray | None) -> None:
         if image is not None:
-            rows.append({"scene": scene.name, "spp": spp, "method": method, **scores(image, scene.reference)})
+            measured = scores(image, scene.reference) | ({"flip": flip_of(image, scene.reference)} if flip else {})
+            rows.append({"scene": scene.name, "spp": spp, "method": method, **measured})
 
     for spp in AVERAGES:
         hr = scene.hrls(spp // 2)
@@ -85,7 +102,7 @@ def run_scene(scene: scenes.Scene, sessions: list[Session]) -> list[dict[str, An
         add(spp, "OIDN on the HRLS", denoised)
         add(spp, "OIDN fast on the HRLS", oidn(hr, "fast"))
         for scale in schema.SCALES:
-            lr = scene.lrhs(scale, spp // 2)
+            lr, nearest = scene.lrhs(scale, spp // 2), scene.nearest(scale, spp // 2)
             low = beauty(lr)
             add(spp, f"LRHS x{scale} nearest", low.repeat(scale, 0).repeat(scale, 1))
             add(spp, f"LRHS x{scale} bicubic", upsample_bicubic(low, width, height))
@@ -97,39 +114,58 @@ def run_scene(scene: scenes.Scene, sessions: list[Session]) -> list[dict[str, An
             for session in sessions:
                 if session.contract.scale == scale:
                     add(spp, session.contract.name, fuse(lr, hr, session).rgb)
+                    if nearest is not None:
+                        add(spp, f"{session.contract.name}, nearest", fuse(nearest, hr, session).rgb)
         full = scene.hrls(spp)
         add(spp, "full resolution", beauty(full))
         add(spp, "OIDN, same samples", oidn(full))
     return rows
 
 
+def mean_of(rows: list[dict[str, Any]], method: str, spp: int, measure: str) -> float:
+    """Over all scenes whose reference is clean; those of several views count once."""
+    values: dict[str, list[float]] = {}
+    for row in rows:
+        if row["method"] == method and row["spp"] == spp and row["scene"] not in NOISY_REFERENCE:
+            values.setdefault(row["scene"], []).append(row[measure])
+    return float(np.mean([np.mean(of_scene) for of_scene in values.values()]))
+
+
 def print_tables(rows: list[dict[str, Any]]) -> None:
     """A table a measure and average spp: methods down, scenes across."""
     names = list(dict.fromkeys(row["scene"] for row in rows))
-    for spp in dict.fromkeys(row["spp"] for row in rows):
-        for measure, form in (("psnr", "{:.2f}"), ("relmse", "{:.4f}")):
-            unit = "PSNR (sRGB, dB)" if measure == "psnr" else "RelMSE (0.5, 0.01)"
+    cases = list(dict.fromkeys(row["spp"] for row in rows))
+    for spp in cases:
+        for measure in ("psnr", "relmse"):
+            unit, form = MEASURES[measure]
             print(f"\n### {unit} at {spp} spp on average\n")
             print("| method | mean | " + " | ".join(f"{s}{'*' if s in NOISY_REFERENCE else ''}" for s in names) + " |")
             print("|---|" + "---|" * (len(names) + 1))
             for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
                 here = [row for row in rows if row["spp"] == spp and row["method"] == method]
-                values = {s: np.mean([row[measure] for row in here if row["scene"] == s]) for s in names}
-                mean = np.mean([v for s, v in values.items() if s not in NOISY_REFERENCE])
-                cells = [form.format(v) for v in (mean, *values.values())]
+                values = [np.mean([row[measure] for row in here if row["scene"] == s]) for s in names]
+                cells = [form.format(v) for v in (mean_of(rows, method, spp, measure), *values)]
                 print(f"| {method} | " + " | ".join(cells) + " |")
     if NOISY_REFERENCE & set(names):
         print("\n\\* noisy reference, not in the mean")
+    measured = {measure: form for measure, form in MEASURES.items() if measure in rows[0]}
+    for spp in cases:
+        print(f"\n### All measures at {spp} spp on average, mean\n")
+        print("| method | " + " | ".join(unit for unit, _ in measured.values()) + " |\n|---|" + "---|" * len(measured))
+        for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
+            cells = [form.format(mean_of(rows, method, spp, measure)) for measure, (_, form) in measured.items()]
+            print(f"| {method} | " + " | ".join(cells) + " |")
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="renders or views")
     parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; all if none")
+    parser.add_argument("--flip", action="store_true", help="also FLIP, which takes longer than all the rest")
     parser.add_argument("--json", type=Path, help="also write the rows here")
     args = parser.parse_args()
     sessions = [Session(find_model(0, name)) for name in args.model or shipped_models()]
-    rows = [row for scene in scenes.load(args.folder) for row in run_scene(scene, sessions)]
+    rows = [row for scene in scenes.load(args.folder) for row in run_scene(scene, sessions, args.flip)]
     print_tables(rows)
     if args.json:
         args.json.parent.mkdir(parents=True, exist_ok=True)

@@ -2,11 +2,12 @@
 """What models are judged by: pairs of renders with a reference, of scenes that nothing was trained on.
 
 Two kinds, by what a folder holds. **Renders**: a folder a scene, with ``ref.exr``, ``hr_<n>spp.exr`` and
-``lr_x<s>_<n>spp.exr``. **Views** of :mod:`training.views`: those of the split ``test``.
+``lr_x<s>_<n>spp.exr``. **Views** of :mod:`training.views`: those of the split ``test`` whose reference is good enough.
 """
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +23,8 @@ from training import data
 
 #: The reference of this one is full of fireflies.
 NOISY_REFERENCE = {"veach-bidir"}
+#: PSNR [dB] that a view's reference must have, as far as its own noise goes.
+MIN_REFERENCE = 30.0
 
 
 @dataclass(frozen=True)
@@ -36,6 +39,8 @@ class Scene:
     """Of a number of spp."""
     lrhs: Callable[[int, int], Source]
     """Of a scale s and an average of n samples a pixel of the HRLS, which is ``s^2 n`` spp."""
+    nearest: Callable[[int, int], Source | None] = lambda scale, spp: None
+    """The same as the paper's data set has it: of every s x s pixels one, of ``s^2 n`` spp. None if there is none."""
 
 
 def load(folder: Path) -> list[Scene]:
@@ -46,9 +51,10 @@ def load(folder: Path) -> list[Scene]:
     """
     if references := sorted(folder.glob("*/ref.exr")):
         return [_render(reference.parent) for reference in references]
-    if views := data.Folder(folder).split("test"):
-        return [_view(view) for view in views]
-    raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing")
+    views = data.Folder(folder).split("test")
+    if clean := [view for view in views if view.meta.get("ref_psnr", 0.0) >= MIN_REFERENCE]:
+        return [_view(view) for view in clean]
+    raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing with clean references")
 
 
 def beauty(source: Source) -> Array:
@@ -85,4 +91,13 @@ def _view(view: data.View) -> Scene:
         image = transforms.box_downsample(data.mean_lrhs(view, chosen) * exposure, scale)
         return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image)
 
-    return Scene(view.scene, reference * exposure, hrls, lrhs)
+    def nearest(scale: int, spp: int) -> Source | None:
+        passes = range(len(view.lr_spp))
+        subsets = itertools.chain.from_iterable(itertools.combinations(passes, n) for n in range(1, len(passes) + 1))
+        chosen = next((list(c) for c in subsets if view.lr_spp[list(c)].sum() == scale**2 * spp), None)
+        if chosen is None:
+            return None
+        image = data.mean_lrhs(view, chosen)[scale // 2 :: scale, scale // 2 :: scale] * exposure
+        return Render.from_arrays(f"{view.path.name}, x{scale} nearest", rgb=image)
+
+    return Scene(view.scene, reference * exposure, hrls, lrhs, nearest)

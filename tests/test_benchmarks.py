@@ -21,9 +21,11 @@ def test_views_for_testing_are_scenes(tmp_path):
     )
     lr = np.stack([np.full((64, 64, 3), float(i + 1)) for i in range(len(views.LR_SPP))])
     for name in ("test", "train"):
-        meta = {"split": name, "seed": f"cycles-{name}"}
-        views.save(tmp_path / f"{name}.npz", views.pack(hr, lr, clean, np.random.default_rng(1), meta))
-    (scene,) = scenes.load(tmp_path)
+        for quality in (25, 35):
+            meta = {"split": name, "seed": f"cycles-{name}", "ref_psnr": quality}
+            arrays = views.pack(hr, lr, clean, np.random.default_rng(1), meta)
+            views.save(tmp_path / f"{name}-{quality}.npz", arrays)
+    (scene,) = scenes.load(tmp_path)  # the one that is held out and has a clean reference
     assert scene.name == "cycles-test"
     assert transforms.exposure_of(scene.reference) == pytest.approx(1, rel=1e-3)
     scale = scene.reference.mean() / clean.mean()
@@ -35,6 +37,12 @@ def test_views_for_testing_are_scenes(tmp_path):
         low = scene.lrhs(8, spp)
         assert low.data_window.width == 8
         np.testing.assert_allclose(scenes.beauty(low), value * scale, rtol=2e-3)
+    # 4 spp are those of the fourth pass, 16 those of all five; more there are not
+    for factor, spp, value in ((2, 1, 4), (2, 4, (1 + 2 + 2 * 3 + 4 * 4 + 8 * 5) / 16)):
+        low = scene.nearest(factor, spp)
+        assert low.data_window.width == 32
+        np.testing.assert_allclose(scenes.beauty(low), value * scale, rtol=2e-3)
+    assert scene.nearest(4, 2) is None
 
 
 def test_folders_of_renders_are_scenes(tmp_path):

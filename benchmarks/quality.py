@@ -9,8 +9,8 @@ gets its renders. From an LRHS and an HRLS: our models; OIDN (if pyoidn is insta
 normal, at quality high and fast; OIDN on the LRHS, upsampled; "OIDN on both": the first brought to the second's local
 brightness; and "together": to that of both renders denoised as :mod:`oiio_msspl.denoiser` does. From one
 full-resolution render of the same average: OIDN. "Nearest" marks the paper's LRHS, of every s x s pixels one; others
-are averages of s x s pixels, as renderers make them. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean; and
-the mean of these, RelMSE (1, 1e-4), SSIM and FLIP. Scenes whose own reference is noisy are listed but not averaged.
+are averages of s x s pixels, as renderers make them. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean;
+and the mean of these, RelMSE (1, 1e-4), SSIM and FLIP. Scenes whose own reference is noisy are listed, not averaged.
 """
 
 from __future__ import annotations

@@ -324,6 +324,19 @@ def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
     np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=1e-5, atol=1e-6)
 
 
+def test_where_both_renders_agree_the_hrls_is_the_result(bilinear_models):
+    """Nothing is filtered that has no noise; a single pixel that has some is enough to filter its tile."""
+    clean = np.maximum(picture(64, 96), 1e-3)
+    session = Session(bilinear_models[4])
+    low = Render.from_arrays("lr", rgb=downsample(clean, 4))
+    fused = fuse(low, Render.from_arrays("hr", rgb=clean), session, error=True)
+    np.testing.assert_allclose(fused.rgb, clean, rtol=1e-4)
+    assert not fused.error.any()
+    noisy_one = clean.copy()
+    noisy_one[30, 40] *= 1.5
+    assert np.abs(fuse(low, Render.from_arrays("hr", rgb=noisy_one), session).rgb - clean).mean() > 1e-3
+
+
 def test_the_error_is_told_as_radiance_where_asked_for(bilinear_models):
     """The models expect 0.1 in network values."""
     low, high, _ = pair_of(4)

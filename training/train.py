@@ -231,7 +231,12 @@ def train(args: argparse.Namespace) -> None:
         warm_start(network, args.init)
     network.to(device, memory_format=torch.channels_last)
     average = Average(network)
-    optimizer = recipe.optimizer(network.parameters(), lr=peak_lr, **recipe.options)
+    for name, parameter in network.named_parameters():
+        parameter.requires_grad_(name.startswith(args.only))
+    learning = [parameter for parameter in network.parameters() if parameter.requires_grad]
+    if not learning:
+        raise SystemExit(f"--only {args.only}: the network has no such part")
+    optimizer = recipe.optimizer(learning, lr=peak_lr, **recipe.options)
     step, elapsed, best_gain = 0, 0.0, -math.inf
 
     def restore(state: dict[str, Any]) -> None:
@@ -334,7 +339,7 @@ def train(args: argparse.Namespace) -> None:
         loss = loss_function(output.float(), pair["target"])
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
-        length = float(torch.nn.utils.clip_grad_norm_(network.parameters(), recipe.clip_gradient))
+        length = float(torch.nn.utils.clip_grad_norm_(learning, recipe.clip_gradient))
         if math.isfinite(length) and length < SPIKE * usual:
             optimizer.step()
             average.update(network, step)
@@ -393,6 +398,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
+    parser.add_argument("--only", default="", help="train the part of the network with this name, such as retouch")
     parser.add_argument("--batch", type=int, help="default: the preset's")
     parser.add_argument("--patch", type=int, help="HR pixels; default: the preset's")
     parser.add_argument("--lr", type=float, help="peak learning rate; default: the preset's")

@@ -13,12 +13,12 @@ from oiio_msspl import assemble, preview
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.assemble import WriteOptions
+from oiio_msspl.choice import choose
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr import open_exr
 from oiio_msspl.fusion import MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_target
-from oiio_msspl.pairing import pair
-from oiio_msspl.session import Session, find_model
+from oiio_msspl.session import Session
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,8 @@ class Report:
     hr: Resolution
     scale: int
     model: str
+    reason: str
+    """Why this model, if it was not named."""
     provider: str
     output: Path
     preview: Path | None
@@ -68,6 +70,7 @@ class Report:
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
+            "reason": self.reason,
             "provider": self.provider,
             "aovs": self.hr.table(),
             "notes": self.hr.notes,
@@ -119,7 +122,7 @@ def fuse_files(
         output: EXR to write.
         inputs, write: how files are understood and stored.
         model: name of a shipped model, a family of them (``paper``) or an ONNX file; None or ``auto``: see
-            :func:`oiio_msspl.session.find_model`.
+            :func:`oiio_msspl.choice.choose`.
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the paper's sRGB curve.
         overwrite: replace existing files.
@@ -140,13 +143,14 @@ def fuse_files(
             preview.check_view(view_transform)
     lr, hr = resolve_pair(lr_path, hr_path, inputs)
     assemble.dropped_channels(hr, write)  # a layer that is not there shows before the work, not after
-    session = Session(find_model(pair(lr, hr).scale, model), device, threads)
+    path, reason = choose(lr, hr, model)
+    session = Session(path, device, threads)
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
     computed = time.perf_counter()
 
-    report = report_on(lr, hr, session, fused, output, preview_path)
+    report = report_on(lr, hr, session, fused, output, preview_path, reason)
     write_frame(report, fused, write, overwrite=overwrite)
     write_preview(report, fused, view_transform, overwrite=overwrite)
     report.seconds = {
@@ -159,7 +163,13 @@ def fuse_files(
 
 
 def report_on(
-    lr: Resolution, hr: Resolution, session: Session, fused: Fused, output: Path, preview_path: Path | None
+    lr: Resolution,
+    hr: Resolution,
+    session: Session,
+    fused: Fused,
+    output: Path,
+    preview_path: Path | None,
+    reason: str,
 ) -> Report:
     """The report of a frame that is fused and not yet written."""
     return Report(
@@ -167,6 +177,7 @@ def report_on(
         hr=hr,
         scale=fused.pairing.scale,
         model=session.contract.name,
+        reason=reason,
         provider=session.provider,
         output=output,
         preview=preview_path,

@@ -111,9 +111,10 @@ def fuse(
             means = transforms.compress(transforms.box_downsample(features[schema.RGB], scale), exposure)
             seen = tile.area.intersect(pairing.grid).slices(tile.area)  # what lies beyond is made up
             if np.abs(means[seen] - lrhs[seen]).max() <= CONVERGED:
-                values, deviation = hrls[..., :3], np.zeros_like(hrls[..., :1])
+                results: tuple[Array, Array | None] = hrls[..., :3], np.zeros_like(hrls[..., :1])
             else:
-                values, deviation = session.run(lrhs, hrls, error=error)
+                results = session.run(lrhs, hrls, error=error)
+            values, deviation = results
             colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
             rgb[target.slices(hr_data)] = colour[target.slices(area)]
             if errors is not None and deviation is not None:

@@ -12,13 +12,9 @@ hold are averaged:
    also carry predicted weights of their own, so that a firefly is left out wherever it might be read. Where another
    denoiser's results are there, every level then mixes them in by predicted shares: see ``CANDIDATES``.
 
-4. Three convolutions see that result beside the features, and colour, albedo and normal pixel by pixel, and retouch it,
-   within ``MAX_RETOUCH``: samples that hit or miss an edge make it jagged, and no mean of samples is as straight as the
-   edge.
+4. No pixel may be darker or brighter than everything around it in both renders.
 
-5. No pixel may be darker or brighter than everything around it in both renders.
-
-6. A last convolution predicts how far each pixel is still off.
+5. A last convolution predicts how far each pixel is still off.
 
 So the result is nearly a weighted mean of the light that was rendered, times a filtered albedo, and whatever the input,
 it stays within what was rendered. Kernel-predicting denoisers are Bako et al. 2017 and Vogels et al. 2018; weights of
@@ -45,11 +41,6 @@ from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, conv3x3
 LEVELS = 5
 #: Smallest reflectance that light is divided by.
 MIN_ALBEDO = 0.02
-#: Largest change of the last step, in network values: from mid-grey, about two stops.
-MAX_RETOUCH = 0.5
-#: The retouch reads the features times this, for they grow to a mean of about 5: unscaled, one step of Adam could shift
-#: a sum over hundreds of them by more than its spread, and nearly all channels of the retouch ended in ReLU's zero.
-RETOUCH_SCALE = 1 / 8
 #: Weights are exponentials of the network's outputs within these bounds.
 MAX_LOGIT = 12.0
 #: Largest factor by which a level's light is told to differ from the denoised HRLS, and its inverse the smallest.
@@ -57,10 +48,9 @@ MAX_RATIO = 8.0
 #: Added to both sides of that ratio, in exposed radiance: black is no light to compare with.
 RATIO_FLOOR = 1e-3
 
-#: Of the HRLS's channels, those that the retouch sees pixel by pixel: colour, albedo and normal.
-_DETAILS = 9
 _LOG_SCALE = 1.0 / math.log1p(transforms.MU)
-_ALBEDO = slice(schema.HRLS_FEATURES[schema.RGB], schema.HRLS_FEATURES[schema.RGB] + 3)
+#: Of the HRLS's channels: colour, albedo, and all up to these.
+_COLOUR, _ALBEDO, _SEEN = slice(0, 3), slice(3, 6), 6
 
 
 def linear(values: Tensor) -> Tensor:
@@ -329,10 +319,6 @@ class PyramidFusion(nn.Module):
         self.heads = nn.ModuleList(
             nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
         )
-        seen = 4 * (3 + _DETAILS + self.hrls_channels - HRLS_CHANNELS)
-        self.retouch = nn.Sequential(
-            conv3x3(finest + seen, finest), nn.ReLU(), conv3x3(finest, finest), nn.ReLU(), conv3x3(finest, 4 * 3)
-        )
         self.error = nn.Conv2d(finest, 4, 1)
         self.reset_parameters()
 
@@ -352,7 +338,6 @@ class PyramidFusion(nn.Module):
                 nn.init.zeros_(module.bias)
         for head in self.heads:
             head.weight.mul_(0.1)
-        self.retouch[-1].weight.zero_()
         self.reset_error()
         if self.denoised:
             for level, head in enumerate(self.heads):
@@ -400,7 +385,7 @@ class PyramidFusion(nn.Module):
         denoised: Pyramid,
         denoised_lows: Pyramid,
     ) -> Tensor:
-        """Make kernels of the features and apply them: the fused image in network values, before its retouch.
+        """Make kernels of the features and apply them: the fused image in network values.
 
         Albedo of the HRLS and the result are (N, 3, 4, H/2, W/2); so is level 0 of all. Other denoisers' results are
         empty without them.
@@ -468,27 +453,21 @@ class PyramidFusion(nn.Module):
             (N, 1, s*h, s*w), mean of the channels, in network values too. Nothing else learns from the latter.
         """
         deepest = len(self.mix) + 2
-        details = to_phases(hrls[:, :_DETAILS])
-        colours = from_finest(linear(details[:, :3]), deepest)
+        phases = to_phases(hrls[:, :_SEEN])
+        colours = from_finest(linear(phases[:, _COLOUR]), deepest)
         lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
         features = self.features(lrhs, hrls, colours, lows)
-        seen = [features[0] * RETOUCH_SCALE, details.flatten(1, 2)]
         denoised: Pyramid = {}
         denoised_lows: Pyramid = {}
         if self.hrls_channels > HRLS_CHANNELS:
-            result = to_phases(hrls[:, HRLS_CHANNELS:])
-            denoised = from_finest(linear(result), LEVELS)
-            seen.append(result.flatten(1, 2))
+            denoised = from_finest(linear(to_phases(hrls[:, HRLS_CHANNELS:])), LEVELS)
         if self.denoised:
             denoised_lows = {level: low[:, LRHS_CHANNELS:] for level, low in lows.items()}
             lows = {level: low[:, :LRHS_CHANNELS] for level, low in lows.items()}
-        fused = self.gather(details[:, _ALBEDO], colours, lows, features, denoised, denoised_lows)
-        seen.insert(1, fused.flatten(1, 2))
-        change = self.retouch(torch.cat(seen, dim=1)).float().unflatten(1, (3, 4))
-        change = MAX_RETOUCH * torch.tanh(change / MAX_RETOUCH)
+        fused = self.gather(phases[:, _ALBEDO], colours, lows, features, denoised, denoised_lows)
         lowest, highest = (
             (sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * hrls[:, :3])).unsqueeze(2)
             for sign in (-1.0, 1.0)
         )
         error = pointwise(self.error, features[0].detach()).float().unsqueeze(1)
-        return from_phases(torch.clamp(fused + change, lowest, highest)), from_phases(error)
+        return from_phases(torch.clamp(fused, lowest, highest)), from_phases(error)

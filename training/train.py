@@ -398,7 +398,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
-    parser.add_argument("--only", default="", help="train the part of the network with this name, such as retouch")
+    parser.add_argument("--only", default="", help="train the part of the network with this name, such as heads")
     parser.add_argument("--batch", type=int, help="default: the preset's")
     parser.add_argument("--patch", type=int, help="HR pixels; default: the preset's")
     parser.add_argument("--lr", type=float, help="peak learning rate; default: the preset's")

@@ -7,6 +7,7 @@ sample can be dropped by itself instead of poisoning its pixel.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import drjit as dr
@@ -150,23 +151,33 @@ def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f):
 
 
 def render_passes(
-    scene: mi.Scene, camera: Camera, size: int, spp: int, seed: int, layers: bool = True, integrator=None
+    scene: mi.Scene,
+    camera: Camera,
+    size: int | tuple[int, int],
+    spp: int,
+    seed: int,
+    layers: bool = True,
+    integrator=None,
+    pixel_filter: Callable[[mi.Float], mi.Float] = lambda uniform: uniform,
 ) -> np.ndarray:
-    """Render `spp` independent 1-spp passes with a box filter: float32 (spp, size, size, C).
+    """Render `spp` independent 1-spp passes: float32 (spp, height, width, C).
 
-    C is 15 with `layers` (colour, albedo, normal, diffuse, specular), 3 without. An `integrator` of Mitsuba
-    replaces the one here (colour only), for comparisons. Samples with a non-finite value are zero.
+    C is 15 with `layers` (colour, albedo, normal, diffuse, specular), 3 without. A `size` is that of a square, or width
+    and height. An `integrator` of Mitsuba replaces the one here (colour only), for comparisons. The `pixel_filter`
+    makes of a uniform number where in a pixel a sample lies, from 0 (left or top edge) to 1 or beyond; the box filter
+    if none is given. Samples with a non-finite value are zero.
     """
-    n = size * size
+    columns, rows = (size, size) if isinstance(size, int) else size
+    n = columns * rows
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, n * spp)
     index = dr.arange(mi.UInt32, n * spp)
-    width, pixels = dr.opaque(mi.UInt32, size), dr.opaque(mi.UInt32, n)
+    width, height, pixels = (dr.opaque(mi.UInt32, v) for v in (columns, rows, n))
     pixel = index % pixels
     row = pixel // width
     jitter, lens = sampler.next_2d(), sampler.next_2d()
-    x = (mi.Float(pixel - row * width) + jitter.x) / mi.Float(width)
-    y = (mi.Float(row) + jitter.y) / mi.Float(width)
+    x = (mi.Float(pixel - row * width) + pixel_filter(jitter.x)) / mi.Float(width)
+    y = (mi.Float(row) + pixel_filter(jitter.y)) / mi.Float(height)
     ray = camera.rays(x, y, lens)
     if integrator is not None:
         channels = [integrator.sample(scene, sampler, ray)[0]]
@@ -176,4 +187,4 @@ def render_passes(
     dr.eval(flat)
     out = np.stack([c.numpy() for c in flat], axis=-1)
     out[~np.isfinite(out).all(axis=-1)] = 0
-    return out.reshape(spp, size, size, len(flat))
+    return out.reshape(spp, rows, columns, len(flat))

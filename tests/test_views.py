@@ -102,3 +102,9 @@ def test_shards_that_cannot_be_made_or_read_are_named(tmp_path):
     (tmp_path / "shards" / "views-000.zip").unlink()
     with pytest.raises(SystemExit, match=r"views-000.zip: is missing; cycles-000020-0.npz is in it"):
         shards.unpack(tmp_path / "shards", tmp_path / "again")
+
+
+def test_seeds_are_ranges():
+    parser = views.parser("x", ref_spp=1)
+    for text, seeds in (("7", [7]), ("3:5", [3, 4]), ("1:50:20", [1, 21, 41])):
+        assert list(parser.parse_args(["--out", "o", "--seeds", text]).seeds) == seeds

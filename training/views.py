@@ -27,7 +27,7 @@ SIZE = 256
 HR_PASSES = 8
 LR_SPP = (1, 1, 2, 4, 8)
 VIEWS = 3
-"""Of each scene."""
+"""Of each scene, if no other number is asked for."""
 
 
 SPLITS = ("train", "validation", "test")
@@ -108,15 +108,18 @@ def save(path: Path, arrays: dict[str, np.ndarray]) -> None:
 
 
 def _seeds(text: str) -> range:
-    first, _, last = text.partition(":")
-    return range(int(first), int(last or int(first) + 1))
+    first, *rest = map(int, text.split(":"))
+    return range(first, *(rest or [first + 1]))
 
 
 def parser(module: str, ref_spp: int) -> argparse.ArgumentParser:
     """Options of every renderer, which may add its own."""
     p = argparse.ArgumentParser(prog=f"python -m {module}", description="Render training views.")
     p.add_argument("--out", type=Path, required=True, help="folder of the .npz files; finished views are kept")
-    p.add_argument("--seeds", type=_seeds, default=range(0, 400), help="first:last, the last not included")
+    p.add_argument(
+        "--seeds", type=_seeds, default=range(0, 400), help="first:last or first:last:step, the last not included"
+    )
+    p.add_argument("--views", type=int, default=VIEWS, help="of each scene")
     p.add_argument("--assets", type=Path, help="folder with hdri/ and models/; procedural content only without it")
     p.add_argument("--minutes", type=float, default=float("inf"), help="start no further scene after this time")
     p.add_argument("--threads", type=int, default=1)

@@ -22,7 +22,9 @@ def main() -> int:
         os.dup2(nowhere.fileno(), 1)
 
     assets = Assets(args.assets)
-    return views.render_all(args, lambda seed: render_scene(args.out, seed, assets, args.ref_spp, args.threads))
+    return views.render_all(
+        args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.threads)
+    )
 
 
 if __name__ == "__main__":

@@ -26,7 +26,7 @@ def main() -> int:
     from .render import render_scene
 
     assets = Assets(args.assets)
-    return views.render_all(args, lambda seed: render_scene(args.out, seed, assets, args.ref_spp))
+    return views.render_all(args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp))
 
 
 if __name__ == "__main__":

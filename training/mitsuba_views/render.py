@@ -85,9 +85,9 @@ def render_view(
     return views.pack(hr, lr, ref, rng, meta)
 
 
-def render_scene(out: Path, seed: int, assets: Assets, ref_spp: int) -> tuple[int, str]:
-    """Write the missing views of a scene; return how many were written and the kind of the scene."""
-    missing = [v for v in range(views.VIEWS) if not views.path_of(out, "mitsuba", seed, v).exists()]
+def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int) -> tuple[int, str]:
+    """Write the missing ones of a scene's first views; return how many were written and the kind of the scene."""
+    missing = [v for v in range(count) if not views.path_of(out, "mitsuba", seed, v).exists()]
     if not missing:
         return 0, "done before"
     scene, plan = scenes.build(seed, assets)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Convolutions of an exported network in 8 bits: half the time on CPUs, a quarter of the weights.
 
-Only convolutions that make features are quantised. What becomes colour stays in float32: the renders' own values, the
-kernels' logits and the last convolution.
+Only convolutions are quantised, which make features. What becomes colour stays in float32: the renders' own values and
+the kernels' logits.
 """
 
 from __future__ import annotations
@@ -38,14 +38,12 @@ def quantise(model: onnx.ModelProto, contract: Contract, views: Path) -> onnx.Mo
     with tempfile.TemporaryDirectory() as folder:
         plain, quantised = (str(Path(folder, name)) for name in ("plain.onnx", "quantised.onnx"))
         onnx.save(_with_inputs_of_their_own(model), plain)
-        last = [node.name for node in model.graph.node if node.op_type == "Conv"][-1]
         quantize_static(
             plain,
             quantised,
             _Samples(contract, views),
             quant_format=QuantFormat.QDQ,
             op_types_to_quantize=["Conv"],
-            nodes_to_exclude=[last],
             per_channel=True,
             reduce_range=True,
             activation_type=QuantType.QUInt8,

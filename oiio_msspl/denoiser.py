@@ -138,33 +138,22 @@ def _guides(hrls: Array) -> dict[str, Array]:
     return {"albedo": albedo} if (albedo != schema.DEFAULTS[schema.ALBEDO]).any() else {}
 
 
-def noises(lrhs: Array, hrls: Array) -> tuple[float, float]:
-    """Variance of the noise in each of two renders of one picture.
+def lrhs_share(lrhs: Array, hrls: Array) -> float:
+    """Share of the LRHS in the mean of both renders that has the least noise.
 
     What one pixel differs by from its neighbours is picture and noise. The picture is the same in both renders, the
     noise is not: their covariance is the picture's part, and what each has beyond that is its noise.
 
     Args:
-        lrhs, hrls: (h, w, 3) at the same resolution, transformed; at least 2 x 2 pixels.
-    """
-    # Of four pixels with the signs of a chessboard: a sum of four variances
-    one, other = (x[1:, 1:] - x[1:, :-1] - x[:-1, 1:] + x[:-1, :-1] for x in (lrhs, hrls))
-    common = np.mean(one * other)
-    low, high = (max(float(np.mean(x * x) - common), 1e-9) / 4 for x in (one, other))
-    return low, high
-
-
-def lrhs_share(lrhs: Array, hrls: Array) -> float:
-    """Share of the LRHS in the mean of both renders that has the least noise.
-
-    Args:
-        lrhs, hrls: as of :func:`noises`.
+        lrhs, hrls: (h, w, 3) at the same resolution, transformed.
 
     Returns:
         The share, within 0.05 and 0.95; 0.5 for equal noise, and for none.
     """
-    low, high = noises(lrhs, hrls)
-    return float(np.clip(high / (low + high), *_SHARE))
+    one, other = (x[1:, 1:] - x[1:, :-1] - x[:-1, 1:] + x[:-1, :-1] for x in (lrhs, hrls))
+    common = np.mean(one * other)
+    noise, other_noise = (max(float(np.mean(x * x) - common), 1e-9) for x in (one, other))
+    return float(np.clip(other_noise / (noise + other_noise), *_SHARE))
 
 
 def _feature(hrls: Array, name: str) -> Array:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import functools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -143,8 +144,7 @@ def fuse_files(
             preview.check_view(view_transform)
     lr, hr = resolve_pair(lr_path, hr_path, inputs)
     assemble.dropped_channels(hr, write)  # a layer that is not there shows before the work, not after
-    path, reason = choose(lr, hr, model)
-    session = Session(path, device, threads)
+    session, reason = choose(lr, hr, model, functools.cache(lambda path: Session(path, device, threads)))
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)

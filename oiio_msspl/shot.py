@@ -31,7 +31,7 @@ from oiio_msspl.fusion import FIXED_MEMORY, MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_folder, check_target, remove_leftovers, replacing
 from oiio_msspl.pairing import Source, pair
 from oiio_msspl.sequence import Frame, Shot, find_shot
-from oiio_msspl.session import Session, find_model
+from oiio_msspl.session import Session
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -284,20 +284,17 @@ class Stages:
         model would flicker."""
         scale = pair(*ready.sources).scale
         if scale not in self.chosen:
-            self.chosen[scale] = self._choose(ready, scale)
-        path, _ = self.chosen[scale]
+            session, reason = choose(*ready.sources, self.model, self._load)
+            self.chosen[scale] = session.path, reason
+        session = self._load(self.chosen[scale][0])
+        if self.options.error_layer:
+            session.require_error()
+        return session
+
+    def _load(self, path: Path) -> Session:
         if path not in self.sessions:
             self.sessions[path] = Session(path, self.device, self.threads)
-        if self.options.error_layer:
-            self.sessions[path].require_error()
         return self.sessions[path]
-
-    def _choose(self, ready: Pair, scale: int) -> tuple[Path, str]:
-        try:
-            return choose(*ready.sources, self.model)
-        except MssplError:
-            # No such model: no frame's fault. Pixels that can't be read: this frame's, as fusing it will say.
-            return find_model(scale, self.model), ""
 
     def fuse(self, ready: Pair, session: Session) -> tuple[Report, Fused]:
         start = time.perf_counter()

@@ -5,7 +5,7 @@
     python -m benchmarks.chart -o docs/chart.html              # also against render and all, and every scene
     python -m benchmarks.chart --scene lamp --total -o lamp.svg
 
-A column an average spp; a point a model or peer. Left and up is better (RelMSE is drawn downwards).
+A column an average spp; a point a model or peer. Left and up is better (errors are drawn downwards).
 """
 
 from __future__ import annotations
@@ -35,7 +35,8 @@ PEERS = {
     "OIDN fast on the HRLS": ("d", "OIDN 2.5.1, quality fast"),
 }
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
-MEASURES = {"psnr": "PSNR (sRGB, dB)", "relmse": "RelMSE (0.5, 0.01)"}
+#: What is drawn of what was measured, a row each.
+MEASURES = {"psnr": "PSNR (sRGB, dB)", "relmse": "RelMSE (0.5, 0.01)", "flip": "FLIP"}
 
 
 @dataclass(frozen=True)
@@ -72,10 +73,16 @@ def draw(rows: list[dict[str, Any]], timings: Timings, scene: str | None, *, tot
     for name in models:
         families.setdefault(name.rpartition("-x")[0], []).append(name)
     averages = sorted({row["spp"] for row in rows})
+    measures = {measure: label for measure, label in MEASURES.items() if measure in rows[0]}
     figure, axes = plt.subplots(
-        len(MEASURES), len(averages), figsize=(4.2 * len(averages), 7), sharex=not total, sharey="row", squeeze=False
+        len(measures),
+        len(averages),
+        figsize=(4.2 * len(averages), 3.5 * len(measures)),
+        sharex=not total,
+        sharey="row",
+        squeeze=False,
     )
-    for line, (measure, label) in zip(axes, MEASURES.items(), strict=True):
+    for line, (measure, label) in zip(axes, measures.items(), strict=True):
         for axis, spp in zip(line, averages, strict=True):
             before = spp * timings.of_a_sample(scene) if total else 0.0
             for colour, (family, members) in zip(COLOURS, families.items(), strict=False):
@@ -99,9 +106,11 @@ def draw(rows: list[dict[str, Any]], timings: Timings, scene: str | None, *, tot
                 axis.set_title(f"{spp} spp on average")
             else:
                 axis.set_yscale("log")
+            if measure == list(measures)[-1]:
                 axis.set_xlabel("seconds for 1024 x 1024" + (", render included" if total else ""))
         line[0].set_ylabel(label)
-    axes[1][0].invert_yaxis()
+        if measure != "psnr":
+            line[0].invert_yaxis()
     figure.suptitle(f"Accuracy against time: {scene or 'mean of the scenes'} (left and up is better)")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9)

@@ -68,7 +68,7 @@ def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
 def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
     """Both renders, denoised together at the LRHS's resolution; None without pyoidn."""
     try:
-        denoiser = Denoiser(mode="low")
+        denoiser = Denoiser(mode="fast")  # what is made at the LRHS's resolution is that of all modes but the low one
     except InputError:
         return None
     low = beauty(lrhs)

@@ -43,20 +43,17 @@ class Scene:
     """The same as the paper's data set has it: of every s x s pixels one, of ``s^2 n`` spp. None if there is none."""
 
 
-def load(folder: Path, split: str = "test") -> list[Scene]:
-    """All scenes of a folder of either kind; of views, those of a split. Only those for testing judge a model; their
-    references are as rendered, others' are denoised.
+def load(folder: Path) -> list[Scene]:
+    """All scenes of a folder of either kind.
 
     Raises:
         SystemExit: there are none.
     """
     if references := sorted(folder.glob("*/ref.exr")):
         return [_render(reference.parent) for reference in references]
-    views = data.Folder(folder).split(split)
-    if split == "test":
-        views = [view for view in views if view.meta.get("ref_psnr", 0.0) >= MIN_REFERENCE]
-    if views:
-        return [_view(view) for view in views]
+    views = data.Folder(folder).split("test")
+    if clean := [view for view in views if view.meta.get("ref_psnr", 0.0) >= MIN_REFERENCE]:
+        return [_view(view) for view in clean]
     raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing with clean references")
 
 

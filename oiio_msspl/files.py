@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -14,12 +13,12 @@ from oiio_msspl import assemble, preview
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.assemble import WriteOptions
-from oiio_msspl.choice import choose
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr import open_exr
 from oiio_msspl.fusion import MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_target
-from oiio_msspl.session import Session
+from oiio_msspl.pairing import pair
+from oiio_msspl.session import Session, find_model
 
 
 @dataclass(frozen=True)
@@ -42,8 +41,6 @@ class Report:
     hr: Resolution
     scale: int
     model: str
-    reason: str
-    """Why this model, if it was not named."""
     provider: str
     output: Path
     preview: Path | None
@@ -71,7 +68,6 @@ class Report:
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
-            "reason": self.reason,
             "provider": self.provider,
             "aovs": self.hr.table(),
             "notes": self.hr.notes,
@@ -123,7 +119,7 @@ def fuse_files(
         output: EXR to write.
         inputs, write: how files are understood and stored.
         model: name of a shipped model, a family of them (``paper``) or an ONNX file; None or ``auto``: see
-            :func:`oiio_msspl.choice.choose`.
+            :func:`oiio_msspl.session.find_model`.
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the paper's sRGB curve.
         overwrite: replace existing files.
@@ -144,13 +140,13 @@ def fuse_files(
             preview.check_view(view_transform)
     lr, hr = resolve_pair(lr_path, hr_path, inputs)
     assemble.dropped_channels(hr, write)  # a layer that is not there shows before the work, not after
-    session, reason = choose(lr, hr, model, functools.cache(lambda path: Session(path, device, threads)))
+    session = Session(find_model(pair(lr, hr).scale, model), device, threads)
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
     computed = time.perf_counter()
 
-    report = report_on(lr, hr, session, fused, output, preview_path, reason)
+    report = report_on(lr, hr, session, fused, output, preview_path)
     write_frame(report, fused, write, overwrite=overwrite)
     write_preview(report, fused, view_transform, overwrite=overwrite)
     report.seconds = {
@@ -163,13 +159,7 @@ def fuse_files(
 
 
 def report_on(
-    lr: Resolution,
-    hr: Resolution,
-    session: Session,
-    fused: Fused,
-    output: Path,
-    preview_path: Path | None,
-    reason: str,
+    lr: Resolution, hr: Resolution, session: Session, fused: Fused, output: Path, preview_path: Path | None
 ) -> Report:
     """The report of a frame that is fused and not yet written."""
     return Report(
@@ -177,7 +167,6 @@ def report_on(
         hr=hr,
         scale=fused.pairing.scale,
         model=session.contract.name,
-        reason=reason,
         provider=session.provider,
         output=output,
         preview=preview_path,

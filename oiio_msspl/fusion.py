@@ -99,7 +99,7 @@ def fuse(
     dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
     seconds = session.seconds
     for done, tile in enumerate(plan):
-        area, core = scaled(tile.area, scale), scaled(tile.core, scale)
+        area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
         target, inside = core.intersect(hr_data), tile.area.slices(grid)
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
@@ -164,8 +164,7 @@ def _interpolated(values: Array, position: NDArray[np.float64], axis: int) -> Ar
     return values.take(before, axis) * (1 - share) + values.take(after, axis) * share
 
 
-def scaled(window: Window, scale: int) -> Window:
-    """A window of the LRHS in pixels of the HRLS."""
+def _scaled(window: Window, scale: int) -> Window:
     return Window(window.x0 * scale, window.y0 * scale, window.x1 * scale, window.y1 * scale)
 
 

@@ -24,14 +24,13 @@ from oiio_msspl import preview, schema
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution
 from oiio_msspl.assemble import WriteOptions
-from oiio_msspl.choice import choose
 from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.files import Inputs, Report, report_on, resolve_pair, write_frame, write_preview
 from oiio_msspl.fusion import FIXED_MEMORY, MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_folder, check_target, remove_leftovers, replacing
 from oiio_msspl.pairing import Source, pair
 from oiio_msspl.sequence import Frame, Shot, find_shot
-from oiio_msspl.session import Session
+from oiio_msspl.session import Session, find_model
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -267,8 +266,6 @@ class Stages:
     overwrite: bool = False
     skip_existing: bool = False
     sessions: dict[Path, Session] = field(default_factory=dict)
-    chosen: dict[int, tuple[Path, str]] = field(default_factory=dict)
-    """By scale, the model and why."""
 
     def read(self, frame: Frame) -> Pair:
         start = time.perf_counter()
@@ -280,20 +277,12 @@ class Stages:
         return Pair(frame, lr, hr, sources, time.perf_counter() - start)
 
     def session(self, ready: Pair) -> Session:
-        """The model, loaded once for each scale that occurs. What is chosen for the first frame is for all: another
-        model would flicker."""
-        scale = pair(*ready.sources).scale
-        if scale not in self.chosen:
-            session, reason = choose(*ready.sources, self.model, self._load)
-            self.chosen[scale] = session.path, reason
-        session = self._load(self.chosen[scale][0])
-        if self.options.error_layer:
-            session.require_error()
-        return session
-
-    def _load(self, path: Path) -> Session:
+        """The model, loaded once for each scale that occurs."""
+        path = find_model(pair(*ready.sources).scale, self.model)
         if path not in self.sessions:
             self.sessions[path] = Session(path, self.device, self.threads)
+        if self.options.error_layer:
+            self.sessions[path].require_error()
         return self.sessions[path]
 
     def fuse(self, ready: Pair, session: Session) -> tuple[Report, Fused]:
@@ -305,8 +294,7 @@ class Stages:
             beside += 2 * (_pixel_bytes(ready.lr) + _pixel_bytes(ready.hr))
         fused = fuse(*ready.sources, session, error=self.options.error_layer, max_memory=self.max_memory - beside)
         preview_path = ready.frame.output.with_suffix(".png") if self.previews else None
-        _, reason = self.chosen[session.contract.scale]
-        report = report_on(ready.lr, ready.hr, session, fused, ready.frame.output, preview_path, reason)
+        report = report_on(ready.lr, ready.hr, session, fused, ready.frame.output, preview_path)
         report.seconds = {"read": ready.seconds, "fuse": time.perf_counter() - start, "network": fused.seconds}
         return report, fused
 

@@ -241,16 +241,6 @@ def test_a_long_shot_loads_the_model_once_and_keeps_no_file_open(make, bilinear_
     assert max(handles[3:]) <= handles[2] + 2
 
 
-def test_a_shot_keeps_the_model_of_its_first_frame(make, bilinear_models, monkeypatch):
-    """Another one would flicker."""
-    asked = []
-    monkeypatch.setattr(shot, "choose", lambda *pair: asked.append(pair) or (bilinear_models[4], "auto: as it is told"))
-    report = run(make(3), "auto")
-    assert report.exit_code == 0
-    assert [model for *_, model in asked] == ["auto"]
-    assert (report.first["model"], report.first["reason"]) == ("bilinear-x4", "auto: as it is told")
-
-
 def test_progress_for_programs(make, bilinear_models):
     folder = make(3)
     (folder / "lr/lr.1002.exr").unlink()

@@ -100,7 +100,6 @@ def print_table(report: ShotReport) -> None:
             f"{report.first['renderer']} pairs at x{report.first['scale']}, read as in frame {report.first['frame']}:"
         )
         show.aov_table(report.first["aovs"], report.first["notes"])
-        print(report.first["model"] + (f" ({report.first['reason']})" if report.first["reason"] else ""))
     # Sentences that differ only in their numbers (a frame's own among them) share a row, which shows the first.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}
     for frame in report.shot.frames:

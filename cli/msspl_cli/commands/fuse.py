@@ -219,7 +219,5 @@ def _print(report: Report, seconds: float) -> None:
         print(f"repaired values that were NaN, infinite or negative: {what}")
     tiles = f", {report.tiles} tiles" if report.tiles > 1 else ""
     network = report.seconds["network"]
-    reason = f" ({report.reason})" if report.reason else ""
-    where = f"on {report.provider}{tiles}"
-    print(f"{report.model}{reason} {where}: {seconds:.1f} s, of which {network:.1f} s in the network")
+    print(f"{report.model} on {report.provider}{tiles}: {seconds:.1f} s, of which {network:.1f} s in the network")
     print(f"wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))

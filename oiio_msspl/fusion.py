@@ -97,13 +97,16 @@ def fuse(
     largest = _largest_tile(session, frame_bytes, max_memory)
     plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
     dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
+    far_dark = _far(dark)
     seconds = session.seconds
     for done, tile in enumerate(plan):
         area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
         target, inside = core.intersect(hr_data), tile.area.slices(grid)
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
-        # Where neither render has any light, not even around, none is invented: a transparent film stays empty.
+        # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
+        # surface may be so dark that hardly a sample finds light; there, that takes more to believe.
         empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
+        empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
         if not empty.all():
             lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
             lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure)
@@ -217,13 +220,30 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
 
 def _settled(low: NDArray[np.bool_], high: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:
     """Where something holds for an HRLS pixel (h, w, 1) and for the 3 x 3 LRHS pixels around it."""
-    around = reduce(np.logical_and, _around(low))
-    return around.repeat(scale, axis=0).repeat(scale, axis=1) & high
+    return _enlarged(reduce(np.logical_and, _around(low)), scale) & high
 
 
-def _around(values: NDArray[Any]) -> Iterator[NDArray[Any]]:
-    """The 3 x 3 neighbours of every pixel (h, w, c), one (h, w, c) each; the edge goes on."""
+def _enlarged(low: NDArray[np.bool_], scale: int) -> NDArray[np.bool_]:
+    """(h, w, 1) to (s*h, s*w, 1)."""
+    return low.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _far(low: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Where something holds for all of the 15 x 15 LRHS pixels around, (h, w, 1)."""
+    for step in (1, 2, 4):
+        low = reduce(np.logical_and, _around(low, step))
+    return low
+
+
+def _bare(layers: dict[str, Array]) -> NDArray[np.bool_]:
+    """Where the HRLS (h, w, c) shows no surface, (h, w, 1); everywhere if it has no layer that could tell."""
+    signs = [np.all(layers[name] == 0, axis=-1, keepdims=True) for name in ("alpha", schema.NORMAL) if name in layers]
+    return reduce(np.logical_or, signs) if signs else np.ones((*layers[schema.RGB].shape[:2], 1), dtype=bool)
+
+
+def _around(values: NDArray[Any], step: int = 1) -> Iterator[NDArray[Any]]:
+    """The 3 x 3 neighbours of every pixel (h, w, c), so many pixels apart, one (h, w, c) each; the edge goes on."""
     height, width = values.shape[:2]
-    padded = np.pad(values, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    for y, x in itertools.product(range(3), repeat=2):
+    padded = np.pad(values, ((step, step), (step, step), (0, 0)), mode="edge")
+    for y, x in itertools.product(range(0, 3 * step, step), repeat=2):
         yield padded[y : y + height, x : x + width]

@@ -147,8 +147,12 @@ def main() -> None:
     )
     print("orders and differences compare, values do not. PSNR is of sRGB pictures, RelMSE has (0.5, 0.01).\n")
     print("## Table 2: scenes of the renderer and kind that training had, held out\n")
-    print("Cycles, `quality_cycles.json`; beside it the paper's Blender scenes.\n")
-    print(comparison(result("quality_cycles")["rows"], BCR, quality.AVERAGES))
+    cycles = result("quality_cycles")["rows"]
+    print(
+        f"Cycles, {len({row['scene'] for row in cycles})} scenes, `quality_cycles.json`; beside it the paper's Blender"
+    )
+    print("scenes.\n")
+    print(comparison(cycles, BCR, quality.AVERAGES))
     print("## Table 3: other people's scenes, another renderer, layers missing\n")
     print("Mitsuba 3, no variance, diffuse and specular, `quality.json`; beside it PSNR on the Gharbi data set.\n")
     print(comparison(result("quality")["rows"], GHARBI, (4, 8)))
@@ -156,7 +160,7 @@ def main() -> None:
     print("Two CPU cores; the paper's on a Titan Xp.\n")
     print(runtimes(result("runtime")["results"]))
     print("## Table 5: against super-resolution\n")
-    budget = f"{ablated['minutes']:g} minutes on one core, {ablated['train_views']} views"
+    budget = f"{ablated['steps']} steps, {ablated['train_views']} views"
     print(f"PSNR of reduced networks ({budget}) on {ablated['held_out_views']} held-out views: HRLS of 1 spp,")
     print("LRHS of 16 samples for every pixel of the frame.\n")
     print(super_resolution(by_name))

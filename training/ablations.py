@@ -14,9 +14,7 @@ from __future__ import annotations
 
 import argparse
 import functools
-import itertools
 import json
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -136,27 +134,25 @@ def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor,
     return batches
 
 
-def train(variant: Variant, views: tuple[data.View, ...], minutes: float) -> tuple[MultiResolutionFusion, int]:
-    """A network after so many minutes, and its steps."""
+def train(variant: Variant, views: tuple[data.View, ...], steps: int) -> MultiResolutionFusion:
+    """A network after so many steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
-    batches = itertools.cycle(pool(views, variant.scale))
-    start, steps = time.monotonic(), 0
-    while (elapsed := (time.monotonic() - start) / (60 * minutes)) < 1:
+    batches = pool(views, variant.scale)
+    for step in range(steps):
         for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * min(1.0, 2 * (1 - elapsed))  # constant, then to zero
-        lrhs, hrls, target = (torch.rot90(image, steps // POOL % 4, (2, 3)) for image in next(batches))
+            group["lr"] = LEARNING_RATE * min(1.0, 2 * (1 - step / steps))  # constant, then to zero
+        lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
         with torch.autocast("cpu", torch.bfloat16):
             output = network(lrhs * low_mask, hrls * high_mask)
         optimizer.zero_grad(set_to_none=True)
         variant.loss(output.float(), target).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
-        steps += 1
-    return network, steps
+    return network
 
 
 @torch.inference_mode()
@@ -179,18 +175,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path)
     parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--minutes", type=float, default=2.5, help="for each row")
+    parser.add_argument("--steps", type=int, default=1500, help="for each row")
     args = parser.parse_args()
     torch.set_num_threads(1)
     result: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {"rows": []}
     folder = data.Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
-    result |= {"minutes": args.minutes, "network": REDUCED, "train_views": len(views), "held_out_views": len(held_out)}
+    result |= {"steps": args.steps, "network": REDUCED, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in result["rows"]}
     for variant in VARIANTS:
         if variant.name not in done:
-            network, steps = train(variant, views, args.minutes)
-            row = {"name": variant.name, "scale": variant.scale, "steps": steps, **evaluate(network, variant, held_out)}
+            network = train(variant, views, args.steps)
+            row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out)}
             print(row, flush=True)
             result["rows"].append(row)
             args.json.write_text(json.dumps(result, indent=1) + "\n")

@@ -431,7 +431,7 @@ def test_a_network_starts_from_one_with_fewer_inputs_and_outputs(tmp_path: Path)
     """What is new counts for nothing at first, or begins as in a new network."""
     small = {"channels": (16,) * 5, "own_size": (3,) * 5}
     plain = PyramidFusion(**small)
-    torch.save({"ema": plain.state_dict()}, tmp_path / "plain.pt")
+    torch.save({"ema": plain.state_dict(), "config": plain.config}, tmp_path / "plain.pt")
     larger = PyramidFusion(**small, denoiser="high")
     train.warm_start(larger, tmp_path / "plain.pt")
     assert torch.equal(larger.stem.weight[:, :16], plain.stem.weight)
@@ -439,6 +439,20 @@ def test_a_network_starts_from_one_with_fewer_inputs_and_outputs(tmp_path: Path)
     taps = len(plain.heads[1].weight)
     assert torch.equal(larger.heads[1].weight[:taps], plain.heads[1].weight)
     torch.testing.assert_close(larger.heads[1].bias[taps:], torch.tensor(CANDIDATES))
+
+
+def test_a_pyramid_begins_with_the_middle_of_larger_kernels(tmp_path: Path) -> None:
+    channels = (8, 8, 8, 8, 8)
+    wide, narrow = (PyramidFusion(channels=channels, own_size=(size, 5, 5, 5, 5)) for size in (5, 3))
+    torch.save({"ema": wide.state_dict(), "config": wide.config}, tmp_path / "wide.pt")
+    train.warm_start(narrow, tmp_path / "wide.pt")
+    ours, theirs = (network.heads[0].weight.unflatten(0, (-1, 4)) for network in (narrow, wide))
+    assert torch.equal(ours[4], theirs[12])  # the middle ones
+    assert torch.equal(ours[0], theirs[6])  # above and left of it
+    assert torch.equal(ours[9:], theirs[25:])
+    torch.save({"ema": narrow.state_dict(), "config": narrow.config}, tmp_path / "narrow.pt")
+    with pytest.raises(SystemExit, match="has 3x3 taps, and no more can be added"):
+        train.warm_start(wide, tmp_path / "narrow.pt")
 
 
 @torch.inference_mode()

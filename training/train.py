@@ -154,8 +154,12 @@ def warm_start(network: Network, path: Path) -> None:
         for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
             deshuffle.reset_to_average()
             shuffle.reset_to_bilinear(network.config["channels"])
-    theirs = torch.load(path, map_location="cpu", weights_only=True)["ema"]
-    ours = network.state_dict()
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    theirs, ours = state["ema"], network.state_dict()
+    if isinstance(network, PyramidFusion):
+        for level, (size, wanted) in enumerate(zip(state["config"]["own_size"], network.own_size, strict=True)):
+            for name in (f"heads.{level}.weight", f"heads.{level}.bias"):
+                theirs[name] = middle_taps(theirs[name], size, wanted, 1 if level else 4)
     for name, value in theirs.items():
         # What a convolution reads beyond the other's inputs counts for nothing at first; what it makes beyond the
         # other's outputs begins as in a new network
@@ -167,6 +171,17 @@ def warm_start(network: Network, path: Path) -> None:
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
+
+
+def middle_taps(parameter: Tensor, size: int, wanted: int, phases: int) -> Tensor:
+    """A parameter of a pyramid's head, whose first outputs are size x size taps for each phase, with fewer of them."""
+    if size < wanted:
+        raise SystemExit(f"--finest-kernel: the network to start from has {size}x{size} taps, and no more can be added")
+    outputs = parameter.unflatten(0, (-1, phases))
+    margin = (size - wanted) // 2
+    middle = slice(margin, margin + wanted)
+    taps = outputs[: size**2].unflatten(0, (size, size))[middle, middle].flatten(0, 1)
+    return torch.cat([taps, outputs[size**2 :]]).flatten(0, 1)
 
 
 class Average:

@@ -114,7 +114,7 @@ def channels_of(name: str) -> Tensor:
     return torch.cat([torch.full((n,), float(f in read)) for f, n in schema.HRLS_FEATURES.items()])[None, :, None, None]
 
 
-@functools.cache
+@functools.lru_cache(maxsize=1)  # some GB; variants come scale by scale
 def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Batches of ``lrhs``, ``hrls`` and target, in network values."""
     rng = np.random.default_rng(0)

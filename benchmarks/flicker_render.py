@@ -20,6 +20,7 @@ import ctypes.util
 import os
 import time
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -164,11 +165,11 @@ class _Sequences:
         return np.asarray(total) / spp
 
 
-def write_exr(path: Path, image: Array) -> None:
-    """Half floats, the first of `CHANNELS`."""
+def write_exr(path: Path, image: Array, channels: Sequence[str] = CHANNELS) -> None:
+    """Half floats, the first of the channels."""
     height, width, count = image.shape
     spec = oiio.ImageSpec(width, height, count, "half")
-    spec.channelnames = CHANNELS[:count]
+    spec.channelnames = tuple(channels[:count])
     spec.attribute("compression", "zip")
     spec.attribute("Software", "Mitsuba 3")
     with replacing(path, overwrite=True) as temporary:

@@ -52,6 +52,8 @@ def table(head: list[str], rows: list[list[str]]) -> str:
 
 
 def _cell(rows: Rows, method: str, spp: int) -> str:
+    if not any((row["method"], row["spp"]) == (method, spp) for row in rows):
+        return ""  # views have too few samples for some of the paper's LRHS
     psnr, relmse = (quality.mean_of(rows, method, spp, measure) for measure in ("psnr", "relmse"))
     return f"{psnr:.2f} / {relmse:.4f}"
 
@@ -148,10 +150,8 @@ def main() -> None:
     print("orders and differences compare, values do not. PSNR is of sRGB pictures, RelMSE has (0.5, 0.01).\n")
     print("## Table 2: scenes of the renderer and kind that training had, held out\n")
     cycles = result("quality_cycles")["rows"]
-    print(
-        f"Cycles, {len({row['scene'] for row in cycles})} scenes, `quality_cycles.json`; beside it the paper's Blender"
-    )
-    print("scenes.\n")
+    count = len({row["scene"] for row in cycles})
+    print(f"Cycles, {count} scenes, `quality_cycles.json`; beside it the paper's Blender scenes.\n")
     print(comparison(cycles, BCR, quality.AVERAGES))
     print("## Table 3: other people's scenes, another renderer, layers missing\n")
     print("Mitsuba 3, no variance, diffuse and specular, `quality.json`; beside it PSNR on the Gharbi data set.\n")

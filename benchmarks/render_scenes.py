@@ -19,13 +19,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 
-from oiio_msspl.errors import MssplError
-from oiio_msspl.output import replacing
+from benchmarks.flicker_render import write_exr
+from benchmarks.render_time import CROP, LONGER
 from oiio_msspl.schema import SCALES
 
-LONGER, CROP = 1280, (384, 256)
 HRLS = (1, 2, 4, 8)
 #: Samples of the LRHS for every pixel of the frame.
 LRHS = (1, 2, 4)
@@ -103,18 +101,8 @@ def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
             passes = render_passes(scene, camera, size, count, seed, layers=layers, **chosen)  # type: ignore[arg-type]
             total += passes.sum(axis=0, dtype=np.float64)
             done += count
-        write(path, (total / spp).astype(np.float32))
-
-
-def write(path: Path, image: np.ndarray) -> None:
-    """Half floats, the first of `CHANNELS`."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    pixels = oiio.ImageBuf(np.ascontiguousarray(np.clip(image, -65000, 65000)))
-    pixels.specmod().channelnames = tuple(CHANNELS[: image.shape[2]])
-    pixels.specmod().attribute("Software", "Mitsuba 3")
-    with replacing(path, overwrite=True) as temporary:
-        if not pixels.write(str(temporary), oiio.HALF):
-            raise MssplError(f"{path}: can't be written ({pixels.geterror()})")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_exr(path, total / spp, CHANNELS)
 
 
 def main() -> None:

@@ -97,7 +97,7 @@ def fuse(
     largest = _largest_tile(session, frame_bytes, max_memory)
     plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
     dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
-    far_dark = _far(dark)
+    far_dark = _far(dark) if dark.any() else dark
     seconds = session.seconds
     for done, tile in enumerate(plan):
         area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
@@ -106,7 +106,8 @@ def fuse(
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
         # surface may be so dark that hardly a sample finds light; there, that takes more to believe.
         empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
-        empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
+        if empty.any():
+            empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
         if not empty.all():
             lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
             lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure)

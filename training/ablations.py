@@ -5,9 +5,9 @@
 
 As in the paper: an HRLS of 1 spp, an LRHS of far more (all 16 samples a pixel of a view's ``lr`` passes, 256 spp at
 x4), and the branch that is not examined reads colour alone. A reduced network of the paper's shape is trained anew for
-every row, for the same few minutes, on the same batches, and scored on the held-out views; so rows can be compared with
+every row, for the same few steps, on the same batches, and scored on the held-out views; so rows can be compared with
 each other, not with what ships. An LRHS with layers has those of the ``hr`` passes that are not in the HRLS. Rows that
-the JSON file has already are kept; run on one idle core, because the clock ends a row.
+the JSON file has already are kept.
 """
 
 from __future__ import annotations

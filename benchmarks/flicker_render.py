@@ -16,8 +16,6 @@ files that exist are kept.
 
 from __future__ import annotations
 
-import ctypes.util
-import os
 import time
 import zlib
 from collections.abc import Sequence
@@ -31,6 +29,7 @@ import OpenImageIO as oiio
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.output import replacing
 from oiio_msspl.render import Array
+from training import mitsuba_start
 
 SCALE = 4
 FRAMES = 10
@@ -73,14 +72,9 @@ def render_sequences(folder: Path, scenes: Path, names: list[str]) -> None:
         InputError: no such scene, or no Mitsuba.
     """
     try:
-        if "DRJIT_LIBLLVM_PATH" not in os.environ and (llvm := ctypes.util.find_library("LLVM-19")):
-            os.environ["DRJIT_LIBLLVM_PATH"] = llvm
-        import drjit as dr
-        import mitsuba as mi
+        mi = mitsuba_start.start()
     except ImportError as error:
         raise InputError("rendering needs Mitsuba 3: pip install '.[train]'") from error
-    mi.set_variant("llvm_ad_rgb")
-    dr.set_thread_count(1)
     for name in names:
         file = scenes / name / "scene.xml"
         if name not in SCENES or not file.is_file():

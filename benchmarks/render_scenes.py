@@ -11,8 +11,6 @@ specular. A filter is sampled, as Cycles does, so that pixels share no noise. Fi
 from __future__ import annotations
 
 import argparse
-import ctypes.util
-import os
 import time
 import zlib
 from pathlib import Path
@@ -23,6 +21,7 @@ import numpy as np
 from benchmarks.flicker_render import write_exr
 from benchmarks.render_time import CROP, LONGER
 from oiio_msspl.schema import SCALES
+from training import mitsuba_start
 
 HRLS = (1, 2, 4, 8)
 #: Samples of the LRHS for every pixel of the frame.
@@ -113,13 +112,7 @@ def main() -> None:
     parser.add_argument("--reference", type=int, default=256, help="spp")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
-    if "DRJIT_LIBLLVM_PATH" not in os.environ and (llvm := ctypes.util.find_library("LLVM-19")):
-        os.environ["DRJIT_LIBLLVM_PATH"] = llvm
-    import drjit as dr
-    import mitsuba as mi
-
-    mi.set_variant("llvm_ad_rgb")
-    dr.set_thread_count(args.threads)
+    mitsuba_start.start(args.threads)
     for file in sorted(args.scenes.glob("*/scene.xml")):
         start = time.perf_counter()
         render(file, args.out / file.parent.name, args.filter, args.reference)

@@ -3,24 +3,16 @@
 
 from __future__ import annotations
 
-import ctypes.util
-import os
 import sys
 
-from .. import views
+from .. import mitsuba_start, views
 
 
 def main() -> int:
     parser = views.parser("training.mitsuba_views", ref_spp=96)
-    parser.add_argument("--variant", default="llvm_ad_rgb")
+    parser.add_argument("--variant", default=mitsuba_start.VARIANT)
     args = parser.parse_args()
-    if "DRJIT_LIBLLVM_PATH" not in os.environ and (llvm := ctypes.util.find_library("LLVM-19")):
-        os.environ["DRJIT_LIBLLVM_PATH"] = llvm
-    import drjit as dr
-    import mitsuba as mi
-
-    mi.set_variant(args.variant)
-    dr.set_thread_count(args.threads)
+    mitsuba_start.start(args.threads, args.variant)
     # Imported only now: these modules name Mitsuba's types, which exist once a variant is set.
     from .assets import Assets
     from .render import render_scene

@@ -32,6 +32,11 @@ SHIFT_CORRELATION = 0.9
 ALBEDO_EDGE, ALBEDO_EDGES, ALBEDO_CORRELATION = 0.2, 200, 0.05
 #: Standard errors that an exposure or a shift must lie from none.
 CERTAIN = 6.0
+#: Sides of blocks in LRHS pixels, and by how many standard errors the renders' means of one must lie apart, as well as
+#: by a quarter of their brightness, to show different things. Of 77 views at x2, x4 and x8, with 1 and 4 spp in either
+#: render and with the nearest-neighbour LRHS, none has such a block.
+PLACES = {8: 6.0, 4: 8.0}
+DIFFERENCE = 0.25
 #: The frame is cut into that many blocks each way, each left out once, to learn how certain an estimate is.
 BLOCKS = 6
 #: LRHS pixels each way in the frame's middle that suffice to find a shift.
@@ -74,11 +79,18 @@ def check(lr_rgb: Array, hr: Source, pairing: Pairing, lr_name: str) -> list[str
         warnings.append(
             "the albedo's edges are not in the picture: is it this frame's albedo? (--map albedo=LAYER says which)"
         )
-    x, y = _shift(low, high) * pairing.scale
-    if max(abs(x), abs(y)) > max(SHIFT, 0.2 * pairing.scale):
+    scale, grid = pairing.scale, pairing.grid
+    x, y = _shift(low, high) * scale
+    if max(abs(x), abs(y)) > max(SHIFT, 0.2 * scale):
         warnings.append(
             f"the HRLS's picture lies {abs(x):.1f} pixels {'right' if x > 0 else 'left'} of and {abs(y):.1f} pixels "
             f"{'below' if y > 0 else 'above'} the LRHS's: are camera, crop and overscan the same?"
+        )
+    if not warnings and (place := _differing(low, high)) is not None:
+        x, y = (start + scale * at for start, at in zip((grid.x0 * scale, grid.y0 * scale), place, strict=True))
+        warnings.append(
+            f"the two renders show different things, most of all around HRLS pixel ({x}, {y}): are they "
+            "the same frame, with the same lights and objects?"
         )
     return warnings
 
@@ -154,6 +166,34 @@ def _shift(low: Array, high: Array) -> NDArray[np.float64]:
     if fit.correlation < SHIFT_CORRELATION:
         return nothing
     return np.where(np.abs(fit.shift) > CERTAIN * fit.error, fit.shift, 0)
+
+
+def _differing(low: Array, high: Array) -> tuple[int, int] | None:
+    """Where (x, y), in LRHS pixels, the two pictures differ by what noise does not explain; None if nowhere.
+
+    A paired t-test a block: what both pictures show cancels, and a single firefly of any size has a t of about 1.
+    """
+    floor = 0.05 * np.median(low + high)
+    for size, certain in PLACES.items():
+        height, width = (n // size for n in low.shape)
+        if height == 0 or width == 0:
+            continue
+        one, other = (
+            v[: height * size, : width * size]
+            .reshape(height, size, width, size)
+            .swapaxes(1, 2)
+            .reshape(height, width, -1)
+            for v in (low.astype(np.float64), high.astype(np.float64))  # the square of a firefly
+        )
+        brightness = (one + other).mean(axis=-1) / 2
+        difference = np.abs((one - other).mean(axis=-1))
+        # Two percent are nothing, even between renders without any noise
+        error = (one - other).std(axis=-1) / size + 0.02 * brightness
+        t = np.where(difference > DIFFERENCE * (brightness + floor), difference / np.maximum(error, 1e-30), 0)
+        if t.max() > certain:
+            y, x = np.unravel_index(t.argmax(), t.shape)
+            return int(x * size + size // 2), int(y * size + size // 2)
+    return None
 
 
 class _Fit(NamedTuple):

@@ -248,6 +248,26 @@ def test_a_shift_of_one_lrhs_pixel_is_noticed(session, scale, shift):
         assert seen == pytest.approx((x, y), abs=0.2 * scale)
 
 
+@pytest.mark.parametrize("moved", [0, 8])
+def test_something_that_moved_between_the_renders_is_noticed(session, scale, moved):
+    """And where, under the noise of 1 spp; noise alone is not taken for it."""
+
+    def picture(offset):
+        image = texture(80 * scale)
+        at = (40 + offset) * scale
+        image[32 * scale : 48 * scale, at : at + 8 * scale] = 4
+        return image
+
+    low = Render.from_arrays("lr", rgb=noisy(downsample(picture(0), scale), scale**2))
+    high = Render.from_arrays("hr", rgb=noisy(picture(moved), 1, seed=1))
+    warnings = fuse(low, high, session).warnings
+    assert len(warnings) == bool(moved)
+    if warnings:
+        x, y = map(int, re.search(r"show different things.* \((\d+), (\d+)\)", warnings[0]).groups())
+        assert 40 * scale <= x < 56 * scale
+        assert 32 * scale <= y < 48 * scale
+
+
 def texture(size):
     """A picture with structure of all sizes, (size, size, 3), the same at any size."""
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size

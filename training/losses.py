@@ -12,6 +12,9 @@ from training.pyramid import linear
 #: :mod:`oiio_msspl.transforms`, where 0.1 is an error of about half a stop at mid-grey.
 BETA = 0.1
 
+#: RelMSE's own floor, in exposed radiance, and the relative squared error that counts half.
+RELATIVE_FLOOR, RELATIVE_LARGE = 0.01, 8.0
+
 
 def robust(output: Tensor, reference: Tensor, beta: float = BETA) -> Tensor:
     """The paper's ``l_r = mean(|e| / (beta + |e|))``: ``|e| / beta`` for small errors, never above 1 for large ones.
@@ -38,6 +41,17 @@ def display(output: Tensor, reference: Tensor) -> Tensor:
     return 10.0 * squared + 0.3 * l1(output, reference)
 
 
+def relative(output: Tensor, reference: Tensor) -> Tensor:
+    """:func:`display`, and the squared error relative to the reference, as RelMSE with (0.5, 0.01) has it.
+
+    That is what light where there is none costs: a firefly believed. The largest count less than in RelMSE, or the few
+    that nothing could have told would be all that a batch has to say.
+    """
+    light = linear(reference)
+    squared = (linear(output) - light).square() / (light.square() + RELATIVE_FLOOR)
+    return display(output, reference) + 0.5 * (squared / (1 + squared / RELATIVE_LARGE)).mean()
+
+
 def of_error(log_error: Tensor, output: Tensor, reference: Tensor) -> Tensor:
     """Of a prediction (N, 1, H, W) of the logarithm of the absolute error, mean of the channels: the negative
     log-likelihood of errors that are distributed exponentially, which is least where the prediction is their mean."""
@@ -51,4 +65,4 @@ def srgb(exposed: Tensor) -> Tensor:
     return torch.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
-LOSSES = {"robust": robust, "l1": l1, "display": display}
+LOSSES = {"robust": robust, "l1": l1, "display": display, "relative": relative}

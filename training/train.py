@@ -157,6 +157,8 @@ def warm_start(network: Network, path: Path) -> None:
     state = torch.load(path, map_location="cpu", weights_only=True)
     theirs, ours = state["ema"], network.state_dict()
     if isinstance(network, PyramidFusion):
+        if "own_size" not in state["config"]:
+            raise SystemExit(f"--init {path}: that is no pyramid network, and nothing of it fits one")
         for level, (size, wanted) in enumerate(zip(state["config"]["own_size"], network.own_size, strict=True)):
             for name in (f"heads.{level}.weight", f"heads.{level}.bias"):
                 theirs[name] = middle_taps(theirs[name], size, wanted, 1 if level else 4)

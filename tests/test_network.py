@@ -14,7 +14,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from oiio_msspl import schema, tensors, transforms  # noqa: E402
+from oiio_msspl import metrics, schema, tensors, transforms  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
 from training import batches, data, losses, train  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
@@ -148,7 +148,13 @@ def test_display_loss_is_the_error_of_the_picture_and_some_of_highlights() -> No
     assert losses.display(brighter, white).item() == pytest.approx(0.3 * 0.1, rel=1e-3)
 
 
-# Data
+def test_relative_loss_counts_light_in_the_dark() -> None:
+    """As RelMSE does, but no pixel for more than four."""
+    dark = torch.full((1, 3, 8, 8), 0.02)
+    for step, at_most in ((0.02, None), (3.0, 4.0)):
+        extra = (losses.relative(dark + step, dark) - losses.display(dark + step, dark)).item()
+        relmse = metrics.relmse(*(linear(x)[0].permute(1, 2, 0).numpy() for x in (dark + step, dark)))
+        assert extra == pytest.approx(at_most or relmse, rel=0.05)
 
 
 def test_hrls_is_the_mean_of_passes(views: Path) -> None:
@@ -453,6 +459,9 @@ def test_a_pyramid_begins_with_the_middle_of_larger_kernels(tmp_path: Path) -> N
     torch.save({"ema": narrow.state_dict(), "config": narrow.config}, tmp_path / "narrow.pt")
     with pytest.raises(SystemExit, match="has 3x3 taps, and no more can be added"):
         train.warm_start(wide, tmp_path / "narrow.pt")
+    torch.save({"ema": {}, "config": {"scale": 4}}, tmp_path / "paper.pt")
+    with pytest.raises(SystemExit, match="no pyramid network"):
+        train.warm_start(wide, tmp_path / "paper.pt")
 
 
 @torch.inference_mode()

@@ -64,6 +64,17 @@ def _cropped(image: Array) -> Array:
     return image[:height, :width]
 
 
+def print_table(results: dict[str, dict[str, Any]]) -> None:
+    """A line a model."""
+    print("| model | predicted | actual | error in the worst tenth | correlation |\n|---|---|---|---|---|")
+    for name, result in results.items():
+        predicted, actual = result["mean"]
+        print(
+            f"| {name} | {predicted:.4f} | {actual:.4f} | {result['share_of_worst_tenth']:.0%} | "
+            f"{result['correlation']:.2f} |"
+        )
+
+
 def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
     """Predicted against actual error, a line a scale."""
     import matplotlib
@@ -97,13 +108,7 @@ def main() -> None:
         session = Session(find_model(scale, args.model))
         pairs = [errors(scene, session, spp) for scene in clean for spp in AVERAGES]
         results[session.contract.name] = measure(pairs)
-    print("| model | predicted | actual | error in the worst tenth | correlation |\n|---|---|---|---|---|")
-    for name, result in results.items():
-        predicted, actual = result["mean"]
-        print(
-            f"| {name} | {predicted:.4f} | {actual:.4f} | {result['share_of_worst_tenth']:.0%} | "
-            f"{result['correlation']:.2f} |"
-        )
+    print_table(results)
     if args.json:
         args.json.write_text(json.dumps(results, indent=1) + "\n")
     if args.picture:

@@ -45,6 +45,12 @@ GRID = {16: (33.94, 34.88, 35.71), 32: (34.22, 35.21, 36.06), 64: (34.42, 35.44,
 Rows = list[dict[str, Any]]
 
 
+def result(name: str) -> dict[str, Any]:
+    """What a benchmark wrote."""
+    found: dict[str, Any] = json.loads((RESULTS / f"{name}.json").read_text())
+    return found
+
+
 def table(head: list[str], rows: list[list[str]]) -> str:
     """Markdown."""
     lines = [head, ["---"] * len(head), *rows]
@@ -137,9 +143,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("renders", type=Path)
     args = parser.parse_args()
-
-    def result(name: str) -> dict[str, Any]:
-        return json.loads((RESULTS / f"{name}.json").read_text())
 
     ablated = result("ablations")
     by_name = {row["name"]: row for row in ablated["rows"]}

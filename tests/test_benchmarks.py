@@ -80,3 +80,28 @@ def test_the_page_has_a_chart_a_scene_with_and_without_the_render(tmp_path):
     page = chart.page(rows, timings)
     assert page.count("<svg") == page.count("</svg>") == 6
     assert all(f"<h2>{name}</h2>" in page for name in ("Mean of the scenes", "lamp", "tire"))
+
+
+def test_pages_have_the_figures_that_were_measured():
+    """`python -m benchmarks.tables` brings README.md and docs/results.md up to date."""
+    from benchmarks import tables
+
+    for path, of_page in tables.TABLES.items():
+        text = path.read_text()
+        assert tables.laid_out(text, of_page) == text, path.name
+        with pytest.raises(SystemExit, match="no <!-- begin: "):
+            tables.laid_out("", of_page)
+
+
+def test_curves_of_a_log_go_on_from_run_to_run(tmp_path):
+    from benchmarks import curves
+
+    lines = ["run,step,minutes,loss,psnr", "a,0,0,0,20", "a,5,2,0.5,21", "b,0,0,0,19", "b,9,3,0.4,22"]
+    (tmp_path / "training_x.csv").write_text("\n".join(lines) + "\n")
+    assert curves.read(tmp_path / "training_x.csv") == {
+        "a": (([0, 2], [20, 21]), ([2], [0.5])),
+        "b": (([2, 5], [19, 22]), ([5], [0.4])),
+    }
+    pytest.importorskip("matplotlib")
+    curves.draw([tmp_path / "training_x.csv"], tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 1000

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lay out what was measured: README.md and docs/results.md have the figures of `benchmarks/results/*.json`.
+
+    python -m benchmarks.tables
+
+What lies between ``<!-- begin: NAME -->`` and ``<!-- end -->`` is replaced; the sentences around it are not.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import re
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import confidence, quality
+from benchmarks.paper import Rows, result, table
+from oiio_msspl.schema import SCALES
+
+ROOT = Path(__file__).parents[1]
+FAMILIES = ("paper", "pyramid", "pyramid-oidn-fast", "pyramid-oidn")
+#: What a user would do instead, by its name in the rows.
+PEERS = {
+    "OIDN fast on the HRLS": "OIDN 2.5.1 on the HRLS, quality fast",
+    "OIDN on the HRLS": "OIDN 2.5.1 on the HRLS",
+    "OIDN on both x2, together": "OIDN 2.5.1 on both together, x2 (no network of ours)",
+    "OIDN, same samples": "OIDN 2.5.1 on full resolution, same samples",
+}
+OIDN = "OIDN 2.5.1, quality high"
+FORMS = {measure: form for measure, (_, form) in quality.MEASURES.items()}
+
+
+def rows_of(name: str) -> Rows:
+    rows: Rows = result(name)["rows"]
+    return rows
+
+
+def code(name: str) -> str:
+    """A method's name, as code if it is a model's."""
+    return f"`{name}`" if name.startswith(FAMILIES) else name
+
+
+def models(scales: Sequence[int] = SCALES, families: Sequence[str] = FAMILIES) -> list[str]:
+    return [f"{family}-x{scale}" for family in families for scale in scales]
+
+
+def accuracy() -> str:
+    """README: PSNR and RelMSE of all models and peers at every average spp."""
+    rows = rows_of("quality")
+
+    def line(title: str, methods: Sequence[str]) -> list[str]:
+        cells = [title]
+        for spp in quality.AVERAGES:
+            psnr, relmse = ([quality.mean_of(rows, m, spp, k) for m in methods] for k in ("psnr", "relmse"))
+            cells += [FORMS["psnr"].format(max(psnr)), FORMS["relmse"].format(min(relmse))]
+        return cells
+
+    body = [
+        line("HRLS alone (1, 2 and 4 spp)", ["HRLS"]),
+        line("full resolution, same samples", ["full resolution"]),
+        line("LRHS bicubic, best scale for each number", [f"LRHS x{scale} bicubic" for scale in SCALES]),
+        *(line(code(name), [name]) for name in models()),
+        *(line(title, [method]) for method, title in PEERS.items()),
+    ]
+    return table(["", *(cell for spp in quality.AVERAGES for cell in (f"{spp} spp: PSNR", "RelMSE"))], body)
+
+
+def runtime() -> str:
+    """README: time and memory."""
+    results = result("runtime")["results"]
+    base = np.median(results[OIDN]["seconds"])
+    body = []
+    for name in [*models(), OIDN, "OIDN 2.5.1, quality fast"]:
+        seconds = np.median(results[name]["seconds"])
+        body.append([code(name), f"{seconds:.2f}", f"{seconds / base:.2f}", f"{results[name]['peak_mb']:.0f}"])
+    return table(["1024 x 1024, two CPU cores", "median s", "of OIDN's time", "peak MB"], body)
+
+
+def scenes() -> str:
+    """All measures of all methods, per scene."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        quality.print_tables(rows_of("quality"))
+    return printed.getvalue().strip() + "\n"
+
+
+def _cells(rows: Rows, method: str, measures: Sequence[str]) -> list[str]:
+    """A cell an average spp; empty where the views have too few samples for a method."""
+    measured = {(row["method"], row["spp"]) for row in rows}
+    return [
+        " / ".join(FORMS[measure].format(quality.mean_of(rows, method, spp, measure)) for measure in measures)
+        if (method, spp) in measured
+        else ""
+        for spp in quality.AVERAGES
+    ]
+
+
+def filters() -> str:
+    """Either pixel filter, with all layers; then the best model against OIDN with the same samples, per scene."""
+    sets = {"box": rows_of("quality_box"), "Blackman-Harris": rows_of("quality_bh")}
+    methods = [*list(PEERS)[1:], *models(SCALES[:2], FAMILIES[1:])]
+    head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in sets for spp in quality.AVERAGES)]
+    body = [
+        [code(m), *(cell for rows in sets.values() for cell in _cells(rows, m, ("psnr", "relmse")))] for m in methods
+    ]
+    judged = [
+        name for name in dict.fromkeys(row["scene"] for row in sets["box"]) if name not in quality.NOISY_REFERENCE
+    ]
+    differences = []
+    for name, rows in sets.items():
+        psnr = {(row["method"], row["spp"], row["scene"]): row["psnr"] for row in rows}
+        for spp in quality.AVERAGES:
+            by_scene = (psnr["pyramid-oidn-x2", spp, s] - psnr["OIDN, same samples", spp, s] for s in judged)
+            differences.append([f"{name}, {spp}", *(f"{value:+.2f}" for value in by_scene)])
+    between = "\nPSNR of `pyramid-oidn-x2` less that of OIDN on full resolution with the same samples, per scene:\n\n"
+    return table(head, body) + between + table(["filter, spp", *judged], differences)
+
+
+def cycles() -> str:
+    """Views by Cycles, with both footprints of the LRHS."""
+    rows = rows_of("quality_cycles")
+    methods = [*list(PEERS)[1:]]
+    for name in models():
+        methods += [m for m in (name, f"{name}, nearest") if any(row["method"] == m for row in rows)]
+    head = ["PSNR / RelMSE / FLIP", *(f"{spp} spp" for spp in quality.AVERAGES)]
+    return table(head, [[code(m), *_cells(rows, m, ("psnr", "relmse", "flip"))] for m in methods])
+
+
+def errors() -> str:
+    """Predicted errors against actual ones."""
+    with contextlib.redirect_stdout(io.StringIO()) as printed:
+        confidence.print_table(result("confidence"))
+    return printed.getvalue()
+
+
+TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
+    ROOT / "README.md": (accuracy, runtime),
+    ROOT / "docs/results.md": (scenes, filters, cycles, errors),
+}
+
+
+def laid_out(text: str, tables: Sequence[Callable[[], str]]) -> str:
+    """A page with these tables anew.
+
+    Raises:
+        SystemExit: there is no place for one.
+    """
+    for make in tables:
+        place = re.compile(rf"(<!-- begin: {make.__name__} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if not place.search(text):
+            raise SystemExit(f"no <!-- begin: {make.__name__} --> ... <!-- end -->")
+        made = make()
+        text = place.sub(lambda found, made=made: f"{found[1]}\n{made}\n{found[2]}", text)  # type: ignore[misc]
+    return text
+
+
+def main() -> None:
+    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
+    for path, tables in TABLES.items():
+        path.write_text(laid_out(path.read_text(), tables))
+
+
+if __name__ == "__main__":
+    main()

@@ -68,14 +68,14 @@ def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
 def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
     """Both renders, denoised together at the LRHS's resolution; None without pyoidn."""
     try:
-        denoiser = Denoiser(mode="fast")  # what is made at the LRHS's resolution is that of all modes but the low one
+        denoiser = Denoiser()
     except InputError:
         return None
     low = beauty(lrhs)
     exposure = transforms.exposure_of(low)
     layers = tensors.read(hrls, hrls.data_window, hrls.data_window)
     packed = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
-    return transforms.expand(denoiser(transforms.compress(low, exposure), packed)[0][..., 3:], exposure)
+    return np.maximum(denoiser.together(transforms.compress(low, exposure), packed), 0) / np.float32(exposure)
 
 
 def flip_of(image: np.ndarray, reference: np.ndarray) -> float:

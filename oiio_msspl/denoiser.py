@@ -93,9 +93,17 @@ class Denoiser:
         Raises:
             MssplError: Open Image Denoise failed.
         """
+        low = _with(lrhs, self.together(lrhs, hrls))
+        return low, hrls if self._high is None else _with(hrls, self._denoised(self._high, _layers(hrls)))
+
+    def together(self, lrhs: Array, hrls: Array) -> Array:
+        """Of the same arguments, radiance of both renders denoised together at the LRHS's resolution, (h, w, 3).
+
+        Raises:
+            MssplError: Open Image Denoise failed.
+        """
         scale = hrls.shape[0] // lrhs.shape[0]
-        high = {"color": transforms.expand(_feature(hrls, schema.RGB), 1.0)} | _guides(hrls)
-        low = {name: transforms.box_downsample(image, scale) for name, image in high.items()}
+        low = {name: transforms.box_downsample(image, scale) for name, image in _layers(hrls).items()}
         share = lrhs_share(lrhs, transforms.compress(low["color"], 1.0))
         low["color"] = share * transforms.expand(lrhs, 1.0) + (1 - share) * low["color"]
         filter_ = self._low
@@ -103,8 +111,7 @@ class Denoiser:
             filter_ = self._low_x2
         elif scale == 2 and "albedo" in low:
             low["albedo"] = np.clip(self._denoised(self._low_albedo, {"albedo": low["albedo"]}), 0, 1)
-        lrhs = _with(lrhs, self._denoised(filter_, low))
-        return lrhs, hrls if self._high is None else _with(hrls, self._denoised(self._high, high))
+        return self._denoised(filter_, low)
 
     def _denoised(self, filter_: pyoidn.Filter, layers: dict[str, Array]) -> Array:
         """The first of the images (h, w, 3), with the help of the others."""
@@ -129,13 +136,14 @@ def _with(image: Array, denoised: Array) -> Array:
     return np.concatenate([image.transpose(2, 0, 1), result.transpose(2, 0, 1)]).transpose(1, 2, 0)
 
 
-def _guides(hrls: Array) -> dict[str, Array]:
-    """Albedo and normal, as far as they are there."""
+def _layers(hrls: Array) -> dict[str, Array]:
+    """The HRLS as Open Image Denoise takes it: radiance, and albedo and normal as far as they are there."""
+    colour = {"color": transforms.expand(_feature(hrls, schema.RGB), 1.0)}
     albedo, normal = np.clip(_feature(hrls, schema.ALBEDO), 0, 1), _feature(hrls, schema.NORMAL)
     # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
     if normal.any():
-        return {"albedo": albedo, "normal": normal}
-    return {"albedo": albedo} if (albedo != schema.DEFAULTS[schema.ALBEDO]).any() else {}
+        return colour | {"albedo": albedo, "normal": normal}
+    return colour | ({"albedo": albedo} if (albedo != schema.DEFAULTS[schema.ALBEDO]).any() else {})
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:

@@ -9,7 +9,8 @@ gets its renders. From an LRHS and an HRLS: our models; OIDN (if pyoidn is insta
 normal, at quality high and fast; OIDN on the LRHS, upsampled; "OIDN on both": the first brought to the second's local
 brightness; and "together": to that of both renders denoised as :mod:`oiio_msspl.denoiser` does. From one
 full-resolution render of the same average: OIDN. "Nearest" marks the paper's LRHS, of every s x s pixels one; others
-are averages of s x s pixels, as renderers make them. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean;
+are averages of s x s pixels, as renderers make them. "3:1" marks pairs whose HRLS has three quarters of the samples,
+others are halved, as in the paper. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean;
 and the mean of these, RelMSE (1, 1e-4), SSIM and FLIP. Scenes whose own reference is noisy are listed, not averaged.
 """
 
@@ -35,6 +36,8 @@ from oiio_msspl.transforms import box_downsample, repair, srgb
 
 #: Average spp; half of it is in the HRLS, half in the LRHS, as in the paper's tables.
 AVERAGES = (2, 4, 8)
+#: Other ways to divide it, HRLS to LRHS, where it divides.
+UNEVEN = ((3, 1), (7, 1))
 #: Key of a row -> what it is called, and how it is printed.
 MEASURES = {
     "psnr": ("PSNR (sRGB, dB)", "{:.2f}"),
@@ -116,6 +119,15 @@ def run_scene(scene: scenes.Scene, sessions: list[Session], flip: bool = False) 
                     add(spp, session.contract.name, fuse(lr, hr, session).rgb)
                     if nearest is not None:
                         add(spp, f"{session.contract.name}, nearest", fuse(nearest, hr, session).rgb)
+        for more, less in UNEVEN:
+            share, rest = divmod(spp, more + less)
+            if rest or not scene.has(share * more):
+                continue
+            hr, divided = scene.hrls(share * more), f"{more}:{less}"
+            add(spp, f"OIDN on the HRLS, {divided}", oidn(hr))
+            for session in sessions:
+                lr = scene.lrhs(session.contract.scale, share * less)
+                add(spp, f"{session.contract.name}, {divided}", fuse(lr, hr, session).rgb)
         full = scene.hrls(spp)
         add(spp, "full resolution", beauty(full))
         add(spp, "OIDN, same samples", oidn(full))

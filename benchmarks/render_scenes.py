@@ -23,7 +23,7 @@ from benchmarks.render_time import CROP, LONGER
 from oiio_msspl.schema import SCALES
 from training import mitsuba_start
 
-HRLS = (1, 2, 4, 8)
+HRLS = (1, 2, 3, 4, 6, 7, 8)
 #: Samples of the LRHS for every pixel of the frame.
 LRHS = (1, 2, 4)
 #: Samples of one launch, so that memory stays small.

@@ -41,6 +41,8 @@ class Scene:
     """Of a scale s and an average of n samples a pixel of the HRLS, which is ``s^2 n`` spp."""
     nearest: Callable[[int, int], Source | None] = lambda scale, spp: None
     """The same as the paper's data set has it: of every s x s pixels one, of ``s^2 n`` spp. None if there is none."""
+    has: Callable[[int], bool] = lambda spp: True
+    """Whether there is an HRLS of so many spp."""
 
 
 def load(folder: Path) -> list[Scene]:
@@ -71,6 +73,7 @@ def _render(folder: Path) -> Scene:
         reference=beauty(file("ref.exr")),
         hrls=lambda spp: file(f"hr_{spp}spp.exr"),
         lrhs=lambda scale, spp: file(f"lr_x{scale}_{scale**2 * spp}spp.exr"),
+        has=lambda spp: (folder / f"hr_{spp}spp.exr").exists(),
     )
 
 

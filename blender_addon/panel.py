@@ -30,7 +30,7 @@ class MSSPLSettings(bpy.types.PropertyGroup):
     hr_spp: IntProperty(name="HRLS Samples", description="Samples a pixel at full resolution", default=1, min=1)
     lr_spp: IntProperty(
         name="LRHS Samples",
-        description="Samples a pixel at low resolution; 0: as many samples in all as the HRLS has",
+        description="Samples a pixel at low resolution; 0: in all, a third of those of the HRLS",
         default=0,
         min=0,
     )

@@ -38,7 +38,7 @@ class Options:
     scale: int = 4
     hr_spp: int = 1
     lr_spp: int = 0
-    """0: as many samples in all as the HRLS has."""
+    """0: in all, a third of the samples that the HRLS has, at least as many as it has pixels."""
     filter: str = "BOX"
     """``BOX``: an LRHS pixel is exactly the mean of its HRLS pixels; ``SCENE``: the scene's own pixel filter."""
     view_layer: str = ""
@@ -48,7 +48,7 @@ class Options:
 
     @property
     def low_spp(self):
-        return self.lr_spp or self.scale**2 * self.hr_spp
+        return self.lr_spp or self.scale**2 * max(1, round(self.hr_spp / 3))
 
 
 def high_size(scene):

@@ -122,8 +122,10 @@ def draw(
     while True:
         n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
         k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
-        lr_passes = rng.permutation(len(spp))[:k]
-        if spp[lr_passes].sum() * (1 if nearest else scale**2) > n:  # high and low spp: as in the paper
+        # Rather the passes of few samples: of all samples, the LRHS should get the smaller part
+        lr_passes = rng.choice(len(spp), k, replace=False, p=_normalised(tuple(1 / spp)))
+        # High and low spp, as in the paper; or an LRHS of fewer, but for a larger pixel
+        if not nearest or spp[lr_passes].sum() > n:
             break
     height, width = chosen[0].ref.shape[:2]
     tops = scale * rng.integers((height - patch) // scale + 1, size=count)

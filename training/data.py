@@ -48,7 +48,7 @@ class Sampling:
 
     hrls_spp: tuple[float, ...] = (0.35, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05, 0.1)
     """Weight of 1, 2, 3, ... spp in the HRLS; low ones are the hard and the useful case."""
-    lrhs_passes: tuple[float, ...] = (0.5, 0.2, 0.1, 0.1, 0.1)
+    lrhs_passes: tuple[float, ...] = (0.65, 0.2, 0.05, 0.05, 0.05)
     """Weight of 1, 2, 3, ... ``lr`` passes in the LRHS."""
     clip: float = math.inf
     """Radiance is clipped here, before anything else. The log curve can do without."""

@@ -48,7 +48,7 @@ def render(
     lr_spp: Annotated[
         int | None,
         typer.Option(
-            min=1, help="Samples a pixel of the LRHS; scale squared times the HRLS's if not given.", show_default=False
+            min=1, help="Samples a pixel of the LRHS; if not given, a third of the HRLS's in all.", show_default=False
         ),
     ] = None,
     hr_spp: Annotated[int, typer.Option(min=1, help="Samples a pixel of the HRLS.")] = 1,

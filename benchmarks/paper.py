@@ -13,6 +13,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ GHARBI = {
 SUPER_RESOLUTION = {2: (30.57, 32.03, 38.40), 4: (25.39, 30.73, 34.27), 8: (22.36, 27.97, 31.08)}
 #: ... and at x4 for LRHS of 16, 32 and 64 spp and HRLS of 1, 2 and 4 (table 6).
 GRID = {16: (33.94, 34.88, 35.71), 32: (34.22, 35.21, 36.06), 64: (34.42, 35.44, 36.31)}
+GRID_HRLS = (1, 2, 4)
 
 Rows = list[dict[str, Any]]
 
@@ -67,7 +69,8 @@ def _cell(rows: Rows, method: str, spp: int) -> str:
 def comparison(rows: Rows, paper: dict[str, tuple[Any, ...]], averages: tuple[int, ...]) -> str:
     """PSNR and RelMSE by average spp, and the paper's own."""
     ours = ["full resolution", "OIDN, same samples", "OIDN on the HRLS"]
-    ours += sorted({row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid"))})
+    models = {row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid"))}
+    ours += sorted(name for name in models if ":" not in name)  # halved, as in the paper
     body = []
     for method in ours:
         theirs = paper.get(method, ("",) * len(averages))
@@ -91,8 +94,8 @@ def _of_the_paper(name: str) -> list[str]:
     return [str(value) for value in runtime.PAPER[int(scale)]] if family == "paper" else ["", ""]
 
 
-def grid(folder: Path) -> str:
-    """PSNR of paper-x4 by the spp of both renders, mean of the scenes with clean references."""
+def measure_grid(folder: Path) -> dict[tuple[int, int], float]:
+    """PSNR of paper-x4 by the spp of LRHS and HRLS, mean of the scenes with clean references."""
     session = Session(find_model(4, "paper-x4"))
     judged = [scene for scene in scenes.load(folder) if scene.name not in scenes.NOISY_REFERENCE]
 
@@ -103,12 +106,16 @@ def grid(folder: Path) -> str:
             values.append(metrics.psnr(fused, scene.reference))
         return float(np.mean(values))
 
-    highs = (1, 2, 4)
+    return {(low, high): psnr(low, high) for low in GRID for high in GRID_HRLS}
+
+
+def grid(measured: dict[tuple[int, int], float]) -> str:
+    """The same as a table."""
     body = []
     for low, theirs in GRID.items():
-        cells = [f"{psnr(low, high):.2f} ({paper:.2f})" for high, paper in zip(highs, theirs, strict=True)]
-        body.append([f"{low} spp", *cells])
-    return table(["LRHS \\ HRLS", *(f"{high} spp" for high in highs)], body)
+        pairs = zip(GRID_HRLS, theirs, strict=True)
+        body.append([f"{low} spp", *(f"{measured[low, high]:.2f} ({paper:.2f})" for high, paper in pairs)])
+    return table(["LRHS \\ HRLS", *(f"{high} spp" for high in GRID_HRLS)], body)
 
 
 def super_resolution(rows: dict[str, dict[str, Any]]) -> str:
@@ -137,6 +144,40 @@ def ablations(rows: dict[str, dict[str, Any]]) -> Iterator[str]:
     yield one("LRHS, beside an HRLS of RGB", low)
     losses = {"l1": same} | {name: name for name in rows if "loss" in name or "linear" in name}
     yield one("loss", losses)
+
+
+def claims(ablated: dict[str, dict[str, Any]], rows: Rows, measured: dict[tuple[int, int], float]) -> Iterator[str]:
+    """What the paper finds, and whether it is found here: PSNR, which must rise from figure to figure."""
+
+    def claim(text: str, *psnr: float) -> str:
+        holds = all(before < after for before, after in pairwise(psnr))
+        return (
+            f"| {text} | {', '.join(f'{value:.2f}' for value in psnr)} | {'holds' if holds else '**does not hold**'} |"
+        )
+
+    def of(*names: str) -> list[float]:
+        return [ablated[name]["psnr"] for name in names]
+
+    def mean(method: str, spp: int) -> float:
+        return quality.mean_of(rows, method, spp, "psnr")
+
+    same, layers = "both RGB, l1", "HRLS: and diffuse, specular"
+    yield "| the paper finds | PSNR here | |\n| --- | --- | --- |"
+    yield claim("an HRLS beats super-resolution: none, RGB", *of("HRLS: none", same))
+    yield claim("its further layers help: RGB, all", *of(same, layers))
+    yield claim("the LRHS's do not: all, RGB", *of("LRHS: and diffuse, specular", same))
+    yield claim(
+        "of linear radiance, the robust loss is better: l1, robust",
+        *of("l1 of linear radiance", "robust loss of linear radiance, beta 0.1"),
+    )
+    for beta in ("0.01", "1"):
+        yield claim(f"its beta is best at 0.1: {beta}, 0.1", *of(f"robust loss, beta {beta}", "robust loss, beta 0.1"))
+    for low in GRID:
+        yield claim(f"more spp in the HRLS is better, LRHS of {low}", *(measured[low, high] for high in GRID_HRLS))
+    for high in GRID_HRLS:
+        yield claim(f"more spp in the LRHS is better, HRLS of {high}", *(measured[low, high] for low in GRID))
+    yield claim("x4 is best at 2 spp: x2, x4", mean("paper-x2", 2), mean("paper-x4", 2))
+    yield claim("x2 is best at 8 spp: x4, x2", mean("paper-x4", 8), mean("paper-x2", 8))
 
 
 def main() -> None:
@@ -169,10 +210,13 @@ def main() -> None:
     print(super_resolution(by_name))
     print("## Table 6: samples, `paper-x4`\n")
     print("PSNR on the scenes of table 3; in brackets the paper's.\n")
-    print(grid(args.renders))
+    measured = measure_grid(args.renders)
+    print(grid(measured))
     print("## Figures 9 and 10: layers and loss\n")
     print("The same reduced networks, x4.\n")
     print("\n".join(ablations(by_name)))
+    print("## What the paper finds\n")
+    print("\n".join(claims(by_name, result("quality")["rows"], measured)))
 
 
 if __name__ == "__main__":

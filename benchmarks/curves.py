@@ -3,7 +3,8 @@
 
     python -m benchmarks.curves docs/images/training.png
 
-A column a log, `benchmarks/results/training_*.csv`; runs that went on from one another stand side by side.
+A column a log, `benchmarks/results/training_*.csv`; runs that went on from one another stand side by side. What they
+gained is PSNR since each began: from run to run views, references and losses changed, and with them every figure.
 """
 
 from __future__ import annotations
@@ -18,17 +19,18 @@ Curve = tuple[list[float], list[float]]
 
 
 def read(path: Path) -> dict[str, tuple[Curve, Curve]]:
-    """Of every run: PSNR on held-out views and training loss, by minutes of the log."""
+    """Of every run: gain in PSNR on held-out views, and training loss, by minutes of the log."""
     runs: dict[str, tuple[Curve, Curve]] = {}
     before = 0.0
     with path.open(newline="") as file:
         for name, rows in itertools.groupby(csv.DictReader(file), key=lambda row: row.get("run", "")):
             psnr, loss = runs.setdefault(name, (([], []), ([], [])))
-            minutes = before
+            minutes, start = before, None
             for row in rows:
                 minutes = before + float(row["minutes"])
+                start = float(row["psnr"]) if start is None else start
                 psnr[0].append(minutes)
-                psnr[1].append(float(row["psnr"]))
+                psnr[1].append(float(row["psnr"]) - start)
                 if float(row["loss"]):  # none yet before the first step
                     loss[0].append(minutes)
                     loss[1].append(float(row["loss"]))
@@ -55,7 +57,7 @@ def draw(logs: list[Path], picture: Path) -> None:
             axis.tick_params(labelsize=8)
         if lower.get_legend_handles_labels()[1]:
             lower.legend(fontsize=6, ncol=2)
-    axes[0][0].set_ylabel("PSNR on held-out views, dB")
+    axes[0][0].set_ylabel("gained on held-out views, dB")
     axes[1][0].set_ylabel("training loss")
     figure.tight_layout()
     figure.savefig(picture, dpi=100)

@@ -495,3 +495,23 @@ def test_onnx_file_of_a_pyramid_agrees_with_it(
     rounded = {name for node in quantised.graph.node if node.op_type == "QuantizeLinear" for name in node.input[:1]}
     readers = {node.op_type for node in quantised.graph.node if rounded & set(node.input)}
     assert readers == {"QuantizeLinear"}
+
+
+def test_the_mean_of_checkpoints_is_one(tmp_path: Path) -> None:
+    from training import average, export
+
+    def state(value: float, denoiser: str = "") -> dict:
+        network = PyramidFusion(channels=(8, 8, 8, 8, 8))
+        weights = {name: torch.full_like(tensor, value) for name, tensor in network.state_dict().items()}
+        return {"ema": weights, "network": weights, "optimizer": {}, "step": 5, "provenance": {"steps": value}} | {
+            "architecture": "pyramid", "config": network.config, "denoiser": denoiser
+        }  # fmt: skip
+
+    both = average.mean([state(1.0), state(2.0)])
+    assert both["provenance"] == {"steps": 2.0, "mean_of": [{"steps": 1.0}, {"steps": 2.0}]}
+    assert "network" not in both and "optimizer" not in both
+    torch.save(both, tmp_path / "mean.pt")
+    network, _ = export.load(tmp_path / "mean.pt")
+    assert all((parameter == 1.5).all() for parameter in network.parameters())
+    with pytest.raises(SystemExit, match="different networks"):
+        average.mean([state(1.0), state(1.0, "high")])

@@ -5,7 +5,8 @@
     python -m benchmarks.chart -o docs/chart.html              # also against render and all, and every scene
     python -m benchmarks.chart --scene lamp --total -o lamp.svg
 
-A column an average spp; a point a model or peer. Left and up is better (errors are drawn downwards).
+A column an average spp; a point a model or peer. Left and up is better (errors are drawn downwards). Dashed: where the
+HRLS has as large a part of the samples as was measured, instead of half.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ matplotlib.use("Agg")
 import matplotlib.pyplot as plt
 from matplotlib.ticker import LogLocator
 
+from benchmarks.quality import UNEVEN
 from benchmarks.scenes import NOISY_REFERENCE
 
 #: Peer of `benchmarks.quality` -> marker, and what it runs as `benchmarks.runtime` names it. Families of models
@@ -74,6 +76,7 @@ def draw(rows: list[dict[str, Any]], timings: Timings, scene: str | None, *, tot
         families.setdefault(name.rpartition("-x")[0], []).append(name)
     averages = sorted({row["spp"] for row in rows})
     measures = {measure: label for measure, label in MEASURES.items() if measure in rows[0]}
+    measured = {(row["method"], row["spp"]) for row in rows if scene in (None, row["scene"])}
     figure, axes = plt.subplots(
         len(measures),
         len(averages),
@@ -88,6 +91,12 @@ def draw(rows: list[dict[str, Any]], timings: Timings, scene: str | None, *, tot
             for colour, (family, members) in zip(COLOURS, families.items(), strict=False):
                 points = [(before + seconds[name], mean(rows, name, spp, measure, scene)) for name in members]
                 axis.plot(*zip(*points, strict=True), "-o", color=colour, label=family, linewidth=1)
+                for more, less in reversed(UNEVEN):
+                    uneven = [f"{name}, {more}:{less}" for name in members]
+                    if all((name, spp) in measured for name in uneven):
+                        values = [mean(rows, name, spp, measure, scene) for name in uneven]
+                        axis.plot([x for x, _ in points], values, "--^", color=colour, linewidth=1, markersize=4)
+                        break
                 for name, point in zip(members, points, strict=True):
                     axis.annotate(name.rpartition("-")[2], point, (4, 4), textcoords="offset points", fontsize=8)
             for peer, (marker, run) in PEERS.items():

@@ -154,9 +154,11 @@ def print_tables(rows: list[dict[str, Any]]) -> None:
             print("| method | mean | " + " | ".join(f"{s}{'*' if s in NOISY_REFERENCE else ''}" for s in names) + " |")
             print("|---|" + "---|" * (len(names) + 1))
             for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
-                here = [row for row in rows if row["spp"] == spp and row["method"] == method]
-                values = [np.mean([row[measure] for row in here if row["scene"] == s]) for s in names]
-                cells = [form.format(v) for v in (mean_of(rows, method, spp, measure), *values)]
+                cells = [form.format(mean_of(rows, method, spp, measure))]
+                for name in names:
+                    case = (method, spp, name)
+                    values = [row[measure] for row in rows if (row["method"], row["spp"], row["scene"]) == case]
+                    cells.append(form.format(np.mean(values)) if values else "")
                 print(f"| {method} | " + " | ".join(cells) + " |")
     if NOISY_REFERENCE & set(names):
         print("\n\\* noisy reference, not in the mean")

@@ -135,6 +135,45 @@ def cycles() -> str:
     return table(head, [[code(m), *_cells(rows, m, ("psnr", "relmse", "flip"))] for m in methods])
 
 
+def total() -> str:
+    """What is gained on OIDN at the same time in all, render included, and how slow a render must be to gain anything.
+
+    OIDN's PSNR at the samples that our time would have bought is interpolated over the logarithm of its own.
+    """
+    rows, results, renders = rows_of("quality"), result("runtime")["results"], result("render_time")["seconds_per_spp"]
+    seconds = {name: float(np.median(entry["seconds"])) for name, entry in results.items()}
+    psnr = {(row["method"], row["spp"], row["scene"]): row["psnr"] for row in rows}
+    judged = [name for name in renders if name not in quality.NOISY_REFERENCE]
+    # On the HRLS of 1 spp, and on full resolution
+    known = [("OIDN on the HRLS", 2), *(("OIDN, same samples", spp) for spp in quality.AVERAGES)]
+    octaves = np.log2([1, *quality.AVERAGES])
+
+    def gain(name: str, spp: int, scene: str, more: float) -> float:
+        """On OIDN with so many more samples; beyond the most that were measured, it goes on as before."""
+        values = [psnr[method, n, scene] for method, n in known]
+        at = np.log2(spp + more)
+        beyond = max(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
+        return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
+
+    body = []
+    for model in ("pyramid-oidn-x2", "pyramid-oidn-x4"):
+        slower = seconds[model] - seconds[OIDN]
+        for spp in quality.AVERAGES:
+            for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
+                if (name, spp, judged[0]) not in psnr:
+                    continue
+                gains = [gain(name, spp, scene, slower / renders[scene]["hrls"]) for scene in judged]
+                # Of ever slower renders, the first that is worth it
+                pays = next(
+                    (f"{cost:.2g} s" for cost in np.geomspace(0.1, 100, 301)
+                     if np.mean([gain(name, spp, scene, slower / cost) for scene in judged]) >= 0),
+                    "never",
+                )  # fmt: skip
+                cells = (f"{value:+.2f}" for value in (float(np.mean(gains)), *gains))
+                body.append([code(name), str(spp), pays, *cells])
+    return table(["", "spp", "pays from, a spp", "mean", *judged], body)
+
+
 def errors() -> str:
     """Predicted errors against actual ones."""
     with contextlib.redirect_stdout(io.StringIO()) as printed:
@@ -144,7 +183,7 @@ def errors() -> str:
 
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (accuracy, runtime),
-    ROOT / "docs/results.md": (scenes, filters, cycles, errors),
+    ROOT / "docs/results.md": (scenes, total, filters, cycles, errors),
 }
 
 

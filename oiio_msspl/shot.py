@@ -370,7 +370,10 @@ def _run(
                 # One frame is written at a time, and results are told in the order of the frames.
                 finish_writing()
                 if error is None:
-                    writing = frame, made, writer.submit(stages.write, made, fused)
+                    # Known before it is handed over: a signal may come while that is done
+                    outcome: Future[None] = Future()
+                    writing = frame, made, outcome
+                    writer.submit(_settle, outcome, stages.write, made, fused)
                     del made, fused
                 else:
                     failed(frame, error)
@@ -379,7 +382,19 @@ def _run(
         finally:
             for reading in ahead:
                 reading.cancel()
-            finish_writing()
+            writer.shutdown()
+            if writing is not None and writing[2].done():  # else it was never handed over
+                finish_writing()
+
+
+def _settle(outcome: Future[None], write: Callable[[Report, Fused], None], report: Report, fused: Fused) -> None:
+    """Write, and say how that ended."""
+    try:
+        write(report, fused)
+    except BaseException as error:
+        outcome.set_exception(error)
+    else:
+        outcome.set_result(None)
 
 
 def _run_on_cluster(

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import OpenEXR
@@ -609,6 +610,27 @@ def test_a_signal_between_writing_and_recording_loses_no_frame(make, bilinear_mo
     report = json.loads((folder / "r.json").read_text())
     files = sorted(path.name for path in (folder / "out").iterdir())
     assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]] != []
+
+
+def test_a_frame_that_is_handed_over_as_the_signal_comes_is_reported(make, bilinear_models, monkeypatch):
+    folder = make(5)
+    submit, handed_over = ThreadPoolExecutor.submit, []
+
+    def interrupted(self, work, *arguments):
+        future = submit(self, work, *arguments)
+        if self._thread_name_prefix == "write":
+            handed_over.append(work)
+            if len(handed_over) == 3:
+                raise KeyboardInterrupt
+        return future
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, bilinear_models[4], report_path=folder / "r.json", previews=False)
+    report = json.loads((folder / "r.json").read_text())
+    files = sorted(path.name for path in (folder / "out").iterdir())
+    assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]]
+    assert len(files) == 3
 
 
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])

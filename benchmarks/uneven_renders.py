@@ -26,7 +26,6 @@ CROPS = {
     "tire": (1280, (384, 704)),
 }
 SPP = (3, 6, 7)
-CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.T")
 
 
 def render(file: Path, folder: Path, longer: int, offset: tuple[int, int]) -> None:
@@ -46,7 +45,7 @@ def render(file: Path, folder: Path, longer: int, offset: tuple[int, int]) -> No
         path = folder / f"hr_{spp}spp.exr"
         if not path.exists():
             image = np.array(mi.render(scene, integrator=integrator, spp=spp, seed=(300 + i) * 1000))
-            write_exr(path, np.where(np.isfinite(image), image, 0), CHANNELS)
+            write_exr(path, np.where(np.isfinite(image), image, 0))
 
 
 def main() -> None:

@@ -93,8 +93,9 @@ class Denoiser:
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        low = _with(lrhs, self.together(lrhs, hrls))
-        return low, hrls if self._high is None else _with(hrls, self._denoised(self._high, _layers(hrls)))
+        layers = _layers(hrls)
+        low = _with(lrhs, self._together(lrhs, layers))
+        return low, hrls if self._high is None else _with(hrls, self._denoised(self._high, layers))
 
     def together(self, lrhs: Array, hrls: Array) -> Array:
         """Of the same arguments, radiance of both renders denoised together at the LRHS's resolution, (h, w, 3).
@@ -102,8 +103,11 @@ class Denoiser:
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        scale = hrls.shape[0] // lrhs.shape[0]
-        low = {name: transforms.box_downsample(image, scale) for name, image in _layers(hrls).items()}
+        return self._together(lrhs, _layers(hrls))
+
+    def _together(self, lrhs: Array, layers: dict[str, Array]) -> Array:
+        scale = layers["color"].shape[0] // lrhs.shape[0]
+        low = {name: transforms.box_downsample(image, scale) for name, image in layers.items()}
         share = lrhs_share(lrhs, transforms.compress(low["color"], 1.0))
         low["color"] = share * transforms.expand(lrhs, 1.0) + (1 - share) * low["color"]
         filter_ = self._low

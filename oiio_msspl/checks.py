@@ -12,7 +12,7 @@ from oiio_msspl import schema, tensors
 from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import Pairing, Source
 from oiio_msspl.render import Array, Window
-from oiio_msspl.transforms import luminance
+from oiio_msspl.transforms import box_downsample, luminance
 
 #: Correlation of log luminance below which two renders hardly show one frame. Measured with a 1-spp HRLS: 0.83 to 0.99
 #: on scenes with clean references, 0.31 where nearly all light is fireflies; between different scenes -0.2 to 0.25.
@@ -103,8 +103,7 @@ def _averaged(hr: Source, pairing: Pairing) -> dict[str, Array]:
         want = Window(grid.x0 * s, y0 * s, grid.x1 * s, min(y0 + BAND, grid.y1) * s)
         layers = tensors.read(hr, want, pairing.hr_data, features=[schema.RGB, schema.ALBEDO])
         for name, values in layers.items():
-            y = luminance(values)
-            bands.setdefault(name, []).append(y.reshape(y.shape[0] // s, s, grid.width, s).mean((1, 3)))
+            bands.setdefault(name, []).append(luminance(box_downsample(values, s)))
     return {name: np.concatenate(parts) for name, parts in bands.items()}
 
 
@@ -162,7 +161,9 @@ def _shift(low: Array, high: Array) -> NDArray[np.float64]:
     # Between 0 and 1: neither fireflies nor black pixels rule.
     low, high = (_smoothed(v[rows, columns] / (v[rows, columns] + grey)) for v in (low, high))
     far = 4 * _fit(_smoothed(_quarter(low)), _smoothed(_quarter(high)), nothing).shift
-    fit = min((_fit(low, high, start) for start in (nothing, np.clip(far, -12, 12))), key=lambda fit: fit.residual)
+    # From a start half a pixel away, the same would be found again
+    starts = [nothing] if np.abs(far).max() < 0.5 else [nothing, np.clip(far, -12, 12)]
+    fit = min((_fit(low, high, start) for start in starts), key=lambda fit: fit.residual)
     if fit.correlation < SHIFT_CORRELATION:
         return nothing
     return np.where(np.abs(fit.shift) > CERTAIN * fit.error, fit.shift, 0)
@@ -211,25 +212,26 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
         inner = slice(margin, -margin)
         moved = _moved(low, shift)
         gy, gx = np.gradient(moved)
-        terms = np.stack([-gx, -gy, moved, np.ones_like(moved)], axis=-1)[inner, inner]
-        rest = (high - moved)[inner, inner]
-        pairs = list(zip(_blocks(terms), _blocks(rest), strict=True))
-        squares = np.stack([np.einsum("hwi,hwj->ij", t, t, dtype=np.float64) for t, _ in pairs])
-        products = np.stack([np.einsum("hwi,hw->i", t, r, dtype=np.float64) for t, r in pairs])
+        planes = np.stack([-gx, -gy, moved, np.ones_like(moved), high - moved])[:, inner, inner]
+        # Of each block, the products of all planes with all; in double precision, for they are nearly the same plane
+        blocks = (block.reshape(len(planes), -1).astype(np.float64) for block in _blocks(planes))
+        dots = np.stack([block @ block.T for block in blocks])
+        squares, products = dots[:, :4, :4], dots[:, :4, 4]
         total = squares.sum(0) + 1e-9 * squares.sum(0).trace() * np.eye(4)  # solvable without any gradient, too
         step = np.linalg.solve(total, products.sum(0))
         shift = np.clip(shift + np.clip(step[:2], -1, 1), -min(low.shape) / 4, min(low.shape) / 4)
         if np.abs(step[:2]).max() < 0.01:
             break
     without = np.linalg.solve(total - squares, (products.sum(0) - products)[..., None])[:, :2, 0]
-    residual = float(np.square(rest).mean() - step @ products.sum(0) / rest.size)
+    residual = float(dots[:, 4, 4].sum() - step @ products.sum(0)) / planes[0].size
     spread = float(moved[inner, inner].std() * high[inner, inner].std())
     covariance = float(np.mean((moved - moved[inner, inner].mean())[inner, inner] * high[inner, inner]))
     return _Fit(shift, _jackknife(without), residual, covariance / max(spread, 1e-12))
 
 
 def _blocks(values: Array) -> list[Array]:
-    return [block for rows in np.array_split(values, BLOCKS, 0) for block in np.array_split(rows, BLOCKS, 1)]
+    """Of planes (..., h, w)."""
+    return [block for rows in np.array_split(values, BLOCKS, -2) for block in np.array_split(rows, BLOCKS, -1)]
 
 
 def _jackknife(without: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -262,4 +264,4 @@ def _smoothed(values: Array) -> Array:
 def _quarter(values: Array) -> Array:
     """Mean of 4 x 4 pixels."""
     height, width = (n // 4 for n in values.shape)
-    return values[: height * 4, : width * 4].reshape(height, 4, width, 4).mean((1, 3))
+    return box_downsample(values[: height * 4, : width * 4], 4)

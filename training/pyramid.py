@@ -75,13 +75,12 @@ def double(image: Tensor) -> Tensor:
 
 def to_phases(image: Tensor) -> Tensor:
     """(N, C, H, W) to (N, C, 4, H/2, W/2): the pixels of every 2x2 square one behind the other."""
-    height, width = image.shape[-2] // 2, image.shape[-1] // 2
-    return image.unflatten(3, (width, 2)).unflatten(2, (height, 2)).permute(0, 1, 3, 5, 2, 4).flatten(2, 3)
+    return F.pixel_unshuffle(image, 2).unflatten(1, (-1, 4))
 
 
 def from_phases(image: Tensor) -> Tensor:
     """(N, C, 4, H/2, W/2) to (N, C, H, W)."""
-    return image.unflatten(2, (2, 2)).permute(0, 1, 4, 2, 5, 3).flatten(4, 5).flatten(2, 3)
+    return F.pixel_shuffle(image.flatten(1, 2), 2)
 
 
 def weighted_sum(weights: Tensor, image: Tensor, dilation: int = 1) -> Tensor:
@@ -194,9 +193,10 @@ def pointwise_split(head: nn.Conv2d, features: Tensor, sizes: list[int]) -> list
     """The same in parts of so many channels. Its weights are split instead of the result, which would be copied."""
     assert head.bias is not None
     flat = features.contiguous().flatten(2)
+    images = flat.unbind() if len(flat) > 1 else [flat.flatten(0, 1)]  # which takes no copy
     # A product and a sum in one, which ONNX has for matrices alone
     planes = (
-        torch.stack([torch.addmm(bias[:, None], weight, image) for image in flat]) if len(weight) else flat[:, :0]
+        torch.stack([torch.addmm(bias[:, None], weight, image) for image in images]) if len(weight) else flat[:, :0]
         for weight, bias in zip(head.weight.flatten(1).split(sizes), head.bias.split(sizes), strict=True)
     )
     return [part.unflatten(2, features.shape[2:]) for part in planes]
@@ -256,9 +256,10 @@ def chosen(logits: Tensor, candidates: list[Tensor | None], tint: Tensor | None)
         present = {i: logarithmic(image * tint) for i, image in present.items()}
     if len(present) == 1:
         return next(iter(present.values()))
-    weights = torch.softmax(torch.cat([logits[:, i : i + 1] for i in present], dim=1), dim=1)
-    weights = MIN_SHARE + (1 - len(present) * MIN_SHARE) * weights
-    terms = (weights[:, k : k + 1] * image for k, image in enumerate(present.values()))
+    # Plane by plane: ONNX Runtime's softmax over another axis than the last takes several times as long
+    weights = [positive(logits[:, i : i + 1]) for i in present]
+    rest = (1 - len(present) * MIN_SHARE) / functools.reduce(torch.add, weights)
+    terms = ((MIN_SHARE + rest * weight) * image for weight, image in zip(weights, present.values(), strict=True))
     return functools.reduce(torch.add, terms)
 
 

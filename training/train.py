@@ -36,7 +36,7 @@ from oiio_msspl.denoiser import MODES, Denoiser
 from training import batches, data, losses
 from training.networks import NETWORKS, Network, run
 from training.paper import MultiResolutionFusion
-from training.pyramid import PyramidFusion
+from training.pyramid import LEVELS, PyramidFusion
 
 log = logging.getLogger(__name__)
 
@@ -178,7 +178,7 @@ def warm_start(network: Network, path: Path) -> None:
 def middle_taps(parameter: Tensor, size: int, wanted: int, phases: int) -> Tensor:
     """A parameter of a pyramid's head, whose first outputs are size x size taps for each phase, with fewer of them."""
     if size < wanted:
-        raise SystemExit(f"--finest-kernel: the network to start from has {size}x{size} taps, and no more can be added")
+        raise SystemExit(f"--kernels: the network to start from has {size}x{size} taps, and no more can be added")
     outputs = parameter.unflatten(0, (-1, phases))
     margin = (size - wanted) // 2
     middle = slice(margin, margin + wanted)
@@ -234,8 +234,7 @@ def train(args: argparse.Namespace) -> None:
     network: Network
     denoiser = Denoiser(args.threads, args.denoiser) if args.denoiser else None
     if args.network == "pyramid":
-        own_size = (args.finest_kernel, 5, 5, 5, 5)
-        network = PyramidFusion(channels=args.channels, own_size=own_size, denoiser=args.denoiser)
+        network = PyramidFusion(channels=args.channels, own_size=args.kernels, denoiser=args.denoiser)
     elif args.denoiser:
         raise SystemExit("--denoiser: for the pyramid network")
     elif len(scales) == 1:
@@ -411,7 +410,12 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="of the levels H/2, H/4, ... of a pyramid network",
     )
     parser.add_argument(
-        "--finest-kernel", type=int, default=5, help="taps across at a pyramid network's full resolution"
+        "--kernels",
+        type=int,
+        nargs=LEVELS,
+        default=(5,) * LEVELS,
+        metavar="TAPS",
+        help="taps across of a pyramid network's kernels at H, H/2, ...",
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The U-Net of an exported network in 8 bits: half the time on CPUs, a quarter of the weights.
+"""Convolutions of an exported network in 8 bits: half the time on CPUs, a quarter of the weights.
 
-Only features are quantised: convolutions, and what adds and enlarges their results. What becomes colour stays in
-float32: the renders' own values and the kernels' logits.
+Only convolutions are quantised, which make features. What becomes colour stays in float32: the renders' own values and
+the kernels' logits.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ BATCHES, BATCH, PATCH = 12, 2, 192
 
 
 def quantise(model: onnx.ModelProto, contract: Contract, views: Path) -> onnx.ModelProto:
-    """A copy of ``model``, an export in float32, whose features are made in 8 bits.
+    """A copy of ``model``, an export in float32, whose convolutions run in 8 bits.
 
     Weights have 7 bits: processors without VNNI instructions add two products in 16 bits.
 
@@ -44,8 +44,8 @@ def quantise(model: onnx.ModelProto, contract: Contract, views: Path) -> onnx.Mo
             quantised,
             _Samples(contract, views),
             quant_format=QuantFormat.QDQ,
-            op_types_to_quantize=["Conv", "Add", "Resize"],
-            nodes_to_quantize=_feature_nodes(separate.graph),
+            op_types_to_quantize=["Conv"],
+            nodes_to_exclude=[node.name for node in separate.graph.node if _sorts_pixels(node)],
             per_channel=True,
             reduce_range=True,
             activation_type=QuantType.QUInt8,
@@ -59,17 +59,9 @@ def quantise(model: onnx.ModelProto, contract: Contract, views: Path) -> onnx.Mo
     return result
 
 
-def _feature_nodes(graph: onnx.GraphProto) -> list[str]:
-    """Names of the convolutions, but for those that only sort pixels, and of what works on their results alone."""
-    features: set[str] = set()
-    names = []
-    for node in graph.node:
-        convolution = node.op_type == "Conv" and not any(a.name == "group" and a.i > 1 for a in node.attribute)
-        read = node.input[:1] if node.op_type == "Resize" else node.input
-        if convolution or (node.op_type in ("Add", "Resize", "Relu") and features.issuperset(read)):
-            features.update(node.output)
-            names.append(node.name)
-    return names
+def _sorts_pixels(node: onnx.NodeProto) -> bool:
+    """Whether a node is the export's pixel unshuffle: a convolution of each plane for itself."""
+    return node.op_type == "Conv" and any(a.name == "group" and a.i > 1 for a in node.attribute)
 
 
 def _with_inputs_of_their_own(model: onnx.ModelProto) -> onnx.ModelProto:
@@ -80,7 +72,7 @@ def _with_inputs_of_their_own(model: onnx.ModelProto) -> onnx.ModelProto:
     readers = collections.Counter(name for node in copy.graph.node for name in set(node.input))
     nodes = []
     for node in copy.graph.node:
-        if node.op_type == "Conv" and readers[node.input[0]] > 1:
+        if node.op_type == "Conv" and not _sorts_pixels(node) and readers[node.input[0]] > 1:
             own = f"{node.name}.input"
             nodes.append(helper.make_node("Identity", [node.input[0]], [own], name=f"{node.name}.identity"))
             node.input[0] = own

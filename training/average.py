@@ -3,6 +3,8 @@
 
     python -m training.average training/checkpoints/NEW.pt training/checkpoints/OLD.pt RUN/checkpoint.pt
 
+Where kernels of the last one have fewer taps, the others' are cut to them.
+
 Between a network and what more training made of it lie others that have most of what either is better at (Wortsman et
 al. 2022). The result is stored in half precision, and says of itself what the last one does.
 """
@@ -15,7 +17,7 @@ from typing import Any
 
 import torch
 
-from training.train import save
+from training.train import cut_kernels, save
 
 #: What only the run itself needs.
 OF_THE_RUN = ("network", "optimizer", "best_gain")
@@ -28,6 +30,10 @@ def mean(states: list[dict[str, Any]]) -> dict[str, Any]:
         SystemExit: they are of different networks.
     """
     last = states[-1]
+    for state in states[:-1]:
+        if "own_size" in last["config"] and state["config"].keys() == last["config"].keys():
+            cut_kernels(state["ema"], state["config"]["own_size"], last["config"]["own_size"])
+            state["config"]["own_size"] = last["config"]["own_size"]
     if any((state["config"], state["denoiser"]) != (last["config"], last["denoiser"]) for state in states):
         raise SystemExit("these checkpoints are of different networks")
     weights = {name: torch.stack([state["ema"][name].float() for state in states]).mean(dim=0) for name in last["ema"]}

@@ -21,7 +21,7 @@ import math
 import os
 import signal
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -159,9 +159,7 @@ def warm_start(network: Network, path: Path) -> None:
     if isinstance(network, PyramidFusion):
         if "own_size" not in state["config"]:
             raise SystemExit(f"--init {path}: that is no pyramid network, and nothing of it fits one")
-        for level, (size, wanted) in enumerate(zip(state["config"]["own_size"], network.own_size, strict=True)):
-            for name in (f"heads.{level}.weight", f"heads.{level}.bias"):
-                theirs[name] = middle_taps(theirs[name], size, wanted, 1 if level else 4)
+        cut_kernels(theirs, state["config"]["own_size"], network.own_size)
     for name, value in theirs.items():
         # What a convolution reads beyond the other's inputs counts for nothing at first; what it makes beyond the
         # other's outputs begins as in a new network
@@ -173,6 +171,13 @@ def warm_start(network: Network, path: Path) -> None:
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
+
+
+def cut_kernels(weights: dict[str, Tensor], sizes: Sequence[int], wanted: Sequence[int]) -> None:
+    """Change a pyramid's weights, whose kernels are so many taps across by level, to those of one with fewer."""
+    for level, (size, fewer) in enumerate(zip(sizes, wanted, strict=True)):
+        for name in (f"heads.{level}.weight", f"heads.{level}.bias"):
+            weights[name] = middle_taps(weights[name], size, fewer, 1 if level else 4)
 
 
 def middle_taps(parameter: Tensor, size: int, wanted: int, phases: int) -> Tensor:

@@ -2,8 +2,9 @@
 """The mean of networks that went on from one another, as a checkpoint to export or to train on from.
 
     python -m training.average training/checkpoints/NEW.pt training/checkpoints/OLD.pt RUN/checkpoint.pt
+    python -m training.average training/checkpoints/NEW.pt RUN/checkpoint.pt --kernels 1 3 3 3 3
 
-Where kernels of the last one have fewer taps, the others' are cut to them.
+A pyramid's kernels are cut to ``--kernels``, or to those of the last one.
 
 Between a network and what more training made of it lie others that have most of what either is better at (Wortsman et
 al. 2022). The result is stored in half precision, and says of itself what the last one does.
@@ -17,37 +18,45 @@ from typing import Any
 
 import torch
 
+from training.pyramid import LEVELS
 from training.train import cut_kernels, save
 
 #: What only the run itself needs.
 OF_THE_RUN = ("network", "optimizer", "best_gain")
 
 
-def mean(states: list[dict[str, Any]]) -> dict[str, Any]:
+def mean(states: list[dict[str, Any]], kernels: list[int] | None = None) -> dict[str, Any]:
     """A checkpoint with the mean of the averaged weights of several.
+
+    Args:
+        kernels: of a pyramid, by level; the last one's if None.
 
     Raises:
         SystemExit: they are of different networks.
     """
     last = states[-1]
-    for state in states[:-1]:
-        if "own_size" in last["config"] and state["config"].keys() == last["config"].keys():
-            cut_kernels(state["ema"], state["config"]["own_size"], last["config"]["own_size"])
-            state["config"]["own_size"] = last["config"]["own_size"]
+    kernels = kernels or last["config"].get("own_size")
+    for state in states:
+        if kernels and "own_size" in state["config"]:
+            cut_kernels(state["ema"], state["config"]["own_size"], kernels)
+            state["config"]["own_size"] = kernels
     if any((state["config"], state["denoiser"]) != (last["config"], last["denoiser"]) for state in states):
         raise SystemExit("these checkpoints are of different networks")
     weights = {name: torch.stack([state["ema"][name].float() for state in states]).mean(dim=0) for name in last["ema"]}
     kept = {name: value for name, value in last.items() if name not in OF_THE_RUN}
-    provenance = last["provenance"] | {"mean_of": [state["provenance"] for state in states]}
-    return kept | {"ema": {name: value.half() for name, value in weights.items()}, "provenance": provenance}
+    if len(states) > 1:
+        kept["provenance"] = last["provenance"] | {"mean_of": [state["provenance"] for state in states]}
+    return kept | {"ema": {name: value.half() for name, value in weights.items()}}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("checkpoints", type=Path, nargs="+")
+    parser.add_argument("--kernels", type=int, nargs=LEVELS, metavar="TAPS", help="as of training.train")
     args = parser.parse_args()
-    save(mean([torch.load(path, map_location="cpu", weights_only=True) for path in args.checkpoints]), args.out)
+    states = [torch.load(path, map_location="cpu", weights_only=True) for path in args.checkpoints]
+    save(mean(states, args.kernels), args.out)
 
 
 if __name__ == "__main__":

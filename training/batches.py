@@ -256,11 +256,13 @@ class Batches:
         self._views = self._load()
         self._queue: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
         self._ahead = device.type == "cpu"
-        if self._ahead:
-            threading.Thread(target=self._work, daemon=True).start()
+        self._worker: threading.Thread | None = None
 
     def next(self) -> Batch:
         start = time.monotonic()
+        if self._ahead and self._worker is None:  # not before: a run that only evaluates must not end amid its work
+            self._worker = threading.Thread(target=self._work, daemon=True)
+            self._worker.start()
         item = self._queue.get() if self._ahead else self._draw()
         self.waited += time.monotonic() - start
         if isinstance(item, BaseException):

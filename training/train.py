@@ -349,7 +349,7 @@ def train(args: argparse.Namespace) -> None:
     checkpoint()
     next_checkpoint = elapsed + args.checkpoint_seconds
     usual = math.inf
-    while not stop:
+    while not stop and elapsed < budget:
         # One step
         step += 1
         for group in optimizer.param_groups:
@@ -373,8 +373,7 @@ def train(args: argparse.Namespace) -> None:
         since["steps"] += 1
         since["loss"] += float(loss.detach())
         elapsed = time.monotonic() - started
-        stop = stop or elapsed >= budget
-        if stop or elapsed >= next_checkpoint:
+        if stop or elapsed >= min(budget, next_checkpoint):
             checkpoint()
             next_checkpoint = elapsed + args.checkpoint_seconds
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lay out what was measured: README.md and docs/results.md have the figures of `benchmarks/results/*.json`.
+"""Lay out what was measured: README.md, docs/results.md and docs/pyramid.md have the figures of
+`benchmarks/results/*.json`.
 
     python -m benchmarks.tables
 
@@ -125,6 +126,25 @@ def filters() -> str:
     return table(head, body) + between + table(["filter, spp", *judged], differences)
 
 
+def division() -> str:
+    """What it is worth to give the HRLS more than half of the samples: box filter, all layers."""
+    rows = rows_of("quality_box")
+    measured = {(row["method"], row["spp"]) for row in rows}
+    ways = ["", *(f", {more}:{less}" for more, less in quality.UNEVEN)]
+    columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (BEST + way, spp) in measured]
+    body = [
+        [code(name)]
+        + [
+            FORMS["psnr"].format(quality.mean_of(rows, name + way, spp, "psnr"))
+            if (name + way, spp) in measured
+            else ""  # OIDN has one render
+            for spp, way in columns
+        ]
+        for name in ("pyramid-oidn-x2", "pyramid-oidn-x4", "pyramid-x4", "OIDN, same samples")
+    ]
+    return table(["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)], body)
+
+
 def cycles() -> str:
     """Views by Cycles, with both footprints of the LRHS."""
     rows = rows_of("quality_cycles")
@@ -184,6 +204,7 @@ def errors() -> str:
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (accuracy, runtime),
     ROOT / "docs/results.md": (scenes, total, filters, cycles, errors),
+    ROOT / "docs/pyramid.md": (division,),
 }
 
 

@@ -89,16 +89,23 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     and width that are multiples of the contract's alignment, and that contract."""
     scale, alignment = contract.scale, contract.alignment
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
-    paper = isinstance(network, MultiResolutionFusion)
+    aten = torch.ops.aten
+    traced: Network
+    if isinstance(network, MultiResolutionFusion):
+        traced, outputs = _with_onnx_channel_order(network), ["fused"]
+        translations = {aten.pixel_unshuffle.default: _space_to_depth}
+    else:
+        traced, outputs = network, ["fused", "log_error"]
+        translations = {aten.pixel_unshuffle.default: _unshuffle, aten.pixel_shuffle.default: _shuffle}
     program = torch.onnx.export(
-        _with_onnx_channel_order(network) if isinstance(network, MultiResolutionFusion) else network,
+        traced,
         example(network, scale, 4 * alignment, 6 * alignment),
         input_names=["lrhs", "hrls"],
-        output_names=["fused"] if paper else ["fused", "log_error"],
+        output_names=outputs,
         opset_version=OPSET,
         dynamo=True,
         dynamic_shapes=tuple({2: size * height, 3: size * width} for size in (alignment, scale * alignment)),
-        custom_translation_table=_OF_PAPER if paper else _OF_PYRAMID,
+        custom_translation_table=translations,
         verbose=False,
     )
     model = program.model_proto
@@ -133,10 +140,6 @@ def _taps(planes: int, size: int):
     """(planes * size**2, 1, size, size): for each plane, kernels of each one of the taps."""
     taps = np.tile(np.eye(size**2, dtype=np.float32), (planes, 1)).reshape(-1, 1, size, size)
     return opset18.Constant(value=numpy_helper.from_array(taps))
-
-
-_OF_PAPER = {torch.ops.aten.pixel_unshuffle.default: _space_to_depth}
-_OF_PYRAMID = {torch.ops.aten.pixel_unshuffle.default: _unshuffle, torch.ops.aten.pixel_shuffle.default: _shuffle}
 
 
 def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:

@@ -23,6 +23,7 @@ from oiio_msspl.render import Array
 if TYPE_CHECKING:
     import pyoidn
 
+_OF_LRHS, _OF_HRLS = sum(schema.LRHS_FEATURES.values()), sum(schema.HRLS_FEATURES.values())
 _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.values()]), strict=False))
 
 
@@ -94,9 +95,25 @@ class Denoiser:
         Raises:
             MssplError: Open Image Denoise failed.
         """
+        low = _with_room(lrhs)
+        high = hrls if self._high is None else _with_room(hrls)
+        self.fill(low, high)
+        return low, high
+
+    def fill(self, lrhs: Array, hrls: Array) -> None:
+        """The same in place: what is denoised is written behind the renders' own channels, which must have room for it.
+
+        Args:
+            lrhs: (h, w, 6).
+            hrls: (s*h, s*w, 19); 16 in mode ``low``.
+
+        Raises:
+            MssplError: Open Image Denoise failed.
+        """
         layers = _layers(hrls)
-        low = _with(lrhs, self._together(lrhs, layers))
-        return low, hrls if self._high is None else _with(hrls, self._denoised(self._high, layers))
+        _write(self._together(lrhs[..., :_OF_LRHS], layers), lrhs[..., _OF_LRHS:])
+        if self._high is not None:
+            _write(self._denoised(self._high, layers), hrls[..., _OF_HRLS:])
 
     def together(self, lrhs: Array, hrls: Array) -> Array:
         """Of the same arguments, radiance of both renders denoised together at the LRHS's resolution, (h, w, 3).
@@ -135,16 +152,24 @@ class Denoiser:
         return images["output"]
 
 
-def _with(image: Array, denoised: Array) -> Array:
-    """An image with denoised radiance as further channels, which lie one behind the other in memory as those before."""
-    result = transforms.compress(np.maximum(denoised, 0.0), 1.0)
-    return np.concatenate([image.transpose(2, 0, 1), result.transpose(2, 0, 1)]).transpose(1, 2, 0)
+def _with_room(image: Array) -> Array:
+    """A copy with three channels more, which lie one behind the other in memory."""
+    height, width, channels = image.shape
+    copy = np.empty((channels + 3, height, width), dtype=np.float32).transpose(1, 2, 0)
+    copy[..., :channels] = image
+    return copy
+
+
+def _write(denoised: Array, out: Array) -> None:
+    """Denoised radiance as network values."""
+    transforms.compress(denoised, 1.0, out)
 
 
 def _layers(hrls: Array) -> dict[str, Array]:
     """The HRLS as Open Image Denoise takes it: radiance, and albedo and normal as far as they are there."""
     colour = {"color": transforms.expand(_feature(hrls, schema.RGB), 1.0)}
-    albedo, normal = np.clip(_feature(hrls, schema.ALBEDO), 0, 1), _feature(hrls, schema.NORMAL)
+    albedo = transforms.limited(_feature(hrls, schema.ALBEDO), 0.0, 1.0)
+    normal = transforms.limited(_feature(hrls, schema.NORMAL), -1.0, 1.0)
     # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
     if normal.any():
         return colour | {"albedo": albedo, "normal": normal}

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl import checks, schema, tensors, tiling, transforms
+from oiio_msspl import bands, checks, schema, tensors, tiling, transforms
 from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import Pairing, Source, pair
 from oiio_msspl.render import Array, Window
@@ -82,60 +82,61 @@ def fuse(
         raise InputError(f"model {contract.name} is for x{contract.scale}, but this pair is x{pairing.scale}")
     scale, grid = pairing.scale, tiling.aligned(pairing.grid, contract.alignment)
 
-    lr_repaired: dict[str, int] = {}
-    low = _read_low(lr, pairing, grid, lr_repaired)
-    frame = low[schema.RGB][pairing.grid.slices(grid)]
-    exposure = transforms.exposure_of(frame)
-    warnings = checks.check(frame, hr, pairing, lr.name)
-    hr_data = pairing.hr_data
-    rgb = np.zeros((hr_data.height, hr_data.width, 3), dtype=np.float32)
-    alpha: Array | None = None
-    errors = np.zeros((hr_data.height, hr_data.width, 1), dtype=np.float32) if error else None
-    hr_repaired: dict[str, int] = {}
-    # What is held of the frame: the result (colour, alpha, error) and the LRHS.
-    frame_bytes = rgb.nbytes * (5 if error else 4) // 3 + sum(values.nbytes for values in low.values())
-    largest = _largest_tile(session, frame_bytes, max_memory)
-    plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
-    dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
-    far_dark = _far(dark) if dark.any() else dark
-    seconds = session.seconds
-    for done, tile in enumerate(plan):
-        area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
-        target, inside = core.intersect(hr_data), tile.area.slices(grid)
-        layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
-        # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
-        # surface may be so dark that hardly a sample finds light; there, that takes more to believe.
-        empty: NDArray[np.bool_] | None = None
-        if dark[inside].any():
-            empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
-            empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
-        if empty is None or not empty.all():
-            lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
-            lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure)
-            hrls = tensors.pack(features, schema.HRLS_FEATURES, exposure)
-            means = transforms.compress(transforms.box_downsample(features[schema.RGB], scale), exposure)
-            seen = tile.area.intersect(pairing.grid).slices(tile.area)  # what lies beyond is made up
-            if np.abs(means[seen] - lrhs[seen]).max() <= CONVERGED:
-                results: tuple[Array, Array | None] = hrls[..., :3], np.zeros_like(hrls[..., :1])
-            else:
-                results = session.run(lrhs, hrls, error=error)
-            values, deviation = results
-            colour = transforms.expand(values, exposure)
-            if empty is not None:
-                colour *= ~empty
-            rgb[target.slices(hr_data)] = colour[target.slices(area)]
-            if errors is not None and deviation is not None:
-                linear = _linear_error(values, deviation, exposure)
+    with bands.threads(session.threads):
+        lr_repaired: dict[str, int] = {}
+        low = _read_low(lr, pairing, grid, lr_repaired)
+        frame = low[schema.RGB][pairing.grid.slices(grid)]
+        exposure = transforms.exposure_of(frame)
+        warnings = checks.check(frame, hr, pairing, lr.name)
+        hr_data = pairing.hr_data
+        rgb = np.zeros((hr_data.height, hr_data.width, 3), dtype=np.float32)
+        alpha: Array | None = None
+        errors = np.zeros((hr_data.height, hr_data.width, 1), dtype=np.float32) if error else None
+        hr_repaired: dict[str, int] = {}
+        # What is held of the frame: the result (colour, alpha, error) and the LRHS.
+        frame_bytes = rgb.nbytes * (5 if error else 4) // 3 + sum(values.nbytes for values in low.values())
+        largest = _largest_tile(session, frame_bytes, max_memory)
+        plan = list(tiling.tiles(grid, largest, contract.overlap, contract.alignment))
+        dark = np.all(low[schema.RGB] == 0, axis=-1, keepdims=True)
+        far_dark = _far(dark) if dark.any() else dark
+        seconds = session.seconds
+        for done, tile in enumerate(plan):
+            area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
+            target, inside = core.intersect(hr_data), tile.area.slices(grid)
+            layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
+            # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
+            # surface may be so dark that hardly a sample finds light; there, that takes more to believe.
+            empty: NDArray[np.bool_] | None = None
+            if dark[inside].any():
+                empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
+                empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
+            if empty is None or not empty.all():
+                lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
+                lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure, len(contract.lrhs))
+                hrls = tensors.pack(features, schema.HRLS_FEATURES, exposure, len(contract.hrls))
+                means = transforms.compress(transforms.box_downsample(features[schema.RGB], scale), exposure)
+                seen = tile.area.intersect(pairing.grid).slices(tile.area)  # what lies beyond is made up
+                if np.abs(means[seen] - lrhs[seen][..., :3]).max() <= CONVERGED:
+                    results: tuple[Array, Array | None] = hrls[..., :3], np.zeros_like(hrls[..., :1])
+                else:
+                    results = session.run(lrhs, hrls, error=error)
+                values, deviation = results
+                colour = rgb[target.slices(hr_data)]
+                transforms.expand(values[target.slices(area)], exposure, colour)
                 if empty is not None:
-                    linear *= ~empty
-                errors[target.slices(hr_data)] = linear[target.slices(area)]
-        if "alpha" in layers:
-            if alpha is None:
-                alpha = np.empty((hr_data.height, hr_data.width, 1), dtype=np.float32)
-            low_alpha = low["alpha"][inside] if "alpha" in low else None
-            alpha[target.slices(hr_data)] = _fuse_alpha(low_alpha, layers, session, scale)[target.slices(area)]
-        if progress is not None:
-            progress(done + 1, len(plan))
+                    colour *= ~empty[target.slices(area)]
+                if errors is not None and deviation is not None:
+                    linear = _linear_error(values, deviation, exposure)
+                    if empty is not None:
+                        linear *= ~empty
+                    errors[target.slices(hr_data)] = linear[target.slices(area)]
+            if "alpha" in layers:
+                if alpha is None:
+                    alpha = np.empty((hr_data.height, hr_data.width, 1), dtype=np.float32)
+                low_alpha = low["alpha"][inside] if "alpha" in low else None
+                alpha[target.slices(hr_data)] = _fuse_alpha(low_alpha, layers, session, scale)[target.slices(area)]
+            if progress is not None:
+                progress(done + 1, len(plan))
     if alpha is not None and "alpha" not in low:
         warnings.append("the LRHS has no alpha: that of the HRLS is kept, noise and all")
     repaired = {f"lrhs.{k}": v for k, v in lr_repaired.items()} | {f"hrls.{k}": v for k, v in hr_repaired.items()}
@@ -195,9 +196,21 @@ def _without_fireflies(low: Array, layers: dict[str, Array], scale: int) -> tupl
     lights = {}
     for name in schema.RADIANCE_FEATURES:
         if name in layers:
-            rows = layers[name].reshape(-1, scale, *layers[name].shape[1:])  # of each LRHS pixel
-            lights[name] = np.minimum(rows, over_high).reshape(layers[name].shape)
+            lights[name] = _darkest(layers[name], over_high, scale)
     return {schema.RGB: np.minimum(low, over_low)}, layers | lights
+
+
+def _darkest(values: Array, ceiling: Array, scale: int) -> Array:
+    """HRLS values (s*h, s*w, c), none above what its LRHS pixel's ceiling allows: (h, 1, s*w, c)."""
+    result = np.empty_like(values)
+
+    def work(rows: slice) -> None:
+        of_low = values[rows].reshape(-1, scale, *values.shape[1:])
+        limits = ceiling[rows.start // scale : rows.stop // scale]
+        result[rows] = np.minimum(of_low, limits).reshape(-1, *values.shape[1:])
+
+    bands.each(work, len(values), values[0].size, multiple=scale)
+    return result
 
 
 def _ceiling(low: Array) -> Array:
@@ -222,8 +235,9 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
         return solid.astype(np.float32)
     grey = {name: values for name, values in high.items() if name in (schema.ALBEDO, schema.NORMAL)}
     grey[schema.RGB] = np.repeat(alpha, 3, axis=-1)
-    lrhs = tensors.pack({schema.RGB: np.repeat(low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0)
-    values, _ = session.run(lrhs, tensors.pack(grey, schema.HRLS_FEATURES, 1.0))
+    contract = session.contract
+    lrhs = tensors.pack({schema.RGB: np.repeat(low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0, len(contract.lrhs))
+    values, _ = session.run(lrhs, tensors.pack(grey, schema.HRLS_FEATURES, 1.0, len(contract.hrls)))
     fused = np.clip(transforms.expand(values, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 

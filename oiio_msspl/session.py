@@ -127,12 +127,15 @@ class Session:
         # With a memory pattern, every size of tile gets a block of its own, which holds all its buffers side by side.
         # The arena alone reuses them within a run: less memory, and no pages that the system clears for every tile.
         options.enable_mem_pattern = False
+        # Threads that spin while they wait for the next run would take the cores from Open Image Denoise and NumPy
+        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
         self._session = _load(path, options, providers)
         self.contract = _contract(self._session, path)
         self._denoiser = Denoiser(threads, self.contract.denoiser) if self.contract.denoiser else None
         self._outputs = [output.name for output in self._session.get_outputs()]
         self.path = Path(path)
+        self.threads = threads
         self.seconds = 0.0
         """Time spent in :meth:`run` so far, the denoiser's included."""
         self.provider = self._session.get_providers()[0]
@@ -151,7 +154,7 @@ class Session:
         Args:
             lrhs: (h, w, 3), transformed.
             hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`. What else the
-                contract lists for either is made here.
+                contract lists for either is made here; in place, if both have room for it.
             error: also return the error, of a model that predicts it.
 
         Returns:
@@ -160,7 +163,10 @@ class Session:
         """
         start = time.perf_counter()
         if self._denoiser is not None:
-            lrhs, hrls = self._denoiser(lrhs, hrls)
+            if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
+                self._denoiser.fill(lrhs, hrls)
+            else:
+                lrhs, hrls = self._denoiser(lrhs, hrls)
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),

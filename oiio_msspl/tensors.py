@@ -15,22 +15,26 @@ from oiio_msspl.render import Array, Window
 SIGNED = {schema.NORMAL}
 
 
-def pack(layers: dict[str, Array], features: dict[str, int], exposure: float) -> Array:
+def pack(layers: dict[str, Array], features: dict[str, int], exposure: float, channels: int = 0) -> Array:
     """Stack repaired features (h, w, c) in the order of the schema, transformed; absent ones at their default.
 
+    Args:
+        channels: of the result, if more than the features have; what is in the rest is undefined.
+
     Returns:
-        float32 (h, w, sum of channels), one channel after the other in memory, as the network wants them.
+        float32 (h, w, channels), one channel after the other in memory, as the network wants them.
     """
     height, width = layers[schema.RGB].shape[:2]
-    stack = np.empty((sum(features.values()), height, width), dtype=np.float32).transpose(1, 2, 0)
+    channels = max(channels, sum(features.values()))
+    stack = np.empty((channels, height, width), dtype=np.float32).transpose(1, 2, 0)
     position = 0
-    for name, channels in features.items():
-        target = stack[..., position : position + channels]
+    for name, count in features.items():
+        target = stack[..., position : position + count]
         if name in layers:
-            target[...] = transforms.forward(name, layers[name], exposure)
+            transforms.forward(name, layers[name], exposure, target)
         else:
             target[...] = schema.DEFAULTS[name]
-        position += channels
+        position += count
     return stack
 
 

@@ -8,12 +8,14 @@ alike. The paper feeds linear values clipped at 100; a log keeps highlights with
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl import schema
+from oiio_msspl import bands, schema
 
 Array = NDArray[np.float32]
 
@@ -53,40 +55,65 @@ def exposure_of(lrhs_rgb: Array) -> float:
     return float(KEY / np.exp(np.mean(np.log(lit + epsilon))))
 
 
-def compress(radiance: Array, exposure: float) -> Array:
-    """Scene-linear radiance >= 0 to network values: ``log(1 + mu e x) / log(1 + mu)``."""
-    # In place: new pages for every step would take as long as the steps
-    values = np.multiply(radiance, np.float32(exposure), out=np.empty(np.shape(radiance), np.float32))
-    np.clip(values, 0.0, MAX_RADIANCE, out=values)
-    values *= np.float32(MU)
-    np.log1p(values, out=values)
-    values *= _LOG_SCALE
-    return values
+def compress(radiance: Array, exposure: float, out: Array | None = None) -> Array:
+    """Scene-linear radiance >= 0 to network values: ``log(1 + mu e x) / log(1 + mu)``; into ``out``, if given."""
+
+    def steps(values: Array) -> None:
+        values *= np.float32(exposure)
+        np.clip(values, 0.0, MAX_RADIANCE, out=values)
+        values *= np.float32(MU)
+        np.log1p(values, out=values)
+        values *= _LOG_SCALE
+
+    return in_place(steps, radiance, out)
 
 
-def expand(values: Array, exposure: float) -> Array:
+def expand(values: Array, exposure: float, out: Array | None = None) -> Array:
     """Inverse of :func:`compress`. Values outside what ``compress`` yields are clipped, so the result is finite."""
     top = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
-    radiance = np.clip(values, 0.0, top, out=np.empty(np.shape(values), np.float32))
-    radiance /= _LOG_SCALE
-    np.expm1(radiance, out=radiance)
-    radiance /= np.float32(MU)
-    radiance /= np.float32(exposure)
-    return radiance
+
+    def steps(radiance: Array) -> None:
+        np.clip(radiance, 0.0, top, out=radiance)
+        radiance /= _LOG_SCALE
+        np.expm1(radiance, out=radiance)
+        radiance /= np.float32(MU)
+        radiance /= np.float32(exposure)
+
+    return in_place(steps, values, out)
 
 
-def forward(feature: str, values: Array, exposure: float) -> Array:
-    """Values of one feature of :mod:`oiio_msspl.schema`, (..., C), to network values of the same shape."""
+def in_place(steps: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:
+    """A float32 copy of ``source``, in ``out`` if given, that ``steps`` have changed: band by band, every value for
+    itself."""
+    result = np.empty(np.shape(source), np.float32) if out is None else out
+
+    def work(rows: slice) -> None:
+        part = np.array(source[rows], np.float32)  # as the source lies in memory, whichever way the result does
+        steps(part)
+        result[rows] = part
+
+    bands.each(work, len(result), result[0].size if len(result) else 0)
+    return result
+
+
+def forward(feature: str, values: Array, exposure: float, out: Array | None = None) -> Array:
+    """Values of one feature of :mod:`oiio_msspl.schema`, (..., C), to network values of the same shape; into ``out``,
+    if given."""
     if feature in schema.RADIANCE_FEATURES:
-        return compress(values, exposure)
+        return compress(values, exposure, out)
     if feature == schema.VARIANCE:
         # A standard deviation is a radiance: it goes through the same exposure and the same curve.
-        return compress(np.sqrt(np.maximum(values, 0.0)), exposure)
+        return compress(np.sqrt(np.maximum(values, 0.0)), exposure, out)
     if feature == schema.ALBEDO:
-        return np.clip(values, 0.0, MAX_ALBEDO)
+        return limited(values, 0.0, MAX_ALBEDO, out)
     if feature == schema.NORMAL:
-        return np.clip(values, -1.0, 1.0)
+        return limited(values, -1.0, 1.0, out)
     raise ValueError(f"unknown feature {feature!r}")
+
+
+def limited(values: Array, lowest: float, highest: float, out: Array | None = None) -> Array:
+    """The values within bounds."""
+    return in_place(lambda part: np.clip(part, lowest, highest, out=part), values, out)
 
 
 def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bool_] | None]:
@@ -95,8 +122,16 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
     NaN becomes 0, infinities the largest half float: the network clips there anyway, and the neighbourhood of an Inf
     is bright in practice. Nothing to repair: the input itself, and no mask.
     """
-    if values.size and np.isfinite(values.max()) and np.isfinite(lowest := values.min()) and (signed or lowest >= 0):
-        return values, None
+    bounds: list[tuple[Any, Any]] = []
+
+    def work(rows: slice) -> None:
+        part = values[rows]
+        bounds.append((part.min(), part.max()))
+
+    if values.size:
+        bands.each(work, len(values), values[0].size)
+        if np.isfinite(bounds).all() and (signed or min(bounds)[0] >= 0):
+            return values, None
     bad = ~np.isfinite(values)
     if not signed:
         bad |= values < 0
@@ -113,7 +148,16 @@ def srgb(linear: Array) -> Array:
 
 
 def box_downsample(image: Array, scale: int) -> Array:
-    """Mean over ``scale`` x ``scale`` pixels: (H, W, C) to (H/s, W/s, C)."""
-    # Sums of strided views: ten times as fast as the mean over short axes, wherever channels lie in memory
-    rows = reduce(np.add, (image[y::scale] for y in range(scale)))
-    return reduce(np.add, (rows[:, x::scale] for x in range(scale))) * np.float32(1 / scale**2)
+    """Mean over ``scale`` x ``scale`` pixels: (H, W, ...) to (H/s, W/s, ...)."""
+    height, width, *channels = image.shape
+    result = np.empty((height // scale, width // scale, *channels), np.float32)
+
+    def work(rows: slice) -> None:
+        # Sums of strided views: ten times as fast as the mean over short axes, wherever channels lie in memory
+        part = image[rows]
+        sums = reduce(np.add, (part[y::scale] for y in range(scale)))
+        total = reduce(np.add, (sums[:, x::scale] for x in range(scale)))
+        np.multiply(total, np.float32(1 / scale**2), out=result[rows.start // scale : rows.stop // scale])
+
+    bands.each(work, height, image[0].size, multiple=scale)
+    return result

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Is the predicted error (`msspl-fuse --error-layer`) that of the result?
 
-    python -m benchmarks.confidence ../shared/renders --model pyramid-oidn --json results/confidence.json \
+    python -m benchmarks.confidence ../shared/renders --model mix --json results/confidence.json \
         --picture docs/images/confidence.png
 
 Pixels of all scenes of :mod:`benchmarks.scenes` whose reference is clean, at every scale and 2, 4 and 8 average spp,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lay out what was measured: README.md, docs/results.md and docs/pyramid.md have the figures of
+"""Lay out what was measured: README.md, docs/results.md and docs/mix.md have the figures of
 `benchmarks/results/*.json`.
 
     python -m benchmarks.tables
@@ -23,7 +23,7 @@ from benchmarks.paper import Rows, result, table
 from oiio_msspl.schema import SCALES
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "pyramid", "pyramid-oidn-fast", "pyramid-oidn")
+FAMILIES = ("paper", "pyramid", "pyramid-oidn-fast", "mix-fast", "mix")
 #: What a user would do instead, by its name in the rows.
 PEERS = {
     "OIDN fast on the HRLS": "OIDN 2.5.1 on the HRLS, quality fast",
@@ -32,7 +32,7 @@ PEERS = {
     "OIDN, same samples": "OIDN 2.5.1 on full resolution, same samples",
 }
 OIDN = "OIDN 2.5.1, quality high"
-BEST = "pyramid-oidn-x2"
+BEST = "mix-x2"
 FORMS = {measure: form for measure, (_, form) in quality.MEASURES.items()}
 
 
@@ -140,7 +140,7 @@ def division() -> str:
             else ""  # OIDN has one render
             for spp, way in columns
         ]
-        for name in ("pyramid-oidn-x2", "pyramid-oidn-x4", "pyramid-x4", "OIDN, same samples")
+        for name in ("mix-x2", "mix-x4", "pyramid-x4", "OIDN, same samples")
     ]
     return table(["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)], body)
 
@@ -176,7 +176,7 @@ def total() -> str:
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 
     body = []
-    for model in ("pyramid-oidn-x2", "pyramid-oidn-x4"):
+    for model in ("mix-x2", "mix-x4"):
         slower = seconds[model] - seconds[OIDN]
         for spp in quality.AVERAGES:
             for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
@@ -204,7 +204,7 @@ def errors() -> str:
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (accuracy, runtime),
     ROOT / "docs/results.md": (scenes, total, filters, cycles, errors),
-    ROOT / "docs/pyramid.md": (division,),
+    ROOT / "docs/mix.md": (division,),
 }
 
 

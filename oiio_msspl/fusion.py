@@ -215,7 +215,11 @@ def _darkest(values: Array, ceiling: Array, scale: int) -> Array:
 
 def _ceiling(low: Array) -> Array:
     """The brightest that one render may be, given the other at the LRHS's resolution, (h, w, 3)."""
-    highest = reduce(np.maximum, _around(low))
+    highest = low
+    for axis in (0, 1):  # 3 x 3, one way after the other
+        count = low.shape[axis]
+        before, after = (highest.take(np.clip(np.arange(count) + step, 0, count - 1), axis) for step in (-1, 1))
+        highest = np.maximum(np.maximum(before, highest), after)
     with np.errstate(over="ignore"):  # no ceiling, then; nor where there is no light at all
         return np.where(highest > 0, highest * np.float32(BRIGHTEST), np.float32(np.inf))
 

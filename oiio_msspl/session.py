@@ -34,7 +34,7 @@ PROVIDERS = {
 
 #: What ``--model`` is where no other is asked for: ``BEST`` if what it needs is installed, otherwise ``ALWAYS``. On
 #: held-out views of 1 spp ``BEST`` gained 1.2 dB.
-AUTO, BEST, ALWAYS = "auto", "pyramid-oidn", "pyramid"
+AUTO, BEST, ALWAYS = "auto", "mix", "pyramid"
 
 
 def shipped_models() -> dict[str, Path]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Teach a trained pyramid network to predict its own error.
+"""Teach a trained pyramid or mixing network to predict its own error.
 
     python -m training.error RUN/best.pt --data VIEWS
 
@@ -18,13 +18,13 @@ import torch
 from oiio_msspl.denoiser import Denoiser
 from training import batches, data, export, losses
 from training.networks import run
-from training.pyramid import PyramidFusion
+from training.pyramid import Trunk
 from training.train import lr_factor, save
 
 PATCH, BATCH, LEARNING_RATE = 192, 4, 2e-3
 
 
-def fit(network: PyramidFusion, views: list[batches.Pixels], scales: list[int], denoiser: str, steps: int) -> float:
+def fit(network: Trunk, views: list[batches.Pixels], scales: list[int], denoiser: str, steps: int) -> float:
     """Train the prediction in place; return the mean of its loss over the last tenth of the steps."""
     network.requires_grad_(False)
     network.error.requires_grad_(True)
@@ -58,8 +58,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     network, state = export.load(args.checkpoint)
-    if not isinstance(network, PyramidFusion):
-        raise SystemExit(f"{args.checkpoint}: only pyramid networks predict their error")
+    if not isinstance(network, Trunk):
+        raise SystemExit(f"{args.checkpoint}: the paper's network does not predict its error")
     views = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
     scales = [int(scale) for scale in state["training_spp"]]
     network.reset_error()

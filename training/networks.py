@@ -5,13 +5,15 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from training.mix import MixFusion
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
 
-Network = MultiResolutionFusion | PyramidFusion
-NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion]] = {
+Network = MultiResolutionFusion | PyramidFusion | MixFusion
+NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[MixFusion]] = {
     "paper": MultiResolutionFusion,
     "pyramid": PyramidFusion,
+    "mix": MixFusion,
 }
 
 

@@ -37,6 +37,8 @@ from torch.nn import functional as F
 from oiio_msspl import schema, transforms
 from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, conv3x3
 
+#: Channels of its U-Net, H/2, H/4, ... H/32.
+PYRAMID_CHANNELS = (48, 64, 96, 128, 128)
 #: Levels of the pyramid of light: H, H/2, ... H/16.
 LEVELS = 5
 #: Smallest reflectance that light is divided by.
@@ -279,33 +281,26 @@ def highest_around(lrhs: Tensor, hrls: Tensor) -> Tensor:
     return torch.maximum(high, F.interpolate(low, scale_factor=2 ** (level_of(lrhs, hrls) - 1), mode="nearest"))
 
 
-class PyramidFusion(nn.Module):
-    """See the module's docstring. One set of weights serves every scale, which follows from the images' sizes.
+class Trunk(nn.Module):
+    """The U-Net that sees both renders; what it makes of them is decided by the networks that build on it.
 
     Sizes must be multiples of ``multiple`` HRLS pixels.
 
     Args:
-        channels: of the U-Net's levels H/2, H/4, H/8, ...
-        own_size: taps across of the kernels over a level's own samples, H, H/2, ... ; odd.
+        channels: of the levels H/2, H/4, H/8, ...
         denoiser: what another denoiser adds to the inputs' channels, see :func:`oiio_msspl.schema.inputs`.
+        stem_size: HRLS pixels across that a pixel of H/2 is first made of; even.
+        refined: whether H/2 has a last convolution, as the coarser levels have.
     """
 
-    def __init__(
-        self,
-        channels: Sequence[int] = (48, 64, 96, 128, 128),
-        own_size: Sequence[int] = (5, 5, 5, 5, 5),
-        denoiser: str = "",
-    ) -> None:
+    def __init__(self, channels: Sequence[int], denoiser: str, stem_size: int, refined: bool) -> None:
         super().__init__()
-        self.config = {"channels": list(channels), "own_size": list(own_size), "denoiser": denoiser}
-        self.own_size = own_size
         self.multiple = 2 ** len(channels)
         finest, *coarser = channels
 
         # Down: H/2 sees every pixel of the HRLS, the levels below the colours of both renders anew
         self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in schema.inputs(denoiser))
-        self.denoised = self.lrhs_channels > LRHS_CHANNELS
-        self.stem = nn.Conv2d(self.hrls_channels, finest, 6, stride=2, padding=2)
+        self.stem = nn.Conv2d(self.hrls_channels, finest, stem_size, stride=2, padding=stem_size // 2 - 1)
         self.stem_low = conv3x3(self.lrhs_channels, finest)
         self.down = nn.ModuleList(nn.Conv2d(above, here, 3, stride=2, padding=1) for above, here in pairwise(channels))
         self.mix = nn.ModuleList(conv3x3(here + 3 + self.lrhs_channels, here) for here in coarser)
@@ -314,40 +309,17 @@ class PyramidFusion(nn.Module):
         self.skip = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
         self.up = nn.ModuleList(conv3x3(below, here) for here, below in pairwise(channels))
         self.refine = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
-
-        # Kernels of every level of the light; those of level 0 are made at H/2, for four pixels each
-        reads = [finest, *channels]
-        self.heads = nn.ModuleList(
-            nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
-        )
+        if not refined:
+            self.refine[0] = nn.Identity()
         self.error = nn.Conv2d(finest, 4, 1)
-        self.reset_parameters()
-
-    def outputs(self, level: int) -> list[int]:
-        """Channels of a level's head: taps over its own samples, weight of the HRLS's samples, taps over the coarser
-        level, weight of the LRHS's samples, taps over the albedo, share of the albedo, choice among CANDIDATES."""
-        own, coarser = self.own_size[level] ** 2, 9 if level < LEVELS - 1 else 0
-        choice = len(CANDIDATES) if self.denoised else 0
-        return [own, 1, coarser, 1, 0, 0, choice] if level else [own, 1, coarser, 0, 9, 1, choice]
 
     @torch.no_grad()
-    def reset_parameters(self) -> None:
-        """Every kernel starts close to a plain mean."""
+    def reset_convolutions(self) -> None:
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
                 nn.init.zeros_(module.bias)
-        for head in self.heads:
-            head.weight.mul_(0.1)
         self.reset_error()
-        if self.denoised:
-            for level, head in enumerate(self.heads):
-                weight, bias = (
-                    parameter.unflatten(0, (-1, 1 if level else 4))[-len(CANDIDATES) :]
-                    for parameter in (head.weight, head.bias)
-                )
-                weight.zero_()
-                bias.copy_(torch.tensor(CANDIDATES)[:, None].expand_as(bias))
 
     @torch.no_grad()
     def reset_error(self) -> None:
@@ -376,6 +348,58 @@ class PyramidFusion(nn.Module):
             x = F.relu(self.refine[i](x))
             decoded.append(x)
         return decoded[::-1]
+
+
+class PyramidFusion(Trunk):
+    """See the module's docstring. One set of weights serves every scale, which follows from the images' sizes.
+
+    Sizes must be multiples of ``multiple`` HRLS pixels.
+
+    Args:
+        channels: of the U-Net's levels H/2, H/4, H/8, ...
+        own_size: taps across of the kernels over a level's own samples, H, H/2, ... ; odd.
+        denoiser: what another denoiser adds to the inputs' channels, see :func:`oiio_msspl.schema.inputs`.
+    """
+
+    def __init__(
+        self,
+        channels: Sequence[int] = PYRAMID_CHANNELS,
+        own_size: Sequence[int] = (5, 5, 5, 5, 5),
+        denoiser: str = "",
+    ) -> None:
+        super().__init__(channels, denoiser, stem_size=6, refined=True)
+        self.config = {"channels": list(channels), "own_size": list(own_size), "denoiser": denoiser}
+        self.own_size = own_size
+        self.denoised = self.lrhs_channels > LRHS_CHANNELS
+
+        # Kernels of every level of the light; those of level 0 are made at H/2, for four pixels each
+        reads = [channels[0], *channels]
+        self.heads = nn.ModuleList(
+            nn.Conv2d(reads[level], sum(self.outputs(level)) * (1 if level else 4), 1) for level in range(LEVELS)
+        )
+        self.reset_parameters()
+
+    def outputs(self, level: int) -> list[int]:
+        """Channels of a level's head: taps over its own samples, weight of the HRLS's samples, taps over the coarser
+        level, weight of the LRHS's samples, taps over the albedo, share of the albedo, choice among CANDIDATES."""
+        own, coarser = self.own_size[level] ** 2, 9 if level < LEVELS - 1 else 0
+        choice = len(CANDIDATES) if self.denoised else 0
+        return [own, 1, coarser, 1, 0, 0, choice] if level else [own, 1, coarser, 0, 9, 1, choice]
+
+    @torch.no_grad()
+    def reset_parameters(self) -> None:
+        """Every kernel starts close to a plain mean."""
+        self.reset_convolutions()
+        for head in self.heads:
+            head.weight.mul_(0.1)
+        if self.denoised:
+            for level, head in enumerate(self.heads):
+                weight, bias = (
+                    parameter.unflatten(0, (-1, 1 if level else 4))[-len(CANDIDATES) :]
+                    for parameter in (head.weight, head.bias)
+                )
+                weight.zero_()
+                bias.copy_(torch.tensor(CANDIDATES)[:, None].expand_as(bias))
 
     def gather(
         self,

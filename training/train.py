@@ -34,9 +34,10 @@ from torch.nn import functional as F
 from oiio_msspl import metrics, transforms
 from oiio_msspl.denoiser import MODES, Denoiser
 from training import batches, data, losses
+from training.mix import MIX_CHANNELS, MixFusion, disagreement, from_pyramid
 from training.networks import NETWORKS, Network, run
 from training.paper import MultiResolutionFusion
-from training.pyramid import LEVELS, PyramidFusion
+from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion, level_of
 
 log = logging.getLogger(__name__)
 
@@ -45,6 +46,9 @@ log = logging.getLogger(__name__)
 SPIKE = 4.0
 #: A run that falls so many dB behind its own best goes back to it, at half the learning rate.
 COLLAPSE = 2.0
+
+#: Weight of the disagreement with a teacher: about as much as the loss itself where training begins.
+TAUGHT = 0.1
 
 #: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
 WARM_UP, FINAL = 0.03, 0.01
@@ -160,6 +164,8 @@ def warm_start(network: Network, path: Path) -> None:
         if "own_size" not in state["config"]:
             raise SystemExit(f"--init {path}: that is no pyramid network, and nothing of it fits one")
         cut_kernels(theirs, state["config"]["own_size"], network.own_size)
+    if isinstance(network, MixFusion) and "own_size" in state["config"]:
+        theirs = from_pyramid(theirs, state["config"]["own_size"])
     for name, value in theirs.items():
         # What a convolution reads beyond the other's inputs counts for nothing at first; what it makes beyond the
         # other's outputs begins as in a new network
@@ -189,6 +195,19 @@ def middle_taps(parameter: Tensor, size: int, wanted: int, phases: int) -> Tenso
     middle = slice(margin, margin + wanted)
     taps = outputs[: size**2].unflatten(0, (size, size))[middle, middle].flatten(0, 1)
     return torch.cat([taps, outputs[size**2 :]]).flatten(0, 1)
+
+
+def fused_and_taught(
+    network: Network, teacher: MixFusion | None, lrhs: Tensor, hrls: Tensor
+) -> tuple[Tensor, Tensor | float]:
+    """The fused image, and what is to be lost by deciding otherwise than the teacher, if there is one."""
+    if teacher is None:
+        return run(network, lrhs, hrls)[0], 0.0
+    assert isinstance(network, MixFusion)
+    logits, _ = network.decide(lrhs, hrls)
+    with torch.no_grad():
+        wanted, _ = teacher.decide(lrhs, hrls)
+    return network.blend(lrhs, hrls, logits), TAUGHT * disagreement(logits, wanted, level_of(lrhs, hrls))
 
 
 class Average:
@@ -239,13 +258,25 @@ def train(args: argparse.Namespace) -> None:
     network: Network
     denoiser = Denoiser(args.threads, args.denoiser) if args.denoiser else None
     if args.network == "pyramid":
-        network = PyramidFusion(channels=args.channels, own_size=args.kernels, denoiser=args.denoiser)
+        network = PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels, args.denoiser)
+    elif args.network == "mix":
+        if args.denoiser in ("", "low"):
+            raise SystemExit("--network mix: it needs a --denoiser that denoises the HRLS, too")
+        network = MixFusion(args.channels or MIX_CHANNELS, args.denoiser, args.stem)
     elif args.denoiser:
-        raise SystemExit("--denoiser: for the pyramid network")
+        raise SystemExit("--denoiser: not for the paper's network")
     elif len(scales) == 1:
         network = MultiResolutionFusion(scales[0])
     else:
         raise SystemExit("--network paper: a network is for one --scale")
+    teacher = None
+    if args.teacher:
+        taught = torch.load(args.teacher, map_location="cpu", weights_only=True)
+        if args.network != "mix" or taught["architecture"] != "mix":
+            raise SystemExit("--teacher: for networks that mix, and one of them")
+        teacher = MixFusion(**taught["config"])
+        teacher.load_state_dict(taught["ema"])
+        teacher.to(device, memory_format=torch.channels_last).requires_grad_(False)
     checkpoint_path, best_path = args.out / "checkpoint.pt", args.out / "best.pt"
     state = torch.load(checkpoint_path, map_location="cpu", weights_only=True) if checkpoint_path.exists() else None
     if state is None and args.init:
@@ -356,8 +387,8 @@ def train(args: argparse.Namespace) -> None:
             group["lr"] = peak_lr * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
         pair = source.next()
         with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
-            output, _ = run(network, pair["lrhs"], pair["hrls"])
-        loss = loss_function(output.float(), pair["target"])
+            output, loss = fused_and_taught(network, teacher, pair["lrhs"], pair["hrls"])
+        loss = loss + loss_function(output.float(), pair["target"])
         optimizer.zero_grad(set_to_none=True)
         loss.backward()
         length = float(torch.nn.utils.clip_grad_norm_(learning, recipe.clip_gradient))
@@ -397,7 +428,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
     parser.add_argument(
-        "--network", choices=NETWORKS, default="paper", help="the paper's, or the kernel-predicting one"
+        "--network", choices=NETWORKS, default="paper", help="the paper's, the kernel-predicting one or the mixing one"
     )
     parser.add_argument(
         "--denoiser",
@@ -410,8 +441,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         "--channels",
         type=int,
         nargs="+",
-        default=(48, 64, 96, 128, 128),
-        help="of the levels H/2, H/4, ... of a pyramid network",
+        help="of the levels H/2, H/4, ...; default: what the shipped networks have",
+    )
+    parser.add_argument(
+        "--stem", type=int, default=2, help="HRLS pixels across that a mixing network's features are first made of"
     )
     parser.add_argument(
         "--kernels",
@@ -423,6 +456,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
+    parser.add_argument(
+        "--teacher", type=Path, help="checkpoint of a larger mixing network, whose choices are learnt too"
+    )
     parser.add_argument("--only", default="", help="train the part of the network with this name, such as heads")
     parser.add_argument("--batch", type=int, help="default: the preset's")
     parser.add_argument("--patch", type=int, help="HR pixels; default: the preset's")

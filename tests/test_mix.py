@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The network that mixes what Open Image Denoise makes of both renders. Needs PyTorch, but no OIDN."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch")
+from torch.nn import functional as F  # noqa: E402
+
+from oiio_msspl import schema  # noqa: E402
+from oiio_msspl.contract import Contract  # noqa: E402
+from training import train  # noqa: E402
+from training.mix import LEVELS, MixFusion, disagreement, mixed  # noqa: E402
+from training.pyramid import CANDIDATES, PyramidFusion, logarithmic  # noqa: E402
+
+HEIGHT, WIDTH = 64, 96
+#: By their place in FINER and in COARSEST.
+BROUGHT, DENOISED, LIGHT, SAMPLES = range(4)
+TOGETHER, DENOISED_MEAN, MEAN, LOW = range(4, 8)
+
+
+@pytest.fixture
+def network() -> MixFusion:
+    torch.manual_seed(0)
+    return MixFusion(channels=(16, 16, 16, 16)).eval()
+
+
+def pair(scale: int) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(scale)
+    return (
+        torch.rand(1, 6, HEIGHT // scale, WIDTH // scale, generator=generator),
+        torch.rand(1, 19, HEIGHT, WIDTH, generator=generator),
+    )
+
+
+def prefer(network: MixFusion, finer: int, coarsest: int = TOGETHER) -> None:
+    """The same choice everywhere: light is all that the albedo colours."""
+    for level, head in enumerate(network.heads):
+        head.weight.data.zero_()
+        choice = torch.full((8,), -40.0)
+        choice[[finer, coarsest]] = 40.0
+        head.bias.data = choice if level else torch.cat([choice[:4], torch.full((1,), 40.0)]).repeat_interleave(4)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_one_network_serves_every_scale(network: MixFusion, scale: int) -> None:
+    fused, log_error = network(*pair(scale))
+    assert (fused.shape, log_error.shape) == ((1, 3, HEIGHT, WIDTH), (1, 1, HEIGHT, WIDTH))
+    assert torch.isfinite(fused).all()
+
+
+@torch.inference_mode()
+def test_shares_are_those_of_a_softmax() -> None:
+    logits = 30 * torch.randn(2, 3, 4, 5)
+    images = [torch.rand(2, 3, 4, 5) for _ in range(3)]
+    expected = (torch.softmax(logits, 1).unsqueeze(2) * torch.stack(images, 1)).sum(1)
+    torch.testing.assert_close(mixed(logits, images), expected)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_it_can_believe_any_of_them(network: MixFusion, scale: int) -> None:
+    """Noise around an even picture, a denoised HRLS that is 1.5 times too dark, an albedo of stripes."""
+    lrhs, hrls = pair(scale)
+    stripes = 0.4 + 0.2 * (torch.arange(WIDTH) % 2).expand(1, 3, HEIGHT, WIDTH)
+    light = 0.5 * torch.ones(1, 3, HEIGHT, WIDTH)
+    hrls[:, 3:6] = stripes
+    hrls[:, 16:] = logarithmic(stripes * light / 1.5)
+    lrhs[:, 3:] = logarithmic(F.avg_pool2d(stripes * light, scale))
+    expected = {
+        BROUGHT: logarithmic(stripes * light),
+        DENOISED: hrls[:, 16:],
+        LIGHT: logarithmic(stripes * light),
+        SAMPLES: hrls[:, :3],
+    }
+    for choice, image in expected.items():
+        prefer(network, choice)
+        torch.testing.assert_close(network(lrhs, hrls)[0], image, atol=0.01, rtol=0)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_the_coarsest_level_too(network: MixFusion, scale: int) -> None:
+    """What it believes there is the brightness of the result, if that follows the coarser levels."""
+    lrhs, hrls = pair(scale)
+    hrls[:, :3], hrls[:, 16:], lrhs[:, :3], lrhs[:, 3:] = 0.2, 0.3, 0.4, 0.35
+    for choice, value in {TOGETHER: 0.35, DENOISED_MEAN: 0.3, MEAN: 0.2, LOW: 0.4}.items():
+        prefer(network, BROUGHT, choice)
+        torch.testing.assert_close(network(lrhs, hrls)[0], torch.full((1, 3, HEIGHT, WIDTH), value), atol=0.01, rtol=0)
+
+
+@torch.inference_mode()
+def test_it_never_leaves_the_range_of_its_inputs(network: MixFusion) -> None:
+    """Even with wild weights, and whatever was denoised: what is bright or dark in the renders stays where it was."""
+    for parameter in network.parameters():
+        parameter.copy_(3 * torch.randn_like(parameter))
+    lrhs, hrls = pair(4)
+    hrls[:, 16:], lrhs[:, 3:] = 4.0 * hrls[:, 16:], 4.0 * lrhs[:, 3:]
+    lrhs[:, :3, :8], hrls[:, :3, :32] = 0.1, 0.2
+    fused, _ = network(lrhs, hrls)
+    assert fused[:, :, :20].min() >= 0.1 and fused[:, :, :20].max() <= 0.2
+    assert fused.max() <= 1.0
+
+
+@torch.inference_mode()
+def test_it_starts_with_the_choices_of_a_pyramid(network: MixFusion, tmp_path: Path) -> None:
+    channels = (16, 16, 16, 16)
+    pyramid = PyramidFusion(channels=(*channels, 16), own_size=(1, 3, 3, 3, 3), denoiser="high")
+    for head in pyramid.heads:
+        head.bias.copy_(torch.randn_like(head.bias))
+    torch.save({"ema": pyramid.state_dict(), "config": pyramid.config}, tmp_path / "pyramid.pt")
+    network = MixFusion(channels=channels, stem_size=6)
+    train.warm_start(network, tmp_path / "pyramid.pt")
+    assert torch.equal(network.stem.weight, pyramid.stem.weight)
+    for level in range(LEVELS):
+        ours, theirs = (n.heads[level].bias.unflatten(0, (-1, 1 if level else 4)) for n in (network, pyramid))
+        means, brought, denoised, together = theirs[-len(CANDIDATES) :]
+        assert torch.equal(ours[:3], torch.stack([brought, denoised, means]))
+        assert torch.equal(ours[4], together) if level else torch.equal(ours[4], theirs[-5] + 2)
+
+
+def test_a_teacher_is_agreed_with(network: MixFusion) -> None:
+    """Deciding as it does costs nothing, otherwise more; what a scale does not use does not count, and it learns
+    nothing itself."""
+    lrhs, hrls = pair(4)
+    logits, _ = network.decide(lrhs, hrls)
+    assert disagreement(logits, logits, first=2).item() == pytest.approx(0, abs=1e-6)
+    others = [logits[0] + 1, logits[1] + torch.randn(8, 1, 1), *logits[2:]]
+    output, loss = train.fused_and_taught(network, network, lrhs, hrls)
+    torch.testing.assert_close(output, network(lrhs, hrls)[0])
+    assert loss.item() == pytest.approx(0, abs=1e-6)
+    assert disagreement(logits, others, first=2) > 0.01
+    unused = [*logits[:3], torch.randn_like(logits[3])]
+    assert disagreement(logits, unused, first=2).item() == pytest.approx(0, abs=1e-6)
+    disagreement(logits, [each.detach() for each in others], first=2).backward()
+    assert network.heads[1].weight.grad.abs().max() > 0
+    assert network.heads[3].weight.grad is None or not network.heads[3].weight.grad.any()
+
+
+def test_its_onnx_file_agrees_with_it(network: MixFusion, tmp_path: Path) -> None:
+    pytest.importorskip("onnxscript")
+    onnx = pytest.importorskip("onnx")
+    from training import export
+
+    for head in network.heads:
+        torch.nn.init.normal_(head.weight, std=0.3)
+    for scale in schema.SCALES:
+        lrhs, hrls = (schema.channel_names(features) for features in schema.inputs("fast"))
+        contract = Contract("tiny", scale, network.multiple // scale, 32, lrhs=lrhs, hrls=hrls, denoiser="fast")
+        onnx.save(export.to_onnx(network, contract), tmp_path / "tiny.onnx")
+        assert export.parity(network, scale, tmp_path / "tiny.onnx") < 1e-4

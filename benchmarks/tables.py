@@ -23,7 +23,7 @@ from benchmarks.paper import Rows, result, table
 from oiio_msspl.schema import SCALES
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "pyramid", "pyramid-oidn-fast", "mix-fast", "mix")
+FAMILIES = ("paper", "pyramid", "pyramid-oidn-fast", "mix", "pyramid-oidn")
 #: What a user would do instead, by its name in the rows.
 PEERS = {
     "OIDN fast on the HRLS": "OIDN 2.5.1 on the HRLS, quality fast",

@@ -111,9 +111,9 @@ class Denoiser:
             MssplError: Open Image Denoise failed.
         """
         layers = _layers(hrls)
-        _write(self._together(lrhs[..., :_OF_LRHS], layers), lrhs[..., _OF_LRHS:])
+        transforms.compress(self._together(lrhs[..., :_OF_LRHS], layers), 1.0, lrhs[..., _OF_LRHS:])
         if self._high is not None:
-            _write(self._denoised(self._high, layers), hrls[..., _OF_HRLS:])
+            transforms.compress(self._denoised(self._high, layers), 1.0, hrls[..., _OF_HRLS:])
 
     def together(self, lrhs: Array, hrls: Array) -> Array:
         """Of the same arguments, radiance of both renders denoised together at the LRHS's resolution, (h, w, 3).
@@ -153,16 +153,12 @@ class Denoiser:
 
 
 def _with_room(image: Array) -> Array:
-    """A copy with three channels more, which lie one behind the other in memory."""
+    """A copy with channels for what is denoised, too; they lie one behind the other in memory."""
     height, width, channels = image.shape
-    copy = np.empty((channels + 3, height, width), dtype=np.float32).transpose(1, 2, 0)
+    more = sum(schema.DENOISED_FEATURES.values())
+    copy = np.empty((channels + more, height, width), dtype=np.float32).transpose(1, 2, 0)
     copy[..., :channels] = image
     return copy
-
-
-def _write(denoised: Array, out: Array) -> None:
-    """Denoised radiance as network values."""
-    transforms.compress(denoised, 1.0, out)
 
 
 def _layers(hrls: Array) -> dict[str, Array]:

@@ -196,12 +196,12 @@ def _without_fireflies(low: Array, layers: dict[str, Array], scale: int) -> tupl
     lights = {}
     for name in schema.RADIANCE_FEATURES:
         if name in layers:
-            lights[name] = _darkest(layers[name], over_high, scale)
+            lights[name] = _dimmed(layers[name], over_high, scale)
     return {schema.RGB: np.minimum(low, over_low)}, layers | lights
 
 
-def _darkest(values: Array, ceiling: Array, scale: int) -> Array:
-    """HRLS values (s*h, s*w, c), none above what its LRHS pixel's ceiling allows: (h, 1, s*w, c)."""
+def _dimmed(values: Array, ceiling: Array, scale: int) -> Array:
+    """HRLS values (s*h, s*w, c), none above the ceiling of its LRHS pixel, (h, 1, s*w, c)."""
     result = np.empty_like(values)
 
     def work(rows: slice) -> None:

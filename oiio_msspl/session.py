@@ -105,7 +105,7 @@ class Session:
     Args:
         path: an ONNX file that carries a contract.
         device: a key of ``PROVIDERS``.
-        threads: CPU threads; 0 lets onnxruntime use one a core.
+        threads: CPU threads of onnxruntime, Open Image Denoise and NumPy alike; 0: one a core.
 
     Raises:
         InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that reads

@@ -286,6 +286,13 @@ def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
     assert state["step"] > 0 and state["training_spp"] == {"2": {"hrls": [1, 8], "lrhs": [4, 64]}}
 
 
+def test_the_thread_that_draws_ahead_ends(views: Path) -> None:
+    source = batches.Batches(data.Folder(views), (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
+    assert source.next()["lrhs"].shape == (1, 3, 8, 8)
+    source.close()
+    assert not source._worker.is_alive()
+
+
 def test_larger_scale_starts_as_the_smaller_one(tiny_network: MultiResolutionFusion, tmp_path: Path) -> None:
     """Warm-started with a x4 network, a x8 one answers alike to images without detail (away from the border)."""
     from training.train import warm_start

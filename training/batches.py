@@ -7,6 +7,7 @@ step of the augmentation runs there on the whole batch, so that the device does 
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -257,6 +258,15 @@ class Batches:
         self._queue: queue.Queue[Batch | BaseException] = queue.Queue(maxsize=4)
         self._ahead = device.type == "cpu"
         self._worker: threading.Thread | None = None
+        self._ended = threading.Event()
+
+    def close(self) -> None:
+        """End the thread that draws ahead: amid its work, the interpreter could not end without an abort."""
+        self._ended.set()
+        while self._worker is not None and self._worker.is_alive():
+            with contextlib.suppress(queue.Empty):
+                self._queue.get_nowait()  # it may wait for room
+            self._worker.join(timeout=0.1)
 
     def next(self) -> Batch:
         start = time.monotonic()
@@ -279,9 +289,9 @@ class Batches:
 
     def _work(self) -> None:
         try:
-            while True:
+            while not self._ended.is_set():
                 deadline = time.monotonic() + self._rescan_seconds
-                while time.monotonic() < deadline:
+                while time.monotonic() < deadline and not self._ended.is_set():
                     self._queue.put(self._draw())
                 self.folder.scan()
                 self._views = self._load()

@@ -32,6 +32,7 @@ from training.pyramid import (
     level_of,
     linear,
     logarithmic,
+    pointwise,
     pyramid,
 )
 
@@ -105,8 +106,8 @@ class MixFusion(Trunk):
         deepest = len(self.mix) + 2
         colours = pyramid(linear(hrls[:, :3]), 0, deepest)
         features = self.features(lrhs, hrls, colours, pyramid(linear(lrhs), level_of(lrhs, hrls), deepest))
-        logits = [head(features[max(level - 1, 0)]).float() for level, head in enumerate(self.heads)]
-        log_error = self.error(features[0].detach()).float()
+        logits = [pointwise(head, features[max(level - 1, 0)]).float() for level, head in enumerate(self.heads)]
+        log_error = pointwise(self.error, features[0].detach()).float()
         return [F.pixel_shuffle(logits[0], 2), *logits[1:]], F.pixel_shuffle(log_error, 2)
 
     def blend(self, lrhs: Tensor, hrls: Tensor, logits: Sequence[Tensor]) -> Tensor:

@@ -407,6 +407,7 @@ def train(args: argparse.Namespace) -> None:
         if stop or elapsed >= min(budget, next_checkpoint):
             checkpoint()
             next_checkpoint = elapsed + args.checkpoint_seconds
+    source.close()
 
 
 def write_row(path: Path, row: dict[str, float]) -> None:

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A network that only mixes, for the time that Open Image Denoise takes.
+"""A network that only mixes what Open Image Denoise (OIDN) makes of both renders.
 
 Where OIDN has filtered, kernels over samples gain next to nothing and cost the most (:mod:`training.pyramid`). This
 network has none. It reads what OIDN makes of the HRLS and of both renders together at the LRHS's resolution, and
 decides pixel by pixel how much it believes of each:
 
-1. At the LRHS's resolution: both renders denoised together, the denoised HRLS's mean, the samples' means.
+1. At the LRHS's resolution: both renders denoised together, the denoised HRLS's mean, either render's samples.
 2. At every finer level, up to the HRLS's: the denoised HRLS as it is; the same at the coarser level's brightness; the
    coarser level's light times the HRLS's albedo; the samples themselves.
 
@@ -68,9 +68,10 @@ class MixFusion(Trunk):
     Args:
         channels: of the U-Net's levels H/2, H/4, H/8, ...; four or more.
         denoiser: a mode of :mod:`oiio_msspl.denoiser` that denoises the HRLS, too.
+        stem_size: HRLS pixels across that a pixel of H/2 is first made of; if more than 2, H/2 has a last convolution.
     """
 
-    def __init__(self, channels: Sequence[int] = MIX_CHANNELS, denoiser: str = "fast", stem_size: int = 2) -> None:
+    def __init__(self, channels: Sequence[int] = MIX_CHANNELS, denoiser: str = "high", stem_size: int = 2) -> None:
         super().__init__(channels, denoiser, stem_size, refined=stem_size > 2)
         self.config = {"channels": list(channels), "denoiser": denoiser, "stem_size": stem_size}
         # Of level 0, four pixels for each of H/2, and the share of the albedo too

@@ -123,6 +123,13 @@ def test_it_starts_with_the_choices_of_a_pyramid(network: MixFusion, tmp_path: P
         assert torch.equal(ours[4], together) if level else torch.equal(ours[4], theirs[-5] + 2)
 
 
+@pytest.mark.parametrize("config", [{"scale": 4}, {"own_size": [1] * 5, "denoiser": ""}, {"denoiser": "low"}])
+def test_it_does_not_start_from_what_has_no_such_choices(network: MixFusion, tmp_path: Path, config: dict) -> None:
+    torch.save({"ema": {}, "config": config}, tmp_path / "other.pt")
+    with pytest.raises(SystemExit, match=r"other\.pt: a network that mixes starts from one that reads"):
+        train.warm_start(network, tmp_path / "other.pt")
+
+
 def test_a_teacher_is_agreed_with(network: MixFusion) -> None:
     """Deciding as it does costs nothing, otherwise more; what a scale does not use does not count, and it learns
     nothing itself."""

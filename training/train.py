@@ -164,6 +164,8 @@ def warm_start(network: Network, path: Path) -> None:
         if "own_size" not in state["config"]:
             raise SystemExit(f"--init {path}: that is no pyramid network, and nothing of it fits one")
         cut_kernels(theirs, state["config"]["own_size"], network.own_size)
+    if isinstance(network, MixFusion) and state["config"].get("denoiser", "") in ("", "low"):
+        raise SystemExit(f"--init {path}: a network that mixes starts from one that reads the denoised HRLS, too")
     if isinstance(network, MixFusion) and "own_size" in state["config"]:
         theirs = from_pyramid(theirs, state["config"]["own_size"])
     for name, value in theirs.items():

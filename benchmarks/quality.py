@@ -71,14 +71,14 @@ def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
 def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
     """Both renders, denoised together at the LRHS's resolution; None without pyoidn."""
     try:
-        denoiser = Denoiser()
+        denoiser = Denoiser(exact=True)
     except InputError:
         return None
     low = beauty(lrhs)
     exposure = transforms.exposure_of(low)
     layers = tensors.read(hrls, hrls.data_window, hrls.data_window)
     packed = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
-    return np.maximum(denoiser.together(transforms.compress(low, exposure), packed), 0) / np.float32(exposure)
+    return transforms.expand(denoiser.together(transforms.compress(low, exposure), packed), exposure)
 
 
 def flip_of(image: np.ndarray, reference: np.ndarray) -> float:

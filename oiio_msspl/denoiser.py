@@ -11,17 +11,25 @@ better at that resolution than its result on the HRLS, for a fraction of the tim
 
 from __future__ import annotations
 
+import logging
 import threading
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from oiio_msspl import schema, transforms
+from oiio_msspl import eight_bit, schema, transforms
+from oiio_msspl.eight_bit import EightBit
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.render import Array
 
 if TYPE_CHECKING:
     import pyoidn
+
+log = logging.getLogger(__name__)
+
+#: A picture to denoise: ``colour`` in network values, ``albedo`` in [0, 1] and ``normal`` in [-1, 1]; (h, w, 3) each.
+Layers = dict[str, Array]
 
 _OF_LRHS, _OF_HRLS = sum(schema.LRHS_FEATURES.values()), sum(schema.HRLS_FEATURES.values())
 _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.values()]), strict=False))
@@ -31,55 +39,138 @@ _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.valu
 MODES = ("low", "fast", "balanced", "high")
 #: Bounds of the LRHS's share in what is denoised at its resolution: an estimate that wants all or none may be wrong.
 _SHARE = (0.05, 0.95)
+#: Largest mean difference in network values between Open Image Denoise and itself in 8 bits, on a small picture.
+TOLERANCE = 0.01
+
+
+class Filter:
+    """One of Open Image Denoise's networks.
+
+    Args:
+        device: of pyoidn, committed.
+        quality: fast, balanced or high.
+        clean: albedo and normal have no noise.
+        network: its name in :mod:`oiio_msspl.eight_bit`, which is then used where it can be.
+        threads: of that; 0 for all.
+    """
+
+    def __init__(
+        self, device: pyoidn.Device, quality: str, *, clean: bool = False, network: str = "", threads: int = 0
+    ) -> None:
+        import pyoidn
+
+        self._device, self._format = device, pyoidn.OIDN_FORMAT_FLOAT3
+        self._quality, self._clean = getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"), clean
+        self._filters: dict[str, pyoidn.Filter] = {}
+        self._lock = threading.Lock()  # a filter remembers the images of one call at a time
+        self._eight_bit = self._in_eight_bits(network, threads) if network else None
+
+    def __call__(self, layers: Layers, out: Array | None = None) -> Array:
+        """Of the layers, the colour denoised, network values (h, w, 3); or, without one, the albedo. Into ``out``, if
+        given.
+
+        Raises:
+            MssplError: Open Image Denoise failed.
+        """
+        if self._eight_bit is not None and layers.keys() == self._eight_bit.reads:
+            return self._eight_bit(**layers, out=out)
+        return self._exactly(layers, out)
+
+    def _exactly(self, layers: Layers, out: Array | None = None) -> Array:
+        images: dict[str, Array] = {name: layers[name] for name in ("albedo", "normal") if name in layers}
+        if "colour" not in layers:
+            return np.clip(self._executed("ldr", images), 0, 1)
+        radiance = transforms.expand(layers["colour"], 1.0)
+        return transforms.compress(self._executed("hdr", {"color": radiance} | images), 1.0, out)
+
+    def _executed(self, kind: str, images: dict[str, Array]) -> Array:
+        """What the network makes of the first of the images (h, w, 3), with the help of the others."""
+        images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in images.items()}
+        images["output"] = np.empty_like(next(iter(images.values())))
+        with self._lock:
+            filter_ = self._filters.get(kind) or self._new(kind)
+            for name in ("color", "albedo", "normal", "output"):
+                if name in images:
+                    filter_.set_image(name, images[name], self._format)
+                else:
+                    filter_.unset_image(name)
+            filter_.commit()
+            filter_.execute()
+            if message := self._device.get_error():
+                raise MssplError(f"Open Image Denoise failed: {message}")
+        return images["output"]
+
+    def _new(self, kind: str) -> pyoidn.Filter:
+        """One for each kind of images: a filter plans anew when it gets others."""
+        import pyoidn
+
+        new = self._filters[kind] = pyoidn.Filter(self._device, pyoidn.OIDN_FILTER_TYPE_RT)
+        new.set_quality(self._quality)
+        new.set_bool("cleanAux", self._clean)
+        if kind == "hdr":
+            new.set_bool("hdr", True)
+            # Network values are exposed by the LRHS. Left alone, it would expose every tile for itself.
+            new.set_float("inputScale", 1.0)
+        return new
+
+    def _in_eight_bits(self, name: str, threads: int) -> EightBit | None:
+        import pyoidn
+
+        library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
+        weights = eight_bit.weights_of(name, library) if library else None
+        if weights is None:
+            log.info("this Open Image Denoise has weights unknown here, and does its work itself")
+            return None
+        network = EightBit(name, weights, threads)
+        picture = {layer: image for layer, image in _picture_to_try().items() if layer in network.reads}
+        # Processors without instructions for it sum products of 8 bits in 16, which overflows
+        difference = float(np.abs(network(**picture) - self._exactly(picture)).mean())
+        if difference > TOLERANCE:
+            log.info("in 8 bits this processor computes Open Image Denoise's network wrongly, by %.3f", difference)
+            return None
+        return network
 
 
 class Denoiser:
-    """Open Image Denoise on the CPU.
+    """Open Image Denoise on both renders, on the CPU.
 
     Args:
         threads: 0 for all.
         mode: one of ``MODES``.
+        exact: never in 8 bits (:mod:`oiio_msspl.eight_bit`), which is otherwise done where it can be.
+
+    Attributes:
+        hrls: what denoises the HRLS, or None.
+        both: what denoises both together.
+        albedo: what denoises the albedo for that, at x2.
 
     Raises:
         InputError: pyoidn is not installed.
     """
 
-    def __init__(self, threads: int = 0, mode: str = "high") -> None:
+    def __init__(self, threads: int = 0, mode: str = "high", *, exact: bool = False) -> None:
         try:
             import pyoidn
         except (ImportError, OSError) as error:  # not installed, or without its library
             raise InputError(
                 "this model reads Open Image Denoise's result: pip install pyoidn, or choose another --model"
             ) from error
-        self._device = pyoidn.Device()
-        self._device.set_int("numThreads", threads)
-        self._device.set_bool("setAffinity", False)  # other threads of the process want the cores too
-        self._device.commit()
-        self._lock = threading.Lock()  # a filter remembers the images of one call at a time
-        self._format = pyoidn.OIDN_FORMAT_FLOAT3
-        # One for each kind of images: a filter plans anew when it gets others
-        self._high = None
-        if mode != "low":
-            self._high = self._filter(hdr=True, quality=getattr(pyoidn, f"OIDN_QUALITY_{mode.upper()}"))
-        self._low = self._filter(hdr=True, quality=pyoidn.OIDN_QUALITY_HIGH, clean=True)
+        device = pyoidn.Device()
+        device.set_int("numThreads", threads)
+        device.set_bool("setAffinity", False)  # other threads of the process want the cores too
+        device.commit()
+
+        def filter_(quality: str, network: str, *, clean: bool = False) -> Filter:
+            return Filter(device, quality, clean=clean, network="" if exact else network, threads=threads)
+
+        # Quality balanced has the same network for the HRLS
+        self.hrls = None if mode == "low" else filter_(mode, "" if mode == "fast" else "usual")
+        self.both = filter_("high", "large", clean=True)
         # For that, Open Image Denoise has a larger network, which at x2 takes for a quarter of the pixels half as long
         # as the usual one for all. Some modes are for those in a hurry: a third of the time for 0 to 0.3 dB less.
-        hurry = mode in ("low", "fast")
-        self._low_x2 = self._filter(hdr=True, quality=pyoidn.OIDN_QUALITY_BALANCED) if hurry else None
+        self._both_x2 = filter_("balanced", "usual") if mode in ("low", "fast") else None
         # Quality high would take four times as long and gain nothing
-        self._low_albedo = self._filter(hdr=False, quality=pyoidn.OIDN_QUALITY_FAST)
-
-    def _filter(self, *, hdr: bool, quality: int, clean: bool = False) -> pyoidn.Filter:
-        import pyoidn
-
-        new = pyoidn.Filter(self._device, pyoidn.OIDN_FILTER_TYPE_RT)
-        new.set_quality(quality)
-        new.set_bool("cleanAux", clean)
-        if hdr:
-            new.set_bool("hdr", True)
-            # Network values are exposed by the LRHS. Left alone, it would expose every tile for itself.
-            new.set_float("inputScale", 1.0)
-        return new
+        self.albedo = filter_("fast", "albedo")
 
     def __call__(self, lrhs: Array, hrls: Array) -> tuple[Array, Array]:
         """Denoise a pair as the network sees it.
@@ -96,7 +187,7 @@ class Denoiser:
             MssplError: Open Image Denoise failed.
         """
         low = _with_room(lrhs)
-        high = hrls if self._high is None else _with_room(hrls)
+        high = hrls if self.hrls is None else _with_room(hrls)
         self.fill(low, high)
         return low, high
 
@@ -110,46 +201,44 @@ class Denoiser:
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        layers = _layers(hrls)
-        transforms.compress(self._together(lrhs[..., :_OF_LRHS], layers), 1.0, lrhs[..., _OF_LRHS:])
-        if self._high is not None:
-            transforms.compress(self._denoised(self._high, layers), 1.0, hrls[..., _OF_HRLS:])
+        layers = layers_of(hrls)
+        self._together(lrhs[..., :_OF_LRHS], layers, lrhs[..., _OF_LRHS:])
+        if self.hrls is not None:
+            self.hrls(layers, hrls[..., _OF_HRLS:])
 
     def together(self, lrhs: Array, hrls: Array) -> Array:
-        """Of the same arguments, radiance of both renders denoised together at the LRHS's resolution, (h, w, 3).
+        """Of the same arguments, both renders denoised together at the LRHS's resolution, network values (h, w, 3).
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        return self._together(lrhs, _layers(hrls))
+        return self._together(lrhs, layers_of(hrls))
 
-    def _together(self, lrhs: Array, layers: dict[str, Array]) -> Array:
-        scale = layers["color"].shape[0] // lrhs.shape[0]
-        low = {name: transforms.box_downsample(image, scale) for name, image in layers.items()}
-        share = lrhs_share(lrhs, transforms.compress(low["color"], 1.0))
-        low["color"] = share * transforms.expand(lrhs, 1.0) + (1 - share) * low["color"]
-        filter_ = self._low
-        if scale == 2 and self._low_x2 is not None:
-            filter_ = self._low_x2
-        elif scale == 2 and "albedo" in low:
-            low["albedo"] = np.clip(self._denoised(self._low_albedo, {"albedo": low["albedo"]}), 0, 1)
-        return self._denoised(filter_, low)
+    def _together(self, lrhs: Array, layers: Layers, out: Array | None = None) -> Array:
+        filter_ = self.both
+        if self._both_x2 is not None and layers["colour"].shape[0] == 2 * lrhs.shape[0]:
+            filter_ = self._both_x2
+        return filter_(self.merged(lrhs, layers), out)
 
-    def _denoised(self, filter_: pyoidn.Filter, layers: dict[str, Array]) -> Array:
-        """The first of the images (h, w, 3), with the help of the others."""
-        images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in layers.items()}
-        images["output"] = np.empty_like(next(iter(images.values())))
-        with self._lock:
-            for name in ("color", "albedo", "normal", "output"):
-                if name in images:
-                    filter_.set_image(name, images[name], self._format)
-                else:
-                    filter_.unset_image(name)
-            filter_.commit()
-            filter_.execute()
-            if message := self._device.get_error():
-                raise MssplError(f"Open Image Denoise failed: {message}")
-        return images["output"]
+    def merged(self, lrhs: Array, layers: Layers) -> Layers:
+        """What is denoised together: the mean of both renders that has the least noise, and layers to go with it.
+
+        Args:
+            lrhs: (h, w, 3), transformed.
+            layers: of the HRLS, see :func:`layers_of`.
+
+        Raises:
+            MssplError: Open Image Denoise failed.
+        """
+        scale = layers["colour"].shape[0] // lrhs.shape[0]
+        radiance = transforms.box_downsample(transforms.expand(layers["colour"], 1.0), scale)
+        share = lrhs_share(lrhs, transforms.compress(radiance, 1.0))
+        mean = share * transforms.expand(lrhs, 1.0) + (1 - share) * radiance
+        low = {"colour": transforms.compress(mean, 1.0)}
+        low |= {name: transforms.box_downsample(layers[name], scale) for name in ("albedo", "normal") if name in layers}
+        if scale == 2 and self._both_x2 is None and "albedo" in low:
+            low["albedo"] = self.albedo({"albedo": low["albedo"]})
+        return low
 
 
 def _with_room(image: Array) -> Array:
@@ -161,15 +250,29 @@ def _with_room(image: Array) -> Array:
     return copy
 
 
-def _layers(hrls: Array) -> dict[str, Array]:
-    """The HRLS as Open Image Denoise takes it: radiance, and albedo and normal as far as they are there."""
-    colour = {"color": transforms.expand(_feature(hrls, schema.RGB), 1.0)}
+def layers_of(hrls: Array) -> Layers:
+    """What Open Image Denoise reads of an HRLS: its colour, and albedo and normal as far as they are there."""
+    colour = {"colour": _feature(hrls, schema.RGB)}
     albedo = transforms.limited(_feature(hrls, schema.ALBEDO), 0.0, 1.0)
     normal = transforms.limited(_feature(hrls, schema.NORMAL), -1.0, 1.0)
     # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
     if normal.any():
         return colour | {"albedo": albedo, "normal": normal}
     return colour | ({"albedo": albedo} if (albedo != schema.DEFAULTS[schema.ALBEDO]).any() else {})
+
+
+def _picture_to_try() -> Layers:
+    """Something of everything: noise, edges, slopes, highlights; all numbers from a formula."""
+    y, x = np.mgrid[:64, :64].astype(np.float32) / 64
+    noise = (np.modf(np.sin(np.arange(64 * 64 * 3, dtype=np.float64) * 12.9898) * 43758.5453)[0] ** 2).astype(
+        np.float32
+    )
+    albedo = np.stack([np.where((x * 6 + y * 3) % 2 < 1, 0.2, 0.7), 0.3 + 0.4 * y, 0.5 + 0 * x], axis=-1)
+    normal = np.stack([np.where(x > y, 0.8, -0.6), np.where(x > y, 0.6, 0), np.where(x > y, 0, 0.8)], axis=-1)
+    light = albedo * (0.05 + 4 * (x * y)[..., None] ** 3) + 50 * ((x - 0.3) ** 2 + (y - 0.6) ** 2 < 0.002)[..., None]
+    radiance = light * -np.log(1e-3 + noise.reshape(64, 64, 3))
+    values = transforms.compress(radiance.astype(np.float32), 1.0)
+    return {"colour": values, "albedo": albedo.astype(np.float32), "normal": normal.astype(np.float32)}
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models and the runtime that evaluates them: the only module of the package that imports onnxruntime."""
+"""Models, and what evaluates them."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from oiio_msspl import runtime
 from oiio_msspl.contract import METADATA_KEY, Contract
 from oiio_msspl.denoiser import Denoiser
 from oiio_msspl.errors import InputError, MssplError
@@ -24,7 +25,7 @@ log = logging.getLogger(__name__)
 
 #: ``--device`` name -> onnxruntime execution provider.
 PROVIDERS = {
-    "cpu": "CPUExecutionProvider",
+    "cpu": runtime.CPU,
     "cuda": "CUDAExecutionProvider",
     "tensorrt": "TensorrtExecutionProvider",
     "openvino": "OpenVINOExecutionProvider",
@@ -63,20 +64,8 @@ def find_model(scale: int, name: str | None = None) -> Path:
 
 def usable_devices() -> list[str]:
     """Keys of ``PROVIDERS`` that the installed onnxruntime was built for."""
-    import onnxruntime
-
-    available = onnxruntime.get_available_providers()
+    available = runtime.available_providers()
     return [device for device, provider in PROVIDERS.items() if provider in available]
-
-
-def _load(path: str | Path, options: onnxruntime.SessionOptions, providers: list[str]) -> onnxruntime.InferenceSession:
-    import onnxruntime
-
-    options.log_severity_level = 3
-    try:
-        return onnxruntime.InferenceSession(str(path), options, providers=providers)
-    except Exception as error:
-        raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
 
 
 def _contract(session: onnxruntime.InferenceSession, path: str | Path) -> Contract:
@@ -92,11 +81,7 @@ def read_contract(path: str | Path) -> Contract:
     Raises:
         InputError: no model, or no contract.
     """
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
-    return _contract(_load(path, options, [PROVIDERS["cpu"]]), path)
+    return _contract(runtime.load(path, optimise=False), path)
 
 
 class Session:
@@ -113,24 +98,15 @@ class Session:
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
-        import onnxruntime
-
         if device not in PROVIDERS:
             raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
         if device not in usable_devices():
             raise InputError(
-                f"--device {device}: the installed onnxruntime {onnxruntime.__version__} has no {PROVIDERS[device]}; "
+                f"--device {device}: the installed onnxruntime {runtime.version()} has no {PROVIDERS[device]}; "
                 f"usable here: {', '.join(usable_devices())}"
             )
-        options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = threads
-        # With a memory pattern, every size of tile gets a block of its own, which holds all its buffers side by side.
-        # The arena alone reuses them within a run: less memory, and no pages that the system clears for every tile.
-        options.enable_mem_pattern = False
-        # Threads that spin while they wait for the next run would take the cores from Open Image Denoise and NumPy
-        options.add_session_config_entry("session.intra_op.allow_spinning", "0")
         providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
-        self._session = _load(path, options, providers)
+        self._session = runtime.load(path, threads, providers)
         self.contract = _contract(self._session, path)
         self._denoiser = Denoiser(threads, self.contract.denoiser) if self.contract.denoiser else None
         self._outputs = [output.name for output in self._session.get_outputs()]

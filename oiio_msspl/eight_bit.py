@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open Image Denoise's own networks in 8 bits, by ONNX Runtime: a third of its time, and nearly its result.
+
+Nothing of them is in this package. Their weights are read from the library that the user has installed, and are taken
+only if they are, to the byte, those that :mod:`training.eight_bit` has seen; what is kept here is the graph, how its
+values are scaled, and by how many steps of 8 bits a weight differs from the nearest one. Whether the processor computes
+it right is tried out, against Open Image Denoise itself. Where any of that fails, Open Image Denoise does the work.
+
+Inputs and outputs are colours of a range of 2^30, and have to go through 8 bits, too. They go in parts: of equal slices
+of the range, one behind the other, each has a channel that says how far it is filled. Their sum is the value.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import mmap
+import struct
+from importlib import resources
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl import bands, runtime, transforms
+from oiio_msspl.render import Array
+
+#: Networks by what they are for, with size in bytes and SHA-256 of their weights as Open Image Denoise 2.5 has them:
+#: HDR colour with albedo and normal (``rt_hdr_alb_nrm``); the larger one for when both of these are free of noise
+#: (``rt_hdr_calb_cnrm_large``); and an albedo alone (``rt_alb``).
+NETWORKS = {
+    "usual": (1841160, "e586ef2ff48d7fbb7611986405220ed8fc5c13ca79bfc40be4dc742fbf959e1a"),
+    "large": (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
+    "albedo": (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
+}
+#: Pixels of either side are a multiple of so many.
+MULTIPLE = 16
+#: Slices of the range that a colour is written in, an albedo alone, and what either is read in.
+SLICES_IN, SLICES_OF_ALBEDO, SLICES_OUT = 3, 5, 10
+#: Channels that a network reads (slices of three colours, albedo, normal, and one that is always 0; or slices of an
+#: albedo, and the same) and makes (slices, and two that do not count). Others than multiples of 16 take long.
+CHANNELS_IN, CHANNELS_OUT = 16, 32
+
+#: The curve that Open Image Denoise sees HDR colours by: a fit to the PU encoding of Aydin et al. 2008, "Extending
+#: Quality Metrics to Full Luminance Range Images", linear below the first bound, a power below the second, a logarithm
+#: beyond. Its numbers are from core/color.h of Open Image Denoise.
+_BOUNDS = (1.57945760e-06, 3.22087631e-02)
+_SLOPE = 1.41283765e03
+_FACTOR, _EXPONENT, _OFFSET = 1.64593172e00, 4.31384981e-01, -2.94139609e-03
+_LOG_FACTOR, _LOG_SHIFT, _LOG_OFFSET = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
+
+#: Entries of the table from network values to slices: as fine as the curve's slope near black asks for.
+_ENTRIES = 1 << 16
+
+Codes = NDArray[np.uint8]
+
+
+def encode(radiance: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Radiance in [0, 65504] as Open Image Denoise's networks see it, in [0, 1]."""
+    curve = np.where(
+        radiance <= _BOUNDS[1],
+        _FACTOR * radiance**_EXPONENT + _OFFSET,
+        _LOG_FACTOR * np.log(radiance + _LOG_SHIFT) + _LOG_OFFSET,
+    )
+    return np.where(radiance <= _BOUNDS[0], _SLOPE * radiance, curve) / _top()
+
+
+def decode(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of :func:`encode`."""
+    curve = values * _top()
+    low, middle = encode(np.asarray(_BOUNDS)) * _top()
+    power = (np.maximum(curve - _OFFSET, 0) / _FACTOR) ** (1 / _EXPONENT)
+    radiance = np.where(curve <= middle, power, np.exp((curve - _LOG_OFFSET) / _LOG_FACTOR) - _LOG_SHIFT)
+    return np.where(curve <= low, curve / _SLOPE, radiance)
+
+
+def _top() -> float:
+    """What the curve ends at."""
+    return _LOG_FACTOR * float(np.log(transforms.MAX_RADIANCE + _LOG_SHIFT)) + _LOG_OFFSET
+
+
+class EightBit:
+    """One of the networks.
+
+    Args:
+        name: a key of ``NETWORKS``.
+        weights: its tensors by name, see :func:`weights_of`.
+        threads: 0 for all.
+
+    Attributes:
+        reads: the layers that it needs.
+    """
+
+    def __init__(self, name: str, weights: dict[str, NDArray[np.float16]], threads: int = 0) -> None:
+        self.reads = {"albedo"} if name == "albedo" else {"colour", "albedo", "normal"}
+        file = resources.files("oiio_msspl").joinpath("denoisers", f"{name}.onnx")
+        with resources.as_file(file) as path:
+            self._session = runtime.load(path, threads, initializers=weights)
+
+    def __call__(
+        self, albedo: Array, colour: Array | None = None, normal: Array | None = None, out: Array | None = None
+    ) -> Array:
+        """Denoise the colour; without one, the albedo.
+
+        Args:
+            albedo: (h, w, 3) in [0, 1].
+            colour: (h, w, 3), network values of an exposed render.
+            normal: (h, w, 3) in [-1, 1].
+            out: where to write the result, (h, w, 3); may be part of what the others are of.
+
+        Returns:
+            Denoised network values, or an albedo.
+        """
+        height, width = albedo.shape[:2]
+        layers = pack(albedo, colour, normal)
+        codes = self._session.run(["codes"], {"layers": layers[None]})[0][0, :height, :width]
+        table = _albedo_by_code() if colour is None else _values_by_code()
+        result = np.empty((height, width, 3), np.float32) if out is None else out
+
+        def work(rows: slice) -> None:
+            result[rows] = np.take(table, codes[rows], mode="clip")  # never beyond; four times as fast as indexing
+
+        bands.each(work, height, 3 * width)
+        return result
+
+
+def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None) -> Codes:
+    """What the network reads, (H, W, CHANNELS_IN): both sides grown to a ``MULTIPLE`` by repeating the edge."""
+    height, width = albedo.shape[:2]
+    grown = tuple(-(-side // MULTIPLE) * MULTIPLE for side in (height, width))
+    result = np.zeros((*grown, CHANNELS_IN), np.uint8)
+
+    def slices(values: Array, largest: float, table: Codes) -> Codes:
+        entries = (values * np.float32((_ENTRIES - 1) / largest)).astype(np.uint16)
+        return np.take(table, entries, axis=0, mode="clip").reshape(*values.shape[:2], -1)
+
+    def work(rows: slice) -> None:
+        part = result[rows, :width]
+        if colour is None or normal is None:
+            part[..., :-1] = slices(albedo[rows], 1.0, _slices_of_albedo())
+            return
+        part[..., :-7] = slices(colour[rows], _largest(), _slices_of_colour())
+        for i in range(3):  # as they lie in memory
+            part[..., -7 + i] = albedo[rows, :, i] * np.float32(255) + np.float32(0.5)
+            part[..., -4 + i] = normal[rows, :, i] * np.float32(127.5) + np.float32(128)
+
+    bands.each(work, height, CHANNELS_IN * width)
+    result[:height, width:] = result[:height, width - 1 : width]
+    result[height:] = result[height - 1]
+    return result
+
+
+def _largest() -> float:
+    """The largest network value."""
+    return float(np.log1p(transforms.MU * transforms.MAX_RADIANCE) / np.log1p(transforms.MU))
+
+
+def _slices(values: NDArray[np.float64], count: int) -> Codes:
+    """How far each slice of the range of values in [0, 1] is filled, (n, count)."""
+    return np.round(np.clip(values[:, None] * count - np.arange(count), 0, 1) * 255).astype(np.uint8)
+
+
+@functools.cache
+def _slices_of_colour() -> Codes:
+    """By network value, from 0 to the largest."""
+    radiance = np.expm1(np.linspace(0, _largest(), _ENTRIES) * np.log1p(transforms.MU)) / transforms.MU
+    return _slices(encode(np.minimum(radiance, transforms.MAX_RADIANCE)), SLICES_IN)
+
+
+@functools.cache
+def _slices_of_albedo() -> Codes:
+    """By albedo, from 0 to 1."""
+    return _slices(np.linspace(0, 1, _ENTRIES), SLICES_OF_ALBEDO)
+
+
+@functools.cache
+def _values_by_code() -> Array:
+    """Network values by how far all slices of the output's range are filled together."""
+    return transforms.compress(decode(_albedo_by_code().astype(np.float64)).astype(np.float32), 1.0)
+
+
+@functools.cache
+def _albedo_by_code() -> Array:
+    return np.linspace(0, 1, 255 * SLICES_OUT + 1, dtype=np.float32)
+
+
+def weights_of(name: str, library: Path) -> dict[str, NDArray[np.float16]] | None:
+    """A network's weights in a library of Open Image Denoise, or None if it has others.
+
+    The format is TZA 2: a magic number, the position of a table of names, shapes and positions, the tensors.
+    """
+    size, digest = NETWORKS[name]
+    with library.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+        start = content.find(b"\xd7\x41\x02")
+        while start >= 0:
+            blob = content[start : start + size]
+            if hashlib.sha256(blob).hexdigest() == digest:
+                return _tensors(blob)
+            start = content.find(b"\xd7\x41\x02", start + 1)
+    return None
+
+
+def _tensors(blob: bytes) -> dict[str, NDArray[np.float16]]:
+    position = 0
+
+    def take(form: str) -> tuple:
+        nonlocal position
+        values = struct.unpack_from(f"<{form}", blob, position)
+        position += struct.calcsize(f"<{form}")
+        return values
+
+    *_, position = take("HBBQ")
+    result = {}
+    for _ in range(*take("I")):
+        name = take(f"{take('H')[0]}s")[0].decode()
+        dimensions = take("B")[0]
+        shape = take(f"{dimensions}I")
+        take(f"{dimensions + 1}s")  # their order, the type of the values
+        (offset,) = take("Q")
+        result[name] = np.frombuffer(blob, np.float16, int(np.prod(shape)), offset).reshape(shape)
+    return result

@@ -169,19 +169,25 @@ def _slices_of_colour() -> Codes:
 
 @functools.cache
 def _slices_of_albedo() -> Codes:
-    """By albedo, from 0 to 1."""
-    return _slices(np.linspace(0, 1, _ENTRIES), SLICES_OF_ALBEDO)
+    """By albedo, from 0 to 1; Open Image Denoise takes it for a picture, and sees it by the curve of sRGB."""
+    return _slices(transforms.srgb(np.linspace(0, 1, _ENTRIES, dtype=np.float32)).astype(np.float64), SLICES_OF_ALBEDO)
+
+
+def _by_code() -> NDArray[np.float64]:
+    """What the network made, by how far all slices of its range are filled together."""
+    return np.linspace(0, 1, 255 * SLICES_OUT + 1)
 
 
 @functools.cache
 def _values_by_code() -> Array:
-    """Network values by how far all slices of the output's range are filled together."""
-    return transforms.compress(decode(_albedo_by_code().astype(np.float64)).astype(np.float32), 1.0)
+    """Network values."""
+    return transforms.compress(decode(_by_code()).astype(np.float32), 1.0)
 
 
 @functools.cache
 def _albedo_by_code() -> Array:
-    return np.linspace(0, 1, 255 * SLICES_OUT + 1, dtype=np.float32)
+    linear = np.linspace(0, 1, _ENTRIES, dtype=np.float32)
+    return np.interp(_by_code(), transforms.srgb(linear), linear).astype(np.float32)
 
 
 def weights_of(name: str, library: Path) -> dict[str, NDArray[np.float16]] | None:

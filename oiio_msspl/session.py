@@ -91,13 +91,14 @@ class Session:
         path: an ONNX file that carries a contract.
         device: a key of ``PROVIDERS``.
         threads: CPU threads of onnxruntime, Open Image Denoise and NumPy alike; 0: one a core.
+        exact: Open Image Denoise itself, never its networks in 8 bits (:mod:`oiio_msspl.eight_bit`).
 
     Raises:
         InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that reads
             another denoiser's result, and that is not installed.
     """
 
-    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
+    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, exact: bool = False) -> None:
         if device not in PROVIDERS:
             raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
         if device not in usable_devices():
@@ -108,7 +109,8 @@ class Session:
         providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
         self._session = runtime.load(path, threads, providers)
         self.contract = _contract(self._session, path)
-        self._denoiser = Denoiser(threads, self.contract.denoiser) if self.contract.denoiser else None
+        mode = self.contract.denoiser
+        self._denoiser = Denoiser(threads, mode, exact=exact) if mode else None
         self._outputs = [output.name for output in self._session.get_outputs()]
         self.path = Path(path)
         self.threads = threads

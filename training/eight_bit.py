@@ -403,6 +403,9 @@ def pictures(views: Path, split: str, name: str, count: int) -> Iterator[Layers]
             layers = ways["low"].merged(lrhs, layers)
         if name == "albedo":
             layers = {key: image for key, image in layers.items() if key == "albedo"}
+            # Depth of field, hair and glass make it noisier than these views are
+            noise = rng.normal(0, rng.choice([0, 0, 0.1, 0.3]), next(iter(layers.values()), np.zeros(1)).shape)
+            layers = {key: (image + noise).clip(0, 1).astype(np.float32) for key, image in layers.items()}
         if len(layers) == (1 if name == "albedo" else 3):
             count -= 1
             yield layers

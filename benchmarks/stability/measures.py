@@ -18,8 +18,9 @@ from oiio_msspl.render import Array
 
 #: Share of pixels that the trimmed RelMSE leaves out: the worst ones.
 TRIMMED = 1e-4
-#: Neighbourhoods whose range a result should not leave: pixels to each side.
-LRHS_REACH, HRLS_REACH = 1, 4
+#: Neighbourhoods whose range a result should not leave: pixels to each side. Our networks look at 10 x 10 HRLS pixels,
+#: four more to each side than the 2 x 2 that a pixel is one of.
+LRHS_REACH, HRLS_REACH = 1, 5
 #: Values are told apart from this share of mid-grey on: below, ratios say nothing.
 FLOOR = 0.01
 

@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+import hashlib
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oiio_msspl import denoiser, eight_bit, runtime, transforms
+from oiio_msspl.denoiser import Denoiser
+from tests.conftest import noisy, picture
+
+
+def layers(height, width, seed=0):
+    clean = picture(height, width)
+    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+    return {"colour": transforms.compress(noisy(clean, 4, seed), 1.0), "albedo": clean.clip(0, 1), "normal": normal}
+
+
+def test_the_curve_and_its_inverse():
+    radiance = np.concatenate([[0.0], np.geomspace(1e-8, transforms.MAX_RADIANCE, 2000)])
+    values = eight_bit.encode(radiance)
+    assert values[0] == 0
+    assert values[-1] == pytest.approx(1)
+    assert (np.diff(values) > 0).all()
+    np.testing.assert_allclose(eight_bit.decode(values), radiance, rtol=1e-3, atol=1e-9)
+
+
+def test_layers_are_written_in_slices_that_add_up():
+    drawn = layers(21, 35)
+    drawn["colour"][0, 0] = transforms.compress(np.float32([0.0, 1.0, 60000.0]), 1.0)
+    codes = eight_bit.pack(**drawn)
+    assert codes.shape == (32, 48, eight_bit.CHANNELS_IN)
+    colour = codes[:21, :35, :9].reshape(21, 35, 3, 3).sum(-1, dtype=int) / (3 * 255)
+    radiance = transforms.expand(drawn["colour"], 1.0).astype(np.float64)
+    np.testing.assert_allclose(colour, eight_bit.encode(radiance), atol=0.6 / (3 * 255))
+    np.testing.assert_allclose(codes[:21, :35, 9:12] / 255, drawn["albedo"], atol=0.6 / 255)
+    np.testing.assert_allclose(codes[:21, :35, 12:15] / 127.5 - 1, drawn["normal"], atol=1.01 / 255)
+    np.testing.assert_array_equal(codes[21:], np.broadcast_to(codes[20], (11, 48, 16)))
+    alone = eight_bit.pack(drawn["albedo"])
+    albedo = alone[:21, :35, :15].reshape(21, 35, 3, 5).sum(-1, dtype=int) / (5 * 255)
+    np.testing.assert_allclose(albedo, transforms.srgb(drawn["albedo"]), atol=0.6 / (5 * 255))
+
+
+def tza(**tensors):
+    """Weights as Open Image Denoise has them in its library."""
+    data, table = bytearray(struct.pack("<HBBQ", 0x41D7, 2, 0, 0)), struct.pack("<I", len(tensors))
+    for name, values in tensors.items():
+        table += struct.pack("<H", len(name)) + name.encode() + struct.pack("<B", values.ndim)
+        table += struct.pack(f"<{values.ndim}I", *values.shape) + b"oihw"[: values.ndim] + b"h"
+        table += struct.pack("<Q", len(data))
+        data += values.tobytes()
+    struct.pack_into("<Q", data, 4, len(data))
+    return bytes(data) + table
+
+
+def test_weights_are_found_in_a_library_or_not_taken(tmp_path, monkeypatch):
+    expected = {"a.weight": np.arange(36, dtype=np.float16).reshape(2, 2, 3, 3), "a.bias": np.float16([1, -2])}
+    blob = tza(**expected)
+    monkeypatch.setitem(eight_bit.NETWORKS, "usual", (len(blob), hashlib.sha256(blob).hexdigest()))
+    library = tmp_path / "library.so"
+    library.write_bytes(b"\xd7\x41\x02\x00other" + tza(b=np.float16([3])) + b"padding" + blob + b"rest")
+    found = eight_bit.weights_of("usual", library)
+    assert list(found) == list(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(found[name], values)
+    library.write_bytes(library.read_bytes().replace(np.float16(-2).tobytes(), np.float16(-3).tobytes()))
+    assert eight_bit.weights_of("usual", library) is None
+
+
+@pytest.fixture(scope="module")
+def both_ways():
+    pytest.importorskip("pyoidn")
+    return Denoiser(threads=1), Denoiser(threads=1, exact=True)
+
+
+@pytest.mark.parametrize("task", ["hrls", "both", "albedo"])
+def test_eight_bits_come_near_open_image_denoise(both_ways, task):
+    """By a tenth of what it takes away; also where sides are no multiple of what the network needs."""
+    ours, theirs = (getattr(way, task) for way in both_ways)
+    assert ours._eight_bit is not None, "pyoidn's weights are others than those known"
+    drawn = layers(100, 150)
+    if task == "albedo":
+        drawn = {"albedo": noisy(drawn["albedo"], 4).clip(0, 1)}
+    result, expected = ours(drawn), theirs(drawn)
+    first = next(iter(drawn.values()))
+    assert result.shape == first.shape
+    assert np.abs(result - expected).mean() < 0.1 * np.abs(first - expected).mean()
+    assert np.abs(result - expected).mean() < denoiser.TOLERANCE
+
+
+def test_without_all_layers_open_image_denoise_does_it_itself(both_ways):
+    drawn = layers(64, 64)
+    del drawn["normal"]
+    np.testing.assert_array_equal(both_ways[0].hrls(drawn), both_ways[1].hrls(drawn))
+
+
+@pytest.mark.parametrize("trouble", ["other weights", "wrong results"])
+def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trouble):
+    if trouble == "other weights":
+        monkeypatch.setattr(eight_bit, "weights_of", lambda name, library: None)
+    else:
+        plain = eight_bit.EightBit.__call__
+        monkeypatch.setattr(eight_bit.EightBit, "__call__", lambda self, **images: plain(self, **images) + 0.02)
+    with caplog.at_level("INFO", logger="oiio_msspl"):
+        doubted = Denoiser(threads=1)
+    drawn = layers(64, 64)
+    for task in ("hrls", "both"):
+        np.testing.assert_array_equal(getattr(doubted, task)(drawn), getattr(both_ways[1], task)(drawn))
+    assert {"other weights": "weights unknown here", "wrong results": "wrongly, by 0.0"}[trouble] in caplog.text
+
+
+# Making them
+
+
+def test_chosen_steps_beat_the_nearest():
+    torch = pytest.importorskip("torch")
+    from training.eight_bit import nearest_steps
+
+    random = torch.Generator().manual_seed(0)
+    mixing = torch.randn(24, 24, generator=random)
+    inputs = (torch.randn(4000, 24, generator=random) @ mixing).relu()
+    weights = torch.randn(5, 25, generator=random)
+    outputs = inputs @ weights[:, :24].T + weights[:, 24]
+
+    def error(chosen, step, bias):
+        return float((inputs @ (chosen * step[:, None]).T + bias - outputs).square().mean())
+
+    chosen, step, bias = nearest_steps(inputs, outputs, weights)
+    assert chosen.abs().max() <= 127
+    torch.testing.assert_close(chosen, chosen.round())
+    step_of_weights = weights[:, :24].abs().amax(1) / 127
+    nearest = (weights[:, :24] / step_of_weights[:, None]).round()
+    assert error(chosen, step, bias) < 0.6 * error(nearest, step_of_weights, weights[:, 24])
+
+
+def test_the_graph_computes_what_was_fitted(tmp_path):
+    """A network of few channels: from original weights and what is added to them, ONNX Runtime makes the same codes."""
+    torch = pytest.importorskip("torch")
+    from training import eight_bit as made
+
+    shape, random = made.SHAPES["usual"], torch.Generator().manual_seed(0)
+    weights: dict[str, torch.Tensor] = {}
+
+    def conv(name, channels):
+        out = 3 if name == shape.last else 8
+        scale = (2 / (9 * channels)) ** 0.5
+        weights[f"{name}.weight"] = (torch.randn(out, channels, 3, 3, generator=random) * scale).half().float()
+        weights[f"{name}.bias"] = (0.1 * torch.rand(out, generator=random)).half().float()
+        return out
+
+    made.walk(shape, 9, conv, lambda channels: channels, lambda below, skipped: below + skipped)
+    pictures = [made.picture(layers(64, 48, seed)) for seed in range(2)]
+    fit = made.quantise("usual", weights, pictures)
+    made.onnx.save(made.Graph("usual", fit).model(), tmp_path / "usual.onnx")
+    halves = {name: values.half().numpy() for name, values in weights.items()}
+    session = runtime.load(tmp_path / "usual.onnx", 1, initializers=halves)
+    codes = pictures[0][1]
+    found = session.run(["codes"], {"layers": codes[0].permute(1, 2, 0).numpy().astype(np.uint8)[None]})[0][0]
+
+    def join(below, skipped):
+        return torch.cat([made.F.interpolate(below, scale_factor=2), skipped], dim=1)
+
+    expected = made.walk(shape, codes, lambda name, x: fit.layers[name](x), lambda x: made.F.max_pool2d(x, 2), join)
+    slices = expected[0, : 3 * eight_bit.SLICES_OUT].unflatten(0, (-1, 3)).sum(dim=0).permute(1, 2, 0).numpy()
+    assert np.ptp(slices) > 100
+    # Codes that lie between two are rounded to the even one or up, and that goes on through the layers
+    assert np.abs(found - slices).mean() < 1
+
+
+def test_the_package_has_no_weights_of_open_image_denoise():
+    """What is shipped is what differs from them, which is little: most are the nearest step itself."""
+    onnx = pytest.importorskip("onnx")
+    for name in eight_bit.NETWORKS:
+        file = Path(eight_bit.__file__).parent / "denoisers" / f"{name}.onnx"
+        graph = onnx.load(file, load_external_data=False).graph
+        for tensor in graph.initializer:
+            if tensor.name.endswith(".weight") or tensor.name.endswith(".bias"):
+                assert tensor.data_location == onnx.TensorProto.EXTERNAL
+                assert not tensor.raw_data

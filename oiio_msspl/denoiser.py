@@ -11,6 +11,7 @@ better at that resolution than its result on the HRLS, for a fraction of the tim
 
 from __future__ import annotations
 
+import functools
 import logging
 import threading
 from pathlib import Path
@@ -63,7 +64,7 @@ class Filter:
         self._quality, self._clean = getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"), clean
         self._filters: dict[str, pyoidn.Filter] = {}
         self._lock = threading.Lock()  # a filter remembers the images of one call at a time
-        self._eight_bit = self._in_eight_bits(network, threads) if network else None
+        self._network, self._threads = network, threads
 
     def __call__(self, layers: Layers, out: Array | None = None) -> Array:
         """Of the layers, the colour denoised, network values (h, w, 3); or, without one, the albedo. Into ``out``, if
@@ -113,15 +114,18 @@ class Filter:
             new.set_float("inputScale", 1.0)
         return new
 
-    def _in_eight_bits(self, name: str, threads: int) -> EightBit | None:
+    @functools.cached_property
+    def _eight_bit(self) -> EightBit | None:
         import pyoidn
 
+        if not self._network:
+            return None
         library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
-        weights = eight_bit.weights_of(name, library) if library else None
+        weights = eight_bit.weights_of(self._network, library) if library else None
         if weights is None:
             log.info("this Open Image Denoise has weights unknown here, and does its work itself")
             return None
-        network = EightBit(name, weights, threads)
+        network = EightBit(self._network, weights, self._threads)
         picture = {layer: image for layer, image in _picture_to_try().items() if layer in network.reads}
         # Processors without instructions for it sum products of 8 bits in 16, which overflows
         difference = float(np.abs(network(**picture) - self._exactly(picture)).mean())

@@ -102,11 +102,10 @@ def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trou
     else:
         plain = eight_bit.EightBit.__call__
         monkeypatch.setattr(eight_bit.EightBit, "__call__", lambda self, **images: plain(self, **images) + 0.02)
+    doubted, drawn = Denoiser(threads=1), layers(64, 64)
     with caplog.at_level("INFO", logger="oiio_msspl"):
-        doubted = Denoiser(threads=1)
-    drawn = layers(64, 64)
-    for task in ("hrls", "both"):
-        np.testing.assert_array_equal(getattr(doubted, task)(drawn), getattr(both_ways[1], task)(drawn))
+        for task in ("hrls", "both"):
+            np.testing.assert_array_equal(getattr(doubted, task)(drawn), getattr(both_ways[1], task)(drawn))
     assert {"other weights": "weights unknown here", "wrong results": "wrongly, by 0.0"}[trouble] in caplog.text
 
 

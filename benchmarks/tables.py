@@ -157,8 +157,12 @@ def cycles() -> str:
     return table(head, [[code(m), *_cells(rows, m, ("psnr", "relmse", "flip"))] for m in methods])
 
 
+#: Seconds that a sample of a frame may take.
+_COSTS = tuple(np.geomspace(0.1, 100, 301))
+
+
 def total() -> str:
-    """What is gained on OIDN at the same time in all, render included, and how slow a render must be to gain anything.
+    """What is gained on OIDN at the same time in all, render included, and how slow or fast a render must be to gain.
 
     OIDN's PSNR at the samples that our time would have bought is interpolated over the logarithm of its own.
     """
@@ -185,15 +189,19 @@ def total() -> str:
                 if (name, spp, judged[0]) not in psnr:
                     continue
                 gains = [gain(name, spp, scene, slower / renders[scene]["hrls"]) for scene in judged]
-                # Of ever slower renders, the first that is worth it
-                pays = next(
-                    (f"{cost:.2g} s" for cost in np.geomspace(0.1, 100, 301)
-                     if np.mean([gain(name, spp, scene, slower / cost) for scene in judged]) >= 0),
-                    "never",
-                )  # fmt: skip
+                pays = [
+                    cost for cost in _COSTS if np.mean([gain(name, spp, scene, slower / cost) for scene in judged]) >= 0
+                ]
                 cells = (f"{value:+.2f}" for value in (float(np.mean(gains)), *gains))
-                body.append([code(name), str(spp), pays, *cells])
-    return table(["", "spp", "pays from, a spp", "mean", *judged], body)
+                body.append([code(name), str(spp), _between(pays), *cells])
+    return table(["", "spp", "pays, a spp", "mean", *judged], body)
+
+
+def _between(paying: list[float]) -> str:
+    """Which of ``_COSTS`` these are: a method slower than the other pays from some cost on, a faster one up to one."""
+    if len(paying) in (0, len(_COSTS)):
+        return "always" if paying else "never"
+    return f"up to {paying[-1]:.2g} s" if paying[0] == _COSTS[0] else f"from {paying[0]:.2g} s"
 
 
 def errors() -> str:

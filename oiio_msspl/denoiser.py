@@ -123,9 +123,13 @@ class Filter:
         library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
         weights = eight_bit.weights_of(self._network, library) if library else None
         if weights is None:
-            log.info("this Open Image Denoise has weights unknown here, and does its work itself")
+            log.info("the weights of this Open Image Denoise are unknown here; it does its work itself")
             return None
-        network = EightBit(self._network, weights, self._threads)
+        try:
+            network = EightBit(self._network, weights, self._threads)
+        except InputError as error:  # an onnxruntime without these operators
+            log.info("%s; Open Image Denoise does its work itself", error)
+            return None
         picture = {layer: image for layer, image in _picture_to_try().items() if layer in network.reads}
         # Processors without instructions for it sum products of 8 bits in 16, which overflows
         difference = float(np.abs(network(**picture) - self._exactly(picture)).mean())

@@ -2,12 +2,14 @@
 import hashlib
 import struct
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from oiio_msspl import denoiser, eight_bit, runtime, transforms
 from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
 
 
@@ -95,10 +97,12 @@ def test_without_all_layers_open_image_denoise_does_it_itself(both_ways):
     np.testing.assert_array_equal(both_ways[0].hrls(drawn), both_ways[1].hrls(drawn))
 
 
-@pytest.mark.parametrize("trouble", ["other weights", "wrong results"])
+@pytest.mark.parametrize("trouble", ["other weights", "wrong results", "no operators"])
 def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trouble):
     if trouble == "other weights":
         monkeypatch.setattr(eight_bit, "weights_of", lambda name, library: None)
+    elif trouble == "no operators":
+        monkeypatch.setattr(runtime, "load", Mock(side_effect=InputError("onnxruntime can't load it")))
     else:
         plain = eight_bit.EightBit.__call__
         monkeypatch.setattr(eight_bit.EightBit, "__call__", lambda self, **images: plain(self, **images) + 0.02)
@@ -106,7 +110,8 @@ def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trou
     with caplog.at_level("INFO", logger="oiio_msspl"):
         for task in ("hrls", "both"):
             np.testing.assert_array_equal(getattr(doubted, task)(drawn), getattr(both_ways[1], task)(drawn))
-    assert {"other weights": "weights unknown here", "wrong results": "wrongly, by 0.0"}[trouble] in caplog.text
+    said = {"other weights": "are unknown here", "wrong results": "wrongly, by 0.0", "no operators": "can't load it"}
+    assert said[trouble] in caplog.text
 
 
 # Making them

@@ -185,9 +185,9 @@ class Fit:
         of_codes = weights[:, values.how.of] * values.how.worth[:, None, None]
         near = torch.cat([of_codes.flatten(1), bias[:, None]], dim=1)
         chosen, step, bias = nearest_steps(torch.cat(inputs), torch.cat(outputs), near)
-        codes, begins = self._written(name, exact)
-        layer = self.layers[name] = Layer(chosen.reshape(of_codes.shape), step, bias, values.how, codes, begins)
-        return Values(exact, [layer(codes) for codes in values.codes], codes)
+        how, begins = self._written(name, exact)
+        layer = self.layers[name] = Layer(chosen.reshape(of_codes.shape), step, bias, values.how, how, begins)
+        return Values(exact, [layer(codes) for codes in values.codes], how)
 
     def _written(self, name: str, exact: list[Tensor]) -> tuple[Codes, Tensor]:
         """How a layer's values are written, and where the slices begin."""

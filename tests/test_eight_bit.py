@@ -7,7 +7,7 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 
-from oiio_msspl import denoiser, eight_bit, runtime, transforms
+from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, runtime, transforms
 from oiio_msspl.denoiser import Denoiser
 from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
@@ -112,6 +112,15 @@ def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trou
             np.testing.assert_array_equal(getattr(doubted, task)(drawn), getattr(both_ways[1], task)(drawn))
     said = {"other weights": "are unknown here", "wrong results": "wrongly, by 0.0", "no operators": "can't load it"}
     assert said[trouble] in caplog.text
+
+
+def test_a_session_may_ask_for_open_image_denoise_itself(both_ways):
+    clean = picture(64, 64)
+    lr = Render.from_arrays("lr", rgb=transforms.box_downsample(noisy(clean, 4, seed=1), 2))
+    hr = Render.from_arrays("hr", rgb=noisy(clean, 4), albedo=clean.clip(0, 1), normal=layers(64, 64)["normal"])
+    model = find_model(2, "mix")
+    quick, exact = (fuse(lr, hr, Session(model, threads=1, exact=exact)).rgb for exact in (False, True))
+    assert 0 < np.abs(quick - exact).mean() < 0.02 * clean.mean()
 
 
 # Making them

@@ -17,24 +17,16 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-import numpy as np
-
+from benchmarks import scenes
 from benchmarks.runtime import frame
 from oiio_msspl import Render, Session, find_model, fuse, metrics, schema, tensors, transforms
 from oiio_msspl.denoiser import Denoiser, layers_of
+from oiio_msspl.pairing import Source
+from oiio_msspl.render import Array
 from training import data
 
 SPP = (1, 2, 4)
 SIZE, REPEATS = 1024, 5
-
-
-def pair(view: data.View, scale: int, spp: int) -> tuple[Render, Render]:
-    """LRHS and HRLS of a view, without diffuse and specular."""
-    whole = slice(None)
-    light = data.mean_lrhs(view, np.flatnonzero(view.lr_spp == spp)[:1])
-    layers = data.split_features(data.read_hrls(view, list(range(spp)), whole, whole).mean(axis=0))
-    kept = {name: layers[name] for name in (schema.RGB, schema.ALBEDO, schema.NORMAL)}
-    return Render.from_arrays("lr", rgb=transforms.box_downsample(light, scale)), Render.from_arrays("hr", **kept)
 
 
 def medians(ways: list[Callable[[], object]]) -> list[float]:
@@ -49,53 +41,52 @@ def medians(ways: list[Callable[[], object]]) -> list[float]:
     return [statistics.median(taken) for taken in seconds]
 
 
+def accuracy(views: list[scenes.Scene], scale: int, ways: list[Callable[[Source, Source], Array]]) -> list[float]:
+    """Mean PSNR of what each way makes of LRHS and HRLS, for each number of samples."""
+    return [
+        statistics.fmean(metrics.psnr(way(view.lrhs(scale, spp), view.hrls(spp)), view.reference) for view in views)
+        for spp in SPP
+        for way in ways
+    ]
+
+
+def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
+    """The HRLS alone, exposed as fusion would."""
+    exposure = transforms.exposure_of(scenes.beauty(lr))
+    layers = tensors.pack(tensors.read(hr, hr.data_window, hr.data_window), schema.HRLS_FEATURES, exposure)
+    return transforms.expand(denoiser.hrls(layers_of(layers)), exposure)
+
+
+def row(name: str, seconds: list[float], psnr: list[float]) -> None:
+    cells = [f"{s:.2f}" for s in seconds] + ([f"{value:.2f}" for value in psnr] or [""] * (2 * len(SPP)))
+    print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path)
     parser.add_argument("--models", nargs="+", default=["mix-x2", "mix-x4", "mix-x8"])
     args = parser.parse_args()
-    views = data.Folder(args.views).split("validation")[::3]
-    both = [Denoiser(exact=True), Denoiser()]
+    views = [scenes.of_view(view) for view in data.Folder(args.views).split("validation")[::3]]
     print("| | seconds | in 8 bits |" + "".join(f" PSNR at {spp} spp | in 8 bits |" for spp in SPP))
     print("|---|---|---|" + "---|---|" * len(SPP))
-
-    def row(name: str, seconds: list[float], scores: list[list[float]]) -> None:
-        shown = [f"{statistics.fmean(of_views):.2f}" if of_views else "" for of_views in scores]
-        print(f"| {name} | " + " | ".join([*(f"{s:.2f}" for s in seconds), *shown]) + " |", flush=True)
-
     layers = frame(SIZE, SIZE)
     hrls = tensors.pack(layers, schema.HRLS_FEATURES, 1.0)
-    scores: list[list[float]] = [[] for _ in range(2 * len(SPP))]
-    for view in views:
-        for i, spp in enumerate(SPP):
-            lr, hr = pair(view, 2, spp)
-            exposure = transforms.exposure_of(lr.layers[schema.RGB])
-            read = layers_of(tensors.pack(hr.layers, schema.HRLS_FEATURES, exposure))
-            for j, denoiser in enumerate(both):
-                image = transforms.expand(denoiser.hrls(read), 1.0)
-                scores[2 * i + j].append(metrics.psnr(image, data.read(view.ref) * np.float32(exposure)))
-    row("OIDN on the HRLS", medians([partial(d.hrls, layers_of(hrls)) for d in both]), scores)
-    for scale, name in ((2, "x2"), (4, "x4")):
+    both = [Denoiser(exact=exact) for exact in (True, False)]
+    seconds = medians([partial(denoiser.hrls, layers_of(hrls)) for denoiser in both])
+    row("OIDN on the HRLS", seconds, accuracy(views, 2, [partial(denoised, denoiser) for denoiser in both]))
+    for scale in schema.SCALES[:2]:
         low = tensors.pack({schema.RGB: layers[schema.RGB][::scale, ::scale]}, schema.LRHS_FEATURES, 1.0)
-        row(
-            f"OIDN on both together, {name}",
-            medians([partial(d.together, low, hrls) for d in both]),
-            [[]] * len(scores),
-        )
+        seconds = medians([partial(denoiser.together, low, hrls) for denoiser in both])
+        row(f"OIDN on both together, x{scale}", seconds, [])
+    hr = Render.from_arrays("hr", **layers)
     for name in args.models:
         sessions = [Session(find_model(0, name), exact=exact) for exact in (True, False)]
         scale = sessions[0].contract.scale
-        scores = [[] for _ in range(2 * len(SPP))]
-        for view in views:
-            for i, spp in enumerate(SPP):
-                lr, hr = pair(view, scale, spp)
-                exposure = np.float32(transforms.exposure_of(lr.layers[schema.RGB]))
-                for j, session in enumerate(sessions):
-                    image = fuse(lr, hr, session).rgb * exposure
-                    scores[2 * i + j].append(metrics.psnr(image, data.read(view.ref) * exposure))
-        hr = Render.from_arrays("hr", **layers)
         lr = Render.from_arrays("lr", rgb=layers[schema.RGB][::scale, ::scale].copy())
-        row(f"`{name}`", medians([partial(fuse, lr, hr, session) for session in sessions]), scores)
+        seconds = medians([partial(fuse, lr, hr, session) for session in sessions])
+        ways = [lambda lr, hr, session=session: fuse(lr, hr, session).rgb for session in sessions]
+        row(f"`{name}`", seconds, accuracy(views, scale, ways))
 
 
 if __name__ == "__main__":

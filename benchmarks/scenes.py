@@ -55,7 +55,7 @@ def load(folder: Path) -> list[Scene]:
         return [_render(reference.parent) for reference in references]
     views = data.Folder(folder).split("test")
     if clean := [view for view in views if view.meta.get("ref_psnr", 0.0) >= MIN_REFERENCE]:
-        return [_view(view) for view in clean]
+        return [of_view(view) for view in clean]
     raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing with clean references")
 
 
@@ -77,7 +77,8 @@ def _render(folder: Path) -> Scene:
     )
 
 
-def _view(view: data.View) -> Scene:
+def of_view(view: data.View) -> Scene:
+    """A rendered view."""
     reference = data.read(view.ref)
     exposure = np.float32(transforms.exposure_of(reference))
     whole = slice(None)

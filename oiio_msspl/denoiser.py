@@ -50,25 +50,30 @@ class Filter:
     Args:
         device: of pyoidn, committed.
         quality: fast, balanced or high.
+        hdr: denoises colour, not an albedo alone.
         clean: albedo and normal have no noise.
         network: its name in :mod:`oiio_msspl.eight_bit`, which is then used where it can be.
         threads: of that; 0 for all.
     """
 
     def __init__(
-        self, device: pyoidn.Device, quality: str, *, clean: bool = False, network: str = "", threads: int = 0
+        self, device: pyoidn.Device, quality: str, *, hdr: bool, clean: bool, network: str, threads: int
     ) -> None:
         import pyoidn
 
-        self._device, self._format = device, pyoidn.OIDN_FORMAT_FLOAT3
-        self._quality, self._clean = getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"), clean
-        self._filters: dict[str, pyoidn.Filter] = {}
+        self._device, self._format, self._hdr = device, pyoidn.OIDN_FORMAT_FLOAT3, hdr
+        self._filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
+        self._filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
+        self._filter.set_bool("cleanAux", clean)
+        if hdr:
+            self._filter.set_bool("hdr", True)
+            # Network values are exposed by the LRHS. Left alone, it would expose every tile for itself.
+            self._filter.set_float("inputScale", 1.0)
         self._lock = threading.Lock()  # a filter remembers the images of one call at a time
         self._network, self._threads = network, threads
 
     def __call__(self, layers: Layers, out: Array | None = None) -> Array:
-        """Of the layers, the colour denoised, network values (h, w, 3); or, without one, the albedo. Into ``out``, if
-        given.
+        """Of the layers, the colour denoised, network values (h, w, 3), or the albedo; into ``out``, if given.
 
         Raises:
             MssplError: Open Image Denoise failed.
@@ -79,48 +84,32 @@ class Filter:
 
     def _exactly(self, layers: Layers, out: Array | None = None) -> Array:
         images: dict[str, Array] = {name: layers[name] for name in ("albedo", "normal") if name in layers}
-        if "colour" not in layers:
-            return np.clip(self._executed("ldr", images), 0, 1)
+        if not self._hdr:
+            return np.clip(self._executed(images), 0, 1, out=out)
         radiance = transforms.expand(layers["colour"], 1.0)
-        return transforms.compress(self._executed("hdr", {"color": radiance} | images), 1.0, out)
+        return transforms.compress(self._executed({"color": radiance} | images), 1.0, out)
 
-    def _executed(self, kind: str, images: dict[str, Array]) -> Array:
+    def _executed(self, images: dict[str, Array]) -> Array:
         """What the network makes of the first of the images (h, w, 3), with the help of the others."""
         images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in images.items()}
         images["output"] = np.empty_like(next(iter(images.values())))
         with self._lock:
-            filter_ = self._filters.get(kind) or self._new(kind)
             for name in ("color", "albedo", "normal", "output"):
                 if name in images:
-                    filter_.set_image(name, images[name], self._format)
+                    self._filter.set_image(name, images[name], self._format)
                 else:
-                    filter_.unset_image(name)
-            filter_.commit()
-            filter_.execute()
+                    self._filter.unset_image(name)
+            self._filter.commit()
+            self._filter.execute()
             if message := self._device.get_error():
                 raise MssplError(f"Open Image Denoise failed: {message}")
         return images["output"]
 
-    def _new(self, kind: str) -> pyoidn.Filter:
-        """One for each kind of images: a filter plans anew when it gets others."""
-        import pyoidn
-
-        new = self._filters[kind] = pyoidn.Filter(self._device, pyoidn.OIDN_FILTER_TYPE_RT)
-        new.set_quality(self._quality)
-        new.set_bool("cleanAux", self._clean)
-        if kind == "hdr":
-            new.set_bool("hdr", True)
-            # Network values are exposed by the LRHS. Left alone, it would expose every tile for itself.
-            new.set_float("inputScale", 1.0)
-        return new
-
     @functools.cached_property
     def _eight_bit(self) -> EightBit | None:
-        import pyoidn
-
         if not self._network:
             return None
-        library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
+        library = installed_library()
         weights = eight_bit.weights_of(self._network, library) if library else None
         if weights is None:
             log.info("the weights of this Open Image Denoise are unknown here; it does its work itself")
@@ -168,8 +157,9 @@ class Denoiser:
         device.set_bool("setAffinity", False)  # other threads of the process want the cores too
         device.commit()
 
-        def filter_(quality: str, network: str, *, clean: bool = False) -> Filter:
-            return Filter(device, quality, clean=clean, network="" if exact else network, threads=threads)
+        def filter_(quality: str, network: str, *, hdr: bool = True, clean: bool = False) -> Filter:
+            name = "" if exact else network
+            return Filter(device, quality, hdr=hdr, clean=clean, network=name, threads=threads)
 
         # Quality balanced has the same network for the HRLS
         self.hrls = None if mode == "low" else filter_(mode, "" if mode == "fast" else "usual")
@@ -178,7 +168,7 @@ class Denoiser:
         # as the usual one for all. Some modes are for those in a hurry: a third of the time for 0 to 0.3 dB less.
         self._both_x2 = filter_("balanced", "usual") if mode in ("low", "fast") else None
         # Quality high would take four times as long and gain nothing
-        self.albedo = filter_("fast", "albedo")
+        self.albedo = filter_("fast", "albedo", hdr=False)
 
     def __call__(self, lrhs: Array, hrls: Array) -> tuple[Array, Array]:
         """Denoise a pair as the network sees it.
@@ -247,6 +237,13 @@ class Denoiser:
         if scale == 2 and self._both_x2 is None and "albedo" in low:
             low["albedo"] = self.albedo({"albedo": low["albedo"]})
         return low
+
+
+def installed_library() -> Path | None:
+    """The library of Open Image Denoise that has its weights."""
+    import pyoidn
+
+    return next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
 
 
 def _with_room(image: Array) -> Array:

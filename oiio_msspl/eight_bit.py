@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise's own networks in 8 bits, by ONNX Runtime: a third of its time, and nearly its result.
+"""Open Image Denoise's own networks in 8 bits, by ONNX Runtime: less than half of its time, and nearly its result.
 
 Nothing of them is in this package. Their weights are read from the library that the user has installed, and are taken
 only if they are, to the byte, those that :mod:`training.eight_bit` has seen; what is kept here is the graph, how its
@@ -125,7 +125,8 @@ class EightBit:
 
 
 def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None) -> Codes:
-    """What the network reads, (H, W, CHANNELS_IN): both sides grown to a ``MULTIPLE`` by repeating the edge."""
+    """What the network reads, of all three or of an albedo alone, (H, W, CHANNELS_IN): both sides grown to a
+    ``MULTIPLE`` by repeating the edge."""
     height, width = albedo.shape[:2]
     grown = tuple(-(-side // MULTIPLE) * MULTIPLE for side in (height, width))
     result = np.zeros((*grown, CHANNELS_IN), np.uint8)

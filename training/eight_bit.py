@@ -6,7 +6,7 @@
 For each network, ``oiio_msspl/denoisers/NAME.onnx``: a graph of 8-bit convolutions that leaves its weights open, how
 its values are scaled, and by how many steps each weight differs from the nearest one.
 
-Rounded to the nearest step, weights cost 1 to 2 dB. So layer after layer they are chosen on pictures of training
+Rounded to the nearest step, weights cost 0.7 dB. So layer after layer they are chosen on pictures of training
 views: first the weights by which the rounded values of the layer before come closest to what the layer made of the
 exact ones; then, weight after weight, the nearest step, the rest of the row making good for the error (Frantar et al.
 2023, "GPTQ", after Hassibi and Stork 1993).
@@ -22,14 +22,13 @@ from typing import TypeVar
 
 import numpy as np
 import onnx
-import pyoidn
 import torch
 import torch.nn.functional as F
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
 from oiio_msspl import eight_bit
-from oiio_msspl.denoiser import Denoiser, Layers, layers_of
+from oiio_msspl.denoiser import Denoiser, Layers, installed_library, layers_of
 from oiio_msspl.schema import SCALES
 from training import batches, data
 
@@ -425,11 +424,11 @@ def main() -> None:
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("--networks", nargs="+", choices=SHAPES, default=list(SHAPES))
     args = parser.parse_args()
-    library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"))
+    library = installed_library()
     for name in args.networks:
-        halves = eight_bit.weights_of(name, library)
+        halves = eight_bit.weights_of(name, library) if library else None
         if halves is None:
-            raise SystemExit(f"{library}: has not the weights that oiio_msspl.eight_bit names")
+            raise SystemExit(f"{library}: has not the weights that oiio_msspl.eight_bit names; install pyoidn 2.5.1")
         weights = {key: torch.from_numpy(values.astype(np.float32)) for key, values in halves.items()}
         images = [picture(layers) for layers in pictures(args.views, "train", name, PICTURES)]
         onnx.save(Graph(name, quantise(name, weights, images)).model(), FOLDER / f"{name}.onnx")

@@ -4,8 +4,9 @@
     python -m benchmarks.eight_bit VIEWS
 
 Of the views for validation (:mod:`training.views`), every third, at 1, 2 and 4 spp in either render: PSNR in sRGB
-against the reference of the HRLS denoised, and of what the models make of both. Times are taken in turn, in one
-process, on a frame of 1024 x 1024 pixels; the medians.
+against the reference of the HRLS denoised, and of what the models make of both. In 32 bits, Open Image Denoise works
+itself, and a joint network by PyTorch. Times are taken in turn, in one process, on a frame of 1024 x 1024 pixels; the
+medians.
 """
 
 from __future__ import annotations
@@ -17,16 +18,20 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import torch
+
 from benchmarks import scenes
 from benchmarks.runtime import frame
 from oiio_msspl import Render, Session, find_model, fuse, metrics, schema, tensors, transforms
 from oiio_msspl.denoiser import Denoiser, layers_of
 from oiio_msspl.pairing import Source
 from oiio_msspl.render import Array
-from training import data
+from training import data, export
+from training.train import to_tensor
 
 SPP = (1, 2, 4)
 SIZE, REPEATS = 1024, 5
+CHECKPOINT = Path(__file__).parents[1] / "training/checkpoints/joint.pt"
 
 
 def medians(ways: list[Callable[[], object]]) -> list[float]:
@@ -57,6 +62,27 @@ def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
     return transforms.expand(denoiser.hrls(layers_of(layers)), exposure)
 
 
+class InTorch(Session):
+    """A joint network in 32 bits, from its checkpoint, beside Open Image Denoise itself."""
+
+    def __init__(self, name: str) -> None:
+        super().__init__(find_model(0, name))
+        self._network, _ = export.load(CHECKPOINT)
+        self._exact = Denoiser(mode=self.contract.denoiser, exact=True)
+
+    def run(self, lrhs: Array, hrls: Array, *, error: bool = False) -> tuple[Array, Array | None]:
+        images = self._exact(lrhs[..., :3], hrls)
+        with torch.inference_mode():
+            fused, _ = self._network(*(to_tensor(image[None], torch.device("cpu")) for image in images))
+        return fused[0].permute(1, 2, 0).numpy(), None
+
+
+def in_32_bits(name: str) -> Session:
+    """A model of which nothing that can be otherwise is computed in 8 bits."""
+    model = Session(find_model(0, name), exact=True)
+    return InTorch(name) if model.contract.weights else model
+
+
 def row(name: str, seconds: list[float], psnr: list[float]) -> None:
     cells = [f"{s:.2f}" for s in seconds] + ([f"{value:.2f}" for value in psnr] or [""] * (2 * len(SPP)))
     print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
@@ -65,7 +91,9 @@ def row(name: str, seconds: list[float], psnr: list[float]) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path)
-    parser.add_argument("--models", nargs="+", default=["mix-x2", "mix-x4", "mix-x8"])
+    parser.add_argument(
+        "--models", nargs="+", default=[f"{family}-x{scale}" for family in ("mix", "joint") for scale in schema.SCALES]
+    )
     args = parser.parse_args()
     views = [scenes.of_view(view) for view in data.Folder(args.views).split("validation")[::3]]
     print("| | seconds | in 8 bits |" + "".join(f" PSNR at {spp} spp | in 8 bits |" for spp in SPP))
@@ -81,7 +109,7 @@ def main() -> None:
         row(f"OIDN on both together, x{scale}", seconds, [])
     hr = Render.from_arrays("hr", **layers)
     for name in args.models:
-        sessions = [Session(find_model(0, name), exact=exact) for exact in (True, False)]
+        sessions = [in_32_bits(name), Session(find_model(0, name))]
         scale = sessions[0].contract.scale
         lr = Render.from_arrays("lr", rgb=layers[schema.RGB][::scale, ::scale].copy())
         seconds = medians([partial(fuse, lr, hr, session) for session in sessions])

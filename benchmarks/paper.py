@@ -69,7 +69,7 @@ def _cell(rows: Rows, method: str, spp: int) -> str:
 def comparison(rows: Rows, paper: dict[str, tuple[Any, ...]], averages: tuple[int, ...]) -> str:
     """PSNR and RelMSE by average spp, and the paper's own."""
     ours = ["full resolution", "OIDN, same samples", "OIDN on the HRLS"]
-    models = {row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid", "mix"))}
+    models = {row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid", "mix", "joint"))}
     ours += sorted(name for name in models if ":" not in name)  # halved, as in the paper
     body = []
     for method in ours:

@@ -182,9 +182,10 @@ def main() -> None:
 
 def compare(args: argparse.Namespace) -> dict[str, Any]:
     """Each model and OIDN, in turn; prints the table."""
-    from oiio_msspl.session import find_model, read_contract, shipped_models
+    from oiio_msspl.contract import Contract
+    from oiio_msspl.session import find_model, shipped_models
 
-    scales = {name: read_contract(find_model(0, name)).scale for name in args.model or shipped_models()}
+    scales = {name: Contract.of_file(find_model(0, name)).scale for name in args.model or shipped_models()}
     cases = [*scales]
     try:
         import pyoidn  # noqa: F401

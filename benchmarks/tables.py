@@ -23,9 +23,9 @@ from benchmarks.paper import Rows, result, table
 from oiio_msspl.schema import SCALES
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "pyramid", "pyramid-oidn-fast", "mix", "pyramid-oidn")
+FAMILIES = ("paper", "pyramid", "mix", "joint")
 #: Those that gain most by an uneven division of the samples.
-DIVIDED = ("mix", "pyramid-oidn")
+DIVIDED = ("mix", "joint")
 #: What a user would do instead, by its name in the rows.
 PEERS = {
     "OIDN fast on the HRLS": "OIDN 2.5.1 on the HRLS, quality fast",
@@ -34,7 +34,7 @@ PEERS = {
     "OIDN, same samples": "OIDN 2.5.1 on full resolution, same samples",
 }
 OIDN = "OIDN 2.5.1, quality high"
-BEST = "mix-x2"
+BEST = "joint-x2"
 FORMS = {measure: form for measure, (_, form) in quality.MEASURES.items()}
 
 
@@ -142,7 +142,7 @@ def division() -> str:
             else ""  # OIDN has one render
             for spp, way in columns
         ]
-        for name in ("mix-x2", "mix-x4", "pyramid-x4", "OIDN, same samples")
+        for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples")
     ]
     return table(["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)], body)
 
@@ -182,7 +182,7 @@ def total() -> str:
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 
     body = []
-    for model in ("mix-x2", "mix-x4"):
+    for model in ("joint-x2", "joint-x4"):
         slower = seconds[model] - seconds[OIDN]
         for spp in quality.AVERAGES:
             for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:

@@ -8,7 +8,9 @@ about scale, channel order, transforms or defaults.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, field
+from pathlib import Path
 from typing import Any
 
 from oiio_msspl import schema, transforms
@@ -57,14 +59,41 @@ class Contract:
     defaults: dict[str, float] = field(default_factory=lambda: dict(schema.DEFAULTS))
     denoiser: str = ""
     """What Open Image Denoise does for the model, a key of :data:`oiio_msspl.denoiser.MODES`; empty: nothing."""
+    weights: str = ""
+    """A key of :data:`oiio_msspl.eight_bit.NETWORKS` whose weights the file leaves open; empty: it has its own."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp seen in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
     """Where the weights come from: data, steps, loss, seed, date, code version."""
     format: int = FORMAT
 
+    @property
+    def features(self) -> dict[str, int]:
+        """What it reads of the HRLS as it was rendered, with the number of channels."""
+        return {
+            name: count
+            for name, count in schema.HRLS_FEATURES.items()
+            if any(c.startswith(f"{name}.") for c in self.hrls)
+        }
+
     def to_json(self) -> str:
         return json.dumps(asdict(self), sort_keys=True)
+
+    @classmethod
+    def of_file(cls, path: str | Path) -> Contract:
+        """The contract of an ONNX file, of which no more is read than its metadata: what its model needs to run need
+        not be there.
+
+        Raises:
+            InputError: no such file, no ONNX file, or no contract that this version can honour.
+        """
+        try:
+            metadata = _metadata(Path(path))
+        except (OSError, ValueError, IndexError) as error:
+            raise InputError(f"{path}: can't be read as an ONNX file ({error})") from error
+        if METADATA_KEY not in metadata:
+            raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
+        return cls.from_json(metadata[METADATA_KEY], str(path))
 
     @classmethod
     def from_json(cls, text: str, source: str) -> Contract:
@@ -103,3 +132,42 @@ class Contract:
         if contract.scale not in schema.SCALES:
             raise InputError(f"{source}: scale {contract.scale} is none of {schema.SCALES}")
         return contract
+
+
+#: Numbers that Protocol Buffers' fields have in ONNX: of a model, its metadata; of an entry, its key and its value.
+_METADATA, _KEY, _VALUE = 14, 1, 2
+#: How a field is written.
+_INTEGER, _BYTES = 0, 2
+
+
+def _metadata(path: Path) -> dict[str, str]:
+    """Metadata of an ONNX file. ONNX Runtime would load the whole model to read it, and refuse one whose weights are
+    left open."""
+    content = memoryview(path.read_bytes())
+    entries = [dict(_fields(entry)) for number, entry in _fields(content) if number == _METADATA]
+    return {str(e[_KEY], "utf-8"): str(e[_VALUE], "utf-8") for e in entries if e.keys() >= {_KEY, _VALUE}}
+
+
+def _fields(message: memoryview) -> Iterator[tuple[int, memoryview]]:
+    """Number and content of a Protocol Buffers message's fields; of those that are no integers."""
+    position = 0
+
+    def integer() -> int:
+        nonlocal position
+        value = shift = 0
+        while True:
+            byte = message[position]
+            position, value, shift = position + 1, value | (byte & 127) << shift, shift + 7
+            if byte < 128:
+                return value
+
+    while position < len(message):
+        number, kind = divmod(integer(), 8)
+        if kind == _INTEGER:
+            integer()
+        elif kind == _BYTES:
+            length = integer()
+            yield number, message[position : position + length]
+            position += length
+        else:
+            raise ValueError("no message of a model")

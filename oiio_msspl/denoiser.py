@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl import eight_bit, schema, transforms
 from oiio_msspl.eight_bit import EightBit
@@ -36,8 +37,8 @@ _OF_LRHS, _OF_HRLS = sum(schema.LRHS_FEATURES.values()), sum(schema.HRLS_FEATURE
 _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.values()]), strict=False))
 
 
-#: What is denoised: both renders together at the LRHS's resolution, and the HRLS too, in one of three qualities.
-MODES = ("low", "fast", "balanced", "high")
+#: What is denoised: both renders together at the LRHS's resolution (``together``), and the HRLS too (``high``).
+MODES = ("together", "high")
 #: Bounds of the LRHS's share in what is denoised at its resolution: an estimate that wants all or none may be wrong.
 _SHARE = (0.05, 0.95)
 #: Largest mean difference in network values between Open Image Denoise and itself in 8 bits, on a small picture.
@@ -49,7 +50,7 @@ class Filter:
 
     Args:
         device: of pyoidn, committed.
-        quality: fast, balanced or high.
+        quality: fast or high.
         hdr: denoises colour, not an albedo alone.
         clean: albedo and normal have no noise.
         network: its name in :mod:`oiio_msspl.eight_bit`, which is then used where it can be.
@@ -81,6 +82,11 @@ class Filter:
         if self._eight_bit is not None and layers.keys() == self._eight_bit.reads:
             return self._eight_bit(**layers, out=out)
         return self._exactly(layers, out)
+
+    @property
+    def in_eight_bits(self) -> bool:
+        """Whether it is that network that does the work, where all layers that it needs are there."""
+        return self._eight_bit is not None
 
     def _exactly(self, layers: Layers, out: Array | None = None) -> Array:
         images: dict[str, Array] = {name: layers[name] for name in ("albedo", "normal") if name in layers}
@@ -161,12 +167,9 @@ class Denoiser:
             name = "" if exact else network
             return Filter(device, quality, hdr=hdr, clean=clean, network=name, threads=threads)
 
-        # Quality balanced has the same network for the HRLS
-        self.hrls = None if mode == "low" else filter_(mode, "" if mode == "fast" else "usual")
+        self.hrls = filter_("high", "usual") if mode == "high" else None
+        # A larger network than the usual one
         self.both = filter_("high", "large", clean=True)
-        # For that, Open Image Denoise has a larger network, which at x2 takes for a quarter of the pixels half as long
-        # as the usual one for all. Some modes are for those in a hurry: a third of the time for 0 to 0.3 dB less.
-        self._both_x2 = filter_("balanced", "usual") if mode in ("low", "fast") else None
         # Quality high would take four times as long and gain nothing
         self.albedo = filter_("fast", "albedo", hdr=False)
 
@@ -175,11 +178,13 @@ class Denoiser:
 
         Args:
             lrhs: (h, w, 3), transformed.
-            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`.
+            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`; the first 9 are
+                enough in mode ``together``.
 
         Returns:
             Both with what was denoised as further channels, transformed colour: (h, w, 6), the LRHS with both renders
-            together at its resolution; and (s*h, s*w, 19), the HRLS with itself denoised, or as it is (mode ``low``).
+            together at its resolution; and (s*h, s*w, 19), the HRLS with itself denoised, or as it is (mode
+            ``together``).
 
         Raises:
             MssplError: Open Image Denoise failed.
@@ -194,13 +199,13 @@ class Denoiser:
 
         Args:
             lrhs: (h, w, 6).
-            hrls: (s*h, s*w, 19); 16 in mode ``low``.
+            hrls: (s*h, s*w, 19); 9 or more in mode ``together``: colour, albedo, normal.
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
         layers = layers_of(hrls)
-        self._together(lrhs[..., :_OF_LRHS], layers, lrhs[..., _OF_LRHS:])
+        self.both(self.merged(lrhs[..., :_OF_LRHS], layers), lrhs[..., _OF_LRHS:])
         if self.hrls is not None:
             self.hrls(layers, hrls[..., _OF_HRLS:])
 
@@ -210,13 +215,7 @@ class Denoiser:
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        return self._together(lrhs, layers_of(hrls))
-
-    def _together(self, lrhs: Array, layers: Layers, out: Array | None = None) -> Array:
-        filter_ = self.both
-        if self._both_x2 is not None and layers["colour"].shape[0] == 2 * lrhs.shape[0]:
-            filter_ = self._both_x2
-        return filter_(self.merged(lrhs, layers), out)
+        return self.both(self.merged(lrhs, layers_of(hrls)))
 
     def merged(self, lrhs: Array, layers: Layers) -> Layers:
         """What is denoised together: the mean of both renders that has the least noise, and layers to go with it.
@@ -234,7 +233,7 @@ class Denoiser:
         mean = share * transforms.expand(lrhs, 1.0) + (1 - share) * radiance
         low = {"colour": transforms.compress(mean, 1.0)}
         low |= {name: transforms.box_downsample(layers[name], scale) for name in ("albedo", "normal") if name in layers}
-        if scale == 2 and self._both_x2 is None and "albedo" in low:
+        if scale == 2 and "albedo" in low:
             low["albedo"] = self.albedo({"albedo": low["albedo"]})
         return low
 
@@ -244,6 +243,39 @@ def installed_library() -> Path | None:
     import pyoidn
 
     return next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
+
+
+@functools.cache
+def eight_bits_work() -> bool:
+    """Whether pyoidn is installed, with weights that :mod:`oiio_msspl.eight_bit` knows, and this machine computes with
+    them in 8 bits what Open Image Denoise does in 32."""
+    try:
+        filter_ = Denoiser(mode="high").hrls
+    except InputError:
+        return False
+    return filter_ is not None and filter_.in_eight_bits
+
+
+@functools.cache
+def installed_weights(network: str) -> dict[str, NDArray[np.float16]]:
+    """Weights of a network of :mod:`oiio_msspl.eight_bit`, from the installed Open Image Denoise.
+
+    Raises:
+        InputError: pyoidn is not installed, or has others.
+    """
+    try:
+        library = installed_library()
+    except (ImportError, OSError) as error:
+        raise InputError(
+            "this model is made of Open Image Denoise's weights: pip install pyoidn, or choose another --model"
+        ) from error
+    weights = eight_bit.weights_of(network, library) if library else None
+    if weights is None:
+        raise InputError(
+            f"this model is made of the weights of Open Image Denoise 2.5, and {library} has others: install "
+            "that version of pyoidn, or choose another --model"
+        )
+    return weights
 
 
 def _with_room(image: Array) -> Array:
@@ -256,10 +288,9 @@ def _with_room(image: Array) -> Array:
 
 
 def layers_of(hrls: Array) -> Layers:
-    """What Open Image Denoise reads of an HRLS: its colour, and albedo and normal as far as they are there."""
-    colour = {"colour": _feature(hrls, schema.RGB)}
+    """What Open Image Denoise reads of a transformed HRLS: its colour, and albedo and normal as far as they are there."""
+    colour, normal = {"colour": _feature(hrls, schema.RGB)}, _feature(hrls, schema.NORMAL)
     albedo = transforms.limited(_feature(hrls, schema.ALBEDO), 0.0, 1.0)
-    normal = transforms.limited(_feature(hrls, schema.NORMAL), -1.0, 1.0)
     # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
     if normal.any():
         return colour | {"albedo": albedo, "normal": normal}

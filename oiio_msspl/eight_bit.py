@@ -44,10 +44,10 @@ CHANNELS_IN, CHANNELS_OUT = 16, 32
 #: The curve that Open Image Denoise sees HDR colours by: a fit to the PU encoding of Aydin et al. 2008, "Extending
 #: Quality Metrics to Full Luminance Range Images", linear below the first bound, a power below the second, a logarithm
 #: beyond. Its numbers are from core/color.h of Open Image Denoise.
-_BOUNDS = (1.57945760e-06, 3.22087631e-02)
-_SLOPE = 1.41283765e03
-_FACTOR, _EXPONENT, _OFFSET = 1.64593172e00, 4.31384981e-01, -2.94139609e-03
-_LOG_FACTOR, _LOG_SHIFT, _LOG_OFFSET = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
+BOUNDS = (1.57945760e-06, 3.22087631e-02)
+SLOPE = 1.41283765e03
+FACTOR, EXPONENT, OFFSET = 1.64593172e00, 4.31384981e-01, -2.94139609e-03
+LOG_FACTOR, LOG_SHIFT, LOG_OFFSET = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
 
 #: Entries of the table from network values to slices: as fine as the curve's slope near black asks for.
 _ENTRIES = 1 << 16
@@ -58,25 +58,25 @@ Codes = NDArray[np.uint8]
 def encode(radiance: NDArray[np.float64]) -> NDArray[np.float64]:
     """Radiance in [0, 65504] as Open Image Denoise's networks see it, in [0, 1]."""
     curve = np.where(
-        radiance <= _BOUNDS[1],
-        _FACTOR * radiance**_EXPONENT + _OFFSET,
-        _LOG_FACTOR * np.log(radiance + _LOG_SHIFT) + _LOG_OFFSET,
+        radiance <= BOUNDS[1],
+        FACTOR * radiance**EXPONENT + OFFSET,
+        LOG_FACTOR * np.log(radiance + LOG_SHIFT) + LOG_OFFSET,
     )
-    return np.where(radiance <= _BOUNDS[0], _SLOPE * radiance, curve) / _top()
+    return np.where(radiance <= BOUNDS[0], SLOPE * radiance, curve) / top()
 
 
 def decode(values: NDArray[np.float64]) -> NDArray[np.float64]:
     """Inverse of :func:`encode`."""
-    curve = values * _top()
-    low, middle = encode(np.asarray(_BOUNDS)) * _top()
-    power = (np.maximum(curve - _OFFSET, 0) / _FACTOR) ** (1 / _EXPONENT)
-    radiance = np.where(curve <= middle, power, np.exp((curve - _LOG_OFFSET) / _LOG_FACTOR) - _LOG_SHIFT)
-    return np.where(curve <= low, curve / _SLOPE, radiance)
+    curve = values * top()
+    low, middle = encode(np.asarray(BOUNDS)) * top()
+    power = (np.maximum(curve - OFFSET, 0) / FACTOR) ** (1 / EXPONENT)
+    radiance = np.where(curve <= middle, power, np.exp((curve - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT)
+    return np.where(curve <= low, curve / SLOPE, radiance)
 
 
-def _top() -> float:
+def top() -> float:
     """What the curve ends at."""
-    return _LOG_FACTOR * float(np.log(transforms.MAX_RADIANCE + _LOG_SHIFT)) + _LOG_OFFSET
+    return LOG_FACTOR * float(np.log(transforms.MAX_RADIANCE + LOG_SHIFT)) + LOG_OFFSET
 
 
 class EightBit:
@@ -114,7 +114,7 @@ class EightBit:
         height, width = albedo.shape[:2]
         layers = pack(albedo, colour, normal)
         codes = self._session.run(["codes"], {"layers": layers[None]})[0][0, :height, :width]
-        table = _albedo_by_code() if colour is None else _values_by_code()
+        table = _albedo_by_code() if colour is None else values_by_code(SLICES_OUT)
         result = np.empty((height, width, 3), np.float32) if out is None else out
 
         def work(rows: slice) -> None:
@@ -140,7 +140,7 @@ def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None
         if colour is None or normal is None:
             part[..., :-1] = slices(albedo[rows], 1.0, _slices_of_albedo())
             return
-        part[..., :-7] = slices(colour[rows], _largest(), _slices_of_colour())
+        part[..., :-7] = slices(colour[rows], largest(), _slices_of_colour())
         for i in range(3):  # as they lie in memory
             part[..., -7 + i] = albedo[rows, :, i] * np.float32(255) + np.float32(0.5)
             part[..., -4 + i] = normal[rows, :, i] * np.float32(127.5) + np.float32(128)
@@ -151,9 +151,15 @@ def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None
     return result
 
 
-def _largest() -> float:
+def largest() -> float:
     """The largest network value."""
     return float(np.log1p(transforms.MU * transforms.MAX_RADIANCE) / np.log1p(transforms.MU))
+
+
+def seen(entries: int) -> NDArray[np.float64]:
+    """What network values from 0 to the largest are to Open Image Denoise, so many equally spaced."""
+    radiance = np.expm1(np.linspace(0, largest(), entries) * np.log1p(transforms.MU)) / transforms.MU
+    return encode(np.minimum(radiance, transforms.MAX_RADIANCE))
 
 
 def _slices(values: NDArray[np.float64], count: int) -> Codes:
@@ -164,8 +170,7 @@ def _slices(values: NDArray[np.float64], count: int) -> Codes:
 @functools.cache
 def _slices_of_colour() -> Codes:
     """By network value, from 0 to the largest."""
-    radiance = np.expm1(np.linspace(0, _largest(), _ENTRIES) * np.log1p(transforms.MU)) / transforms.MU
-    return _slices(encode(np.minimum(radiance, transforms.MAX_RADIANCE)), SLICES_IN)
+    return _slices(seen(_ENTRIES), SLICES_IN)
 
 
 @functools.cache
@@ -174,21 +179,21 @@ def _slices_of_albedo() -> Codes:
     return _slices(transforms.srgb(np.linspace(0, 1, _ENTRIES, dtype=np.float32)).astype(np.float64), SLICES_OF_ALBEDO)
 
 
-def _by_code() -> NDArray[np.float64]:
+def _by_code(slices: int) -> NDArray[np.float64]:
     """What the network made, by how far all slices of its range are filled together."""
-    return np.linspace(0, 1, 255 * SLICES_OUT + 1)
+    return np.linspace(0, 1, 255 * slices + 1)
 
 
 @functools.cache
-def _values_by_code() -> Array:
-    """Network values."""
-    return transforms.compress(decode(_by_code()).astype(np.float32), 1.0)
+def values_by_code(slices: int) -> Array:
+    """Network values of what the network made, by the sum of its slices' codes."""
+    return transforms.compress(decode(_by_code(slices)).astype(np.float32), 1.0)
 
 
 @functools.cache
 def _albedo_by_code() -> Array:
     linear = np.linspace(0, 1, _ENTRIES, dtype=np.float32)
-    return np.interp(_by_code(), transforms.srgb(linear), linear).astype(np.float32)
+    return np.interp(_by_code(SLICES_OUT), transforms.srgb(linear), linear).astype(np.float32)
 
 
 def weights_of(name: str, library: Path) -> dict[str, NDArray[np.float16]] | None:

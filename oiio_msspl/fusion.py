@@ -80,6 +80,7 @@ def fuse(
         session.require_error()
     if contract.scale != pairing.scale:
         raise InputError(f"model {contract.name} is for x{contract.scale}, but this pair is x{pairing.scale}")
+    read = [*contract.features, "alpha"]
     scale, grid = pairing.scale, tiling.aligned(pairing.grid, contract.alignment)
 
     with bands.threads(session.threads):
@@ -103,7 +104,7 @@ def fuse(
         for done, tile in enumerate(plan):
             area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
             target, inside = core.intersect(hr_data), tile.area.slices(grid)
-            layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core)
+            layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core, features=read)
             # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
             # surface may be so dark that hardly a sample finds light; there, that takes more to believe.
             empty: NDArray[np.bool_] | None = None
@@ -113,7 +114,7 @@ def fuse(
             if empty is None or not empty.all():
                 lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
                 lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure, len(contract.lrhs))
-                hrls = tensors.pack(features, schema.HRLS_FEATURES, exposure, len(contract.hrls))
+                hrls = tensors.pack(features, contract.features, exposure, len(contract.hrls))
                 means = transforms.compress(transforms.box_downsample(features[schema.RGB], scale), exposure)
                 seen = tile.area.intersect(pairing.grid).slices(tile.area)  # what lies beyond is made up
                 if np.abs(means[seen] - lrhs[seen][..., :3]).max() <= CONVERGED:
@@ -241,7 +242,7 @@ def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, sca
     grey[schema.RGB] = np.repeat(alpha, 3, axis=-1)
     contract = session.contract
     lrhs = tensors.pack({schema.RGB: np.repeat(low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0, len(contract.lrhs))
-    values, _ = session.run(lrhs, tensors.pack(grey, schema.HRLS_FEATURES, 1.0, len(contract.hrls)))
+    values, _ = session.run(lrhs, tensors.pack(grey, contract.features, 1.0, len(contract.hrls)))
     fused = np.clip(transforms.expand(values, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 

@@ -36,8 +36,6 @@ def load(
     threads: int = 0,
     providers: Sequence[str] = (CPU,),
     initializers: Mapping[str, NDArray[Any]] | None = None,
-    *,
-    optimise: bool = True,
 ) -> onnxruntime.InferenceSession:
     """A network, ready to run.
 
@@ -46,7 +44,6 @@ def load(
         threads: of the CPU; 0: one a core.
         providers: execution providers, the first one that can takes a node.
         initializers: by name, those that the file leaves open.
-        optimise: not needed to read what a file says about itself.
 
     Raises:
         InputError: it can't be loaded.
@@ -61,8 +58,6 @@ def load(
     options.enable_mem_pattern = False
     # Threads that spin while they wait for the next run would take the cores from Open Image Denoise and NumPy
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    if not optimise:
-        options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     if initializers:
         values = [onnxruntime.OrtValue.ortvalue_from_numpy(array) for array in initializers.values()]
         options.add_external_initializers(list(initializers), values)

@@ -48,5 +48,6 @@ def channel_names(features: dict[str, int]) -> list[str]:
 def inputs(denoiser: str) -> tuple[dict[str, int], dict[str, int]]:
     """What a model reads of the LRHS and of the HRLS, with a denoiser of :data:`oiio_msspl.denoiser.MODES` or none."""
     low = DENOISED_FEATURES if denoiser else {}
-    high = DENOISED_FEATURES if denoiser not in ("", "low") else {}
-    return LRHS_FEATURES | low, HRLS_FEATURES | high
+    if denoiser == "together":  # and it denoises the HRLS itself, from the layers that denoisers read
+        return LRHS_FEATURES | low, {name: HRLS_FEATURES[name] for name in (RGB, ALBEDO, NORMAL)}
+    return LRHS_FEATURES | low, HRLS_FEATURES | low

@@ -8,18 +8,15 @@ import time
 from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from oiio_msspl import runtime
-from oiio_msspl.contract import METADATA_KEY, Contract
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.contract import Contract
+from oiio_msspl.denoiser import Denoiser, eight_bits_work, installed_weights
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.render import Array
-
-if TYPE_CHECKING:
-    import onnxruntime
 
 log = logging.getLogger(__name__)
 
@@ -33,9 +30,9 @@ PROVIDERS = {
     "directml": "DmlExecutionProvider",
 }
 
-#: What ``--model`` is where no other is asked for: ``BEST`` if what it needs is installed, otherwise ``ALWAYS``. On the
-#: scenes that judge, ``BEST`` has 0.4 to 0.8 dB more (README).
-AUTO, BEST, ALWAYS = "auto", "mix", "pyramid"
+#: What ``--model`` is where no other is asked for: ``BEST`` where pyoidn is installed and its weights are of use in 8
+#: bits; ``BESIDE`` with any other pyoidn; otherwise ``ALWAYS``.
+AUTO, BEST, BESIDE, ALWAYS = "auto", "joint", "mix", "pyramid"
 
 
 def shipped_models() -> dict[str, Path]:
@@ -52,7 +49,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
     """
     models = shipped_models()
     if name in (None, AUTO):
-        name = BEST if find_spec("pyoidn") else ALWAYS
+        name = (BEST if eight_bits_work() else BESIDE) if find_spec("pyoidn") else ALWAYS
     for known in (name, f"{name}-x{scale}"):
         if known in models:
             return models[known]
@@ -68,22 +65,6 @@ def usable_devices() -> list[str]:
     return [device for device, provider in PROVIDERS.items() if provider in available]
 
 
-def _contract(session: onnxruntime.InferenceSession, path: str | Path) -> Contract:
-    metadata = session.get_modelmeta().custom_metadata_map
-    if METADATA_KEY not in metadata:
-        raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
-    return Contract.from_json(metadata[METADATA_KEY], str(path))
-
-
-def read_contract(path: str | Path) -> Contract:
-    """A model's contract alone; what the model needs to run need not be there.
-
-    Raises:
-        InputError: no model, or no contract.
-    """
-    return _contract(runtime.load(path, optimise=False), path)
-
-
 class Session:
     """A loaded model on a device, with its contract.
 
@@ -91,11 +72,12 @@ class Session:
         path: an ONNX file that carries a contract.
         device: a key of ``PROVIDERS``.
         threads: CPU threads of onnxruntime, Open Image Denoise and NumPy alike; 0: one a core.
-        exact: Open Image Denoise itself, never its networks in 8 bits (:mod:`oiio_msspl.eight_bit`).
+        exact: Open Image Denoise itself, never its networks in 8 bits (:mod:`oiio_msspl.eight_bit`). What the model
+            computes in 8 bits stays so.
 
     Raises:
         InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that reads
-            another denoiser's result, and that is not installed.
+            another denoiser's result, or is made of its weights, and that is not installed, or is another version.
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, exact: bool = False) -> None:
@@ -107,8 +89,16 @@ class Session:
                 f"usable here: {', '.join(usable_devices())}"
             )
         providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
-        self._session = runtime.load(path, threads, providers)
-        self.contract = _contract(self._session, path)
+        self.contract = Contract.of_file(path)
+        weights = None
+        if self.contract.weights:
+            weights = installed_weights(self.contract.weights)
+            if not eight_bits_work():
+                raise InputError(
+                    f"model {self.contract.name} is in 8 bits, which this machine computes wrongly; "
+                    "choose another --model"
+                )
+        self._session = runtime.load(path, threads, providers, weights)
         mode = self.contract.denoiser
         self._denoiser = Denoiser(threads, mode, exact=exact) if mode else None
         self._outputs = [output.name for output in self._session.get_outputs()]
@@ -145,6 +135,7 @@ class Session:
                 self._denoiser.fill(lrhs, hrls)
             else:
                 lrhs, hrls = self._denoiser(lrhs, hrls)
+                hrls = hrls[..., : len(self.contract.hrls)]
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),

@@ -79,7 +79,7 @@ def test_its_exposure_is_the_frames_not_the_tiles(denoiser):
 
 def test_it_may_leave_the_hrls_alone(denoiser):
     lrhs, hrls, _ = packed()
-    low, high = Denoiser(threads=1, mode="low")(lrhs, hrls)
+    low, high = Denoiser(threads=1, mode="together")(lrhs, hrls)
     np.testing.assert_array_equal(low, denoiser(lrhs, hrls)[0])
     assert high is hrls
 

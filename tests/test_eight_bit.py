@@ -139,7 +139,7 @@ def test_chosen_steps_beat_the_nearest():
     def error(chosen, step, bias):
         return float((inputs @ (chosen * step[:, None]).T + bias - outputs).square().mean())
 
-    chosen, step, bias = nearest_steps(inputs, outputs, weights)
+    chosen, step, bias = nearest_steps(inputs, outputs, weights, weights[:, :24])
     assert chosen.abs().max() <= 127
     torch.testing.assert_close(chosen, chosen.round())
     step_of_weights = weights[:, :24].abs().amax(1) / 127
@@ -162,19 +162,26 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
         weights[f"{name}.bias"] = (0.1 * torch.rand(out, generator=random)).half().float()
         return out
 
-    made.walk(shape, 9, conv, lambda channels: channels, lambda below, skipped: below + skipped)
+    def same(channels):
+        return channels
+
+    made.walk(shape, [9], conv, same, same, lambda one, other: one + other)
     pictures = [made.picture(layers(64, 48, seed)) for seed in range(2)]
     fit = made.quantise("usual", weights, pictures)
-    made.onnx.save(made.Graph("usual", fit).model(), tmp_path / "usual.onnx")
+    made.onnx.save(made.Graph(fit).model(), tmp_path / "usual.onnx")
     halves = {name: values.half().numpy() for name, values in weights.items()}
     session = runtime.load(tmp_path / "usual.onnx", 1, initializers=halves)
     codes = pictures[0][1]
     found = session.run(["codes"], {"layers": codes[0].permute(1, 2, 0).numpy().astype(np.uint8)[None]})[0][0]
 
-    def join(below, skipped):
-        return torch.cat([made.F.interpolate(below, scale_factor=2), skipped], dim=1)
-
-    expected = made.walk(shape, codes, lambda name, x: fit.layers[name](x), lambda x: made.F.max_pool2d(x, 2), join)
+    expected = made.walk(
+        shape,
+        [codes],
+        lambda name, x: fit.layers[name](x),
+        lambda x: made.F.max_pool2d(x, 2),
+        lambda x: made.F.interpolate(x, scale_factor=2),
+        lambda one, other: torch.cat([one, other], dim=1),
+    )
     slices = expected[0, : 3 * eight_bit.SLICES_OUT].unflatten(0, (-1, 3)).sum(dim=0).permute(1, 2, 0).numpy()
     assert np.ptp(slices) > 100
     # Codes that lie between two are rounded to the even one or up, and that goes on through the layers

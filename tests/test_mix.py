@@ -13,8 +13,8 @@ from torch.nn import functional as F  # noqa: E402
 from oiio_msspl import schema  # noqa: E402
 from oiio_msspl.contract import Contract  # noqa: E402
 from training import train  # noqa: E402
-from training.mix import LEVELS, MixFusion, disagreement, mixed  # noqa: E402
-from training.pyramid import CANDIDATES, PyramidFusion, logarithmic  # noqa: E402
+from training.mix import MixFusion, disagreement, mixed  # noqa: E402
+from training.pyramid import logarithmic  # noqa: E402
 
 HEIGHT, WIDTH = 64, 96
 #: By their place in FINER and in COARSEST.
@@ -106,30 +106,6 @@ def test_it_never_leaves_the_range_of_its_inputs(network: MixFusion) -> None:
     assert fused.max() <= 1.0
 
 
-@torch.inference_mode()
-def test_it_starts_with_the_choices_of_a_pyramid(network: MixFusion, tmp_path: Path) -> None:
-    channels = (16, 16, 16, 16)
-    pyramid = PyramidFusion(channels=(*channels, 16), own_size=(1, 3, 3, 3, 3), denoiser="high")
-    for head in pyramid.heads:
-        head.bias.copy_(torch.randn_like(head.bias))
-    torch.save({"ema": pyramid.state_dict(), "config": pyramid.config}, tmp_path / "pyramid.pt")
-    network = MixFusion(channels=channels, stem_size=6)
-    train.warm_start(network, tmp_path / "pyramid.pt")
-    assert torch.equal(network.stem.weight, pyramid.stem.weight)
-    for level in range(LEVELS):
-        ours, theirs = (n.heads[level].bias.unflatten(0, (-1, 1 if level else 4)) for n in (network, pyramid))
-        means, brought, denoised, together = theirs[-len(CANDIDATES) :]
-        assert torch.equal(ours[:3], torch.stack([brought, denoised, means]))
-        assert torch.equal(ours[4], together) if level else torch.equal(ours[4], theirs[-5] + 2)
-
-
-@pytest.mark.parametrize("config", [{"scale": 4}, {"own_size": [1] * 5, "denoiser": ""}, {"denoiser": "low"}])
-def test_it_does_not_start_from_what_has_no_such_choices(network: MixFusion, tmp_path: Path, config: dict) -> None:
-    torch.save({"ema": {}, "config": config}, tmp_path / "other.pt")
-    with pytest.raises(SystemExit, match=r"other\.pt: a network that mixes starts from one that reads"):
-        train.warm_start(network, tmp_path / "other.pt")
-
-
 def test_a_teacher_is_agreed_with(network: MixFusion) -> None:
     """Deciding as it does costs nothing, otherwise more; what a scale does not use does not count, and it learns
     nothing itself."""
@@ -156,7 +132,7 @@ def test_its_onnx_file_agrees_with_it(network: MixFusion, tmp_path: Path) -> Non
     for head in network.heads:
         torch.nn.init.normal_(head.weight, std=0.3)
     for scale in schema.SCALES:
-        lrhs, hrls = (schema.channel_names(features) for features in schema.inputs("fast"))
-        contract = Contract("tiny", scale, network.multiple // scale, 32, lrhs=lrhs, hrls=hrls, denoiser="fast")
+        lrhs, hrls = (schema.channel_names(features) for features in schema.inputs("high"))
+        contract = Contract("tiny", scale, network.multiple // scale, 32, lrhs=lrhs, hrls=hrls, denoiser="high")
         onnx.save(export.to_onnx(network, contract), tmp_path / "tiny.onnx")
         assert export.parity(network, scale, tmp_path / "tiny.onnx") < 1e-4

@@ -19,12 +19,9 @@ from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
 from training import batches, data, losses, train  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
 from training.pyramid import (  # noqa: E402
-    CANDIDATES,
-    LEVELS,
     PyramidFusion,
     from_phases,
     linear,
-    logarithmic,
     to_phases,
     weighted_sum,
 )
@@ -399,35 +396,6 @@ def test_weighted_sum_of_phases_is_that_of_the_picture(size: int) -> None:
     torch.testing.assert_close(from_phases(weighted_sum(to_phases(weights), small.unsqueeze(2), 2)), by_hand(large, 2))
 
 
-@torch.inference_mode()
-@pytest.mark.parametrize("scale", [2, 4, 8])
-def test_a_pyramid_may_follow_another_denoiser(scale: int) -> None:
-    """Pixel by pixel as far as it trusts it, but for ``MIN_SHARE``: its result can be the other's, or that brought to
-    the brightness that both renders together have at the LRHS's resolution."""
-    network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5, denoiser="high").eval()
-    height, width = 128 // scale, 64 // scale
-    lrhs, hrls = torch.rand(1, 3, height, width), torch.rand(1, 16, 128, 64)
-    pattern = 0.3 + 0.1 * (torch.arange(64) % 2).expand(1, 3, 128, 64)
-    together = logarithmic(1.5 * torch.nn.functional.avg_pool2d(linear(pattern), scale))
-    inputs = torch.cat([lrhs, together], 1), torch.cat([hrls, pattern], 1)
-
-    def prefer(level: int, candidate: int) -> None:
-        bias = network.heads[level].bias.unflatten(0, (-1, 1 if level else 4))[-len(CANDIDATES) :]
-        bias.fill_(-50.0)
-        bias[candidate] = 50.0
-
-    filtered, guided, denoised, low = range(len(CANDIDATES))
-    for level in range(LEVELS):
-        network.heads[level].weight.zero_()
-        prefer(level, low if 2**level >= scale else guided)
-    brighter = logarithmic(1.5 * linear(pattern))
-    torch.testing.assert_close(network(*inputs)[0], brighter, atol=0.03, rtol=0)
-    prefer(0, denoised)
-    torch.testing.assert_close(network(*inputs)[0], pattern, atol=0.02, rtol=0)
-    prefer(0, filtered)
-    assert (network(*inputs)[0] - pattern).abs().mean() > 0.05
-
-
 def test_a_predicted_error_is_that_of_the_output_in_the_mean() -> None:
     """The loss of the prediction is least at the mean error; the output learns nothing from it."""
     output, reference = torch.rand(1, 3, 8, 8), torch.rand(1, 3, 8, 8)
@@ -438,20 +406,6 @@ def test_a_predicted_error_is_that_of_the_output_in_the_mean() -> None:
     fused, log_error = network(torch.rand(1, 3, 16, 16), torch.rand(1, 16, 64, 64))
     losses.of_error(log_error, fused.detach(), torch.rand(1, 3, 64, 64)).backward()
     assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}
-
-
-def test_a_network_starts_from_one_with_fewer_inputs_and_outputs(tmp_path: Path) -> None:
-    """What is new counts for nothing at first, or begins as in a new network."""
-    small = {"channels": (16,) * 5, "own_size": (3,) * 5}
-    plain = PyramidFusion(**small)
-    torch.save({"ema": plain.state_dict(), "config": plain.config}, tmp_path / "plain.pt")
-    larger = PyramidFusion(**small, denoiser="high")
-    train.warm_start(larger, tmp_path / "plain.pt")
-    assert torch.equal(larger.stem.weight[:, :16], plain.stem.weight)
-    assert not larger.stem.weight[:, 16:].any()
-    taps = len(plain.heads[1].weight)
-    assert torch.equal(larger.heads[1].weight[:taps], plain.heads[1].weight)
-    torch.testing.assert_close(larger.heads[1].bias[taps:], torch.tensor(CANDIDATES))
 
 
 def test_a_pyramid_begins_with_the_middle_of_larger_kernels(tmp_path: Path) -> None:

@@ -46,7 +46,7 @@ PASS_FEATURES = tuple(name for name in schema.HRLS_FEATURES if name != schema.VA
 class Sampling:
     """How training pairs are drawn: the renderings they imitate and the augmentations. Shares are probabilities."""
 
-    hrls_spp: tuple[float, ...] = (0.35, 0.2, 0.1, 0.1, 0.05, 0.05, 0.05, 0.1)
+    hrls_spp: tuple[float, ...] = (0.22, 0.2, 0.12, 0.2, 0.05, 0.06, 0.05, 0.1)
     """Weight of 1, 2, 3, ... spp in the HRLS; low ones are the hard and the useful case."""
     lrhs_passes: tuple[float, ...] = (0.65, 0.2, 0.05, 0.05, 0.05)
     """Weight of 1, 2, 3, ... ``lr`` passes in the LRHS."""

@@ -15,10 +15,9 @@ exact ones; then, weight after weight, the nearest step, the rest of the row mak
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TypeVar
 
 import numpy as np
 import onnx
@@ -27,14 +26,17 @@ import torch.nn.functional as F
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
-from oiio_msspl import eight_bit
+from oiio_msspl import eight_bit, transforms
 from oiio_msspl.denoiser import Denoiser, Layers, installed_library, layers_of
 from oiio_msspl.schema import SCALES
 from training import batches, data
+from training.unet import LARGER, SMALLER, Shape, walk
 
 FOLDER = Path(__file__).parent.parent / "oiio_msspl" / "denoisers"
 #: Pictures that are learnt from, and the pixels of each that a layer's weights are fitted to.
 PICTURES, PIXELS, PATCH = 64, 4000, 256
+#: Pictures without the layers that are needed, one after the other, until it is given up.
+PATIENCE = 200
 #: Share of a layer's values, in every picture, that its 8 bits reach beyond.
 REACH = 0.9995
 #: How far the channels of a layer have ranges of their own: 1, each its own; 0, all the largest. Between them, neither
@@ -46,58 +48,13 @@ STEPS = 127
 #: Bounds of the slices that the last layer but one is written in, as shares of its range: what is rounded there is seen
 #: as it is.
 FINE_BOUNDS = (0.0, 0.5, 1.0)
+#: Names of convolutions that read a layer of a U-Net beside it; and, of their outputs and of those that the last layer
+#: makes behind its colours, the range and the code of zero: logits, and logarithms.
+SIDE = ("head1", "head2", "head3")
+COLOURS, SIGNED_RANGE, SIGNED_ZERO = 3, 10.0, 128
 
 
-@dataclass(frozen=True)
-class Shape:
-    """Names of a U-Net's convolutions, all 3 x 3 and followed by a ReLU: of each level down, at the bottom, of each
-    level up (which reads the level below, enlarged, and what went into the level down), and the one that makes colour.
-    """
-
-    down: list[list[str]]
-    bottom: list[str]
-    up: list[list[str]]
-    last: str
-
-
-_SMALLER = Shape(
-    [["enc_conv0", "enc_conv1"], ["enc_conv2"], ["enc_conv3"], ["enc_conv4"]],
-    ["enc_conv5a", "enc_conv5b"],
-    [[f"dec_conv{level}{part}" for part in "ab"] for level in (4, 3, 2, 1)],
-    "dec_conv0",
-)
-SHAPES = {
-    "usual": _SMALLER,
-    "albedo": _SMALLER,
-    "large": Shape(
-        [[f"enc_conv{level}{part}" for part in "ab"] for level in (1, 2, 3, 4)],
-        ["enc_conv5a", "enc_conv5b"],
-        [[f"dec_conv{level}{part}" for part in "ab"] for level in (4, 3, 2, 1)],
-        "dec_conv1c",
-    ),
-}
-
-
-T = TypeVar("T")
-
-
-def walk(
-    shape: Shape, picture: T, conv: Callable[[str, T], T], halve: Callable[[T], T], join: Callable[[T, T], T]
-) -> T:
-    """A U-Net on anything: tensors, lists of them, names of a graph. ``join`` enlarges its first argument."""
-    values, skipped = picture, []
-    for level in shape.down:
-        skipped.append(values)
-        for name in level:
-            values = conv(name, values)
-        values = halve(values)
-    for name in shape.bottom:
-        values = conv(name, values)
-    for level in shape.up:
-        values = join(values, skipped.pop())
-        for name in level:
-            values = conv(name, values)
-    return conv(shape.last, values)
+SHAPES = {"usual": SMALLER, "albedo": SMALLER, "large": LARGER}
 
 
 # Choosing the weights
@@ -164,46 +121,102 @@ def codes_of_pictures(*, alone: bool) -> Codes:
 
 
 @dataclass
+class Given:
+    """A convolution that whoever runs a network has already.
+
+    Attributes:
+        weight, bias: as they are found.
+        rows, columns: its outputs and inputs that the network's first ones stand for.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    rows: Sequence[int]
+    columns: Sequence[int]
+
+    @classmethod
+    def of(cls, weights: Mapping[str, Tensor]) -> dict[str, Given]:
+        """All of a network's own convolutions, whole."""
+        names = [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
+        pairs = {name: (weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names}
+        return {
+            name: cls(weight, bias, *(list(range(count)) for count in weight.shape[:2]))
+            for name, (weight, bias) in pairs.items()
+        }
+
+
+@dataclass
 class Fit:
-    """Layer after layer in 8 bits."""
+    """Layer after layer in 8 bits.
+
+    Attributes:
+        shape: of the U-Net.
+        weights: of its convolutions, and of any that read a layer beside it.
+        given: convolutions of the same names that they are written as differences from; not all need to have one.
+        slices_out: slices that colour is written in.
+        fine: whether the last layer but one is written in slices, too.
+    """
 
     shape: Shape
-    weights: dict[str, Tensor]
+    weights: Mapping[str, Tensor]
+    given: Mapping[str, Given]
+    slices_out: int = eight_bit.SLICES_OUT
+    fine: bool = True
     layers: dict[str, Layer] = field(default_factory=dict)
     _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
 
     def conv(self, name: str, values: Values) -> Values:
         weights, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+        signed = self._signed(name, len(bias))
         inputs, outputs, exact = [], [], []
         for image, codes in zip(values.exact, values.codes, strict=True):
             result = F.conv2d(image, weights, bias, padding=1)
             pixels = torch.randperm(result[0, 0].numel(), generator=self._random)[:PIXELS]
             inputs.append(_around(codes, pixels))
             outputs.append(result[0].flatten(1)[:, pixels].T)
-            exact.append(result.relu_())
-        of_codes = weights[:, values.how.of] * values.how.worth[:, None, None]
+            result[:, :signed].relu_()
+            exact.append(result)
+        of_codes, given = (
+            w[:, values.how.of] * values.how.worth[:, None, None] for w in (weights, self.given_as(name, weights))
+        )
         near = torch.cat([of_codes.flatten(1), bias[:, None]], dim=1)
-        chosen, step, bias = nearest_steps(torch.cat(inputs), torch.cat(outputs), near)
-        how, begins = self._written(name, exact)
+        chosen, step, bias = nearest_steps(torch.cat(inputs), torch.cat(outputs), near, given.flatten(1))
+        how, begins = self._written(name, exact, signed)
         layer = self.layers[name] = Layer(chosen.reshape(of_codes.shape), step, bias, values.how, how, begins)
         return Values(exact, [layer(codes) for codes in values.codes], how)
 
-    def _written(self, name: str, exact: list[Tensor]) -> tuple[Codes, Tensor]:
+    def given_as(self, name: str, weights: Tensor) -> Tensor:
+        """A convolution's given weights with zeros where there are none, as many as there are weights."""
+        result = torch.zeros_like(weights)
+        if given := self.given.get(name):
+            result[: len(given.rows), : len(given.columns)] = given.weight[given.rows][:, given.columns]
+        return result
+
+    def _signed(self, name: str, count: int) -> int:
+        """The first of a layer's outputs that no ReLU follows: those beside the U-Net's own."""
+        if name in SIDE:
+            return 0
+        return COLOURS if name == self.shape.last else count
+
+    def _written(self, name: str, exact: list[Tensor], signed: int) -> tuple[Codes, Tensor]:
         """How a layer's values are written, and where the slices begin."""
         count = len(exact[0][0])
-        if name == self.shape.last:
-            tops, bounds = torch.ones(count), torch.linspace(0, 1, eight_bit.SLICES_OUT + 1)
+        if name == self.shape.last or signed < count:
+            tops, bounds = torch.ones(signed), torch.linspace(0, 1, self.slices_out + 1)
         else:
             tops = torch.stack([_quantile(image[0].flatten(1), REACH) for image in exact]).amax(dim=0)
             tops = tops.clamp_min(1e-3 * tops.max())
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
-            bounds = torch.tensor(FINE_BOUNDS if name == self.shape.up[-1][-1] else (0.0, 1.0))
-        of = torch.arange(count).repeat(len(bounds) - 1)
+            fine = self.fine and name == self.shape.up[-1][-1]
+            bounds = torch.tensor(FINE_BOUNDS if fine else (0.0, 1.0))
+        of = torch.arange(signed).repeat(len(bounds) - 1)
         worth, begins = ((share[:, None] * tops).flatten() for share in (bounds.diff() / 255, bounds[:-1]))
-        if name == self.shape.last:
-            of, worth, begins = (
-                F.pad(x, (0, eight_bit.CHANNELS_OUT - len(x)), value=x[0]) for x in (of, worth, begins)
-            )
+        beside = torch.arange(signed, count)
+        of = torch.cat([of, beside])
+        worth = torch.cat([worth, torch.full(beside.shape, 2 * SIGNED_RANGE / 255)])
+        begins = torch.cat([begins, torch.full(beside.shape, -SIGNED_ZERO * 2 * SIGNED_RANGE / 255)])
+        if name == self.shape.last or signed < count:
+            of, worth, begins = (F.pad(x, (0, -len(x) % 16), value=x[0]) for x in (of, worth, begins))
         return Codes(worth, of), begins
 
 
@@ -220,13 +233,14 @@ def _around(image: Tensor, pixels: Tensor) -> Tensor:
     return torch.stack(parts, dim=1).flatten(0, 1).T
 
 
-def nearest_steps(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def nearest_steps(inputs: Tensor, outputs: Tensor, weights: Tensor, given: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Weights of -STEPS to STEPS whole steps that make the outputs of the inputs.
 
     Args:
         inputs: (P, K).
         outputs: (P, O).
         weights: (O, K + 1) that nearly do; bias last.
+        given: (O, K), from which no weight may be more than STEPS away.
 
     Returns:
         Whole numbers (O, K), the size of a step (O), bias (O).
@@ -238,19 +252,45 @@ def nearest_steps(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Ten
     damping[count, count] = 1e-9
     original = weights.double()
     weights = torch.linalg.solve(power + damping, x.T @ outputs.double() / len(x) + damping @ original.T).T
-    step = weights[:, :count].abs().amax(dim=1).clamp_min(1e-12) / STEPS
+    # Not so small that biases in steps would not fit into 32 bits
+    step = (weights[:, :count].abs().amax(dim=1) / STEPS).clamp_min(1e-8)
     # Strong inputs first, while there are others to make good for their error; the bias last, which is not rounded
     order = torch.cat([power.diagonal()[:count].argsort(descending=True), torch.tensor([count])])
     inverse = torch.cholesky_inverse(torch.linalg.cholesky((power + damping)[order][:, order]))
     upper = torch.linalg.cholesky(inverse, upper=True)
     rest, chosen = weights[:, order].clone(), torch.zeros(len(weights), count, dtype=torch.double)
     for i in range(count):
-        nearest = (original[:, order[i]] / step).round()
+        nearest = (given[:, order[i]].double() / step).round()
         steps = torch.clamp((rest[:, i] / step).round(), nearest - STEPS, nearest + STEPS)  # the rest is kept in 8 bits
         chosen[:, order[i]] = steps.clamp(-STEPS, STEPS)
         error = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
         rest[:, i:] -= error[:, None] * upper[i, i:]
     return chosen.float(), step.float(), rest[:, count].float()
+
+
+def walk_values(shape: Shape, pictures: Sequence[Values], conv: Callable[[str, Values], Values]) -> Values:
+    """A U-Net on values and their codes."""
+
+    def each(change: Callable[[Tensor], Tensor], values: Values) -> Values:
+        return Values([change(i) for i in values.exact], [change(i) for i in values.codes], values.how)
+
+    def join(one: Values, other: Values) -> Values:
+        exact, codes = (
+            [torch.cat(pair, dim=1) for pair in zip(*images, strict=True)]
+            for images in ((one.exact, other.exact), (one.codes, other.codes))
+        )
+        of = torch.cat([one.how.of, other.how.of + one.exact[0].shape[1]])
+        return Values(exact, codes, Codes(torch.cat([one.how.worth, other.how.worth]), of))
+
+    with torch.no_grad():
+        return walk(
+            shape,
+            pictures,
+            conv,
+            halve=lambda values: each(lambda image: F.max_pool2d(image, 2), values),
+            double=lambda values: each(lambda image: F.interpolate(image, scale_factor=2), values),
+            join=join,
+        )
 
 
 def quantise(name: str, weights: dict[str, Tensor], pictures: Sequence[tuple[Tensor, Tensor]]) -> Fit:
@@ -261,24 +301,9 @@ def quantise(name: str, weights: dict[str, Tensor], pictures: Sequence[tuple[Ten
         weights: in full precision.
         pictures: see :func:`picture`.
     """
-    fit = Fit(SHAPES[name], weights)
-
-    def halve(values: Values) -> Values:
-        exact, codes = ([F.max_pool2d(i, 2) for i in images] for images in (values.exact, values.codes))
-        return Values(exact, codes, values.how)
-
-    def join(below: Values, skipped: Values) -> Values:
-        exact, codes = (
-            [torch.cat([F.interpolate(b, scale_factor=2), s], dim=1) for b, s in zip(*both, strict=True)]
-            for both in ((below.exact, skipped.exact), (below.codes, skipped.codes))
-        )
-        of = torch.cat([below.how.of, skipped.how.of + below.exact[0].shape[1]])
-        return Values(exact, codes, Codes(torch.cat([below.how.worth, skipped.how.worth]), of))
-
+    fit = Fit(SHAPES[name], weights, Given.of(weights))
     exact, codes = (list(images) for images in zip(*pictures, strict=True))
-    how = codes_of_pictures(alone=name == "albedo")
-    with torch.no_grad():
-        walk(SHAPES[name], Values(exact, codes, how), fit.conv, halve, join)
+    walk_values(fit.shape, [Values(exact, codes, codes_of_pictures(alone=name == "albedo"))], fit.conv)
     return fit
 
 
@@ -288,28 +313,40 @@ def quantise(name: str, weights: dict[str, Tensor], pictures: Sequence[tuple[Ten
 class Graph:
     """What ONNX Runtime runs: height, width and channels in this order, codes from the first layer to the last."""
 
-    def __init__(self, name: str, fit: Fit) -> None:
-        self._shape, self._fit = SHAPES[name], fit
+    def __init__(self, fit: Fit) -> None:
+        self.fit = fit
         self.nodes: list[onnx.NodeProto] = []
         self.initializers: dict[str, np.ndarray] = {
-            "one": np.float32(1), "zero": np.uint8(0), "no_offset": np.int8(0),
-            "all_slices": np.eye(3, dtype=np.int8)[np.arange(eight_bit.CHANNELS_OUT) % 3],
+            "one": np.float32(1), "zero": np.uint8(0), "no_offset": np.int8(0)
         }  # fmt: skip
-        self.initializers["all_slices"][3 * eight_bit.SLICES_OUT :] = 0
         self.open: list[onnx.TensorProto] = []
 
     def model(self) -> onnx.ModelProto:
-        colour = walk(self._shape, "layers", self._conv, self._halved, self._joined)
-        self._add("MatMulInteger", [colour, "all_slices", "zero", "no_offset"], "codes")
-        graph = helper.make_graph(
-            self.nodes,
+        """Of one of Open Image Denoise's own."""
+        self.colours(["layers"], "codes")
+        return self.finished(
             "oidn",
             [helper.make_tensor_value_info("layers", TensorProto.UINT8, [1, "h", "w", eight_bit.CHANNELS_IN])],
             [helper.make_tensor_value_info("codes", TensorProto.INT32, [1, "h", "w", 3])],
-            [*self.open, *(numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())],
         )
+
+    def finished(
+        self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
+    ) -> onnx.ModelProto:
+        values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
+        graph = helper.make_graph(self.nodes, name, inputs, outputs, [*self.open, *values])
         opsets = [helper.make_opsetid("", 18), helper.make_opsetid("com.microsoft", 1)]
         return helper.make_model(graph, opset_imports=opsets, ir_version=9)
+
+    def colours(self, pictures: list[str], output: str) -> str:
+        """The U-Net, and the sum of the slices that its last layer makes; what it makes of pictures by level."""
+        last = walk(self.fit.shape, pictures, self.conv, self._halved, self._doubled, self._joined)
+        outputs = self.fit.layers[last].outputs
+        all_slices = np.zeros((len(outputs.of), COLOURS), np.int8)
+        rows = np.arange(COLOURS * self.fit.slices_out)
+        all_slices[rows, rows % COLOURS] = 1
+        self.initializers["all_slices"] = all_slices
+        return self._add("MatMulInteger", [last, "all_slices", "zero", "no_offset"], output)
 
     def _add(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
         domain = "com.microsoft" if kind in ("QLinearConv", "NhwcMaxPool") else ""
@@ -320,27 +357,36 @@ class Graph:
         self.initializers[name] = values
         return name
 
-    def _left_open(self, name: str, shape: tuple[int, ...]) -> str:
-        tensor = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=shape)
+    def _left_open(self, name: str, values: np.ndarray, rows: np.ndarray) -> str:
+        """Some rows of a tensor that whoever loads the graph has."""
+        tensor = TensorProto(name=name, data_type=TensorProto.FLOAT16, dims=values.shape)
         tensor.data_location = TensorProto.EXTERNAL
         tensor.external_data.add(key="location", value="oidn")
         self.open.append(tensor)
+        if len(rows) < len(values):
+            name = self._add("Gather", [name, self._constant(f"{name}.kept", rows)], f"{name}.rows", axis=0)
         return self._add("Cast", [name], f"{name}.float", to=TensorProto.FLOAT)
 
-    def _conv(self, name: str, values: str) -> str:
+    def conv(self, name: str, values: str) -> str:
         """A convolution. Its weights are computed when the graph is loaded: in steps, rounded, and what is added."""
-        layer, shape = self._fit.layers[name], self._fit.weights[f"{name}.weight"].shape
-        steps, inputs, outputs = layer.step.numpy(), layer.inputs, layer.outputs
-        original = self._left_open(f"{name}.weight", shape)
-        of = self._constant(f"{name}.of", inputs.of.numpy())
-        worth = self._constant(f"{name}.worth", inputs.worth[None, :, None, None].numpy())
-        original = self._add("Gather", [original, of], f"{name}.weight.of", axis=1)
-        original = self._add("Mul", [original, worth], f"{name}.weight.in_codes")
-        near = self._fit.weights[f"{name}.weight"][:, inputs.of].numpy() * inputs.worth[:, None, None].numpy()
-        weights = self._whole(original, near, layer.weights.numpy().astype(np.int8), steps[:, None, None, None])
-        bias = np.round(layer.bias.numpy() / steps).astype(np.int32)
-        original = self._left_open(f"{name}.bias", bias.shape)
-        biases = self._whole(original, self._fit.weights[f"{name}.bias"].numpy(), bias, steps)
+        layer, given = self.fit.layers[name], self.fit.given.get(name)
+        steps, outputs = layer.step.numpy(), layer.outputs
+        whole, bias = layer.weights.numpy().astype(np.int8), np.round(layer.bias.numpy() / steps).astype(np.int32)
+        if given is None:
+            weights, biases = self._constant(f"{name}.weight", whole), self._constant(f"{name}.bias", bias)
+        else:
+            rows, columns = np.array(given.rows), np.array(given.columns)
+            known = layer.inputs.of.numpy() < len(columns)  # of the others, nothing is given
+            of = columns[np.where(known, layer.inputs.of.numpy(), 0)]
+            worth = np.where(known, layer.inputs.worth.numpy(), 0).astype(np.float32)
+            original = self._left_open(f"{name}.weight", given.weight.numpy(), rows)
+            original = self._add("Gather", [original, self._constant(f"{name}.of", of)], f"{name}.weight.of", axis=1)
+            worths = self._constant(f"{name}.worth", worth[None, :, None, None])
+            original = self._add("Mul", [original, worths], f"{name}.weight.in_codes")
+            near = given.weight.numpy()[rows][:, of] * worth[:, None, None]
+            weights = self._whole(original, near, whole, steps[:, None, None, None])
+            original = self._left_open(f"{name}.bias", given.bias.numpy(), rows)
+            biases = self._whole(original, given.bias.numpy()[rows], bias, steps)
         if len(outputs.of) > len(steps):  # slices, one behind the other: biases are less by where a slice begins
             of, steps = self._constant(f"{name}.slices", outputs.of.numpy()), steps[outputs.of.numpy()]
             begins = self._constant(f"{name}.begins", np.round(layer.begins.numpy() / steps).astype(np.int32))
@@ -360,36 +406,54 @@ class Graph:
         )
 
     def _whole(self, name: str, near: np.ndarray, chosen: np.ndarray, steps: np.ndarray) -> str:
-        """What was chosen, kept as how much more that is than the original in the nearest whole steps."""
-        in_steps = self._add("Div", [name, self._constant(f"{name}.step", steps)], f"{name}.in_steps")
+        """What was chosen, kept as how much more that is than the original in the nearest whole steps; where there are
+        fewer originals than were chosen, the rest as it is."""
+        count = len(near)
+        in_steps = self._add("Div", [name, self._constant(f"{name}.step", steps[:count])], f"{name}.in_steps")
         nearest = self._add("Round", [in_steps], f"{name}.nearest")
-        more = self._constant(f"{name}.more", (chosen - np.round(near / steps)).astype(chosen.dtype))
+        more = self._constant(f"{name}.more", (chosen[:count] - np.round(near / steps[:count])).astype(chosen.dtype))
         added = self._add("Cast", [more], f"{name}.added", to=TensorProto.FLOAT)
         kind = TensorProto.INT8 if chosen.dtype == np.int8 else TensorProto.INT32
-        return self._add("Cast", [self._add("Add", [nearest, added], f"{name}.chosen")], f"{name}.whole", to=kind)
+        whole = self._add("Cast", [self._add("Add", [nearest, added], f"{name}.chosen")], f"{name}.whole", to=kind)
+        if count == len(chosen):
+            return whole
+        rest = self._constant(f"{name}.rest", chosen[count:])
+        return self._add("Concat", [whole, rest], f"{name}.all", axis=0)
 
     def _halved(self, values: str) -> str:
         return self._add("NhwcMaxPool", [values], f"{values}.halved", kernel_shape=[2, 2], strides=[2, 2])
 
-    def _joined(self, below: str, skipped: str) -> str:
-        """What lies below, every pixel four times, and what was skipped, by channels."""
-        name = f"{below}+{skipped}"
-        height_width = self._add("Shape", [below], f"{name}.small", start=1, end=3)
-        two, one = self._constant("two", np.array([2, 2])), self._constant("only", np.array([1]))
-        channels = self._constant(f"{name}.channels", np.array([len(self._fit.layers[below].outputs.of)]))
+    def _doubled(self, values: str) -> str:
+        """Every pixel four times; of a layer."""
+        return self.enlarged(values, len(self.fit.layers[values].outputs.of), 2)
+
+    def enlarged(self, values: str, channels: int, factor: int) -> str:
+        """Every pixel as a square of so many across."""
+        height_width = self._add("Shape", [values], f"{values}.small", start=1, end=3)
+        factors, one = self._constant(f"by{factor}", np.array([factor, factor])), self._constant("only", np.array([1]))
+        count = self._constant(f"{values}.channels", np.array([channels]))
         large = self._add(
-            "Concat", [one, self._add("Mul", [height_width, two], f"{name}.twice"), channels], f"{name}.shape", axis=0
+            "Concat",
+            [one, self._add("Mul", [height_width, factors], f"{values}.times"), count],
+            f"{values}.shape",
+            axis=0,
         )
-        apart = self._add("Unsqueeze", [below, self._constant("apart", np.array([2, 4]))], f"{name}.apart")
-        four = self._add("Expand", [apart, self._constant("four", np.array([1, 1, 2, 1, 2, 1]))], f"{name}.four")
-        return self._add("Concat", [self._add("Reshape", [four, large], f"{name}.large"), skipped], name, axis=3)
+        apart = self._add("Unsqueeze", [values, self._constant("apart", np.array([2, 4]))], f"{values}.apart")
+        squares = self._constant(f"squares{factor}", np.array([1, 1, factor, 1, factor, 1]))
+        return self._add(
+            "Reshape", [self._add("Expand", [apart, squares], f"{values}.squares"), large], f"{values}.large"
+        )
+
+    def _joined(self, one: str, other: str) -> str:
+        return self._add("Concat", [one, other], f"{one}+{other}", axis=3)
 
 
 def pictures(views: Path, split: str, name: str, count: int) -> Iterator[Layers]:
     """What a network reads of views, drawn as training draws them."""
-    ways = {mode: Denoiser(mode=mode, exact=True) for mode in ("high", "low")}
+    denoiser = Denoiser(exact=True)
     rng = np.random.default_rng(0)
     folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(views).split(split)]
+    left_out = 0
     while count:
         with torch.no_grad():
             scale = 2 if name == "albedo" else int(rng.choice(SCALES))
@@ -397,17 +461,17 @@ def pictures(views: Path, split: str, name: str, count: int) -> Iterator[Layers]
         lrhs, hrls = (batch[key][0].permute(1, 2, 0).numpy() for key in ("lrhs", "hrls"))
         layers = layers_of(hrls)
         if name == "large":
-            layers = ways["high"].merged(lrhs, layers)
-        elif name == "albedo" or count % 4 == 0:  # the usual one denoises both together, too
-            layers = ways["low"].merged(lrhs, layers)
-        if name == "albedo":
-            layers = {key: image for key, image in layers.items() if key == "albedo"}
+            layers = denoiser.merged(lrhs, layers)
+        elif name == "albedo" and "albedo" in layers:
+            albedo = transforms.box_downsample(layers["albedo"], scale)
             # Depth of field, hair and glass make it noisier than these views are
-            noise = rng.normal(0, rng.choice([0, 0, 0.1, 0.3]), next(iter(layers.values()), np.zeros(1)).shape)
-            layers = {key: (image + noise).clip(0, 1).astype(np.float32) for key, image in layers.items()}
-        if len(layers) == (1 if name == "albedo" else 3):
-            count -= 1
+            noise = rng.normal(0, rng.choice([0, 0, 0.1, 0.3]), albedo.shape)
+            layers = {"albedo": (albedo + noise).clip(0, 1).astype(np.float32)}
+        if layers.keys() == ({"albedo"} if name == "albedo" else {"colour", "albedo", "normal"}):
+            count, left_out = count - 1, 0
             yield layers
+        elif (left_out := left_out + 1) > PATIENCE:
+            raise SystemExit(f"{views}: hardly any view for {split} has what {name} reads, albedo and normal above all")
 
 
 def compare(name: str, network: eight_bit.EightBit, views: Path) -> None:
@@ -431,7 +495,7 @@ def main() -> None:
             raise SystemExit(f"{library}: has not the weights that oiio_msspl.eight_bit names; install pyoidn 2.5.1")
         weights = {key: torch.from_numpy(values.astype(np.float32)) for key, values in halves.items()}
         images = [picture(layers) for layers in pictures(args.views, "train", name, PICTURES)]
-        onnx.save(Graph(name, quantise(name, weights, images)).model(), FOLDER / f"{name}.onnx")
+        onnx.save(Graph(quantise(name, weights, images)).model(), FOLDER / f"{name}.onnx")
         compare(name, eight_bit.EightBit(name, halves), args.views)
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Teach a trained pyramid or mixing network to predict its own error.
+"""Teach a trained network, of any family but the paper's, to predict its own error.
 
     python -m training.error RUN/best.pt --data VIEWS
 
@@ -17,6 +17,7 @@ import torch
 
 from oiio_msspl.denoiser import Denoiser
 from training import batches, data, export, losses
+from training.joint import JointFusion
 from training.networks import run
 from training.pyramid import Trunk
 from training.train import lr_factor, save
@@ -24,7 +25,9 @@ from training.train import lr_factor, save
 PATCH, BATCH, LEARNING_RATE = 192, 4, 2e-3
 
 
-def fit(network: Trunk, views: list[batches.Pixels], scales: list[int], denoiser: str, steps: int) -> float:
+def fit(
+    network: Trunk | JointFusion, views: list[batches.Pixels], scales: list[int], denoiser: str, steps: int
+) -> float:
     """Train the prediction in place; return the mean of its loss over the last tenth of the steps."""
     network.requires_grad_(False)
     network.error.requires_grad_(True)
@@ -58,7 +61,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     network, state = export.load(args.checkpoint)
-    if not isinstance(network, Trunk):
+    if not isinstance(network, Trunk | JointFusion):
         raise SystemExit(f"{args.checkpoint}: the paper's network does not predict its error")
     views = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
     scales = [int(scale) for scale in state["training_spp"]]

@@ -25,10 +25,14 @@ import onnxruntime
 import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
+from torch import nn
+from torch.utils._pytree import tree_map
 
-from oiio_msspl import schema
+from oiio_msspl import runtime, schema
 from oiio_msspl.contract import METADATA_KEY, Contract
-from training import data
+from oiio_msspl.denoiser import installed_weights
+from training import data, joint_graph
+from training.joint import JointFusion
 from training.networks import NETWORKS, Network, run
 from training.paper import MultiResolutionFusion
 from training.quantize import quantise
@@ -60,6 +64,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
         lrhs=schema.channel_names(lrhs),
         hrls=schema.channel_names(hrls),
         denoiser=denoiser,
+        weights="usual" if isinstance(network, JointFusion) else "",
         bytes_per_pixel=MEMORY_WITH_DENOISER if denoiser else MEMORY,
         name=name,
         scale=scale,
@@ -88,33 +93,71 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     """Graph with inputs ``lrhs`` and ``hrls``, output ``fused`` (a pyramid's ``log_error`` too), batch of 1, any height
     and width that are multiples of the contract's alignment, and that contract."""
     scale, alignment = contract.scale, contract.alignment
-    height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
+    inputs = example(network, scale, 4 * alignment, 6 * alignment)
     aten = torch.ops.aten
-    traced: Network
+    traced: nn.Module
     if isinstance(network, MultiResolutionFusion):
         traced, outputs = _with_onnx_channel_order(network), ["fused"]
         translations = {aten.pixel_unshuffle.default: _space_to_depth}
     else:
         traced, outputs = network, ["fused", "log_error"]
         translations = {aten.pixel_unshuffle.default: _unshuffle, aten.pixel_shuffle.default: _shuffle}
-    program = torch.onnx.export(
-        traced,
-        example(network, scale, 4 * alignment, 6 * alignment),
-        input_names=["lrhs", "hrls"],
-        output_names=outputs,
-        opset_version=OPSET,
-        dynamo=True,
-        dynamic_shapes=tuple({2: size * height, 3: size * width} for size in (alignment, scale * alignment)),
-        custom_translation_table=translations,
-        verbose=False,
-    )
-    model = program.model_proto
-    _strip_traces(model)
+    model = _traced(traced, inputs, ["lrhs", "hrls"], outputs, alignment, translations)
     if half:
         _store_as_half(model.graph)
     model.ir_version = IR_VERSION
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _traced(
+    module: nn.Module,
+    inputs: tuple[Any, ...],
+    names: list[str],
+    outputs: list[str],
+    alignment: int,
+    translations: dict[Any, Any] | None = None,
+) -> onnx.ModelProto:
+    """Graph of a module for images of any size: of the first, multiples of ``alignment``, of the others as much larger
+    as they are here."""
+    height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
+
+    def dynamic(image: torch.Tensor) -> dict[int, Any]:
+        size = alignment * image.shape[2] // inputs[0].shape[2]
+        return {2: size * height, 3: size * width}
+
+    program = torch.onnx.export(
+        module,
+        inputs,
+        input_names=names,
+        output_names=outputs,
+        opset_version=OPSET,
+        dynamo=True,
+        dynamic_shapes=tree_map(dynamic, inputs),
+        custom_translation_table=translations or {},
+        verbose=False,
+    )
+    model = program.model_proto
+    _strip_traces(model)
+    return model
+
+
+@torch.inference_mode()
+def joint_to_onnx(
+    network: JointFusion, contract: Contract, pairs: list[tuple[torch.Tensor, torch.Tensor]]
+) -> onnx.ModelProto:
+    """Graph with the same inputs and outputs, whose convolutions are fitted to pairs in 8 bits, and which leaves Open
+    Image Denoise's weights open."""
+    scale, alignment = contract.scale, contract.alignment
+    lrhs, hrls = example(network, scale, 4 * alignment, 6 * alignment)
+    levels = range(scale.bit_length())
+    sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
+    inputs = (lrhs, hrls, hrls[:, :3], [torch.rand(1, *size) for size in sizes])
+    names = ["lrhs", "hrls", "denoised", *(f"logits{level}" for level in levels)]
+    mixing = _traced(joint_graph.Blend().eval(), inputs, names, ["fused"], alignment)
+    model = joint_graph.to_onnx(network, scale, pairs, mixing)
+    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return model
 
 
@@ -182,7 +225,7 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
 
 def parity(network: Network, scale: int, path: Path) -> float:
     """Largest difference of an exported file from the network it was made of, in network values."""
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    session = _loaded(path)
     block = network.multiple // scale
     block *= -(-6 // block)  # a few pixels, where the network would take any number
     worst = 0.0
@@ -229,11 +272,13 @@ def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int 
     return image[..., part, part]
 
 
-def describe(network: Network, scale: int, path: Path) -> None:
-    """Print what the file contains, what ONNX Runtime makes of it and how long it takes."""
-    model = onnx.load(path)
-    counts = collections.Counter(node.op_type for node in model.graph.node)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
+def _loaded(path: Path) -> onnxruntime.InferenceSession:
+    weights = Contract.of_file(path).weights
+    return runtime.load(path, initializers=installed_weights(weights) if weights else None)
+
+
+def _check_casts(path: Path) -> None:
+    """Refuse a file that ONNX Runtime would cast the weights of at every run."""
     options = onnxruntime.SessionOptions()
     optimised = path.with_suffix(".optimised")
     options.optimized_model_filepath = str(optimised)
@@ -247,7 +292,15 @@ def describe(network: Network, scale: int, path: Path) -> None:
             f"{path}: {counts['Cast']} casts of weights are left after loading; they would slow every tile"
         )
 
-    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+
+def describe(network: Network, scale: int, path: Path) -> None:
+    """Print what the file contains, what ONNX Runtime makes of it and how long it takes."""
+    model = onnx.load(path, load_external_data=False)
+    counts = collections.Counter(node.op_type for node in model.graph.node)
+    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
+    if not Contract.of_file(path).weights:
+        _check_casts(path)
+    session = _loaded(path)
     lrhs, hrls = (image.numpy() for image in example(network, scale, 64, 64))
     seconds = min(timeit.repeat(lambda: session.run(None, {"lrhs": lrhs, "hrls": hrls}), number=1, repeat=3))
     print(f"64x64 LRHS pixels: {seconds:.2f} s")
@@ -279,9 +332,14 @@ def main() -> None:
             print(f"overlap {overlap}: {difference:.2g}")
     if args.output:
         contract = contract_of(network, scale, args.name, args.overlap, state)
-        model = to_onnx(network, contract, half=args.half and not args.int8)
-        if args.int8:
-            model = quantise(model, contract, args.int8)
+        if isinstance(network, JointFusion):
+            if not args.int8:
+                raise SystemExit("--int8: a network that is made of Open Image Denoise's is exported in 8 bits")
+            model = joint_to_onnx(network, contract, joint_graph.drawn(args.int8, contract))
+        else:
+            model = to_onnx(network, contract, half=args.half and not args.int8)
+            if args.int8:
+                model = quantise(model, contract, args.int8)
         onnx.save(model, args.output)
         describe(network, scale, args.output)
         print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")

@@ -23,10 +23,7 @@ from torch.nn import functional as F
 
 from training.paper import HRLS_CHANNELS, LRHS_CHANNELS
 from training.pyramid import (
-    CANDIDATES,
-    MAX_RATIO,
     MIN_ALBEDO,
-    RATIO_FLOOR,
     Trunk,
     highest_around,
     level_of,
@@ -46,6 +43,10 @@ COARSEST = (2.0, 0.0, -2.0, -2.0)
 FINER = (2.0, 0.0, 0.0, -2.0)
 #: Levels that have logits: H, H/2, H/4, H/8.
 LEVELS = 4
+#: Largest factor by which a level's light is told to differ from the denoised HRLS, and its inverse the smallest.
+MAX_RATIO = 8.0
+#: Added to both sides of that ratio, in exposed radiance: black is no light to compare with.
+RATIO_FLOOR = 1e-3
 
 
 def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
@@ -62,18 +63,56 @@ def smoothly_doubled(image: Tensor) -> Tensor:
     return F.interpolate(image, scale_factor=2, mode="bilinear", align_corners=False)
 
 
+def blend(lrhs: Tensor, hrls: Tensor, denoised: Tensor, logits: Sequence[Tensor]) -> Tensor:
+    """The fused image that such logits mean."""
+    first = level_of(lrhs, hrls)
+    samples, albedo = hrls[:, :3], hrls[:, 3:6]
+    means = pyramid(linear(samples), 0, first + 1)
+    filtered = pyramid(linear(denoised), 0, first + 1)
+    share = torch.sigmoid(logits[0][:, len(FINER) :])
+    tints = pyramid((share * albedo + (1 - share)).clamp_min(MIN_ALBEDO), 0, first + 1)
+    fused = mixed(
+        logits[first][:, len(FINER) :],
+        [
+            lrhs[:, LRHS_CHANNELS:],
+            logarithmic(filtered[first]),
+            logarithmic(means[first]),
+            lrhs[:, :LRHS_CHANNELS],
+        ],
+    )
+    for level in reversed(range(first)):
+        radiance, below = linear(fused), filtered[level + 1]
+        light = smoothly_doubled(radiance / tints[level + 1])
+        ratio = ((radiance + RATIO_FLOOR) / (below + RATIO_FLOOR)).clamp(1 / MAX_RATIO, MAX_RATIO)
+        fused = mixed(
+            logits[level],
+            [
+                logarithmic(filtered[level] * smoothly_doubled(ratio)),
+                logarithmic(filtered[level]) if level else denoised,
+                logarithmic(light * tints[level]),
+                logarithmic(means[level]) if level else samples,
+            ],
+        )
+    lowest, highest = (
+        F.interpolate(
+            sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * samples), scale_factor=2, mode="nearest"
+        )
+        for sign in (-1.0, 1.0)
+    )
+    return torch.clamp(fused, lowest, highest)
+
+
 class MixFusion(Trunk):
     """See the module's docstring. One set of weights serves every scale, which follows from the images' sizes.
 
     Args:
         channels: of the U-Net's levels H/2, H/4, H/8, ...; four or more.
-        denoiser: a mode of :mod:`oiio_msspl.denoiser` that denoises the HRLS, too.
         stem_size: HRLS pixels across that a pixel of H/2 is first made of; if more than 2, H/2 has a last convolution.
     """
 
-    def __init__(self, channels: Sequence[int] = MIX_CHANNELS, denoiser: str = "high", stem_size: int = 2) -> None:
-        super().__init__(channels, denoiser, stem_size, refined=stem_size > 2)
-        self.config = {"channels": list(channels), "denoiser": denoiser, "stem_size": stem_size}
+    def __init__(self, channels: Sequence[int] = MIX_CHANNELS, stem_size: int = 2) -> None:
+        super().__init__(channels, "high", stem_size, refined=stem_size > 2)
+        self.config = {"channels": list(channels), "stem_size": stem_size}
         # Of level 0, four pixels for each of H/2, and the share of the albedo too
         reads = [channels[0], *channels]
         outputs = [4 * (len(FINER) + 1), *[len(FINER) + len(COARSEST)] * (LEVELS - 1)]
@@ -100,7 +139,7 @@ class MixFusion(Trunk):
             (N, 1, s*h, s*w), mean of the channels, in network values too. Nothing else learns from the latter.
         """
         logits, log_error = self.decide(lrhs, hrls)
-        return self.blend(lrhs, hrls, logits), log_error
+        return blend(lrhs, hrls, hrls[:, HRLS_CHANNELS:], logits), log_error
 
     def decide(self, lrhs: Tensor, hrls: Tensor) -> tuple[list[Tensor], Tensor]:
         """Logits of every level, H, H/2, ..., and of the expected error: all that is learnt."""
@@ -110,44 +149,6 @@ class MixFusion(Trunk):
         logits = [pointwise(head, features[max(level - 1, 0)]).float() for level, head in enumerate(self.heads)]
         log_error = pointwise(self.error, features[0].detach()).float()
         return [F.pixel_shuffle(logits[0], 2), *logits[1:]], F.pixel_shuffle(log_error, 2)
-
-    def blend(self, lrhs: Tensor, hrls: Tensor, logits: Sequence[Tensor]) -> Tensor:
-        """The fused image that such logits mean."""
-        first = level_of(lrhs, hrls)
-        samples, albedo, denoised = hrls[:, :3], hrls[:, 3:6], hrls[:, HRLS_CHANNELS:]
-        means = pyramid(linear(samples), 0, first + 1)
-        filtered = pyramid(linear(denoised), 0, first + 1)
-        share = torch.sigmoid(logits[0][:, len(FINER) :])
-        tints = pyramid((share * albedo + (1 - share)).clamp_min(MIN_ALBEDO), 0, first + 1)
-        fused = mixed(
-            logits[first][:, len(FINER) :],
-            [
-                lrhs[:, LRHS_CHANNELS:],
-                logarithmic(filtered[first]),
-                logarithmic(means[first]),
-                lrhs[:, :LRHS_CHANNELS],
-            ],
-        )
-        for level in reversed(range(first)):
-            radiance, below = linear(fused), filtered[level + 1]
-            light = smoothly_doubled(radiance / tints[level + 1])
-            ratio = ((radiance + RATIO_FLOOR) / (below + RATIO_FLOOR)).clamp(1 / MAX_RATIO, MAX_RATIO)
-            fused = mixed(
-                logits[level],
-                [
-                    logarithmic(filtered[level] * smoothly_doubled(ratio)),
-                    logarithmic(filtered[level]) if level else denoised,
-                    logarithmic(light * tints[level]),
-                    logarithmic(means[level]) if level else samples,
-                ],
-            )
-        lowest, highest = (
-            F.interpolate(
-                sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * samples), scale_factor=2, mode="nearest"
-            )
-            for sign in (-1.0, 1.0)
-        )
-        return torch.clamp(fused, lowest, highest)
 
 
 def disagreement(logits: Sequence[Tensor], others: Sequence[Tensor], first: int) -> Tensor:
@@ -159,26 +160,3 @@ def disagreement(logits: Sequence[Tensor], others: Sequence[Tensor], first: int)
         ours, theirs = (torch.log_softmax(each[level][:, used], dim=1) for each in (logits, others))
         total = total + (theirs.exp() * (theirs - ours)).sum(dim=1).mean()
     return total
-
-
-def from_pyramid(weights: dict[str, Tensor], own_size: Sequence[int]) -> dict[str, Tensor]:
-    """A pyramid's weights as those of a network that mixes, as far as both decide alike.
-
-    Args:
-        weights: of a :class:`training.pyramid.PyramidFusion` that reads the denoised HRLS, too.
-        own_size: its kernels.
-    """
-    changed = {name: value for name, value in weights.items() if not name.startswith("heads.")}
-    for level in range(LEVELS):
-        phases = 1 if level else 4
-        for kind in ("weight", "bias"):
-            outputs = weights[f"heads.{level}.{kind}"].float().unflatten(0, (-1, phases))
-            means, brought, denoised, together = outputs[-len(CANDIDATES) :]
-            few = torch.zeros_like(means) - (4.0 if kind == "bias" else 0.0)
-            wanted = [brought, denoised, means, few]
-            if level:
-                wanted += [together, denoised, few, few]
-            else:
-                wanted.append(outputs[-len(CANDIDATES) - 1] + (2.0 if kind == "bias" else 0.0))
-            changed[f"heads.{level}.{kind}"] = torch.stack(wanted).flatten(0, 1)
-    return changed

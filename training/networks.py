@@ -5,16 +5,21 @@ from __future__ import annotations
 
 from torch import Tensor
 
+from training.joint import JointFusion
 from training.mix import MixFusion
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
 
-Network = MultiResolutionFusion | PyramidFusion | MixFusion
-NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[MixFusion]] = {
+Network = MultiResolutionFusion | PyramidFusion | MixFusion | JointFusion
+NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[MixFusion] | type[JointFusion]] = {
     "paper": MultiResolutionFusion,
     "pyramid": PyramidFusion,
     "mix": MixFusion,
+    "joint": JointFusion,
 }
+
+#: What Open Image Denoise does for those that read its results, see :data:`oiio_msspl.denoiser.MODES`.
+DENOISERS = {"mix": "high", "joint": "together"}
 
 
 def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -9,9 +9,7 @@ hold are averaged:
    per pixel says how far the colour follows it (not at all for mirrors, glass, emitters and sky).
 3. From coarse to fine, H/16 to H, every level averages its own samples (the downsampled HRLS and, from the LRHS's
    resolution on, the LRHS) over predicted kernels, together with the coarser level's result around the pixel. Samples
-   also carry predicted weights of their own, so that a firefly is left out wherever it might be read. Where another
-   denoiser's results are there, every level then mixes them in by predicted shares: see ``CANDIDATES``.
-
+   also carry predicted weights of their own, so that a firefly is left out wherever it might be read.
 4. No pixel may be darker or brighter than everything around it in both renders.
 
 5. A last convolution predicts how far each pixel is still off.
@@ -23,7 +21,6 @@ samples beside weights of taps are like the splats of Gharbi et al. 2019.
 
 from __future__ import annotations
 
-import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -35,7 +32,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl import schema, transforms
-from training.paper import HRLS_CHANNELS, LRHS_CHANNELS, conv3x3
+from training.paper import conv3x3
 
 #: Channels of its U-Net, H/2, H/4, ... H/32.
 PYRAMID_CHANNELS = (48, 64, 96, 128, 128)
@@ -45,10 +42,6 @@ LEVELS = 5
 MIN_ALBEDO = 0.02
 #: Weights are exponentials of the network's outputs within these bounds.
 MAX_LOGIT = 12.0
-#: Largest factor by which a level's light is told to differ from the denoised HRLS, and its inverse the smallest.
-MAX_RATIO = 8.0
-#: Added to both sides of that ratio, in exposed radiance: black is no light to compare with.
-RATIO_FLOOR = 1e-3
 
 _LOG_SCALE = 1.0 / math.log1p(transforms.MU)
 #: Of the HRLS's channels: colour, albedo, and all up to these.
@@ -224,13 +217,6 @@ def positive(logits: Tensor) -> Tensor:
 #: An image by level.
 Pyramid = dict[int, Tensor]
 
-#: What a level of the light is mixed of beside another denoiser's results, with the logits that training starts from:
-#: the level's weighted means; the denoised HRLS, as much brighter or darker as the coarser level has become; the
-#: denoised HRLS as it is; both renders denoised together, from the LRHS's resolution on.
-CANDIDATES = (0.0, 1.0, 0.0, 2.0)
-#: Every candidate's smallest share: what makes it keeps learning, however good another one is.
-MIN_SHARE = 0.01
-
 
 def pyramid(image: Tensor, first: int, levels: int) -> Pyramid:
     """Means of 2x2 pixels of means of 2x2 pixels ...: the image as level ``first``, up to level ``levels - 1``."""
@@ -243,26 +229,6 @@ def pyramid(image: Tensor, first: int, levels: int) -> Pyramid:
 def from_finest(phases: Tensor, levels: int) -> Pyramid:
     """The same of an image (N, C, 4, H/2, W/2), which stays level 0."""
     return {0: phases} | pyramid(phases.mean(dim=2), 1, levels)
-
-
-def chosen(logits: Tensor, candidates: list[Tensor | None], tint: Tensor | None) -> Tensor:
-    """The mean of those candidates that are there, weighted by the softmax of their logits and at least ``MIN_SHARE``.
-
-    Args:
-        logits: (N, len(candidates), P, H, W).
-        candidates: light (N, 3, P, H, W).
-        tint: makes light colour; then colours are averaged, and returned, in network values, where no outlier rules.
-    """
-    present = {i: image for i, image in enumerate(candidates) if image is not None}
-    if tint is not None:
-        present = {i: logarithmic(image * tint) for i, image in present.items()}
-    if len(present) == 1:
-        return next(iter(present.values()))
-    # Plane by plane: ONNX Runtime's softmax over another axis than the last takes several times as long
-    weights = [positive(logits[:, i : i + 1]) for i in present]
-    rest = (1 - len(present) * MIN_SHARE) / functools.reduce(torch.add, weights)
-    terms = ((MIN_SHARE + rest * weight) * image for weight, image in zip(weights, present.values(), strict=True))
-    return functools.reduce(torch.add, terms)
 
 
 def level_of(lrhs: Tensor, hrls: Tensor) -> int:
@@ -358,19 +324,12 @@ class PyramidFusion(Trunk):
     Args:
         channels: of the U-Net's levels H/2, H/4, H/8, ...
         own_size: taps across of the kernels over a level's own samples, H, H/2, ... ; odd.
-        denoiser: what another denoiser adds to the inputs' channels, see :func:`oiio_msspl.schema.inputs`.
     """
 
-    def __init__(
-        self,
-        channels: Sequence[int] = PYRAMID_CHANNELS,
-        own_size: Sequence[int] = (5, 5, 5, 5, 5),
-        denoiser: str = "",
-    ) -> None:
-        super().__init__(channels, denoiser, stem_size=6, refined=True)
-        self.config = {"channels": list(channels), "own_size": list(own_size), "denoiser": denoiser}
+    def __init__(self, channels: Sequence[int] = PYRAMID_CHANNELS, own_size: Sequence[int] = (5, 5, 5, 5, 5)) -> None:
+        super().__init__(channels, "", stem_size=6, refined=True)
+        self.config = {"channels": list(channels), "own_size": list(own_size)}
         self.own_size = own_size
-        self.denoised = self.lrhs_channels > LRHS_CHANNELS
 
         # Kernels of every level of the light; those of level 0 are made at H/2, for four pixels each
         reads = [channels[0], *channels]
@@ -381,10 +340,9 @@ class PyramidFusion(Trunk):
 
     def outputs(self, level: int) -> list[int]:
         """Channels of a level's head: taps over its own samples, weight of the HRLS's samples, taps over the coarser
-        level, weight of the LRHS's samples, taps over the albedo, share of the albedo, choice among CANDIDATES."""
+        level, weight of the LRHS's samples, taps over the albedo, share of the albedo."""
         own, coarser = self.own_size[level] ** 2, 9 if level < LEVELS - 1 else 0
-        choice = len(CANDIDATES) if self.denoised else 0
-        return [own, 1, coarser, 1, 0, 0, choice] if level else [own, 1, coarser, 0, 9, 1, choice]
+        return [own, 1, coarser, 1, 0, 0] if level else [own, 1, coarser, 0, 9, 1]
 
     @torch.no_grad()
     def reset_parameters(self) -> None:
@@ -392,28 +350,11 @@ class PyramidFusion(Trunk):
         self.reset_convolutions()
         for head in self.heads:
             head.weight.mul_(0.1)
-        if self.denoised:
-            for level, head in enumerate(self.heads):
-                weight, bias = (
-                    parameter.unflatten(0, (-1, 1 if level else 4))[-len(CANDIDATES) :]
-                    for parameter in (head.weight, head.bias)
-                )
-                weight.zero_()
-                bias.copy_(torch.tensor(CANDIDATES)[:, None].expand_as(bias))
 
-    def gather(
-        self,
-        albedo: Tensor,
-        colours: Pyramid,
-        lows: Pyramid,
-        features: list[Tensor],
-        denoised: Pyramid,
-        denoised_lows: Pyramid,
-    ) -> Tensor:
+    def gather(self, albedo: Tensor, colours: Pyramid, lows: Pyramid, features: list[Tensor]) -> Tensor:
         """Make kernels of the features and apply them: the fused image in network values.
 
-        Albedo of the HRLS and the result are (N, 3, 4, H/2, W/2); so is level 0 of all. Other denoisers' results are
-        empty without them.
+        Albedo of the HRLS and the result are (N, 3, 4, H/2, W/2); so is level 0 of all.
         """
         logits = []
         for level, head in enumerate(self.heads):
@@ -423,7 +364,7 @@ class PyramidFusion(Trunk):
             logits.append([part.float().unflatten(1, (-1, phases)) for part in parts])
 
         # Albedo, and the part of it that colours the light
-        *_, albedo_taps, gamma, _ = logits[0]
+        *_, albedo_taps, gamma = logits[0]
         filtered = divided(weighted_sum(positive(albedo_taps), weighted(albedo, torch.ones_like(albedo[:, :1]))))
         share = torch.sigmoid(gamma + 2.0)
         tint = (share * filtered + (1 - share)).clamp_min(MIN_ALBEDO)
@@ -433,45 +374,26 @@ class PyramidFusion(Trunk):
             return images[level] / tints[level] if level == 0 else (images[level] / tints[level]).unsqueeze(2)
 
         light: Tensor | None = None
-        guide: Tensor | None = None  # the denoised HRLS's light
         for level in reversed(range(LEVELS)):
-            own, importance, coarser, low_importance, _, _, choice = logits[level]
+            own, importance, coarser, low_importance, *_ = logits[level]
             samples = weighted(as_light(colours, level), positive(importance))
             if level in lows:
                 samples = samples + weighted(as_light(lows, level), positive(low_importance + 1.0))
             total = weighted_sum(positive(own), samples)
-            ratio: Tensor | None = None
             if light is not None:
-                planes = [light, torch.ones_like(light[:, :1])]
-                around = torch.cat(planes if guide is None else [*planes, guide], dim=1)
+                around = torch.cat([light, torch.ones_like(light[:, :1])], dim=1)
                 if level > 0:
                     around = double(around.squeeze(2)).unsqueeze(2)
-                gathered = weighted_sum(positive(coarser), around, dilation=2)
-                total = total + gathered[:, :4]
-                if guide is not None:
-                    # Of the means, not the mean of ratios: where it is dark, that would be noise
-                    light, guide = (
-                        part / gathered[:, 3:4].clamp_min(1e-12) for part in (gathered[:, :3], gathered[:, 4:])
-                    )
-                    ratio = ((light + RATIO_FLOOR) / (guide + RATIO_FLOOR)).clamp(1 / MAX_RATIO, MAX_RATIO)
+                total = total + weighted_sum(positive(coarser), around, dilation=2)
             light = divided(total)
-            guide = as_light(denoised, level) if denoised else None
-            candidates = [
-                light,
-                # Of no influence on what is coarser: training through a chain of ratios made the features explode
-                (guide * ratio).detach() if guide is not None and ratio is not None else None,
-                guide,
-                as_light(denoised_lows, level) if level in denoised_lows else None,
-            ]
-            light = chosen(choice, candidates, tint if level == 0 else None)
         assert light is not None
-        return light
+        return logarithmic(light * tint)
 
     def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
         """
         Args:
-            lrhs: (N, 3, h, w), network values; or (N, 6, h, w) with another denoiser's result.
-            hrls: (N, 16, s*h, s*w), or 19, likewise.
+            lrhs: (N, 3, h, w), network values.
+            hrls: (N, 16, s*h, s*w).
 
         Returns:
             The fused image (N, 3, s*h, s*w) in network values, and the logarithm of its expected absolute error
@@ -482,17 +404,9 @@ class PyramidFusion(Trunk):
         colours = from_finest(linear(phases[:, _COLOUR]), deepest)
         lows = pyramid(linear(lrhs), level_of(lrhs, hrls), deepest)
         features = self.features(lrhs, hrls, colours, lows)
-        denoised: Pyramid = {}
-        denoised_lows: Pyramid = {}
-        if self.hrls_channels > HRLS_CHANNELS:
-            denoised = from_finest(linear(to_phases(hrls[:, HRLS_CHANNELS:])), LEVELS)
-        if self.denoised:
-            denoised_lows = {level: low[:, LRHS_CHANNELS:] for level, low in lows.items()}
-            lows = {level: low[:, :LRHS_CHANNELS] for level, low in lows.items()}
-        fused = self.gather(phases[:, _ALBEDO], colours, lows, features, denoised, denoised_lows)
+        fused = self.gather(phases[:, _ALBEDO], colours, lows, features)
         lowest, highest = (
-            (sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * hrls[:, :3])).unsqueeze(2)
-            for sign in (-1.0, 1.0)
+            (sign * highest_around(sign * lrhs, sign * hrls[:, :3])).unsqueeze(2) for sign in (-1.0, 1.0)
         )
         error = pointwise(self.error, features[0].detach()).float().unsqueeze(1)
         return from_phases(torch.clamp(fused, lowest, highest)), from_phases(error)

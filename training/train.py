@@ -32,11 +32,12 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from oiio_msspl import metrics, transforms
-from oiio_msspl.denoiser import MODES, Denoiser
+from oiio_msspl.denoiser import Denoiser
 from training import batches, data, losses
-from training.mix import MIX_CHANNELS, MixFusion, disagreement, from_pyramid
-from training.networks import NETWORKS, Network, run
-from training.paper import MultiResolutionFusion
+from training.joint import JointFusion
+from training.mix import MIX_CHANNELS, MixFusion, blend, disagreement
+from training.networks import DENOISERS, NETWORKS, Network, run
+from training.paper import HRLS_CHANNELS, MultiResolutionFusion
 from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion, level_of
 
 log = logging.getLogger(__name__)
@@ -164,18 +165,6 @@ def warm_start(network: Network, path: Path) -> None:
         if "own_size" not in state["config"]:
             raise SystemExit(f"--init {path}: that is no pyramid network, and nothing of it fits one")
         cut_kernels(theirs, state["config"]["own_size"], network.own_size)
-    if isinstance(network, MixFusion) and state["config"].get("denoiser", "") in ("", "low"):
-        raise SystemExit(f"--init {path}: a network that mixes starts from one that reads the denoised HRLS, too")
-    if isinstance(network, MixFusion) and "own_size" in state["config"]:
-        theirs = from_pyramid(theirs, state["config"]["own_size"])
-    for name, value in theirs.items():
-        # What a convolution reads beyond the other's inputs counts for nothing at first; what it makes beyond the
-        # other's outputs begins as in a new network
-        larger = ours[name].shape if name in ours else ()
-        if value.ndim == len(larger) and all(size <= limit for size, limit in zip(value.shape, larger, strict=True)):
-            theirs[name] = ours[name].clone()
-            theirs[name][: len(value)] = 0
-            theirs[name][tuple(slice(size) for size in value.shape)] = value
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
@@ -209,7 +198,9 @@ def fused_and_taught(
     logits, _ = network.decide(lrhs, hrls)
     with torch.no_grad():
         wanted, _ = teacher.decide(lrhs, hrls)
-    return network.blend(lrhs, hrls, logits), TAUGHT * disagreement(logits, wanted, level_of(lrhs, hrls))
+    return blend(lrhs, hrls, hrls[:, HRLS_CHANNELS:], logits), TAUGHT * disagreement(
+        logits, wanted, level_of(lrhs, hrls)
+    )
 
 
 class Average:
@@ -258,15 +249,17 @@ def train(args: argparse.Namespace) -> None:
 
     # Network, from the last checkpoint, from another run, or new
     network: Network
-    denoiser = Denoiser(args.threads, args.denoiser) if args.denoiser else None
+    mode = DENOISERS.get(args.network, "")
+    denoiser = Denoiser(args.threads, mode) if mode else None
     if args.network == "pyramid":
-        network = PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels, args.denoiser)
+        network = PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels)
     elif args.network == "mix":
-        if args.denoiser in ("", "low"):
-            raise SystemExit("--network mix: it needs a --denoiser that denoises the HRLS, too")
-        network = MixFusion(args.channels or MIX_CHANNELS, args.denoiser, args.stem)
-    elif args.denoiser:
-        raise SystemExit("--denoiser: not for the paper's network")
+        network = MixFusion(args.channels or MIX_CHANNELS, args.stem)
+    elif args.network == "joint":
+        begun = args.out / "checkpoint.pt"
+        earlier = begun if begun.exists() else args.init
+        kept = torch.load(earlier, map_location="cpu", weights_only=True)["config"].get("kept") if earlier else None
+        network = JointFusion(kept)
     elif len(scales) == 1:
         network = MultiResolutionFusion(scales[0])
     else:
@@ -290,7 +283,17 @@ def train(args: argparse.Namespace) -> None:
     learning = [parameter for parameter in network.parameters() if parameter.requires_grad]
     if not learning:
         raise SystemExit(f"--only {args.only}: the network has no such part")
-    optimizer = recipe.optimizer(learning, lr=peak_lr, **recipe.options)
+    # Given weights, which took weeks to learn, go in smaller steps than new ones
+    retrained = {id(p) for p in network.retrained()} if isinstance(network, JointFusion) else set()
+    groups = [
+        {"params": params, "share": share}
+        for params, share in (
+            ([p for p in learning if id(p) not in retrained], 1.0),
+            ([p for p in learning if id(p) in retrained], args.retrain),
+        )
+        if params
+    ]
+    optimizer = recipe.optimizer(groups, lr=peak_lr, **recipe.options)
     step, elapsed, best_gain = 0, 0.0, -math.inf
 
     def restore(state: dict[str, Any]) -> None:
@@ -348,7 +351,7 @@ def train(args: argparse.Namespace) -> None:
             "optimizer": optimizer.state_dict(),
             "architecture": args.network,
             "config": network.config,
-            "denoiser": args.denoiser,
+            "denoiser": mode,
             "step": step,
             "seconds": elapsed,
             "best_gain": best_gain,
@@ -386,7 +389,7 @@ def train(args: argparse.Namespace) -> None:
         # One step
         step += 1
         for group in optimizer.param_groups:
-            group["lr"] = peak_lr * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
+            group["lr"] = peak_lr * group["share"] * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
         pair = source.next()
         with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
             output, loss = fused_and_taught(network, teacher, pair["lrhs"], pair["hrls"])
@@ -430,16 +433,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--data", type=Path, required=True, help="folder of views (.npz)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
-    parser.add_argument(
-        "--network", choices=NETWORKS, default="paper", help="the paper's, the kernel-predicting one or the mixing one"
-    )
-    parser.add_argument(
-        "--denoiser",
-        choices=MODES,
-        default="",
-        help="a network that also reads what Open Image Denoise makes of both renders together (low), and of the HRLS "
-        "in some quality",
-    )
+    parser.add_argument("--network", choices=NETWORKS, default="paper", help="the paper's, or another of docs/")
     parser.add_argument(
         "--channels",
         type=int,
@@ -466,6 +460,9 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--batch", type=int, help="default: the preset's")
     parser.add_argument("--patch", type=int, help="HR pixels; default: the preset's")
     parser.add_argument("--lr", type=float, help="peak learning rate; default: the preset's")
+    parser.add_argument(
+        "--retrain", type=float, default=0.06, help="share of the learning rate for a joint network's given weights"
+    )
     parser.add_argument("--loss", choices=losses.LOSSES, help="default: the preset's")
     parser.add_argument(
         "--precision", choices=("bf16", "fp32"), default="bf16", help="of convolutions; weights stay fp32"

@@ -16,11 +16,12 @@ EXAMPLES = """[bold]Examples[/bold]
 
 def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
     """List the models inside the package, and the devices that can run them."""
-    from oiio_msspl.session import PROVIDERS, read_contract, shipped_models, usable_devices
+    from oiio_msspl.contract import Contract
+    from oiio_msspl.session import PROVIDERS, shipped_models, usable_devices
 
     rows: list[dict[str, Any]] = []
     for name, path in shipped_models().items():
-        contract = read_contract(path)
+        contract = Contract.of_file(path)
         rows.append(
             {
                 "name": name,

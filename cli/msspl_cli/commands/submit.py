@@ -50,9 +50,10 @@ def submit(
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl import preview
     from oiio_msspl.bundle import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
+    from oiio_msspl.contract import Contract
     from oiio_msspl.schema import SCALES
     from oiio_msspl.sequence import find_shot, format_frames, is_sequence
-    from oiio_msspl.session import ALWAYS, AUTO, PROVIDERS, find_model, read_contract, shipped_models
+    from oiio_msspl.session import ALWAYS, AUTO, PROVIDERS, find_model, shipped_models
     from oiio_msspl.shot import check_no_input
 
     # What is wrong for every frame is said here, not by every task.
@@ -70,7 +71,7 @@ def submit(
         passed_on += ["--model", model]
     else:
         files["--model"] = find_model(0, model)
-        read_contract(files["--model"])
+        Contract.of_file(files["--model"])
 
     paths = given["lr"], given["hr"], given["output"]
     if not any(map(is_sequence, paths[:2])):

@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open Image Denoise's network, taught to read both renders."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, schema, session, transforms
+from oiio_msspl.contract import Contract
+from oiio_msspl.denoiser import Denoiser, layers_of
+from oiio_msspl.errors import InputError
+from tests.conftest import noisy, picture
+
+JOINT = [f"joint-x{scale}" for scale in schema.SCALES]
+
+
+@pytest.fixture
+def forget():
+    """What is known of the installed pyoidn, before and after."""
+    for known in (denoiser.installed_weights, denoiser.eight_bits_work):
+        known.cache_clear()
+    yield
+    for known in (denoiser.installed_weights, denoiser.eight_bits_work):
+        known.cache_clear()
+
+
+# The models that ship
+
+
+@pytest.mark.parametrize("name", JOINT)
+def test_the_package_has_no_weights_of_open_image_denoise(name):
+    """What a file holds is what differs from them, and what they do not have."""
+    onnx = pytest.importorskip("onnx")
+    graph = onnx.load(find_model(0, name), load_external_data=False).graph
+    tensors = {tensor.name: tensor for tensor in graph.initializer}
+    convolutions = [name.removesuffix(".in_codes.more") for name in tensors if name.endswith(".in_codes.more")]
+    assert len(convolutions) == 16
+    for layer in convolutions:
+        assert tensors[layer].data_location == onnx.TensorProto.EXTERNAL
+        assert not tensors[layer].raw_data
+
+
+@pytest.mark.parametrize("trouble", ["not installed", "other weights", "wrong results"])
+def test_what_it_needs_is_said_and_done_without(trouble, monkeypatch, forget):
+    pytest.importorskip("pyoidn")
+    if trouble == "not installed":
+        monkeypatch.setattr(denoiser, "installed_library", lambda: (_ for _ in ()).throw(ImportError))
+        monkeypatch.setattr(session, "find_spec", lambda name: None)
+    elif trouble == "other weights":
+        monkeypatch.setattr(eight_bit, "weights_of", lambda name, library: None)
+    else:
+        plain = eight_bit.EightBit.__call__
+        monkeypatch.setattr(eight_bit.EightBit, "__call__", lambda self, **images: plain(self, **images) + 0.02)
+    said = {
+        "not installed": "pip install pyoidn, or choose another --model",
+        "other weights": "has others: install that version of pyoidn, or choose another --model",
+        "wrong results": "model joint-x4 is in 8 bits, which this machine computes wrongly; choose another --model",
+    }
+    with pytest.raises(InputError, match=said[trouble]):
+        Session(find_model(4, "joint"))
+    assert find_model(4).stem == ("pyramid-x4" if trouble == "not installed" else "mix-x4")
+
+
+def test_it_is_the_default_where_it_can_be(forget):
+    pytest.importorskip("pyoidn")
+    assert find_model(2).stem == "joint-x2"
+    assert find_model(2, "auto").stem == "joint-x2"
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_it_comes_nearer_than_open_image_denoise(scale):
+    """Also where sides are no multiple of what the network needs; and within the renders' range."""
+    pytest.importorskip("pyoidn")
+    clean = picture(136, 200)
+    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+    albedo = noisy(clean.clip(0, 1), 64).clip(0, 1)
+    lr = Render.from_arrays("lr", rgb=transforms.box_downsample(noisy(clean, 4, seed=1), scale))
+    hr = Render.from_arrays("hr", rgb=noisy(clean, 4), albedo=albedo, normal=normal)
+    model = Session(find_model(scale, "joint"), threads=1)
+    fused = fuse(lr, hr, model, error=True)
+    assert fused.rgb.shape == clean.shape
+    assert fused.rgb.min() >= 0
+    assert fused.rgb.max() <= max(lr.layers["rgb"].max(), hr.layers["rgb"].max())
+    layers = layers_of(np.concatenate([transforms.compress(hr.layers["rgb"], fused.exposure), albedo, normal], axis=-1))
+    alone = transforms.expand(Denoiser(threads=1, exact=True).hrls(layers), fused.exposure)
+
+    def error(image):
+        return np.abs(transforms.compress(image, 1.0) - transforms.compress(clean, 1.0)).mean()
+
+    assert error(fused.rgb) < error(alone)
+    assert (fused.error > 0).all()
+
+
+def test_layers_that_it_does_not_read_are_not_read():
+    pytest.importorskip("pyoidn")
+    model = Session(find_model(2, "joint"), threads=1)
+    assert list(model.contract.features) == [schema.RGB, schema.ALBEDO, schema.NORMAL]
+    clean, asked = picture(64, 64), []
+
+    class Watched(Render):
+        def read(self, window, features=None):
+            asked.append(None if features is None else set(features))
+            return super().read(window, features)
+
+    layers = {name: clean for name in (schema.RGB, schema.ALBEDO, schema.DIFFUSE, schema.SPECULAR)}
+    lr = Render.from_arrays("lr", rgb=transforms.box_downsample(noisy(clean, 4, seed=1), 2))
+    fuse(lr, Watched.from_arrays("hr", **layers), model)
+    assert {schema.RGB, schema.ALBEDO, schema.NORMAL, "alpha"} in asked
+    assert not any(features is None or schema.DIFFUSE in features for features in asked)
+
+
+# Making them
+
+
+@pytest.fixture(scope="module")
+def torch():
+    pytest.importorskip("pyoidn")
+    return pytest.importorskip("torch")
+
+
+def pairs(torch, scale, count=2, size=64):
+    """Inputs of the network: pictures with noise."""
+    denoise = Denoiser(threads=1, mode="together")
+    result = []
+    for seed in range(count):
+        clean = picture(size, size)
+        values = [transforms.compress(noisy(clean, 4, seed + i), 1.0) for i in range(2)]
+        normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+        hrls = np.concatenate([values[0], clean.clip(0, 1), normal], axis=-1)
+        images = denoise(transforms.box_downsample(values[1], scale), hrls)
+        result.append(tuple(torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[None])) for i in images))
+    return result
+
+
+def test_it_begins_as_open_image_denoise(torch):
+    from training.joint import JointFusion
+
+    network = JointFusion().eval()
+    for head in network.heads:  # believe what the U-Net makes, and nothing else
+        head.weight.data.zero_()
+        head.bias.data[1] = 60.0
+    ((lrhs, hrls),) = pairs(torch, 2, count=1)
+    with torch.inference_mode():
+        fused = network(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
+    expected = Denoiser(threads=1, exact=True).hrls(layers_of(hrls[0].permute(1, 2, 0).numpy()))
+    assert np.abs(fused - expected).mean() < 1e-3
+    assert not any(parameter.any() for parameter in network.retrained())
+
+
+@pytest.mark.parametrize("scale", [2, 8])
+def test_the_graph_computes_what_the_network_does(torch, scale, tmp_path):
+    """With weights that have learnt something, some of them left out; and a contract that says what is left open."""
+    from training import export
+    from training.joint import JointFusion
+    from training.unet import SMALLER
+
+    torch.manual_seed(0)
+    ups = [name for level in SMALLER.up for name in level]
+    network = JointFusion(kept={name: list(range(i, 16 + i)) for i, name in enumerate(ups)}).eval()
+    for name, parameter in network.named_parameters():
+        parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
+    state = {"denoiser": "together", "architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
+    contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
+    drawn = pairs(torch, scale)
+    path = tmp_path / "joint.onnx"
+    export.onnx.save(export.joint_to_onnx(network, contract, drawn), path)
+    assert Contract.of_file(path).weights == "usual"
+    model = export._loaded(path)
+    for lrhs, hrls in drawn:
+        fused, log_error = model.run(["fused", "log_error"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
+        with torch.inference_mode():
+            expected = [values.numpy() for values in network(lrhs, hrls)]
+        assert np.abs(fused - expected[0]).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - expected[0]).mean()
+        assert np.abs(log_error - expected[1]).mean() < 0.1
+
+
+def test_what_the_next_convolution_does_not_read_can_be_left_out(torch):
+    from training import prune
+    from training.joint import JointFusion
+
+    torch.manual_seed(0)
+    network = JointFusion().eval()
+    idle = torch.tensor([3, 20, 40])
+    reader = network.convs["dec_conv1a"]
+    reader.weight.data[:, idle] = -reader.given_weight[:, idle]
+    head = network.heads[1]
+    head.weight.data[:, idle] = 0
+    drawn = pairs(torch, 2, count=1)
+    pruned = prune.without(network, "dec_conv2b", 61, [{"lrhs": lrhs, "hrls": hrls} for lrhs, hrls in drawn]).eval()
+    assert len(pruned.kept["dec_conv2b"]) == 61
+    assert pruned.convs["dec_conv2b"].weight.shape[0] == pruned.heads[1].in_channels == 61
+    with torch.inference_mode():
+        for before, after in zip(network(*drawn[0]), pruned(*drawn[0]), strict=True):
+            torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
+    with pytest.raises(SystemExit, match="only convolutions on the way up"):
+        prune.without(network, "enc_conv1", 16, [])
+
+
+def test_it_goes_on_from_an_earlier_run(torch, tmp_path: Path):
+    from training.joint import JointFusion
+    from training.train import warm_start
+
+    network = JointFusion(kept={"dec_conv1a": list(range(48))})
+    network.convs["enc_conv2"].more.data.fill_(0.5)
+    torch.save({"ema": network.state_dict(), "config": network.config}, tmp_path / "earlier.pt")
+    other = JointFusion(kept=network.kept)
+    warm_start(other, tmp_path / "earlier.pt")
+    assert (other.convs["enc_conv2"].more == 0.5).all()
+    retrained, everything = len(list(other.retrained())), len(list(other.parameters()))
+    assert retrained == 32 and everything == 32 + 2 + 2 * 5

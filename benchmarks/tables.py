@@ -177,7 +177,7 @@ def total() -> str:
     def gain(name: str, spp: int, scene: str, more: float) -> float:
         """On OIDN with so many more samples; beyond the most that were measured, it goes on as before."""
         values = [psnr[method, n, scene] for method, n in known]
-        at = np.log2(spp + more)
+        at = np.log2(max(spp + more, 1.0))  # with less it has no picture to show
         beyond = max(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 

@@ -288,7 +288,7 @@ def _with_room(image: Array) -> Array:
 
 
 def layers_of(hrls: Array) -> Layers:
-    """What Open Image Denoise reads of a transformed HRLS: its colour, and albedo and normal as far as they are there."""
+    """What Open Image Denoise reads of a transformed HRLS: colour, and albedo and normal as far as they are there."""
     colour, normal = {"colour": _feature(hrls, schema.RGB)}, _feature(hrls, schema.NORMAL)
     albedo = transforms.limited(_feature(hrls, schema.ALBEDO), 0.0, 1.0)
     # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.

@@ -107,7 +107,7 @@ class JointFusion(nn.Module):
             nn.Conv2d(len(self.convs[name].bias), size, 3, padding=1)
             for name, size in zip(DECODED, OUTPUTS, strict=True)
         )
-        self.error = nn.Conv2d(len(self.convs[DECODED[0]].bias), 1, 3, padding=1)
+        self.error = nn.Conv2d(len(self.convs[DECODED[1]].bias), 4, 3, padding=1)
         with torch.no_grad():
             for level, head in enumerate(self.heads):
                 nn.init.kaiming_normal_(head.weight)
@@ -164,7 +164,7 @@ class JointFusion(nn.Module):
             join=lambda one, other: torch.cat([one, other], dim=1),
         )
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
-        log_error = self.error(features[DECODED[0]].detach()).float()
+        log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = unseen(colour.float().clamp_max(1.0))
         return blend(lrhs, hrls, denoised, logits), log_error
 

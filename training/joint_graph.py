@@ -22,7 +22,7 @@ from oiio_msspl.contract import Contract
 from oiio_msspl.denoiser import Denoiser
 from training import batches, data
 from training.eight_bit import COLOURS, SIGNED_RANGE, SIGNED_ZERO, Codes, Fit, Given, Graph, Values, walk_values
-from training.joint import DECODED, JointFusion, seen
+from training.joint import DECODED, OUTPUTS, JointFusion, seen
 from training.mix import blend
 from training.paper import LRHS_CHANNELS
 from training.unet import SMALLER
@@ -110,12 +110,13 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
         given[name] = Given(
             *(network.given[f"{name}.{kind}"] for kind in ("weight", "bias")), *network.given_channels(name)
         )
-    beside = {f"head{level}": head for level, head in enumerate(network.heads)} | {"error": network.error}
     for kind in ("weight", "bias"):
-        for name, conv in beside.items():
-            weights[f"{name}.{kind}"] = getattr(conv, kind)
-        last = [weights[f"{name}.{kind}"] for name in (SMALLER.last, "head0", "error")]
-        weights[f"{SMALLER.last}.{kind}"] = torch.cat(last)
+        heads = [getattr(head, kind) for head in network.heads]
+        last = f"{SMALLER.last}.{kind}"
+        weights[last] = torch.cat([weights[last], heads[0]])
+        # What is expected to be wrong, four pixels for each of H/2, is made beside that level's logits
+        heads[1] = torch.cat([heads[1], getattr(network.error, kind)])
+        weights |= {f"head{level}.{kind}": heads[level] for level in range(1, len(heads))}
     fit = Fit(SMALLER, {name: value.detach() for name, value in weights.items()}, given, OUT, fine=False)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
@@ -186,12 +187,14 @@ class JointGraph(Graph):
         pixels = self._add("Gather", ["unseen", sums], "denoised.pixels")
         self._add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
         count = len(self.fit.layers[SMALLER.last].step) - COLOURS
-        beside = self._planes(SMALLER.last, COLOURS * OUT, count)
-        self._cut(beside, 0, count - 1, "logits0")
-        self._cut(beside, count - 1, count, "log_error")
+        self._add("Identity", [self._planes(SMALLER.last, COLOURS * OUT, count)], "logits0")
         for level in range(1, self._scale.bit_length()):
             name = self.conv(f"head{level}", DECODED[level])
-            self._add("Identity", [self._planes(name, 0, len(self.fit.layers[name].step))], f"logits{level}")
+            planes = self._planes(name, 0, len(self.fit.layers[name].step))
+            self._cut(planes, 0, OUTPUTS[level], f"logits{level}")
+            if level == 1:
+                phases = self._cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
+                self._add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
         self.nodes += mixing.graph.node
         model = self.finished("joint", inputs, outputs)
         model.graph.initializer.extend(mixing.graph.initializer)

@@ -45,7 +45,7 @@ def without(network: JointFusion, name: str, count: int, pairs: list[batches.Bat
     readers: list[Retrained | nn.Conv2d] = [network.convs[next(n for n, before in BEFORE.items() if before == name)]]
     readers += [
         head
-        for head, source in zip((*network.heads, network.error), (*DECODED, DECODED[0]), strict=True)
+        for head, source in zip((*network.heads, network.error), (*DECODED, DECODED[1]), strict=True)
         if source == name
     ]
     mean, variance = statistics(network, name, pairs)

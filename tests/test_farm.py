@@ -151,7 +151,7 @@ def test_a_canceled_job_ends_with_whole_frames(tmp_path, bilinear_models):
         (["lr", "hr", "-o", "out", "--json"], "--json has no meaning in a job"),
         (["lr", "hr", "-o", "out", "--layout", "x"], "--layout 'x': use one of"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
-        (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: onnxruntime can't load it"),
+        (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: can't be read as an ONNX file"),
         (["lr", "hr", "-o", "out", "--device", "abacus"], "--device 'abacus': use one of cpu"),
         (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
         (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),

@@ -23,6 +23,7 @@ import torch
 from benchmarks import scenes
 from benchmarks.runtime import frame
 from oiio_msspl import Render, Session, find_model, fuse, metrics, schema, tensors, transforms
+from oiio_msspl.contract import Contract
 from oiio_msspl.denoiser import Denoiser, layers_of
 from oiio_msspl.pairing import Source
 from oiio_msspl.render import Array
@@ -65,8 +66,8 @@ def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
 class InTorch(Session):
     """A joint network in 32 bits, from its checkpoint, beside Open Image Denoise itself."""
 
-    def __init__(self, name: str) -> None:
-        super().__init__(find_model(0, name))
+    def __init__(self, path: Path) -> None:
+        super().__init__(path)
         self._network, _ = export.load(CHECKPOINT)
         self._exact = Denoiser(mode=self.contract.denoiser, exact=True)
 
@@ -79,8 +80,8 @@ class InTorch(Session):
 
 def in_32_bits(name: str) -> Session:
     """A model of which nothing that can be otherwise is computed in 8 bits."""
-    model = Session(find_model(0, name), exact=True)
-    return InTorch(name) if model.contract.weights else model
+    path = find_model(0, name)
+    return InTorch(path) if Contract.of_file(path).weights else Session(path, exact=True)
 
 
 def row(name: str, seconds: list[float], psnr: list[float]) -> None:

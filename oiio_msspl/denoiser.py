@@ -115,8 +115,7 @@ class Filter:
     def _eight_bit(self) -> EightBit | None:
         if not self._network:
             return None
-        library = installed_library()
-        weights = eight_bit.weights_of(self._network, library) if library else None
+        weights = known_weights(self._network)
         if weights is None:
             log.info("the weights of this Open Image Denoise are unknown here; it does its work itself")
             return None
@@ -257,23 +256,28 @@ def eight_bits_work() -> bool:
 
 
 @functools.cache
+def known_weights(network: str) -> dict[str, NDArray[np.float16]] | None:
+    """Weights of a network of :mod:`oiio_msspl.eight_bit`, from the installed pyoidn; None if it has others."""
+    library = installed_library()
+    return eight_bit.weights_of(network, library) if library else None
+
+
 def installed_weights(network: str) -> dict[str, NDArray[np.float16]]:
-    """Weights of a network of :mod:`oiio_msspl.eight_bit`, from the installed Open Image Denoise.
+    """The same for a model that can't do without.
 
     Raises:
         InputError: pyoidn is not installed, or has others.
     """
     try:
-        library = installed_library()
+        weights = known_weights(network)
     except (ImportError, OSError) as error:
         raise InputError(
             "this model is made of Open Image Denoise's weights: pip install pyoidn, or choose another --model"
         ) from error
-    weights = eight_bit.weights_of(network, library) if library else None
     if weights is None:
         raise InputError(
-            f"this model is made of the weights of Open Image Denoise 2.5, and {library} has others: install "
-            "that version of pyoidn, or choose another --model"
+            "this model is made of the weights of Open Image Denoise 2.5, and the installed pyoidn has others: "
+            "install that version of pyoidn, or choose another --model"
         )
     return weights
 

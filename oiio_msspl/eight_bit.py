@@ -37,9 +37,9 @@ NETWORKS = {
 MULTIPLE = 16
 #: Slices of the range that a colour is written in, an albedo alone, and what either is read in.
 SLICES_IN, SLICES_OF_ALBEDO, SLICES_OUT = 3, 5, 10
-#: Channels that a network reads (slices of three colours, albedo, normal, and one that is always 0; or slices of an
-#: albedo, and the same) and makes (slices, and two that do not count). Others than multiples of 16 take long.
-CHANNELS_IN, CHANNELS_OUT = 16, 32
+#: Channels that a network reads: slices of three colours, albedo, normal, and one that is always 0; or slices of an
+#: albedo, and the same. Others than multiples of 16 take long.
+CHANNELS_IN = 16
 
 #: The curve that Open Image Denoise sees HDR colours by: a fit to the PU encoding of Aydin et al. 2008, "Extending
 #: Quality Metrics to Full Luminance Range Images", linear below the first bound, a power below the second, a logarithm

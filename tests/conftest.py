@@ -9,7 +9,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl import schema
+from oiio_msspl import denoiser, schema
 from oiio_msspl.contract import METADATA_KEY, Contract
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -132,3 +132,13 @@ def bilinear_models(tmp_path_factory):
         made[scale] = folder / f"bilinear-x{scale}.onnx"
         onnx.save(model, made[scale])
     return made
+
+
+@pytest.fixture
+def forget():
+    """What is known of the installed pyoidn, before and after."""
+    for known in (denoiser.known_weights, denoiser.eight_bits_work):
+        known.cache_clear()
+    yield
+    for known in (denoiser.known_weights, denoiser.eight_bits_work):
+        known.cache_clear()

@@ -98,7 +98,7 @@ def test_without_all_layers_open_image_denoise_does_it_itself(both_ways):
 
 
 @pytest.mark.parametrize("trouble", ["other weights", "wrong results", "no operators"])
-def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trouble):
+def test_what_cannot_be_trusted_is_not_used(both_ways, monkeypatch, caplog, trouble, forget):
     if trouble == "other weights":
         monkeypatch.setattr(eight_bit, "weights_of", lambda name, library: None)
     elif trouble == "no operators":

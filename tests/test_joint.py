@@ -17,16 +17,6 @@ from tests.conftest import noisy, picture
 JOINT = [f"joint-x{scale}" for scale in schema.SCALES]
 
 
-@pytest.fixture
-def forget():
-    """What is known of the installed pyoidn, before and after."""
-    for known in (denoiser.installed_weights, denoiser.eight_bits_work):
-        known.cache_clear()
-    yield
-    for known in (denoiser.installed_weights, denoiser.eight_bits_work):
-        known.cache_clear()
-
-
 # The models that ship
 
 

@@ -68,6 +68,11 @@ class Codes:
     worth: Tensor
     of: Tensor
 
+    def values(self, codes: Tensor) -> Tensor:
+        """What codes (C, H, W) are worth: (max(of) + 1, H, W)."""
+        result = torch.zeros(int(self.of.max()) + 1, *codes.shape[1:])
+        return result.index_add_(0, self.of, codes * self.worth[:, None, None])
+
 
 @dataclass
 class Values:
@@ -109,8 +114,7 @@ def picture(layers: Layers) -> tuple[Tensor, Tensor]:
     """What the network reads: planes of values, which are what their codes are worth; and the codes."""
     how = codes_of_pictures(alone="colour" not in layers)
     codes = torch.from_numpy(eight_bit.pack(**layers)).permute(2, 0, 1).float()
-    values = torch.zeros(int(how.of.max()) + 1, *codes.shape[1:])
-    return values.index_add_(0, how.of, codes * how.worth[:, None, None])[None], codes[None]
+    return how.values(codes)[None], codes[None]
 
 
 def codes_of_pictures(*, alone: bool) -> Codes:

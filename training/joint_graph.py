@@ -80,14 +80,10 @@ def pictures(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Values]
         for images, image in zip(codes, (full, half), strict=True):
             images.append(F.pad(image, (0, 0, 0, 0, 0, 1)))
 
-    def values(images: list[Tensor], how: Codes) -> Values:
-        exact = []
-        for image in images:
-            worth = image[0] * how.worth[:, None, None]
-            exact.append(torch.zeros(int(how.of.max()) + 1, *worth.shape[1:]).index_add_(0, how.of, worth)[None])
-        return Values(exact, images, how)
-
-    return [values(*each) for each in zip(codes, how, strict=True)]
+    return [
+        Values([written.values(image[0])[None] for image in images], images, written)
+        for images, written in zip(codes, how, strict=True)
+    ]
 
 
 def drawn(views: Path, contract: Contract, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:

@@ -28,6 +28,7 @@ from oiio_msspl.denoiser import Denoiser, layers_of
 from oiio_msspl.pairing import Source
 from oiio_msspl.render import Array
 from training import data, export
+from training.joint import with_mean
 from training.train import to_tensor
 
 SPP = (1, 2, 4)
@@ -64,15 +65,14 @@ def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
 
 
 class InTorch(Session):
-    """A joint network in 32 bits, from its checkpoint, beside Open Image Denoise itself."""
+    """A joint network in 32 bits, from its checkpoint."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
         self._network, _ = export.load(CHECKPOINT)
-        self._exact = Denoiser(mode=self.contract.denoiser, exact=True)
 
     def run(self, lrhs: Array, hrls: Array, *, error: bool = False) -> tuple[Array, Array | None]:
-        images = self._exact(lrhs[..., :3], hrls)
+        images = with_mean(lrhs[..., :3], hrls)
         with torch.inference_mode():
             fused, _ = self._network(*(to_tensor(image[None], torch.device("cpu")) for image in images))
         return fused[0].permute(1, 2, 0).numpy(), None

@@ -9,14 +9,18 @@ the network takes all.
 from __future__ import annotations
 
 import contextlib
+import contextvars
 import functools
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
+from typing import TypeVar
 
 #: Values of a band: 512 KiB of float32.
 BAND = 1 << 17
+
+T = TypeVar("T")
 
 _threads: ContextVar[int] = ContextVar("threads", default=0)
 
@@ -56,9 +60,21 @@ def each(work: Callable[[slice], object], rows: int, row_size: int, multiple: in
         other.result()
 
 
+def aside(work: Callable[[], T]) -> Callable[[], T]:
+    """Begin some work on a thread of its own, if several may be used; what is returned waits for its result."""
+    if (_threads.get() or cores()) == 1:
+        return work
+    return _beside().submit(contextvars.copy_context().run, work).result
+
+
 def _all_of(work: Callable[[slice], object], slices: list[slice]) -> None:
     for part in slices:
         work(part)
+
+
+@functools.cache
+def _beside() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_name_prefix="aside")
 
 
 @functools.cache  # never so many that it matters: a process has one number of threads, or two
@@ -67,4 +83,5 @@ def _pool(count: int) -> ThreadPoolExecutor:
 
 
 if hasattr(os, "register_at_fork"):
-    os.register_at_fork(after_in_child=_pool.cache_clear)  # a child has none of its parent's threads
+    for pool in (_pool, _beside):
+        os.register_at_fork(after_in_child=pool.cache_clear)  # a child has none of its parent's threads

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl import schema, tensors
+from oiio_msspl import bands, schema, tensors
 from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import Pairing, Source
 from oiio_msspl.render import Array, Window
@@ -66,6 +66,7 @@ def check(lr_rgb: Array, hr: Source, pairing: Pairing, lr_name: str) -> list[str
                 "check which layer it is (--map rgb=LAYER)"
             )
     warnings = []
+    shift = bands.aside(lambda: _shift(low, high))  # takes as long as all else
     ratio, certain = _ratio(low, high)
     if not 1 / EXPOSURE_RATIO < ratio < EXPOSURE_RATIO and certain:
         warnings.append(f"the HRLS is {ratio:.3g} times as bright as the LRHS: are exposure and view layer the same?")
@@ -80,7 +81,7 @@ def check(lr_rgb: Array, hr: Source, pairing: Pairing, lr_name: str) -> list[str
             "the albedo's edges are not in the picture: is it this frame's albedo? (--map albedo=LAYER says which)"
         )
     scale, grid = pairing.scale, pairing.grid
-    x, y = _shift(low, high) * scale
+    x, y = shift() * scale
     if max(abs(x), abs(y)) > max(SHIFT, 0.2 * scale):
         warnings.append(
             f"the HRLS's picture lies {abs(x):.1f} pixels {'right' if x > 0 else 'left'} of and {abs(y):.1f} pixels "
@@ -98,13 +99,13 @@ def check(lr_rgb: Array, hr: Source, pairing: Pairing, lr_name: str) -> list[str
 def _averaged(hr: Source, pairing: Pairing) -> dict[str, Array]:
     """Luminance of the HRLS's colour and, if it is there, albedo, averaged over each pixel of the grid."""
     s, grid = pairing.scale, pairing.grid
-    bands: dict[str, list[Array]] = {}
+    rows: dict[str, list[Array]] = {}
     for y0 in range(grid.y0, grid.y1, BAND):
         want = Window(grid.x0 * s, y0 * s, grid.x1 * s, min(y0 + BAND, grid.y1) * s)
         layers = tensors.read(hr, want, pairing.hr_data, features=[schema.RGB, schema.ALBEDO])
         for name, values in layers.items():
-            bands.setdefault(name, []).append(luminance(box_downsample(values, s)))
-    return {name: np.concatenate(parts) for name, parts in bands.items()}
+            rows.setdefault(name, []).append(luminance(box_downsample(values, s)))
+    return {name: np.concatenate(parts) for name, parts in rows.items()}
 
 
 def _albedo_correlation(picture: Array, albedo: Array) -> float:

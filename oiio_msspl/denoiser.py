@@ -6,7 +6,8 @@ The HRLS is denoised as anyone would, with its albedo and normal. The LRHS has n
 independent samples of the same scene, so at the LRHS's resolution their mean has less noise than either, and the
 HRLS's albedo and normal, averaged over s x s pixels, have hardly any: Open Image Denoise may be told that they are
 clean, which is worth 0.8 to 1.5 dB (at x2 the albedo is denoised first, or nothing is told). What it makes of these is
-better at that resolution than its result on the HRLS, for a fraction of the time.
+better at that resolution than its result on the HRLS, for a fraction of the time. A network of ours that was made of
+Open Image Denoise's does the same without its help.
 """
 
 from __future__ import annotations
@@ -37,10 +38,10 @@ _OF_LRHS, _OF_HRLS = sum(schema.LRHS_FEATURES.values()), sum(schema.HRLS_FEATURE
 _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.values()]), strict=False))
 
 
-#: What is denoised: both renders together at the LRHS's resolution (``together``), and the HRLS too (``high``).
-MODES = ("together", "high")
 #: Bounds of the LRHS's share in what is denoised at its resolution: an estimate that wants all or none may be wrong.
 _SHARE = (0.05, 0.95)
+#: What the noise of both renders' mean is written in.
+NOISE_GAIN = 2.0
 #: Largest mean difference in network values between Open Image Denoise and itself in 8 bits, on a small picture.
 TOLERANCE = 0.01
 
@@ -138,11 +139,10 @@ class Denoiser:
 
     Args:
         threads: 0 for all.
-        mode: one of ``MODES``.
         exact: never in 8 bits (:mod:`oiio_msspl.eight_bit`), which is otherwise done where it can be.
 
     Attributes:
-        hrls: what denoises the HRLS, or None.
+        hrls: what denoises the HRLS.
         both: what denoises both together.
         albedo: what denoises the albedo for that, at x2.
 
@@ -150,7 +150,7 @@ class Denoiser:
         InputError: pyoidn is not installed.
     """
 
-    def __init__(self, threads: int = 0, mode: str = "high", *, exact: bool = False) -> None:
+    def __init__(self, threads: int = 0, *, exact: bool = False) -> None:
         try:
             import pyoidn
         except (ImportError, OSError) as error:  # not installed, or without its library
@@ -166,7 +166,7 @@ class Denoiser:
             name = "" if exact else network
             return Filter(device, quality, hdr=hdr, clean=clean, network=name, threads=threads)
 
-        self.hrls = filter_("high", "usual") if mode == "high" else None
+        self.hrls = filter_("high", "usual")
         # A larger network than the usual one
         self.both = filter_("high", "large", clean=True)
         # Quality high would take four times as long and gain nothing
@@ -177,19 +177,16 @@ class Denoiser:
 
         Args:
             lrhs: (h, w, 3), transformed.
-            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`; the first 9 are
-                enough in mode ``together``.
+            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`.
 
         Returns:
             Both with what was denoised as further channels, transformed colour: (h, w, 6), the LRHS with both renders
-            together at its resolution; and (s*h, s*w, 19), the HRLS with itself denoised, or as it is (mode
-            ``together``).
+            together at its resolution; and (s*h, s*w, 19), the HRLS with itself denoised.
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        low = _with_room(lrhs)
-        high = hrls if self.hrls is None else _with_room(hrls)
+        low, high = _with_room(lrhs), _with_room(hrls)
         self.fill(low, high)
         return low, high
 
@@ -198,15 +195,14 @@ class Denoiser:
 
         Args:
             lrhs: (h, w, 6).
-            hrls: (s*h, s*w, 19); 9 or more in mode ``together``: colour, albedo, normal.
+            hrls: (s*h, s*w, 19).
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
         layers = layers_of(hrls)
         self.both(self.merged(lrhs[..., :_OF_LRHS], layers), lrhs[..., _OF_LRHS:])
-        if self.hrls is not None:
-            self.hrls(layers, hrls[..., _OF_HRLS:])
+        self.hrls(layers, hrls[..., _OF_HRLS:])
 
     def together(self, lrhs: Array, hrls: Array) -> Array:
         """Of the same arguments, both renders denoised together at the LRHS's resolution, network values (h, w, 3).
@@ -227,14 +223,76 @@ class Denoiser:
             MssplError: Open Image Denoise failed.
         """
         scale = layers["colour"].shape[0] // lrhs.shape[0]
-        radiance = transforms.box_downsample(transforms.expand(layers["colour"], 1.0), scale)
-        share = lrhs_share(lrhs, transforms.compress(radiance, 1.0))
-        mean = share * transforms.expand(lrhs, 1.0) + (1 - share) * radiance
-        low = {"colour": transforms.compress(mean, 1.0)}
-        low |= {name: transforms.box_downsample(layers[name], scale) for name in ("albedo", "normal") if name in layers}
+        low = merged(lrhs, layers)
+        del low["noise"]
         if scale == 2 and "albedo" in low:
             low["albedo"] = self.albedo({"albedo": low["albedo"]})
         return low
+
+
+class Together:
+    """Both renders denoised together, by a network in 8 bits that was made of Open Image Denoise's larger one
+    (:mod:`training.together`).
+
+    Args:
+        threads: 0 for all.
+
+    Raises:
+        InputError: pyoidn is not installed, or has other weights.
+    """
+
+    def __init__(self, threads: int = 0) -> None:
+        self._network = EightBit("together", installed_weights("large"), threads)
+
+    def __call__(self, lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+        """Denoise a pair as the network sees it.
+
+        Args:
+            lrhs: (h, w, 3), transformed.
+            hrls: (s*h, s*w, 9) or more, transformed: colour, albedo, normal.
+
+        Returns:
+            The LRHS with what was denoised as further channels, transformed colour: (h, w, 6); and the HRLS.
+        """
+        low = _with_room(lrhs)
+        self.fill(low, hrls)
+        return low, hrls
+
+    def fill(self, lrhs: Array, hrls: Array) -> None:
+        """The same in place, of an LRHS (h, w, 6): what is denoised is written behind its own channels."""
+        self._network(**merged(lrhs[..., :_OF_LRHS], layers_of(hrls, complete=True)), out=lrhs[..., _OF_LRHS:])
+
+
+def for_model(mode: str, threads: int, *, exact: bool = False) -> Denoiser | Together | None:
+    """What denoises for a model: nothing for an empty mode; ``high``: a :class:`Denoiser`; ``together``."""
+    if mode == "together":
+        return Together(threads)
+    return Denoiser(threads, exact=exact) if mode else None
+
+
+def merged(lrhs: Array, layers: Layers) -> Layers:
+    """The mean of both renders that has the least noise, at the LRHS's resolution.
+
+    Args:
+        lrhs: (h, w, 3), transformed.
+        layers: of the HRLS, see :func:`layers_of`.
+
+    Returns:
+        ``colour``; of the layers the means; and ``noise`` (h, w, 1), what the colour's is estimated to be: how far the
+        renders differ there, in network values times ``NOISE_GAIN``, at most 1.
+    """
+    scale = layers["colour"].shape[0] // lrhs.shape[0]
+    radiance = transforms.box_downsample(transforms.expand(layers["colour"], 1.0), scale)
+    other = transforms.compress(radiance, 1.0)
+    share = lrhs_share(lrhs, other)
+    mean = share * transforms.expand(lrhs, 1.0) + (1 - share) * radiance
+    low = {"colour": transforms.compress(mean, 1.0)}
+    # Of a difference, which has both renders' noise, so much is what their mean has
+    gain = np.float32(NOISE_GAIN * (share * (1 - share)) ** 0.5)
+    low["noise"] = np.minimum(gain * np.abs(lrhs - other).mean(axis=-1, keepdims=True), 1)
+    return low | {
+        name: transforms.box_downsample(layers[name], scale) for name in ("albedo", "normal") if name in layers
+    }
 
 
 def installed_library() -> Path | None:
@@ -249,10 +307,9 @@ def eight_bits_work() -> bool:
     """Whether pyoidn is installed, with weights that :mod:`oiio_msspl.eight_bit` knows, and this machine computes with
     them in 8 bits what Open Image Denoise does in 32."""
     try:
-        filter_ = Denoiser(mode="high").hrls
+        return Denoiser().hrls.in_eight_bits
     except InputError:
         return False
-    return filter_ is not None and filter_.in_eight_bits
 
 
 @functools.cache
@@ -291,10 +348,16 @@ def _with_room(image: Array) -> Array:
     return copy
 
 
-def layers_of(hrls: Array) -> Layers:
-    """What Open Image Denoise reads of a transformed HRLS: colour, and albedo and normal as far as they are there."""
+def layers_of(hrls: Array, *, complete: bool = False) -> Layers:
+    """What Open Image Denoise reads of a transformed HRLS: colour, and albedo and normal as far as they are there.
+
+    Args:
+        complete: all of them; where one is absent, its default.
+    """
     colour, normal = {"colour": _feature(hrls, schema.RGB)}, _feature(hrls, schema.NORMAL)
     albedo = transforms.limited(_feature(hrls, schema.ALBEDO), 0.0, 1.0)
+    if complete:
+        return colour | {"albedo": albedo, "normal": normal}
     # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
     if normal.any():
         return colour | {"albedo": albedo, "normal": normal}

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from oiio_msspl import bands, runtime, transforms
 from oiio_msspl.render import Array
 
-#: Networks by what they are for, with size in bytes and SHA-256 of their weights as Open Image Denoise 2.5 has them:
+#: Networks of Open Image Denoise 2.5, with size in bytes and SHA-256 of their weights:
 #: HDR colour with albedo and normal (``rt_hdr_alb_nrm``); the larger one for when both of these are free of noise
 #: (``rt_hdr_calb_cnrm_large``); and an albedo alone (``rt_alb``).
 NETWORKS = {
@@ -33,12 +33,19 @@ NETWORKS = {
     "large": (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
     "albedo": (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
 }
+#: The layers that each needs, and ``together``, which is made of the large one.
+READS = {
+    "usual": {"colour", "albedo", "normal"},
+    "large": {"colour", "albedo", "normal"},
+    "albedo": {"albedo"},
+    "together": {"colour", "albedo", "normal", "noise"},
+}
 #: Pixels of either side are a multiple of so many.
 MULTIPLE = 16
 #: Slices of the range that a colour is written in, an albedo alone, and what either is read in.
 SLICES_IN, SLICES_OF_ALBEDO, SLICES_OUT = 3, 5, 10
-#: Channels that a network reads: slices of three colours, albedo, normal, and one that is always 0; or slices of an
-#: albedo, and the same. Others than multiples of 16 take long.
+#: Channels that a network reads: slices of three colours, albedo, normal, and noise or one that is always 0; or slices
+#: of an albedo, and one that is. Others than multiples of 16 take long.
 CHANNELS_IN = 16
 
 #: The curve that Open Image Denoise sees HDR colours by: a fit to the PU encoding of Aydin et al. 2008, "Extending
@@ -83,8 +90,8 @@ class EightBit:
     """One of the networks.
 
     Args:
-        name: a key of ``NETWORKS``.
-        weights: its tensors by name, see :func:`weights_of`.
+        name: a key of ``READS``.
+        weights: the network's, or that one's that it is made of, by name, see :func:`weights_of`.
         threads: 0 for all.
 
     Attributes:
@@ -92,13 +99,18 @@ class EightBit:
     """
 
     def __init__(self, name: str, weights: dict[str, NDArray[np.float16]], threads: int = 0) -> None:
-        self.reads = {"albedo"} if name == "albedo" else {"colour", "albedo", "normal"}
+        self.reads = READS[name]
         file = resources.files("oiio_msspl").joinpath("denoisers", f"{name}.onnx")
         with resources.as_file(file) as path:
             self._session = runtime.load(path, threads, initializers=weights)
 
     def __call__(
-        self, albedo: Array, colour: Array | None = None, normal: Array | None = None, out: Array | None = None
+        self,
+        albedo: Array,
+        colour: Array | None = None,
+        normal: Array | None = None,
+        noise: Array | None = None,
+        out: Array | None = None,
     ) -> Array:
         """Denoise the colour; without one, the albedo.
 
@@ -106,13 +118,14 @@ class EightBit:
             albedo: (h, w, 3) in [0, 1].
             colour: (h, w, 3), network values of an exposed render.
             normal: (h, w, 3) in [-1, 1].
+            noise: (h, w, 1) in [0, 1], of the colour, see :func:`oiio_msspl.denoiser.merged`.
             out: where to write the result, (h, w, 3); may be part of what the others are of.
 
         Returns:
             Denoised network values, or an albedo.
         """
         height, width = albedo.shape[:2]
-        layers = pack(albedo, colour, normal)
+        layers = pack(albedo, colour, normal, noise)
         codes = self._session.run(["codes"], {"layers": layers[None]})[0][0, :height, :width]
         table = _albedo_by_code() if colour is None else values_by_code(SLICES_OUT)
         result = np.empty((height, width, 3), np.float32) if out is None else out
@@ -124,8 +137,8 @@ class EightBit:
         return result
 
 
-def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None) -> Codes:
-    """What the network reads, of all three or of an albedo alone, (H, W, CHANNELS_IN): both sides grown to a
+def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None, noise: Array | None = None) -> Codes:
+    """What the network reads, of all layers or of an albedo alone, (H, W, CHANNELS_IN): both sides grown to a
     ``MULTIPLE`` by repeating the edge."""
     height, width = albedo.shape[:2]
     grown = tuple(-(-side // MULTIPLE) * MULTIPLE for side in (height, width))
@@ -144,6 +157,8 @@ def pack(albedo: Array, colour: Array | None = None, normal: Array | None = None
         for i in range(3):  # as they lie in memory
             part[..., -7 + i] = albedo[rows, :, i] * np.float32(255) + np.float32(0.5)
             part[..., -4 + i] = normal[rows, :, i] * np.float32(127.5) + np.float32(128)
+        if noise is not None:
+            part[..., -1] = noise[rows, :, 0] * np.float32(255) + np.float32(0.5)
 
     bands.each(work, height, CHANNELS_IN * width)
     result[:height, width:] = result[:height, width - 1 : width]

@@ -49,6 +49,8 @@ class Report:
     tiles: int
     seconds: dict[str, float]
     """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
+    features: frozenset[str]
+    """What the model reads of the HRLS."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -56,6 +58,15 @@ class Report:
         if self.lr.spp is None or self.hr.spp is None:
             return None
         return self.lr.spp / self.scale**2 + self.hr.spp
+
+    def aovs(self) -> list[dict[str, str]]:
+        """As :meth:`oiio_msspl.aovs.Resolution.table`; but what the model does not read is ``unused``."""
+        rows = self.hr.table()
+        for row in rows:
+            if row["feature"] not in {*self.features, "alpha"}:
+                row |= {"source": ""} if row["status"] == "default" else {}
+                row |= {"status": "unused"}
+        return rows
 
     def as_dict(self) -> dict[str, Any]:
         return {
@@ -69,7 +80,7 @@ class Report:
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
             "provider": self.provider,
-            "aovs": self.hr.table(),
+            "aovs": self.aovs(),
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "warnings": self.warnings,
@@ -174,6 +185,7 @@ def report_on(
         warnings=[*_spp_warnings(lr, hr, session), *fused.warnings],
         tiles=fused.tiles,
         seconds={},
+        features=frozenset(session.contract.features),
     )
 
 
@@ -230,7 +242,5 @@ def _provenance(report: Report) -> dict[str, str]:
         "msspl/spp_lrhs": "unknown" if report.lr.spp is None else f"{report.lr.spp:g}",
         "msspl/spp_hrls": "unknown" if report.hr.spp is None else f"{report.hr.spp:g}",
         "msspl/spp_average": "unknown" if spp is None else f"{spp:g}",
-        "msspl/aovs": "; ".join(
-            f"{row['feature']}: {row['status']} {row['source']}".strip() for row in report.hr.table()
-        ),
+        "msspl/aovs": "; ".join(f"{row['feature']}: {row['status']} {row['source']}".strip() for row in report.aovs()),
     }

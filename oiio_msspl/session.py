@@ -14,7 +14,7 @@ import numpy as np
 
 from oiio_msspl import runtime
 from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser, eight_bits_work, installed_weights
+from oiio_msspl.denoiser import eight_bits_work, for_model, installed_weights
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.render import Array
 
@@ -99,8 +99,7 @@ class Session:
                     "choose another --model"
                 )
         self._session = runtime.load(path, threads, providers, weights)
-        mode = self.contract.denoiser
-        self._denoiser = Denoiser(threads, mode, exact=exact) if mode else None
+        self._denoiser = for_model(self.contract.denoiser, threads, exact=exact)
         self._outputs = [output.name for output in self._session.get_outputs()]
         self.path = Path(path)
         self.threads = threads

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import schema, tensors, transforms
-from oiio_msspl.denoiser import Denoiser, lrhs_share
+from oiio_msspl.denoiser import NOISE_GAIN, Denoiser, Together, lrhs_share, merged
 from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
 
@@ -77,11 +77,30 @@ def test_its_exposure_is_the_frames_not_the_tiles(denoiser):
     np.testing.assert_allclose(part[:, :40], whole[:, :40], atol=0.01)
 
 
-def test_it_may_leave_the_hrls_alone(denoiser):
-    lrhs, hrls, _ = packed()
-    low, high = Denoiser(threads=1, mode="together")(lrhs, hrls)
-    np.testing.assert_array_equal(low, denoiser(lrhs, hrls)[0])
+@pytest.mark.parametrize("layers", [(), (schema.ALBEDO,), (schema.ALBEDO, schema.NORMAL)])
+def test_a_network_of_ours_denoises_both_together_as_well(denoiser, layers):
+    """With or without the layers, and where sides are no multiple of what it needs."""
+    clean = picture(200, 200)
+    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+    there = {schema.ALBEDO: noisy(clean.clip(0, 1), 1024).clip(0, 1), schema.NORMAL: normal}
+    lrhs, hrls, clean = packed(200, **{name: there[name] for name in layers})
+    low, high = Together(threads=1)(lrhs, hrls)
     assert high is hrls
+    np.testing.assert_array_equal(low[..., :3], lrhs)
+    expected = small(clean)
+    theirs = denoiser(lrhs, hrls)[0]
+    assert np.abs(low[..., 3:] - expected).mean() < 1.1 * np.abs(theirs[..., 3:] - expected).mean()
+
+
+def test_noise_is_estimated_from_how_far_the_renders_differ():
+    """Of the mean of both, on average, whatever either render's share of samples."""
+    clean = 0.5 + 0.3 * picture(192, 192)
+    for spp in ((8, 8), (24, 8)):
+        lrhs, hrls = (transforms.compress(noisy(clean, n, seed), 1.0) for seed, n in enumerate(spp))
+        low = merged(lrhs, {"colour": hrls})
+        error = np.abs(low["colour"] - transforms.compress(clean, 1.0)).mean()
+        assert low["noise"].mean() / NOISE_GAIN == pytest.approx(error, rel=0.1)
+        assert 0 < low["noise"].min() <= low["noise"].max() <= 1
 
 
 @pytest.mark.parametrize(("spp", "expected"), [((4, 4), 0.5), ((12, 4), 0.75), ((4, 12), 0.25)])

@@ -166,8 +166,9 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
         return channels
 
     made.walk(shape, [9], conv, same, same, lambda one, other: one + other)
-    pictures = [made.picture(layers(64, 48, seed)) for seed in range(2)]
-    fit = made.quantise("usual", weights, pictures)
+    drawn = [layers(64, 48, seed) for seed in range(2)]
+    pictures = [made.picture(picture) for picture in drawn]
+    fit = made.quantise("usual", weights, weights, drawn)
     made.onnx.save(made.Graph(fit).model(), tmp_path / "usual.onnx")
     halves = {name: values.half().numpy() for name, values in weights.items()}
     session = runtime.load(tmp_path / "usual.onnx", 1, initializers=halves)
@@ -191,8 +192,7 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
 def test_the_package_has_no_weights_of_open_image_denoise():
     """What is shipped is what differs from them, which is little: three of four are within a step of the nearest."""
     onnx = pytest.importorskip("onnx")
-    for name in eight_bit.NETWORKS:
-        file = Path(eight_bit.__file__).parent / "denoisers" / f"{name}.onnx"
+    for file in (Path(eight_bit.__file__).parent / "denoisers").glob("*.onnx"):
         tensors = {tensor.name: tensor for tensor in onnx.load(file, load_external_data=False).graph.initializer}
         convolutions = [name.removesuffix(".scale") for name in tensors if name.endswith(".scale")]
         assert len(convolutions) in (16, 19)

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, schema, session, transforms
+from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, fuse_files, schema, session, transforms
 from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser, layers_of
+from oiio_msspl.denoiser import Denoiser, Together, layers_of
 from oiio_msspl.errors import InputError
-from tests.conftest import noisy, picture
+from tests.conftest import noisy, picture, rgb, write_exr
 
 JOINT = [f"joint-x{scale}" for scale in schema.SCALES]
 
@@ -67,7 +67,7 @@ def test_it_denoises_no_worse_than_open_image_denoise(scale):
     pytest.importorskip("pyoidn")
     clean = picture(136, 200)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
-    albedo = noisy(clean.clip(0, 1), 64).clip(0, 1)
+    albedo = noisy(clean.clip(0, 1), 1024).clip(0, 1)
     lr = Render.from_arrays("lr", rgb=transforms.box_downsample(noisy(clean, 4, seed=1), scale))
     hr = Render.from_arrays("hr", rgb=noisy(clean, 4), albedo=albedo, normal=normal)
     model = Session(find_model(scale, "joint"), threads=1)
@@ -103,6 +103,19 @@ def test_layers_that_it_does_not_read_are_not_read():
     assert not any(features is None or schema.DIFFUSE in features for features in asked)
 
 
+def test_what_it_does_not_read_is_said_to_be_unused(tmp_path):
+    pytest.importorskip("pyoidn")
+    clean = picture(64, 64)
+    write_exr(tmp_path / "lr.exr", rgb(transforms.box_downsample(noisy(clean, 4, seed=1), 2)))
+    layers = rgb(clean, "albedo.") | rgb(0.5 * clean, "diffuse.")
+    write_exr(tmp_path / "hr.exr", rgb(noisy(clean, 4)) | layers)
+    report = fuse_files(tmp_path / "lr.exr", tmp_path / "hr.exr", tmp_path / "out.exr", model="joint")
+    rows = {row["feature"]: (row["status"], row["source"]) for row in report.aovs()}
+    assert rows["albedo"][0] == "found" and rows["normal"][0] == "default"
+    assert rows["diffuse"] == ("unused", "diffuse")
+    assert rows["variance"] == ("unused", "")
+
+
 # Making them
 
 
@@ -112,16 +125,15 @@ def torch():
     return pytest.importorskip("torch")
 
 
-def pairs(torch, scale, count=2, size=64):
-    """Inputs of the network: pictures with noise."""
-    denoise = Denoiser(threads=1, mode="together")
+def pairs(torch, scale, prepare, count=2, size=64):
+    """Inputs of a network: pictures with noise."""
     result = []
     for seed in range(count):
         clean = picture(size, size)
         values = [transforms.compress(noisy(clean, 4, seed + i), 1.0) for i in range(2)]
         normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
         hrls = np.concatenate([values[0], clean.clip(0, 1), normal], axis=-1)
-        images = denoise(transforms.box_downsample(values[1], scale), hrls)
+        images = prepare(transforms.box_downsample(values[1], scale), hrls)
         result.append(tuple(torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[None])) for i in images))
     return result
 
@@ -133,9 +145,9 @@ def test_it_begins_as_open_image_denoise(torch):
     for head in network.heads:  # believe what the U-Net makes, and nothing else
         head.weight.data.zero_()
         head.bias.data[1] = 60.0
-    ((lrhs, hrls),) = pairs(torch, 2, count=1)
+    ((lrhs, hrls),) = pairs(torch, 2, Together(threads=1), count=1)
     with torch.inference_mode():
-        fused = network(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
+        fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
     expected = Denoiser(threads=1, exact=True).hrls(layers_of(hrls[0].permute(1, 2, 0).numpy()))
     assert np.abs(fused - expected).mean() < 1e-3
     assert not any(parameter.any() for parameter in network.retrained())
@@ -155,7 +167,7 @@ def test_the_graph_computes_what_the_network_does(torch, scale, tmp_path):
         parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
     state = {"denoiser": "together", "architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
     contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
-    drawn = pairs(torch, scale)
+    drawn = pairs(torch, scale, Together(threads=1))
     path = tmp_path / "joint.onnx"
     export.onnx.save(export.joint_to_onnx(network, contract, drawn), path)
     assert Contract.of_file(path).weights == "usual"
@@ -163,14 +175,14 @@ def test_the_graph_computes_what_the_network_does(torch, scale, tmp_path):
     for lrhs, hrls in drawn:
         fused, log_error = model.run(["fused", "log_error"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
         with torch.inference_mode():
-            expected = [values.numpy() for values in network(lrhs, hrls)]
+            expected = [values.numpy() for values in network.fuse(lrhs, hrls)]
         assert np.abs(fused - expected[0]).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - expected[0]).mean()
         assert np.abs(log_error - expected[1]).mean() < 0.1
 
 
 def test_what_the_next_convolution_does_not_read_can_be_left_out(torch):
     from training import prune
-    from training.joint import JointFusion
+    from training.joint import JointFusion, with_mean
 
     torch.manual_seed(0)
     network = JointFusion().eval()
@@ -179,7 +191,7 @@ def test_what_the_next_convolution_does_not_read_can_be_left_out(torch):
     reader.weight.data[:, idle] = -reader.given_weight[:, idle]
     head = network.heads[1]
     head.weight.data[:, idle] = 0
-    drawn = pairs(torch, 2, count=1)
+    drawn = pairs(torch, 2, with_mean, count=1)
     pruned = prune.without(network, "dec_conv2b", 61, [{"lrhs": lrhs, "hrls": hrls} for lrhs, hrls in drawn]).eval()
     assert len(pruned.kept["dec_conv2b"]) == 61
     assert pruned.convs["dec_conv2b"].weight.shape[0] == pruned.heads[1].in_channels == 61
@@ -188,6 +200,51 @@ def test_what_the_next_convolution_does_not_read_can_be_left_out(torch):
             torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
     with pytest.raises(SystemExit, match="only convolutions on the way up"):
         prune.without(network, "enc_conv1", 16, [])
+
+
+def test_a_mean_with_what_it_begins_as_lies_between(torch):
+    from training import average
+    from training.joint import JointFusion
+
+    network = JointFusion()
+    bias = network.heads[0].bias.detach().clone()
+    for parameter in network.parameters():
+        parameter.data += 0.5
+    state = {"architecture": "joint", "config": network.config, "ema": network.state_dict(), "denoiser": "together"}
+    mean = average.mean([state | {"provenance": {}}], beginning=(0.25, 0.75))
+    assert mean["provenance"] == {"share_of_beginning": [0.25, 0.75]}
+    assert (mean["ema"]["convs.enc_conv0.weight"] == 0.375).all()
+    assert (mean["ema"]["together.convs.enc_conv1a.more"] == 0.125).all()
+    torch.testing.assert_close(mean["ema"]["heads.0.bias"].float(), bias + 0.375)
+    torch.testing.assert_close(mean["ema"]["error.bias"], network.error.bias.half())
+    with pytest.raises(SystemExit, match="only a joint network"):
+        average.mean([state | {"architecture": "mix", "config": {}, "provenance": {}}], beginning=(0.25, 0))
+
+
+def test_what_denoises_both_begins_as_open_image_denoise(torch):
+    """Of the estimated noise it makes nothing yet."""
+    from training import together
+
+    ((lrhs, hrls),) = pairs(torch, 2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=96)
+    low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
+    layers = denoiser.merged(low, layers_of(high, complete=True))
+    found = together.Together().eval().denoised(layers)
+    del layers["noise"]
+    expected = Denoiser(threads=1, exact=True).both(layers)
+    assert np.abs(found - expected).mean() < 1e-3
+
+
+def test_what_ships_denoises_both_as_the_checkpoint_does(torch):
+    """By a tenth of the noise; also where sides are no multiples of what it needs."""
+    from training.eight_bit import CHECKPOINT
+    from training.together import Together as InTorch
+
+    ((lrhs, hrls),) = pairs(torch, 2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
+    low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
+    layers = denoiser.merged(low, layers_of(high, complete=True))
+    expected = InTorch.of(CHECKPOINT).denoised(layers)
+    found = Together(threads=1)(low, high)[0][..., 3:]
+    assert np.abs(found - expected).mean() < 0.1 * np.abs(layers["colour"] - expected).mean()
 
 
 def test_it_goes_on_from_an_earlier_run(torch, tmp_path: Path):
@@ -201,4 +258,6 @@ def test_it_goes_on_from_an_earlier_run(torch, tmp_path: Path):
     warm_start(other, tmp_path / "earlier.pt")
     assert (other.convs["enc_conv2"].more == 0.5).all()
     retrained, everything = len(list(other.retrained())), len(list(other.parameters()))
-    assert retrained == 32 and everything == 32 + 2 + 2 * 5
+    held = 6
+    assert retrained == 2 * (16 + 19 - held)
+    assert everything == retrained + 2 + 2 + 2 * 5

@@ -20,12 +20,11 @@ import torch
 from torch import Tensor
 
 from oiio_msspl import schema, transforms
-from oiio_msspl.denoiser import Denoiser
-from training.data import PASS_FEATURES, Folder, Sampling, View, random_orthogonal
+from training.data import PASS_FEATURES, Folder, Prepare, Sampling, View, random_orthogonal
 from training.pyramid import logarithmic
 
 #: What a batch is made of, by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w); all
-#: in network values, and channels-last in memory. With a denoiser, the first two have three channels more.
+#: in network values, and channels-last in memory. For some networks, the first two have further channels.
 Batch = dict[str, Tensor]
 
 
@@ -110,11 +109,11 @@ def draw(
     count: int,
     rng: np.random.Generator,
     sampling: Sampling,
-    denoiser: Denoiser | None = None,
+    prepare: Prepare | None = None,
 ) -> Batch:
     """``count`` pairs of ``patch`` x ``patch`` HRLS pixels; spp, footprint, mirroring and turning are the batch's.
 
-    With a denoiser, its results follow the renders' own channels.
+    What is prepared follows the renders' own channels.
     """
     # Renderings: how many samples, and which part of which view
     chosen = [views[i] for i in rng.choice(len(views), count)]
@@ -181,9 +180,9 @@ def draw(
 
     low_areas = [tuple(slice(side.start // scale, side.stop // scale) for side in area) for area in areas]
     lrhs = compress(torch.stack([image[area] for image, area in zip(lrhs, low_areas, strict=True)]), exposure)
-    if denoiser is not None:
-        denoised = [denoiser(*images) for images in zip(lrhs.cpu().numpy(), hrls.cpu().numpy(), strict=True)]
-        lrhs, hrls = (on_device(np.stack(images)) for images in zip(*denoised, strict=True))
+    if prepare is not None:
+        prepared = [prepare(*images) for images in zip(lrhs.cpu().numpy(), hrls.cpu().numpy(), strict=True)]
+        lrhs, hrls = (on_device(np.stack(images)) for images in zip(*prepared, strict=True))
     pair = {"lrhs": lrhs, "hrls": hrls, "target": compress(target, exposure)}
     return {
         name: torch.rot90(image.flip(2) if mirrored else image, turns, (1, 2)).contiguous().permute(0, 3, 1, 2)
@@ -245,11 +244,11 @@ class Batches:
         sampling: Sampling,
         seed: int,
         device: torch.device,
-        denoiser: Denoiser | None = None,
+        prepare: Prepare | None = None,
         rescan_seconds: float = 120,
     ) -> None:
         self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
-        self.device, self.denoiser = device, denoiser
+        self.device, self.prepare = device, prepare
         self.waited = 0.0
         """Seconds that :meth:`next` has taken of the training loop."""
         self._rescan_seconds = rescan_seconds
@@ -285,7 +284,7 @@ class Batches:
     @torch.no_grad()
     def _draw(self) -> Batch:
         scale = int(self._rng.choice(self.scales))
-        return draw(self._views, scale, self.patch, self.batch, self._rng, self.sampling, self.denoiser)
+        return draw(self._views, scale, self.patch, self.batch, self._rng, self.sampling, self.prepare)
 
     def _work(self) -> None:
         try:

@@ -22,6 +22,7 @@ import math
 import mmap
 import struct
 import zipfile
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -30,7 +31,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl import schema, tensors, transforms
-from oiio_msspl.denoiser import Denoiser
 
 Array = NDArray[np.float32]
 log = logging.getLogger(__name__)
@@ -212,20 +212,24 @@ def spp_range(view: View, sampling: Sampling, scale: int) -> dict[str, list[int]
     }
 
 
+#: What adds to a pair, (h, w, 3) and (s*h, s*w, 16), the further channels that some networks read.
+Prepare = Callable[[Array, Array], tuple[Array, Array]]
+
+
 @dataclass(frozen=True)
 class Evaluation:
     """A fixed pair for validation: the paper's (s^2 - 1), one sample per HR pixel in LRHS and HRLS each."""
 
     lrhs: Array
-    """Transformed (h, w, 3), or 6 with a denoiser's result."""
+    """Transformed (h, w, 3), and what :func:`training.networks.preparation` adds."""
     hrls: Array
-    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have; or 19, likewise."""
+    """Transformed (s*h, s*w, 16), every layer but the variance, which one sample does not have; and likewise."""
     reference: Array
     """Linear (s*h, s*w, 3)."""
     exposure: float
 
     @classmethod
-    def centre(cls, view: View, scale: int, patch: int, denoiser: Denoiser | None = None) -> Evaluation:
+    def centre(cls, view: View, scale: int, patch: int, prepare: Prepare | None = None) -> Evaluation:
         """The middle ``patch`` x ``patch`` pixels of a view."""
         height, width, _ = view.ref.shape
         top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
@@ -235,8 +239,8 @@ class Evaluation:
         hrls = tensors.pack(split_features(read_hrls(view, [0], rows, columns)[0]), schema.HRLS_FEATURES, exposure)
         lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
         lrhs = transforms.compress(lrhs, exposure)
-        if denoiser is not None:
-            lrhs, hrls = denoiser(lrhs, hrls)
+        if prepare is not None:
+            lrhs, hrls = prepare(lrhs, hrls)
         return cls(
             lrhs=lrhs,
             hrls=hrls,

@@ -15,7 +15,7 @@ exact ones; then, weight after weight, the nearest step, the rest of the row mak
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -27,12 +27,14 @@ from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
 from oiio_msspl import eight_bit, transforms
-from oiio_msspl.denoiser import Denoiser, Layers, installed_library, layers_of
+from oiio_msspl.denoiser import Denoiser, Layers, installed_weights, layers_of, merged
 from oiio_msspl.schema import SCALES
 from training import batches, data
+from training.together import Together
 from training.unet import LARGER, SMALLER, Shape, walk
 
 FOLDER = Path(__file__).parent.parent / "oiio_msspl" / "denoisers"
+CHECKPOINT = Path(__file__).parent / "checkpoints" / "joint.pt"
 #: Pictures that are learnt from, and the pixels of each that a layer's weights are fitted to.
 PICTURES, PIXELS, PATCH = 64, 4000, 256
 #: Pictures without the layers that are needed, one after the other, until it is given up.
@@ -54,8 +56,10 @@ SIDE = ("head1", "head2", "head3")
 COLOURS, SIGNED_RANGE, SIGNED_ZERO = 3, 10.0, 128
 
 
-SHAPES = {"usual": SMALLER, "albedo": SMALLER, "large": LARGER}
+SHAPES = {"usual": SMALLER, "albedo": SMALLER, "large": LARGER, "together": LARGER}
 
+
+Weights = Mapping[str, Tensor]
 
 # Choosing the weights
 
@@ -112,16 +116,17 @@ class Layer:
 
 def picture(layers: Layers) -> tuple[Tensor, Tensor]:
     """What the network reads: planes of values, which are what their codes are worth; and the codes."""
-    how = codes_of_pictures(alone="colour" not in layers)
+    how = codes_of_pictures(set(layers))
     codes = torch.from_numpy(eight_bit.pack(**layers)).permute(2, 0, 1).float()
     return how.values(codes)[None], codes[None]
 
 
-def codes_of_pictures(*, alone: bool) -> Codes:
-    """As :func:`oiio_msspl.eight_bit.pack` writes them: of an albedo alone, or of three layers."""
-    slices, whole = (eight_bit.SLICES_OF_ALBEDO, 0) if alone else (eight_bit.SLICES_IN, 6)
-    worth = [1 / slices / 255] * (3 * slices) + [1 / 255] * whole + [0.0]
-    return Codes(torch.tensor(worth), torch.tensor([*np.repeat(range(3), slices), *range(3, 3 + whole), 0]))
+def codes_of_pictures(layers: Set[str]) -> Codes:
+    """As :func:`oiio_msspl.eight_bit.pack` writes them: of an albedo alone, or of more layers."""
+    slices, whole = (eight_bit.SLICES_IN, 6) if "colour" in layers else (eight_bit.SLICES_OF_ALBEDO, 0)
+    last = (1 / 255, 3 + whole) if "noise" in layers else (0.0, 0)
+    worth = [1 / slices / 255] * (3 * slices) + [1 / 255] * whole + [last[0]]
+    return Codes(torch.tensor(worth), torch.tensor([*np.repeat(range(3), slices), *range(3, 3 + whole), last[1]]))
 
 
 @dataclass
@@ -139,7 +144,7 @@ class Given:
     columns: Sequence[int]
 
     @classmethod
-    def of(cls, weights: Mapping[str, Tensor]) -> dict[str, Given]:
+    def of(cls, weights: Weights) -> dict[str, Given]:
         """All of a network's own convolutions, whole."""
         names = [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
         pairs = {name: (weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names}
@@ -162,7 +167,7 @@ class Fit:
     """
 
     shape: Shape
-    weights: Mapping[str, Tensor]
+    weights: Weights
     given: Mapping[str, Given]
     slices_out: int = eight_bit.SLICES_OUT
     fine: bool = True
@@ -297,17 +302,18 @@ def walk_values(shape: Shape, pictures: Sequence[Values], conv: Callable[[str, V
         )
 
 
-def quantise(name: str, weights: dict[str, Tensor], pictures: Sequence[tuple[Tensor, Tensor]]) -> Fit:
+def quantise(name: str, weights: Weights, given: Weights, pictures: Sequence[Layers]) -> Fit:
     """A network in 8 bits.
 
     Args:
         name: a key of ``SHAPES``.
         weights: in full precision.
-        pictures: see :func:`picture`.
+        given: Open Image Denoise's own, which it is written as a difference from.
+        pictures: what it reads.
     """
-    fit = Fit(SHAPES[name], weights, Given.of(weights))
-    exact, codes = (list(images) for images in zip(*pictures, strict=True))
-    walk_values(fit.shape, [Values(exact, codes, codes_of_pictures(alone=name == "albedo"))], fit.conv)
+    fit = Fit(SHAPES[name], weights, Given.of(given))
+    exact, codes = (list(images) for images in zip(*map(picture, pictures), strict=True))
+    walk_values(fit.shape, [Values(exact, codes, codes_of_pictures(set(pictures[0])))], fit.conv)
     return fit
 
 
@@ -464,24 +470,27 @@ def pictures(views: Path, split: str, name: str, count: int) -> Iterator[Layers]
             batch = batches.draw(folder, scale, PATCH, 1, rng, data.Sampling())
         lrhs, hrls = (batch[key][0].permute(1, 2, 0).numpy() for key in ("lrhs", "hrls"))
         layers = layers_of(hrls)
-        if name == "large":
+        if name == "together":
+            layers = merged(lrhs, layers_of(hrls, complete=True))
+        elif name == "large":
             layers = denoiser.merged(lrhs, layers)
         elif name == "albedo" and "albedo" in layers:
             albedo = transforms.box_downsample(layers["albedo"], scale)
             # Depth of field, hair and glass make it noisier than these views are
             noise = rng.normal(0, rng.choice([0, 0, 0.1, 0.3]), albedo.shape)
             layers = {"albedo": (albedo + noise).clip(0, 1).astype(np.float32)}
-        if layers.keys() == ({"albedo"} if name == "albedo" else {"colour", "albedo", "normal"}):
+        if layers.keys() == eight_bit.READS[name]:
             count, left_out = count - 1, 0
             yield layers
         elif (left_out := left_out + 1) > PATIENCE:
             raise SystemExit(f"{views}: hardly any view for {split} has what {name} reads, albedo and normal above all")
 
 
-def compare(name: str, network: eight_bit.EightBit, views: Path) -> None:
-    """Print how near it comes to Open Image Denoise on views for validation."""
+def compare(name: str, network: eight_bit.EightBit, views: Path, together: Together) -> None:
+    """Print how near it comes on views for validation to the same in 32 bits: Open Image Denoise, or ours."""
     exact = Denoiser(exact=True)
-    peer = {"usual": exact.hrls, "large": exact.both, "albedo": exact.albedo}[name]
+    peers = {"usual": exact.hrls, "large": exact.both, "albedo": exact.albedo, "together": together.denoised}
+    peer = peers[name]
     seen = pictures(views, "validation", name, 24)
     differences = [np.abs(network(**layers) - peer(layers)).mean() for layers in seen]
     print(f"{name}: mean difference in network values {np.mean(differences):.4f}, at most {np.max(differences):.4f}")
@@ -491,16 +500,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("--networks", nargs="+", choices=SHAPES, default=list(SHAPES))
+    parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="of a joint network, for together")
     args = parser.parse_args()
-    library = installed_library()
+    together = Together.of(args.checkpoint)
     for name in args.networks:
-        halves = eight_bit.weights_of(name, library) if library else None
-        if halves is None:
-            raise SystemExit(f"{library}: has not the weights that oiio_msspl.eight_bit names; install pyoidn 2.5.1")
-        weights = {key: torch.from_numpy(values.astype(np.float32)) for key, values in halves.items()}
-        images = [picture(layers) for layers in pictures(args.views, "train", name, PICTURES)]
-        onnx.save(Graph(quantise(name, weights, images)).model(), FOLDER / f"{name}.onnx")
-        compare(name, eight_bit.EightBit(name, halves), args.views)
+        halves = installed_weights("large" if name == "together" else name)
+        given = {key: torch.from_numpy(values.astype(np.float32)) for key, values in halves.items()}
+        weights = together.weights() if name == "together" else given
+        images = list(pictures(args.views, "train", name, PICTURES))
+        onnx.save(Graph(quantise(name, weights, given, images)).model(), FOLDER / f"{name}.onnx")
+        compare(name, eight_bit.EightBit(name, halves), args.views, together)
 
 
 if __name__ == "__main__":

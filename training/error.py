@@ -15,10 +15,9 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from oiio_msspl.denoiser import Denoiser
 from training import batches, data, export, losses
 from training.joint import JointFusion
-from training.networks import run
+from training.networks import preparation, run
 from training.pyramid import Trunk
 from training.train import lr_factor, save
 
@@ -26,20 +25,23 @@ PATCH, BATCH, LEARNING_RATE = 192, 4, 2e-3
 
 
 def fit(
-    network: Trunk | JointFusion, views: list[batches.Pixels], scales: list[int], denoiser: str, steps: int
+    network: Trunk | JointFusion,
+    views: list[batches.Pixels],
+    scales: list[int],
+    prepare: data.Prepare | None,
+    steps: int,
 ) -> float:
     """Train the prediction in place; return the mean of its loss over the last tenth of the steps."""
     network.requires_grad_(False)
     network.error.requires_grad_(True)
     optimizer = torch.optim.Adam(network.error.parameters())
     rng = np.random.default_rng(0)
-    helper = Denoiser(torch.get_num_threads(), denoiser) if denoiser else None
     last = []
     for step in range(steps):
         for group in optimizer.param_groups:
             group["lr"] = LEARNING_RATE * lr_factor(step / steps)
         with torch.no_grad():
-            pair = batches.draw(views, int(rng.choice(scales)), PATCH, BATCH, rng, data.Sampling(), helper)
+            pair = batches.draw(views, int(rng.choice(scales)), PATCH, BATCH, rng, data.Sampling(), prepare)
         with torch.autocast("cpu", torch.bfloat16):
             output, log_error = run(network, pair["lrhs"], pair["hrls"])
         assert log_error is not None
@@ -66,7 +68,7 @@ def main() -> None:
     views = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
     scales = [int(scale) for scale in state["training_spp"]]
     network.reset_error()
-    loss = fit(network, views, scales, state.get("denoiser") or "", args.steps)
+    loss = fit(network, views, scales, preparation(state["architecture"], args.threads), args.steps)
     state["ema"] = network.state_dict()
     state["provenance"]["error_steps"] = args.steps
     save(state, args.checkpoint)

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise's network, taught to read both renders.
+"""Open Image Denoise's networks, taught to read both renders.
 
 Open Image Denoise has learnt from far more pictures than we can render; what it has not learnt is what a second render
 says. So this network begins as its usual one for HDR colour with albedo and normal. At H/2 it reads two pictures more,
-the LRHS and both renders denoised together at the LRHS's resolution (:mod:`oiio_msspl.denoiser`), which count for
-nothing at first; and all of its weights go on learning, for renders of so few samples alone.
+the LRHS and both renders denoised together at the LRHS's resolution (:mod:`training.together`), which count for nothing
+at first; and all of its weights go on learning, for renders of so few samples alone.
 
 Its parameters are what they differ by from Open Image Denoise's, which are read from the installed library: no file
 holds the latter. Weight decay pulls towards them.
@@ -23,24 +23,14 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl import schema, transforms
-from oiio_msspl.denoiser import installed_weights
-from oiio_msspl.eight_bit import (
-    BOUNDS,
-    EXPONENT,
-    FACTOR,
-    LOG_FACTOR,
-    LOG_OFFSET,
-    LOG_SHIFT,
-    OFFSET,
-    SLOPE,
-    encode,
-    top,
-)
+from oiio_msspl import schema
+from oiio_msspl.denoiser import installed_weights, layers_of, merged
+from oiio_msspl.render import Array
 from training.mix import COARSEST, FINER, blend
 from training.paper import LRHS_CHANNELS
-from training.pyramid import level_of, linear, logarithmic
-from training.unet import SMALLER, walk
+from training.pyramid import level_of
+from training.together import Together
+from training.unet import SMALLER, Retrained, seen, unseen, walk_tensors
 
 #: Channels that H/2 reads more: both together, the LRHS.
 MORE = 6
@@ -53,33 +43,6 @@ BEFORE = {
     name: before for before, name in itertools.pairwise([*(n for level in SMALLER.up for n in level), SMALLER.last])
 }
 OUTPUTS = (len(FINER) + 1, *[len(FINER) + len(COARSEST)] * 3)
-
-
-class Retrained(nn.Module):
-    """A 3 x 3 convolution whose parameters are added to given ones.
-
-    Args:
-        weight, bias: the given ones.
-        more: input channels, behind the others, for which there are none.
-    """
-
-    def __init__(self, weight: Tensor, bias: Tensor, more: int = 0) -> None:
-        super().__init__()
-        self.register_buffer("given_weight", weight, persistent=False)
-        self.register_buffer("given_bias", bias, persistent=False)
-        self.weight = nn.Parameter(torch.zeros_like(weight))
-        self.bias = nn.Parameter(torch.zeros_like(bias))
-        self.more = nn.Parameter(weight.new_zeros(len(weight), more, 3, 3)) if more else None
-
-    def parameters_in_all(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias that the convolution has."""
-        weight = self.given_weight + self.weight
-        if self.more is not None:
-            weight = torch.cat([weight, self.more], dim=1)
-        return weight, self.given_bias + self.bias
-
-    def forward(self, image: Tensor) -> Tensor:
-        return F.conv2d(image, *self.parameters_in_all(), padding=1)
 
 
 class JointFusion(nn.Module):
@@ -98,6 +61,7 @@ class JointFusion(nn.Module):
         self.given = {
             name: torch.from_numpy(values.astype("float32")) for name, values in installed_weights("usual").items()
         }
+        self.together = Together()
         self.convs = nn.ModuleDict()
         for name in (name.removesuffix(".weight") for name in self.given if name.endswith(".weight")):
             rows, columns = self.given_channels(name)
@@ -126,8 +90,16 @@ class JointFusion(nn.Module):
 
     def retrained(self) -> Iterator[nn.Parameter]:
         """Parameters that are added to given ones."""
-        for conv in self.convs.values():
-            yield from (conv.weight, conv.bias)
+        for conv in (*self.convs.values(), *self.together.convs.values()):
+            yield from conv.retrained()
+
+    def beginning(self) -> dict[str, Tensor]:
+        """Of a network that is new, all parameters but those of the expected error, without what is random."""
+        return {
+            name: value.clone() if name.startswith("heads") and name.endswith("bias") else torch.zeros_like(value)
+            for name, value in self.state_dict().items()
+            if not name.startswith("error")
+        }
 
     @torch.no_grad()
     def reset_error(self) -> None:
@@ -136,6 +108,20 @@ class JointFusion(nn.Module):
         self.error.bias.fill_(math.log(0.05))
 
     def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
+        """
+        Args:
+            lrhs: (N, 7, h, w), network values: the LRHS, both renders' mean and its noise (:func:`with_mean`).
+            hrls: (N, 16, s*h, s*w), network values: the HRLS's layers.
+
+        Returns:
+            What :meth:`fuse` does.
+        """
+        low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
+        scale = 2 ** level_of(lrhs, hrls)
+        albedo, normal = (F.avg_pool2d(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
+        return self.fuse(torch.cat([low, self.together(mean, noise, albedo, normal)], dim=1), hrls)
+
+    def fuse(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
         """
         Args:
             lrhs: (N, 6, h, w), network values: the LRHS, and both renders denoised together.
@@ -155,35 +141,14 @@ class JointFusion(nn.Module):
             features[name] = F.relu(self.convs[name](values))
             return features[name]
 
-        colour = walk(
-            SMALLER,
-            [picture, more],
-            conv,
-            halve=lambda values: F.max_pool2d(values, 2),
-            double=lambda values: F.interpolate(values, scale_factor=2, mode="nearest"),
-            join=lambda one, other: torch.cat([one, other], dim=1),
-        )
+        colour = walk_tensors(SMALLER, [picture, more], conv)
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = unseen(colour.float().clamp_max(1.0))
         return blend(lrhs, hrls, denoised, logits), log_error
 
 
-def seen(values: Tensor) -> Tensor:
-    """Network values as Open Image Denoise sees them, as :func:`oiio_msspl.eight_bit.encode`."""
-    radiance = linear(values.float()).clamp(0, transforms.MAX_RADIANCE)
-    low, middle = BOUNDS
-    power = FACTOR * radiance.clamp_min(low) ** EXPONENT + OFFSET
-    curve = torch.where(radiance <= middle, power, LOG_FACTOR * torch.log(radiance + LOG_SHIFT) + LOG_OFFSET)
-    return torch.where(radiance <= low, SLOPE * radiance, curve) / top()
-
-
-def unseen(values: Tensor) -> Tensor:
-    """Inverse of :func:`seen`, as :func:`oiio_msspl.eight_bit.decode`."""
-    curve = values * top()
-    low, middle = (encode(np.asarray(BOUNDS)) * top()).tolist()
-    # Bounded, because what torch.where leaves out must not be infinite: its gradient would be NaN
-    power = ((curve.clamp(low, middle) - OFFSET) / FACTOR) ** (1 / EXPONENT)
-    logarithm = torch.exp((curve.clamp_min(middle) - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT
-    radiance = torch.where(curve <= middle, power, logarithm)
-    return logarithmic(torch.where(curve <= low, curve / SLOPE, radiance))
+def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+    """What the network reads, of a pair as renders are: (h, w, 3) and (s*h, s*w, 16), transformed."""
+    low = merged(lrhs, layers_of(hrls, complete=True))
+    return np.concatenate([lrhs, low["colour"], low["noise"]], axis=-1), hrls

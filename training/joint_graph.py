@@ -19,7 +19,7 @@ from torch.nn import functional as F
 
 from oiio_msspl import eight_bit
 from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.denoiser import for_model
 from training import batches, data
 from training.eight_bit import COLOURS, SIGNED_RANGE, SIGNED_ZERO, Codes, Fit, Given, Graph, Values, walk_values
 from training.joint import DECODED, OUTPUTS, JointFusion, seen
@@ -88,7 +88,7 @@ def pictures(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Values]
 
 def drawn(views: Path, contract: Contract, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
     """Pairs as training draws them."""
-    denoiser, rng = Denoiser(mode=contract.denoiser), np.random.default_rng(0)
+    denoiser, rng = for_model(contract.denoiser, 0), np.random.default_rng(0)
     folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(views).split("train")]
     with torch.no_grad():
         each = (batches.draw(folder, contract.scale, PATCH, 1, rng, data.Sampling(), denoiser) for _ in range(count))

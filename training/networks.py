@@ -5,7 +5,9 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from training.joint import JointFusion
+from oiio_msspl.denoiser import Denoiser
+from training.data import Prepare
+from training.joint import JointFusion, with_mean
 from training.mix import MixFusion
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
@@ -18,8 +20,15 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[Mix
     "joint": JointFusion,
 }
 
-#: What Open Image Denoise does for those that read its results, see :data:`oiio_msspl.denoiser.MODES`.
+#: What is done for them when they run, see :data:`oiio_msspl.denoiser.MODES`.
 DENOISERS = {"mix": "high", "joint": "together"}
+
+
+def preparation(architecture: str, threads: int) -> Prepare | None:
+    """How pairs are prepared for a network by this name, on so many threads; None: they are read as they are."""
+    if architecture == "joint":
+        return with_mean
+    return Denoiser(threads) if architecture == "mix" else None
 
 
 def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from oiio_msspl.denoiser import Denoiser
 from training import batches, data, export
-from training.joint import BEFORE, DECODED, JointFusion, Retrained
+from training.joint import BEFORE, DECODED, JointFusion, with_mean
 from training.train import save
+from training.unet import Retrained
 
 PAIRS, PATCH = 24, 256
 
@@ -81,9 +81,9 @@ def main() -> None:
     if not isinstance(network, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
     folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
-    denoiser, rng = Denoiser(torch.get_num_threads(), state["denoiser"]), np.random.default_rng(0)
+    rng = np.random.default_rng(0)
     with torch.no_grad():
-        pairs = [batches.draw(folder, 2, PATCH, 1, rng, data.Sampling(), denoiser) for _ in range(PAIRS)]
+        pairs = [batches.draw(folder, 2, PATCH, 1, rng, data.Sampling(), with_mean) for _ in range(PAIRS)]
     for name, _, count in (part.partition("=") for part in args.keep):
         network = without(network, name, int(count), pairs)
     state["ema"] = network.state_dict()

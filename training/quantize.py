@@ -19,7 +19,7 @@ from onnx import helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
 from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.denoiser import for_model
 from training import batches, data
 
 #: Batches that the ranges of values are learnt from: as training draws them, with layers left out and colours changed.
@@ -91,7 +91,7 @@ class _Samples(CalibrationDataReader):
 
     @staticmethod
     def _draw(contract: Contract, folder: data.Folder) -> Iterator[dict[str, np.ndarray]]:
-        denoiser = Denoiser(mode=contract.denoiser) if contract.denoiser else None
+        denoiser = for_model(contract.denoiser, 0)
         rng = np.random.default_rng(0)
         cpu = torch.device("cpu")
         views = [batches.Pixels.of(view, cpu) for view in folder.split("train")]

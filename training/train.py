@@ -32,11 +32,10 @@ from torch import Tensor
 from torch.nn import functional as F
 
 from oiio_msspl import metrics, transforms
-from oiio_msspl.denoiser import Denoiser
 from training import batches, data, losses
 from training.joint import JointFusion
 from training.mix import MIX_CHANNELS, MixFusion, blend, disagreement
-from training.networks import DENOISERS, NETWORKS, Network, run
+from training.networks import DENOISERS, NETWORKS, Network, preparation, run
 from training.paper import HRLS_CHANNELS, MultiResolutionFusion
 from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion, level_of
 
@@ -249,8 +248,7 @@ def train(args: argparse.Namespace) -> None:
 
     # Network, from the last checkpoint, from another run, or new
     network: Network
-    mode = DENOISERS.get(args.network, "")
-    denoiser = Denoiser(args.threads, mode) if mode else None
+    prepare = preparation(args.network, args.threads)
     if args.network == "pyramid":
         network = PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels)
     elif args.network == "mix":
@@ -305,7 +303,7 @@ def train(args: argparse.Namespace) -> None:
         restore(state)
         step, elapsed, best_gain = state["step"], state["seconds"], state.get("best_gain", -math.inf)
         log.info("continues at step %d, minute %.1f", step, elapsed / 60)
-    source = batches.Batches(folder, scales, patch, batch, recipe.sampling, args.seed + step, device, denoiser)
+    source = batches.Batches(folder, scales, patch, batch, recipe.sampling, args.seed + step, device, prepare)
 
     stop = False
 
@@ -327,7 +325,7 @@ def train(args: argparse.Namespace) -> None:
         if not validation:  # a set that grew would make scores of different times incomparable
             for view in folder.split("validation")[: args.val_views]:
                 for scale in scales:
-                    validation[view.path, scale] = data.Evaluation.centre(view, scale, args.val_patch, denoiser)
+                    validation[view.path, scale] = data.Evaluation.centre(view, scale, args.val_patch, prepare)
         scores = evaluate(average.network, validation.values(), device)
         row = {
             "step": step,
@@ -351,7 +349,7 @@ def train(args: argparse.Namespace) -> None:
             "optimizer": optimizer.state_dict(),
             "architecture": args.network,
             "config": network.config,
-            "denoiser": mode,
+            "denoiser": DENOISERS.get(args.network, ""),
             "step": step,
             "seconds": elapsed,
             "best_gain": best_gain,

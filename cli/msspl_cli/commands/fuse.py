@@ -213,7 +213,7 @@ def _bar(quiet: bool) -> Callable[[int, int], None]:
 def _print(report: Report, seconds: float) -> None:
     spp = report.spp_avg
     print(f"{report.hr.renderer} pair at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
-    show.aov_table(report.hr.table(), report.hr.notes)
+    show.aov_table(report.aovs(), report.hr.notes)
     if report.repaired:
         what = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())
         print(f"repaired values that were NaN, infinite or negative: {what}")

@@ -139,8 +139,8 @@ def measured(kind: str, size: str, *extra: str) -> dict[str, Any]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="1024x1024")
-    parser.add_argument("--repeats", type=int, default=3)
-    parser.add_argument("--rounds", type=int, default=2, help="times that each is measured, in turn")
+    parser.add_argument("--repeats", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=5, help="times that each is measured, in turn")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--max-memory", type=int, default=3 << 30)
     parser.add_argument(

@@ -58,7 +58,7 @@ class Contract:
     transforms: dict[str, Any] = field(default_factory=current_transforms)
     defaults: dict[str, float] = field(default_factory=lambda: dict(schema.DEFAULTS))
     denoiser: str = ""
-    """What Open Image Denoise does for the model, a key of :data:`oiio_msspl.denoiser.MODES`; empty: nothing."""
+    """What is denoised for the model, a mode of :func:`oiio_msspl.denoiser.for_model`; empty: nothing."""
     weights: str = ""
     """A key of :data:`oiio_msspl.eight_bit.NETWORKS` whose weights the file leaves open; empty: it has its own."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)

@@ -46,7 +46,7 @@ def channel_names(features: dict[str, int]) -> list[str]:
 
 
 def inputs(denoiser: str) -> tuple[dict[str, int], dict[str, int]]:
-    """What a model reads of the LRHS and of the HRLS, with a denoiser of :data:`oiio_msspl.denoiser.MODES` or none."""
+    """What a model reads of the LRHS and of the HRLS, with a mode of :func:`oiio_msspl.denoiser.for_model`."""
     low = DENOISED_FEATURES if denoiser else {}
     if denoiser == "together":  # and it denoises the HRLS itself, from the layers that denoisers read
         return LRHS_FEATURES | low, {name: HRLS_FEATURES[name] for name in (RGB, ALBEDO, NORMAL)}

@@ -81,3 +81,20 @@ def test_bands_change_no_value(monkeypatch, planar):
     with bands.threads(3):
         for one, other in zip(results(), whole, strict=True):
             np.testing.assert_array_equal(one, other)
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_work_begins_aside_if_there_are_threads_for_it(count):
+    """With what the caller has set; otherwise when it is asked for."""
+    begun = threading.Event()
+
+    def work():
+        begun.set()
+        return threading.current_thread(), bands._threads.get()
+
+    with bands.threads(count):
+        result = bands.aside(work)
+        assert begun.wait(5 if count > 1 else 0) == (count > 1)
+        thread, threads = result()
+    assert (thread is threading.current_thread()) == (count == 1)
+    assert threads == count

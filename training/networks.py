@@ -20,7 +20,7 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[Mix
     "joint": JointFusion,
 }
 
-#: What is done for them when they run, see :data:`oiio_msspl.denoiser.MODES`.
+#: What is done for them when they run, see :func:`oiio_msspl.denoiser.for_model`.
 DENOISERS = {"mix": "high", "joint": "together"}
 
 

@@ -60,14 +60,15 @@ def test_it_is_the_default_where_it_can_be(forget):
     assert find_model(2, "auto").stem == "joint-x2"
 
 
+@pytest.mark.parametrize("spp_of_albedo", [64, 1024])
 @pytest.mark.parametrize("scale", schema.SCALES)
-def test_it_denoises_no_worse_than_open_image_denoise(scale):
-    """Nor by a tenth at x8, whose LRHS is 17 x 25 pixels; also where sides are no multiple of what the network needs,
-    and within the renders' range."""
+def test_it_denoises_no_worse_than_open_image_denoise(scale, spp_of_albedo):
+    """Nor by a tenth at x8, whose LRHS is 17 x 25 pixels, and at x2 with a noisy albedo; also where sides are no
+    multiple of what the network needs, and within the renders' range."""
     pytest.importorskip("pyoidn")
     clean = picture(136, 200)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
-    albedo = noisy(clean.clip(0, 1), 1024).clip(0, 1)
+    albedo = noisy(clean.clip(0, 1), spp_of_albedo).clip(0, 1)
     lr = Render.from_arrays("lr", rgb=transforms.box_downsample(noisy(clean, 4, seed=1), scale))
     hr = Render.from_arrays("hr", rgb=noisy(clean, 4), albedo=albedo, normal=normal)
     model = Session(find_model(scale, "joint"), threads=1)
@@ -81,7 +82,7 @@ def test_it_denoises_no_worse_than_open_image_denoise(scale):
     def error(image):
         return np.abs(transforms.compress(image, 1.0) - transforms.compress(clean, 1.0)).mean()
 
-    assert error(fused.rgb) < (1.1 if scale == 8 else 1.0) * error(alone)
+    assert error(fused.rgb) < (1.1 if scale == 8 or (scale, spp_of_albedo) == (2, 64) else 1.0) * error(alone)
     assert (fused.error > 0).all()
 
 

@@ -31,7 +31,7 @@ from oiio_msspl.denoiser import Denoiser, Layers, installed_weights, layers_of, 
 from oiio_msspl.schema import SCALES
 from training import batches, data
 from training.together import Together
-from training.unet import LARGER, SMALLER, Shape, walk
+from training.unet import LARGER, SMALLER, Shape, convolutions, given_weights, walk
 
 FOLDER = Path(__file__).parent.parent / "oiio_msspl" / "denoisers"
 CHECKPOINT = Path(__file__).parent / "checkpoints" / "joint.pt"
@@ -146,8 +146,7 @@ class Given:
     @classmethod
     def of(cls, weights: Weights) -> dict[str, Given]:
         """All of a network's own convolutions, whole."""
-        names = [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
-        pairs = {name: (weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in names}
+        pairs = {name: (weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in convolutions(weights)}
         return {
             name: cls(weight, bias, *(list(range(count)) for count in weight.shape[:2]))
             for name, (weight, bias) in pairs.items()
@@ -504,12 +503,12 @@ def main() -> None:
     args = parser.parse_args()
     together = Together.of(args.checkpoint)
     for name in args.networks:
-        halves = installed_weights("large" if name == "together" else name)
-        given = {key: torch.from_numpy(values.astype(np.float32)) for key, values in halves.items()}
+        original = "large" if name == "together" else name
+        given = given_weights(original)
         weights = together.weights() if name == "together" else given
         images = list(pictures(args.views, "train", name, PICTURES))
         onnx.save(Graph(quantise(name, weights, given, images)).model(), FOLDER / f"{name}.onnx")
-        compare(name, eight_bit.EightBit(name, halves), args.views, together)
+        compare(name, eight_bit.EightBit(name, installed_weights(original)), args.views, together)
 
 
 if __name__ == "__main__":

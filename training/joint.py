@@ -24,13 +24,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl import schema
-from oiio_msspl.denoiser import installed_weights, layers_of, merged
+from oiio_msspl.denoiser import layers_of, merged
 from oiio_msspl.render import Array
 from training.mix import COARSEST, FINER, blend
 from training.paper import LRHS_CHANNELS
 from training.pyramid import level_of
 from training.together import Together
-from training.unet import SMALLER, Retrained, seen, unseen, walk_tensors
+from training.unet import SMALLER, Retrained, convolutions, given_weights, seen, unseen, walk_tensors
 
 #: Channels that H/2 reads more: both together, the LRHS.
 MORE = 6
@@ -58,12 +58,10 @@ class JointFusion(nn.Module):
         self.kept = dict(kept or {})
         self.config = {"kept": self.kept}
         self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in schema.inputs("together"))
-        self.given = {
-            name: torch.from_numpy(values.astype("float32")) for name, values in installed_weights("usual").items()
-        }
+        self.given = given_weights("usual")
         self.together = Together()
         self.convs = nn.ModuleDict()
-        for name in (name.removesuffix(".weight") for name in self.given if name.endswith(".weight")):
+        for name in convolutions(self.given):
             rows, columns = self.given_channels(name)
             weight, bias = self.given[f"{name}.weight"][rows][:, columns], self.given[f"{name}.bias"][rows]
             self.convs[name] = Retrained(weight, bias, MORE if name in READERS else 0)

@@ -14,16 +14,17 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.denoiser import Layers, installed_weights
+from oiio_msspl.denoiser import Layers
 from oiio_msspl.eight_bit import MULTIPLE
 from oiio_msspl.render import Array
-from training.unet import LARGER, Retrained, seen, unseen, walk_tensors
+from training.unet import LARGER, Retrained, convolutions, given_weights, seen, unseen, walk_tensors
 
 #: Convolutions that stay as they are: of the two lowest levels, two thirds of all weights.
 HELD = ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b")
-#: Channels that the first convolution reads more, and the last level's, which reads what it does: the noise.
+#: Channels that the picture has more: the noise.
 MORE = 1
-FIRST, BESIDE = "enc_conv1a", "dec_conv1a"
+#: The convolutions that read it.
+READERS = ("enc_conv1a", "dec_conv1a")
 
 
 class Together(nn.Module):
@@ -31,17 +32,16 @@ class Together(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        given = {name: torch.from_numpy(w.astype("float32")) for name, w in installed_weights("large").items()}
-        names = [name.removesuffix(".weight") for name in given if name.endswith(".weight")]
+        given = given_weights("large")
         self.convs = nn.ModuleDict(
             {
                 name: Retrained(
                     given[f"{name}.weight"],
                     given[f"{name}.bias"],
-                    MORE if name in (FIRST, BESIDE) else 0,
+                    MORE if name in READERS else 0,
                     held=name in HELD,
                 )
-                for name in names
+                for name in convolutions(given)
             }
         )
 

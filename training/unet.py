@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl import transforms
+from oiio_msspl.denoiser import installed_weights
 from oiio_msspl.eight_bit import (
     BOUNDS,
     EXPONENT,
@@ -26,6 +27,20 @@ from oiio_msspl.eight_bit import (
     top,
 )
 from training.pyramid import linear, logarithmic
+
+
+def given_weights(network: str) -> dict[str, Tensor]:
+    """Of one of :data:`oiio_msspl.eight_bit.NETWORKS`, as Open Image Denoise has them.
+
+    Raises:
+        InputError: pyoidn is not installed, or has others.
+    """
+    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in installed_weights(network).items()}
+
+
+def convolutions(weights: Mapping[str, Tensor]) -> list[str]:
+    """Names of those that there are weights of."""
+    return [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
 
 
 @dataclass(frozen=True)

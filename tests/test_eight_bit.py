@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import hashlib
+import itertools
 import struct
 from pathlib import Path
 from unittest.mock import Mock
@@ -145,6 +146,18 @@ def test_chosen_steps_beat_the_nearest():
     step_of_weights = weights[:, :24].abs().amax(1) / 127
     nearest = (weights[:, :24] / step_of_weights[:, None]).round()
     assert error(chosen, step, bias) < 0.6 * error(nearest, step_of_weights, weights[:, 24])
+
+
+def test_slices_are_those_with_the_least_noise():
+    torch = pytest.importorskip("torch")
+    from training.eight_bit import least_noise
+
+    noise = torch.tensor([9.0, 4.0, 1.5, 0.0])
+    slices = least_noise(noise, 6)
+    ways = [torch.tensor(way) for way in itertools.product(range(1, 8), repeat=4) if sum(way) == 10]
+    assert int(slices.sum()) == 10
+    assert slices[-1] == 1
+    assert float((noise / slices**2).sum()) == pytest.approx(min(float((noise / way**2).sum()) for way in ways))
 
 
 def test_the_graph_computes_what_was_fitted(tmp_path):

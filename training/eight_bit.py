@@ -36,20 +36,22 @@ from training.unet import LARGER, SMALLER, Shape, convolutions, given_weights, w
 FOLDER = Path(__file__).parent.parent / "oiio_msspl" / "denoisers"
 CHECKPOINT = Path(__file__).parent / "checkpoints" / "joint.pt"
 #: Pictures that are learnt from, and the pixels of each that a layer's weights are fitted to.
-PICTURES, PIXELS, PATCH = 64, 4000, 256
+PICTURES, PIXELS, PATCH = 96, 4000, 256
 #: Pictures without the layers that are needed, one after the other, until it is given up.
 PATIENCE = 200
 #: Share of a layer's values, in every picture, that its 8 bits reach beyond.
 REACH = 0.9995
 #: How far the channels of a layer have ranges of their own: 1, each its own; 0, all the largest. Between them, neither
 #: the values of a weak channel nor the weights that read it have too few steps.
-OWN_RANGE = 0.5
-#: Strength of what keeps fitted weights near the original ones, against the power of their input.
-DAMPING = 0.01
+OWN_RANGE = 0.75
+#: Strength of what keeps fitted weights near the original ones, against the power of their input, where there are as
+#: many weights to an output as pixels to fit them to.
+DAMPING = 1.0
 STEPS = 127
-#: Bounds of the slices that the last layer but one is written in, as shares of its range: what is rounded there is seen
-#: as it is.
-FINE_BOUNDS = (0.0, 0.5, 1.0)
+#: Channels of codes that each layer of the last level has beyond those of its values, for slices of a few: what is
+#: rounded there is seen as it is, and most of what is seen comes from a few channels. And of the larger network, which
+#: works where pixels are fewer.
+FURTHER, FURTHER_OF_LARGER = 32, 48
 #: Names of convolutions that read a layer of a U-Net beside it; and, of their outputs and of those that the last layer
 #: makes behind its colours, the range and the code of zero: logits, and logarithms.
 SIDE = ("head1", "head2", "head3")
@@ -162,14 +164,12 @@ class Fit:
         weights: of its convolutions, and of any that read a layer beside it.
         given: convolutions of the same names that they are written as differences from; not all need to have one.
         slices_out: slices that colour is written in.
-        fine: whether the last layer but one is written in slices, too.
     """
 
     shape: Shape
     weights: Weights
     given: Mapping[str, Given]
     slices_out: int = eight_bit.SLICES_OUT
-    fine: bool = True
     layers: dict[str, Layer] = field(default_factory=dict)
     _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
 
@@ -206,19 +206,33 @@ class Fit:
             return 0
         return COLOURS if name == self.shape.last else count
 
+    def _seen_of(self, name: str) -> Tensor:
+        """Of what is added to each channel of a layer of the last level, as if no ReLU followed: how much power the
+        colours get, which see no other channel's."""
+        level = self.shape.up[-1]
+        result = torch.zeros(len(self.weights[f"{self.shape.last}.bias"]))
+        result[:COLOURS] = 1
+        for reader in (self.shape.last, *level[: level.index(name) : -1]):
+            result = result @ self.weights[f"{reader}.weight"].square().sum(dim=(2, 3))
+        return result
+
     def _written(self, name: str, exact: list[Tensor], signed: int) -> tuple[Codes, Tensor]:
         """How a layer's values are written, and where the slices begin."""
         count = len(exact[0][0])
         if name == self.shape.last or signed < count:
-            tops, bounds = torch.ones(signed), torch.linspace(0, 1, self.slices_out + 1)
+            tops, slices = torch.ones(signed), torch.full((signed,), self.slices_out)
         else:
             tops = torch.stack([_quantile(image[0].flatten(1), REACH) for image in exact]).amax(dim=0)
             tops = tops.clamp_min(1e-3 * tops.max())
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
-            fine = self.fine and name == self.shape.up[-1][-1]
-            bounds = torch.tensor(FINE_BOUNDS if fine else (0.0, 1.0))
-        of = torch.arange(signed).repeat(len(bounds) - 1)
-        worth, begins = ((share[:, None] * tops).flatten() for share in (bounds.diff() / 255, bounds[:-1]))
+            slices = torch.ones(signed, dtype=torch.long)
+            if name in self.shape.up[-1]:
+                further = FURTHER_OF_LARGER if self.shape is LARGER else FURTHER
+                slices = least_noise(self._seen_of(name) * tops**2, further)
+        # The first slice of all, the second of those that have one ...
+        nth, of = (torch.arange(int(slices.sum()))[:, None] < slices).nonzero(as_tuple=True)
+        width = (tops / slices)[of]
+        begins, worth = nth * width, width / 255
         beside = torch.arange(signed, count)
         of = torch.cat([of, beside])
         worth = torch.cat([worth, torch.full(beside.shape, 2 * SIGNED_RANGE / 255)])
@@ -226,6 +240,15 @@ class Fit:
         if name == self.shape.last or signed < count:
             of, worth, begins = (F.pad(x, (0, -len(x) % 16), value=x[0]) for x in (of, worth, begins))
         return Codes(worth, of), begins
+
+
+def least_noise(noise: Tensor, further: int) -> Tensor:
+    """Of how many slices each channel should be made, so many more than there are channels, where one slice has some
+    noise and n have a share of 1 / n² of it."""
+    slices = torch.ones(len(noise), dtype=torch.long)
+    for _ in range(further):
+        slices[(noise * (1 / slices**2 - 1 / (slices + 1) ** 2)).argmax()] += 1
+    return slices
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:
@@ -256,7 +279,7 @@ def nearest_steps(inputs: Tensor, outputs: Tensor, weights: Tensor, given: Tenso
     count = inputs.shape[1]
     x = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1).double()
     power = x.T @ x / len(x)
-    damping = torch.diag(DAMPING * power.diagonal() + 1e-6 * power.diagonal().mean())
+    damping = torch.diag(DAMPING * count / len(x) * power.diagonal() + 1e-6 * power.diagonal().mean())
     damping[count, count] = 1e-9
     original = weights.double()
     weights = torch.linalg.solve(power + damping, x.T @ outputs.double() / len(x) + damping @ original.T).T

@@ -30,7 +30,7 @@ from training.unet import SMALLER
 #: Pairs that the 8 bits are fitted to, and their HRLS pixels across.
 PAIRS, PATCH = 64, 256
 #: Slices of the range that colours are written in: the HRLS's, both renders' together, the LRHS's; and what is made.
-OF_HRLS, OF_BOTH, OF_LRHS, OUT = 3, 3, 2, 8
+OF_HRLS, OF_BOTH, OF_LRHS, OUT = 3, 3, 2, 9
 #: Of the LRHS's channels: both renders together, and its own.
 BOTH, LOW = slice(LRHS_CHANNELS, 2 * LRHS_CHANNELS), slice(0, LRHS_CHANNELS)
 #: Entries of the table from network values to what Open Image Denoise sees.
@@ -113,7 +113,7 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
         # What is expected to be wrong, four pixels for each of H/2, is made beside that level's logits
         heads[1] = torch.cat([heads[1], getattr(network.error, kind)])
         weights |= {f"head{level}.{kind}": heads[level] for level in range(1, len(heads))}
-    fit = Fit(SMALLER, {name: value.detach() for name, value in weights.items()}, given, OUT, fine=False)
+    fit = Fit(SMALLER, {name: value.detach() for name, value in weights.items()}, given, OUT)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
     def conv(name: str, values: Values) -> Values:

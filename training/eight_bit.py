@@ -51,7 +51,7 @@ STEPS = 127
 #: Channels of codes that each layer of the last level has beyond those of its values, for slices of a few: what is
 #: rounded there is seen as it is, and most of what is seen comes from a few channels. And of the larger network, which
 #: works where pixels are fewer.
-FURTHER, FURTHER_OF_LARGER = 32, 48
+FURTHER, FURTHER_OF_LARGER = 16, 32
 #: Names of convolutions that read a layer of a U-Net beside it; and, of their outputs and of those that the last layer
 #: makes behind its colours, the range and the code of zero: logits, and logarithms.
 SIDE = ("head1", "head2", "head3")

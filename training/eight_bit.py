@@ -207,8 +207,8 @@ class Fit:
         return COLOURS if name == self.shape.last else count
 
     def _seen_of(self, name: str) -> Tensor:
-        """Of what is added to each channel of a layer of the last level, as if no ReLU followed: how much power the
-        colours get, which see no other channel's."""
+        """Power that the colours get of noise of power 1 in each channel of a layer of the last level, as if no ReLU
+        followed."""
         level = self.shape.up[-1]
         result = torch.zeros(len(self.weights[f"{self.shape.last}.bias"]))
         result[:COLOURS] = 1

@@ -5,7 +5,7 @@
 
 Of every ``NAME/scene.xml`` the middle 384 x 256 pixels of a frame whose longer side is 1280 pixels: a reference, HRLS
 of 1, 2, 4 and 8 spp and LRHS of as many samples for every one of their pixels, both with albedo, normal, diffuse and
-specular. A filter is sampled, as Cycles does, so that pixels share no noise. Files that exist are kept.
+specular. Files that exist are kept.
 """
 
 from __future__ import annotations
@@ -21,26 +21,15 @@ import numpy as np
 from benchmarks.flicker_render import write_exr
 from benchmarks.render_time import CROP, LONGER
 from oiio_msspl.schema import SCALES
-from training import mitsuba_start
+from training import mitsuba_start, views
 
 HRLS = (1, 2, 3, 4, 6, 7, 8)
 #: Samples of the LRHS for every pixel of the frame.
 LRHS = (1, 2, 4)
 #: Samples of one launch, so that memory stays small.
 LAUNCH = 1_500_000
-#: Width of the Blackman-Harris filter in pixels, Blender's default.
-WIDTH = 1.5
 LAYERS = ("", "albedo.", "nn.", "diffuse.", "specular.")
 CHANNELS = [layer + c for layer in LAYERS for c in ("XYZ" if layer == "nn." else "RGB")]
-
-
-def blackman_harris(size: int = 1024) -> np.ndarray:
-    """Where samples lie in a pixel, for equal steps of a uniform number: the inverse of the filter's integral."""
-    t = np.linspace(0, 1, 16 * size)
-    a = (0.35875, -0.48829, 0.14128, -0.01168)
-    window = sum(value * np.cos(2 * np.pi * k * t) for k, value in enumerate(a))
-    integral = np.cumsum(window) / np.sum(window)
-    return 0.5 + WIDTH * (np.interp(np.linspace(0, 1, size), integral, t) - 0.5)
 
 
 class SensorCamera:
@@ -68,22 +57,13 @@ class SensorCamera:
 
 def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
     """Render what is missing of a scene."""
-    import drjit as dr
     import mitsuba as mi
 
-    from training.mitsuba_views.trace import render_passes
+    from training.mitsuba_views.trace import blackman_harris, box, render_passes
 
     scene = mi.load_file(str(file))
     camera = SensorCamera(mi, scene.sensors()[0])
-    table = mi.Float(blackman_harris())
-
-    def inverse(uniform: Any) -> Any:
-        position = uniform * (len(table) - 1)
-        index = dr.minimum(mi.UInt32(position), len(table) - 2)
-        low, high = (dr.gather(mi.Float, table, index + i) for i in range(2))
-        return low + (high - low) * (position - mi.Float(index))
-
-    chosen = {"pixel_filter": inverse} if pixel_filter == "blackman-harris" else {}
+    placing = blackman_harris() if pixel_filter == "blackman-harris" else box
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS] + [("ref", 1, reference)]
     jobs += [(f"lr_x{scale}_{scale**2 * n}spp", scale, scale**2 * n) for scale in SCALES for n in LRHS]
     for name, scale, spp in jobs:
@@ -97,7 +77,7 @@ def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
         while done < spp:
             count = min(per_launch, spp - done)
             seed = zlib.crc32(f"{folder.name} {pixel_filter} {name} {done}".encode())
-            passes = render_passes(scene, camera, size, count, seed, layers=layers, **chosen)  # type: ignore[arg-type]
+            passes = render_passes(scene, camera, size, count, seed, layers, pixel_filter=placing)  # type: ignore[arg-type]
             total += passes.sum(axis=0, dtype=np.float64)
             done += count
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -108,7 +88,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--filter", choices=("box", "blackman-harris"), default="blackman-harris")
+    parser.add_argument("--filter", choices=views.FILTERS, default="blackman-harris")
     parser.add_argument("--reference", type=int, default=256, help="spp")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()

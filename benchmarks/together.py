@@ -63,17 +63,14 @@ def main() -> None:
         for spp in SPP:
             for average in SPP:
                 chosen = np.flatnonzero(view.lr_spp == average)[:1]
-                light = data.mean_lrhs(view, chosen)
-                exposure = np.float32(transforms.exposure_of(light))
                 layers = data.split_features(passes[:spp].mean(axis=0))
                 color, albedo, normal = (layers[name] for name in (schema.RGB, schema.ALBEDO, schema.NORMAL))
+                exposure = np.float32(transforms.exposure_of(data.mean_lrhs(view, chosen, SCALES[0])))
                 reference = data.read(view.ref) * exposure
                 alone = denoise(color * exposure, albedo, normal)
                 for scale in SCALES:
-                    small = [
-                        transforms.box_downsample(image, scale)
-                        for image in (light * exposure, color * exposure, albedo, normal)
-                    ]
+                    of_hrls = [transforms.box_downsample(image, scale) for image in (color * exposure, albedo, normal)]
+                    small = [data.mean_lrhs(view, chosen, scale) * exposure, *of_hrls]
                     expected = transforms.box_downsample(reference, scale)
                     for name, image in results(*small).items():
                         scores.setdefault((name, scale, spp, average), []).append(

@@ -23,7 +23,7 @@ def test_views_for_testing_are_scenes(tmp_path):
     for name in ("test", "train"):
         for quality in (25, 35):
             meta = {"split": name, "seed": f"cycles-{name}", "ref_psnr": quality}
-            arrays = views.pack(hr, lr, clean, np.random.default_rng(1), meta)
+            arrays = views.pack(hr, {1: lr}, clean, np.random.default_rng(1), meta)
             views.save(tmp_path / f"{name}-{quality}.npz", arrays)
     (scene,) = scenes.load(tmp_path)  # the one that is held out and has a clean reference
     assert scene.name == "cycles-test"

@@ -192,6 +192,26 @@ def test_sample_shapes_ranges_and_agreement(views: Path) -> None:
         torch.testing.assert_close(down, batch["lrhs"], atol=0.01, rtol=0)
 
 
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_an_lrhs_with_a_filter_of_its_own_is_read_as_it_was_rendered(views: Path, tmp_path: Path, scale: int) -> None:
+    """Passes at 1/s of the resolution are no means of pixels, and have no nearest ones; one scale alone is no view."""
+    rendered = {s: np.full((5, SIZE // s, SIZE // s, 3), s / 10, np.float16) for s in schema.SCALES}
+    with np.load(views / "train.npz") as stored:
+        others = {name: stored[name] for name in stored if name != "lr"}
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    np.savez(wide / "one.npz", **others, lr_x2=rendered[2])
+    np.savez(wide / "all.npz", **others, **{f"lr_x{s}": passes for s, passes in rendered.items()})
+    (view,) = data.Folder(wide).split("train")
+    for nearest in (False, True):
+        np.testing.assert_array_equal(data.mean_lrhs(view, [0, 3], scale, nearest=nearest), rendered[scale][0])
+        sampling = data.Sampling(nearest=float(nearest), exposure_stops=0, gain_stops=0, grey=0)
+        lrhs = drawn(wide, scale, 32, 2, sampling)["lrhs"]
+        # A flat picture is exposed to the key
+        expected = transforms.compress(np.full((2, 3, 32 // scale, 32 // scale), transforms.KEY, np.float32), 1.0)
+        np.testing.assert_allclose(lrhs, expected, rtol=1e-3)
+
+
 def test_absent_layers_have_their_defaults(views: Path) -> None:
     batch = drawn(views, 4, 32, 1, data.Sampling(drop_all=1.0))
     layers = features_of(batch["hrls"][0].permute(1, 2, 0).numpy())

@@ -93,7 +93,7 @@ class Pair:
 def pair_of(view: data.View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
     """A crop whose HRLS is the pass ``chosen``."""
     rows, columns = slice(top, top + patch), slice(left, left + patch)
-    colour = transforms.box_downsample(data.mean_lrhs(view, list(range(len(view.lr)))), scale)
+    colour = data.mean_lrhs(view, list(range(len(view.lr_spp))), scale)
     exposure = transforms.exposure_of(colour)
     low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
 

@@ -33,14 +33,30 @@ class Pixels:
     """A view's arrays as tensors."""
 
     hr: Tensor
-    lr: Tensor
+    lr: dict[int, Tensor]
     ref: Tensor
     lr_spp: np.ndarray
 
     @classmethod
     def of(cls, view: View, device: torch.device) -> Pixels:
         """On a CPU they share the file's mapped pages."""
-        return cls(*(torch.from_numpy(array).to(device) for array in (view.hr, view.lr, view.ref)), view.lr_spp)
+
+        def on_device(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array).to(device)
+
+        lr = {scale: on_device(passes) for scale, passes in view.lr.items()}
+        return cls(on_device(view.hr), lr, on_device(view.ref), view.lr_spp)
+
+    def lrhs(self, passes: np.ndarray, scale: int, clip: float, *, nearest: bool) -> Tensor:
+        """As :func:`training.data.mean_lrhs`, clipped before pixels are joined: (H/s, W/s, 3)."""
+        stored = self.lr[scale if scale in self.lr else 1]
+        weights = torch.from_numpy((self.lr_spp[passes] / self.lr_spp[passes].sum()).astype(np.float32))
+        mean = torch.einsum(
+            "p,phwc->hwc", weights.to(stored.device), repair(torch.stack([stored[p] for p in passes]))
+        ).clamp_max(clip)
+        if scale in self.lr:
+            return mean
+        return (nearest_downsample if nearest else box_downsample)(mean[None], scale)[0]
 
 
 # Transforms, as oiio_msspl.transforms and oiio_msspl.tensors have them for one image
@@ -137,10 +153,7 @@ def draw(
     def on_device(array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(device, non_blocking=True)
 
-    weights = on_device(spp[lr_passes] / spp[lr_passes].sum())
-    whole = torch.stack([torch.stack([view.lr[p] for p in lr_passes]) for view in chosen])
-    lrhs = torch.einsum("p,bphwc->bhwc", weights, repair(whole)).clamp_max(sampling.clip)
-    lrhs = nearest_downsample(lrhs, scale) if nearest else box_downsample(lrhs, scale)
+    lrhs = torch.stack([view.lrhs(lr_passes, scale, sampling.clip, nearest=nearest) for view in chosen])
     passes = [
         [view.hr[p, *area] for p in rng.permutation(len(view.hr))[:n]] for view, area in zip(chosen, areas, strict=True)
     ]

@@ -6,12 +6,14 @@ A view is an uncompressed ``.npz`` with
 * ``hr``: float16 (P, H, W, 15), P independent 1-spp passes of rgb, albedo, normal, diffuse, specular, three channels
   each;
 * ``lr``: float16 (Q, H, W, 3), colour alone, also at full resolution and independent of ``hr``; ``lr_spp``: int (Q,);
+  or, where the pixel filter is wider than a pixel, for each scale s ``lr_x<s>``: float16 (Q, H/s, W/s, 3), rendered at
+  1/s of the resolution with s^2 times ``lr_spp``, so that the filter is that of its own larger pixels;
 * ``ref``: float16 (H, W, 3), the reference colour;
 * ``meta``: a JSON string with ``split``: ``train``, ``validation`` or ``test``; and ``seed``, which tells scenes apart.
 
 Because passes are kept apart, one view yields many different pairs: an HRLS of n spp is the mean of any n passes, and
 an LRHS of scale s is the box average over s x s pixels of any ``lr`` passes, which is a render of s^2 times their spp
-at 1/s of the resolution.
+at 1/s of the resolution, or the mean of any ``lr_x<s>`` passes.
 """
 
 from __future__ import annotations
@@ -31,6 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl import schema, tensors, transforms
+from training import views
 
 Array = NDArray[np.float32]
 log = logging.getLogger(__name__)
@@ -131,13 +134,23 @@ class View:
         self.scene: str = str(meta["seed"])
         self.source: str = f"{meta.get('renderer', 'unknown renderer')}, generator {meta.get('generator', '?')}"
         """What rendered it, for the provenance of what is trained on it."""
-        self.hr, self.lr, self.ref = arrays["hr"], arrays["lr"], arrays["ref"]
+        self.hr, self.ref = arrays["hr"], arrays["ref"]
+        self.lr: dict[int, NDArray] = {
+            scale: arrays[key] for scale in (1, *schema.SCALES) if (key := views.lr_key(scale)) in arrays
+        }
+        """Passes of the LRHS by scale: those at full resolution, or those of every other."""
         if clean_reference(path).exists():
             self.ref = np.load(clean_reference(path), mmap_mode="c")
         self.lr_spp = np.asarray(arrays["lr_spp"], dtype=np.int64)
         channels = sum(schema.HRLS_FEATURES[name] for name in PASS_FEATURES)
-        if self.hr.ndim != 4 or self.hr.shape[-1] != channels or self.lr.shape[0] != len(self.lr_spp):
-            raise ValueError(f"{path}: hr is {self.hr.shape}, lr {self.lr.shape}, lr_spp {self.lr_spp.shape}")
+        shapes = {scale: passes.shape for scale, passes in self.lr.items()}
+        if (
+            self.hr.ndim != 4
+            or self.hr.shape[-1] != channels
+            or not (1 in shapes or shapes.keys() >= set(schema.SCALES))
+            or any(shape[0] != len(self.lr_spp) for shape in shapes.values())
+        ):
+            raise ValueError(f"{path}: hr is {self.hr.shape}, lr {shapes}, lr_spp {self.lr_spp.shape}")
 
 
 class Folder:
@@ -188,10 +201,20 @@ def read(values: NDArray, *, signed: bool = False) -> Array:
     return transforms.repair(values.astype(np.float32), signed=signed)[0]
 
 
-def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int]) -> Array:
-    """Mean of some ``lr`` passes of the whole view, each weighted by its spp: (H, W, 3)."""
+def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int, *, nearest: bool = False) -> Array:
+    """An LRHS of the whole view, (H // s, W // s, 3): the mean of some ``lr`` passes, each weighted by its spp.
+
+    ``nearest`` takes one pixel of s x s, as the paper does, where the passes have full resolution.
+    """
     weights = view.lr_spp[passes] / view.lr_spp[passes].sum()
-    return np.einsum("p,phwc->hwc", weights.astype(np.float32), read(view.lr[passes]))
+    stored = view.lr[scale if scale in view.lr else 1]
+    mean = np.einsum("p,phwc->hwc", weights.astype(np.float32), read(stored[passes]))
+    if scale in view.lr:
+        return mean
+    if nearest:
+        return mean[scale // 2 :: scale, scale // 2 :: scale]
+    height, width = (n // scale * scale for n in mean.shape[:2])
+    return transforms.box_downsample(mean[:height, :width], scale)
 
 
 def read_hrls(view: View, passes: NDArray[np.int64] | list[int], rows: slice, columns: slice) -> Array:
@@ -234,7 +257,7 @@ class Evaluation:
         height, width, _ = view.ref.shape
         top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
         rows, columns = slice(top, top + patch), slice(left, left + patch)
-        lrhs = transforms.box_downsample(mean_lrhs(view, [0]), scale)
+        lrhs = mean_lrhs(view, [0], scale)
         exposure = transforms.exposure_of(lrhs)
         hrls = tensors.pack(split_features(read_hrls(view, [0], rows, columns)[0]), schema.HRLS_FEATURES, exposure)
         lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]

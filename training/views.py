@@ -26,6 +26,7 @@ from oiio_msspl.transforms import luminance as luminance_of
 SIZE = 256
 HR_PASSES = 8
 LR_SPP = (1, 1, 2, 4, 8)
+FILTERS = ("box", "blackman-harris")
 VIEWS = 3
 """Of each scene, if no other number is asked for."""
 
@@ -75,10 +76,18 @@ def _half(x: np.ndarray) -> np.ndarray:
     return np.clip(x, -65504, 65504).astype(np.float16)
 
 
+def lr_key(scale: int) -> str:
+    """The name of the LRHS's passes at 1/scale of the resolution."""
+    return "lr" if scale == 1 else f"lr_x{scale}"
+
+
 def pack(
-    hr: np.ndarray, lr: np.ndarray, ref: np.ndarray, rng: np.random.Generator, meta: dict[str, Any]
+    hr: np.ndarray, lr: dict[int, np.ndarray], ref: np.ndarray, rng: np.random.Generator, meta: dict[str, Any]
 ) -> dict[str, np.ndarray]:
-    """All arrays of a view's file, exposed at random over three decades so that half floats hold them."""
+    """All arrays of a view's file, exposed at random over three decades so that half floats hold them.
+
+    ``lr`` has the passes at full resolution as those of scale 1, or those of every other scale.
+    """
     luminance = luminance_of(ref)
     target = 10 ** rng.uniform(-1.5, 1.3)
     scale = target / log_mean(ref)
@@ -91,7 +100,7 @@ def pack(
     }  # fmt: skip
     return {
         "hr": _half(hr),
-        "lr": _half(lr * scale),
+        **{lr_key(smaller): _half(passes * scale) for smaller, passes in lr.items()},
         "lr_spp": np.array(LR_SPP, np.int32),
         "ref": _half(ref * scale),
         "meta": np.array(json.dumps({**meta, "exposure": exposure})),

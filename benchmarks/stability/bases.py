@@ -103,8 +103,7 @@ class View(Base):
         if hr_spp > len(self.view.hr) or not found:
             raise LookupError(f"{self.name} has no HRLS of {hr_spp} spp with an LRHS of {lr_spp}")
         height, width = (n // scale * scale for n in self.view.ref.shape[:2])
-        low = data.mean_lrhs(self.view, found[:1])[:height, :width]
-        low = low[scale // 2 :: scale, scale // 2 :: scale] if nearest else transforms.box_downsample(low, scale)
+        low = data.mean_lrhs(self.view, found[:1], scale, nearest=nearest)[: height // scale, : width // scale]
         samples = data.read_hrls(self.view, list(range(hr_spp)), slice(0, height), slice(0, width))
         features = data.split_features(samples)
         layers = {name: values.mean(axis=0) for name, values in features.items()}

@@ -172,7 +172,7 @@ def render_view(
         "assets": sorted(stage.sources),
         "camera": camera,
     }
-    return views.pack(hr, lr, ref, rng, meta)
+    return views.pack(hr, {1: lr}, ref, rng, meta)
 
 
 def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int, threads: int) -> tuple[int, str]:

@@ -11,6 +11,9 @@ from .. import mitsuba_start, views
 def main() -> int:
     parser = views.parser("training.mitsuba_views", ref_spp=96)
     parser.add_argument("--variant", default=mitsuba_start.VARIANT)
+    parser.add_argument(
+        "--filter", choices=views.FILTERS, default="box", help="the LRHS's at its own resolution; 1 to 3.2 pixels wide"
+    )
     args = parser.parse_args()
     mitsuba_start.start(args.threads, args.variant)
     # Imported only now: these modules name Mitsuba's types, which exist once a variant is set.
@@ -18,7 +21,9 @@ def main() -> int:
     from .render import render_scene
 
     assets = Assets(args.assets)
-    return views.render_all(args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp))
+    return views.render_all(
+        args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.filter)
+    )
 
 
 if __name__ == "__main__":

@@ -10,14 +10,17 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
+from oiio_msspl.schema import SCALES
+
 from .. import views
 from . import scenes
 from .assets import Assets
-from .trace import MAX_DEPTH, Camera, render_passes
+from .trace import MAX_DEPTH, Camera, PixelFilter, blackman_harris, box, render_passes
 
 _ATTEMPTS, _RENDERS = 12, 2  # cameras tried, and how many of them are rendered at most, per view
 _GOOD_REFERENCE, _WORST_REFERENCE = 27.0, 21.0  # dB, of the reference's own noise
 _BATCH = 16  # samples a pixel per wavefront: bounds the memory
+_WIDTHS = (1.0, 3.2)  # pixels, of the Blackman-Harris filter: from Blender's 1.5 and less to the 3 of others
 
 
 def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int) -> Iterator[Camera]:
@@ -38,7 +41,9 @@ def _distance(scene: mi.Scene, camera: Camera) -> float:
     return float(np.percentile(np.minimum(t, 1e3), 10))
 
 
-def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[np.ndarray, int, float] | None:
+def _reference(
+    scene: mi.Scene, camera: Camera, spp: int, seed: int, pixel_filter: PixelFilter
+) -> tuple[np.ndarray, int, float] | None:
     """The mean of `spp` samples a pixel, (H, W, 3), or of twice as many where that is noisy.
 
     Also the number of samples, and the reference's own error as an sRGB PSNR: its halves differ by twice it.
@@ -51,7 +56,9 @@ def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[np
 
     while True:
         for half in range(2):
-            passes = render_passes(scene, camera, views.SIZE, _BATCH, seed + done + half, layers=False)
+            passes = render_passes(
+                scene, camera, views.SIZE, _BATCH, seed + done + half, layers=False, pixel_filter=pixel_filter
+            )
             halves[half] += passes.sum(0, dtype=np.float64)
         done += 2 * _BATCH
         if done == 2 * _BATCH and quality() + 10 * np.log10(2 * spp / done) < _WORST_REFERENCE:
@@ -60,32 +67,47 @@ def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[np
             return halves.sum(0) / done, done, quality()
 
 
+def _lrhs(scene: mi.Scene, camera: Camera, scale: int, seed: int, pixel_filter: PixelFilter) -> np.ndarray:
+    """`lr` passes at 1/scale of the resolution, of scale² times the samples."""
+    groups = []
+    for spp in views.LR_SPP:
+        passes = render_passes(
+            scene, camera, views.SIZE // scale, scale**2 * spp, seed, layers=False, pixel_filter=pixel_filter
+        )
+        groups.append(passes.mean(0))
+        seed += 1
+    return np.stack(groups)
+
+
 def render_view(
-    scene: mi.Scene, plan: scenes.Scene, camera: Camera, seed: int, view: int, ref_spp: int
+    scene: mi.Scene, plan: scenes.Scene, camera: Camera, seed: int, view: int, ref_spp: int, filter_name: str
 ) -> dict[str, np.ndarray] | None:
     """All arrays of one training file as the package's docstring has them; None if it will not converge."""
     rng = np.random.default_rng([seed, view, 7])
     # A stretch of 1000 seeds for each of the independent renders.
     base = [int(s) * 1000 for s in rng.choice(4_000_000, 3, replace=False)]
-    found = _reference(scene, camera, ref_spp, base[0])
+    width = float(np.random.default_rng([seed, 8]).uniform(*_WIDTHS))  # one renderer's, for all views of a scene
+    pixel_filter = box if filter_name == "box" else blackman_harris(width)
+    found = _reference(scene, camera, ref_spp, base[0], pixel_filter)
     if found is None:
         return None
     ref, spent, quality = found
-    hr = render_passes(scene, camera, views.SIZE, views.HR_PASSES, base[1])
-    passes = render_passes(scene, camera, views.SIZE, sum(views.LR_SPP), base[2], layers=False)
-    groups = np.split(passes, np.cumsum(views.LR_SPP)[:-1])
-    lr = np.stack([g.mean(0) for g in groups])
+    hr = render_passes(scene, camera, views.SIZE, views.HR_PASSES, base[1], pixel_filter=pixel_filter)
+    # The box averages of samples at full resolution serve every scale, those of a wider filter none.
+    scales = (1,) if pixel_filter is box else SCALES
+    lr = {scale: _lrhs(scene, camera, scale, base[2] + 100 * scale, pixel_filter) for scale in scales}
 
     meta = {
         "seed": seed, "view": view, "split": views.split(seed), "generator": scenes.VERSION, "kind": plan.kind,
         "renderer": f"Mitsuba {mi.__version__}, variant {mi.variant()}, own path tracer, {MAX_DEPTH} bounces",
-        "sampler": "independent", "filter": "box", "ref_spp": spent, "ref_psnr": quality,
+        "sampler": "independent", "filter": filter_name if pixel_filter is box else f"{filter_name} {width:.2f}",
+        "ref_spp": spent, "ref_psnr": quality,
         "assets": sorted(plan.sources), "camera": camera.__dict__,
     }  # fmt: skip
     return views.pack(hr, lr, ref, rng, meta)
 
 
-def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int) -> tuple[int, str]:
+def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int, filter_name: str) -> tuple[int, str]:
     """Write the missing ones of a scene's first views; return how many were written and the kind of the scene."""
     missing = [v for v in range(count) if not views.path_of(out, "mitsuba", seed, v).exists()]
     if not missing:
@@ -93,7 +115,8 @@ def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int)
     scene, plan = scenes.build(seed, assets)
     written = 0
     for view in missing:
-        renders = (render_view(scene, plan, c, seed, view, ref_spp) for c in find_cameras(scene, plan, seed, view))
+        cameras = find_cameras(scene, plan, seed, view)
+        renders = (render_view(scene, plan, c, seed, view, ref_spp, filter_name) for c in cameras)
         arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
         if arrays is None:
             continue

@@ -28,7 +28,7 @@ from benchmarks import scenes
 from benchmarks.scenes import NOISY_REFERENCE, beauty
 from oiio_msspl import fuse, schema, tensors, transforms
 from oiio_msspl.comparison import scores, upsample_bicubic
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.denoiser import Denoiser, aovs_of_lrhs
 from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import Source
 from oiio_msspl.session import Session, find_model, shipped_models
@@ -78,7 +78,9 @@ def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
     exposure = transforms.exposure_of(low)
     layers = tensors.read(hrls, hrls.data_window, hrls.data_window)
     packed = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
-    return transforms.expand(denoiser.together(transforms.compress(low, exposure), packed), exposure)
+    names = aovs_of_lrhs(packed.shape[0] // low.shape[0])
+    low_aovs = tensors.read(lrhs, lrhs.data_window, lrhs.data_window, features=names) if names else {}
+    return transforms.expand(denoiser.together(transforms.compress(low, exposure), packed, low_aovs), exposure)
 
 
 def flip_of(image: np.ndarray, reference: np.ndarray) -> float:

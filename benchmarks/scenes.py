@@ -92,8 +92,13 @@ def of_view(view: data.View) -> Scene:
 
     def lrhs(scale: int, spp: int) -> Source:
         chosen = np.flatnonzero(view.lr_spp == spp)[:1]
-        image = transforms.box_downsample(data.mean_lrhs(view, chosen) * exposure, scale)
-        return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image)
+        image = data.mean_lrhs(view, chosen, scale) * exposure
+        # The last passes, which no HRLS has at the same average
+        features = data.split_features(
+            data.read_hrls(view, list(range(len(view.hr)))[-spp:], whole, whole).mean(axis=0)
+        )
+        layers = {name: transforms.box_downsample(features[name], scale) for name in (schema.ALBEDO, schema.NORMAL)}
+        return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image, **layers)
 
     def nearest(scale: int, spp: int) -> Source | None:
         passes = range(len(view.lr_spp))
@@ -101,7 +106,7 @@ def of_view(view: data.View) -> Scene:
         chosen = next((list(c) for c in subsets if view.lr_spp[list(c)].sum() == scale**2 * spp), None)
         if chosen is None:
             return None
-        image = data.mean_lrhs(view, chosen)[scale // 2 :: scale, scale // 2 :: scale] * exposure
+        image = data.mean_lrhs(view, chosen, scale, nearest=True) * exposure
         return Render.from_arrays(f"{view.path.name}, x{scale} nearest", rgb=image)
 
     return Scene(view.scene, reference * exposure, hrls, lrhs, nearest)

@@ -107,10 +107,11 @@ def check(scene, options):
 
 
 def _common(scene, options):
-    """Noise that is independent from pixel to pixel, unbiased and unfiltered, written losslessly."""
+    """What is read of either render, with noise that is independent from pixel to pixel, unbiased, as numbers."""
     image = scene.render.image_settings
     one = layer(scene, options)
     values = {f"{_path(each)}.use": each == one for each in scene.view_layers}
+    values |= {f"{_path(one)}.{name}": True for name in PASSES}
     values |= {
         "cycles.use_denoising": False,
         "cycles.use_adaptive_sampling": False,
@@ -168,12 +169,11 @@ def low(scene, options):
 def high(scene, options):
     """Settings of the HRLS."""
     width, height = high_size(scene)
-    path = _path(layer(scene, options))
-    return (
-        _common(scene, options)
-        | {"render.resolution_x": width, "render.resolution_y": height, "cycles.samples": options.hr_spp}
-        | {f"{path}.{name}": True for name in PASSES}
-    )
+    return _common(scene, options) | {
+        "render.resolution_x": width,
+        "render.resolution_y": height,
+        "cycles.samples": options.hr_spp,
+    }
 
 
 def plain(scene, options, spp):

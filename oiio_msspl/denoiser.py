@@ -5,7 +5,8 @@ optional.
 The HRLS is denoised as anyone would, with its albedo and normal. The LRHS has neither; but its light and the HRLS's are
 independent samples of the same scene, so at the LRHS's resolution their mean has less noise than either, and the
 HRLS's albedo and normal, averaged over s x s pixels, have hardly any: Open Image Denoise may be told that they are
-clean, which is worth 0.8 to 1.5 dB (at x2 the albedo is denoised first, or nothing is told). What it makes of these is
+clean, which is worth 0.8 to 1.5 dB (at x2 the LRHS's own help, and the albedo is denoised first, or nothing is told).
+What it makes of these is
 better at that resolution than its result on the HRLS, for a fraction of the time. A network of ours that was made of
 Open Image Denoise's does the same without its help.
 """
@@ -33,6 +34,7 @@ log = logging.getLogger(__name__)
 
 #: A picture to denoise: ``colour`` in network values, ``albedo`` in [0, 1] and ``normal`` in [-1, 1]; (h, w, 3) each.
 Layers = dict[str, Array]
+NO_LAYERS: Layers = {}
 
 _OF_LRHS, _OF_HRLS = sum(schema.LRHS_FEATURES.values()), sum(schema.HRLS_FEATURES.values())
 _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.values()]), strict=False))
@@ -40,6 +42,10 @@ _FIRST = dict(zip(schema.HRLS_FEATURES, np.cumsum([0, *schema.HRLS_FEATURES.valu
 
 #: Bounds of the LRHS's share in what is denoised at its resolution: an estimate that wants all or none may be wrong.
 _SHARE = (0.05, 0.95)
+#: Mean squared difference of an LRHS's layer from the HRLS's, as a share of the latter's variance (and so much more),
+#: above which it is another one. Of 60 views with 1 spp in either render one in ten has more than 0.2 (albedo) and 0.1
+#: (normal) at x2; with the LRHS's mirrored one in twenty is below 0.55.
+_OTHER, _NOTHING = 0.5, 4e-4
 #: What the noise of both renders' mean is written in.
 NOISE_GAIN = 2.0
 #: Largest mean difference in network values between Open Image Denoise and itself in 8 bits, on a small picture.
@@ -172,12 +178,13 @@ class Denoiser:
         # Quality high would take four times as long and gain nothing
         self.albedo = filter_("fast", "albedo", hdr=False)
 
-    def __call__(self, lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+    def __call__(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> tuple[Array, Array]:
         """Denoise a pair as the network sees it.
 
         Args:
             lrhs: (h, w, 3), transformed.
             hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`.
+            low_aovs: see :func:`merged`.
 
         Returns:
             Both with what was denoised as further channels, transformed colour: (h, w, 6), the LRHS with both renders
@@ -187,43 +194,40 @@ class Denoiser:
             MssplError: Open Image Denoise failed.
         """
         low, high = _with_room(lrhs), _with_room(hrls)
-        self.fill(low, high)
+        self.fill(low, high, low_aovs)
         return low, high
 
-    def fill(self, lrhs: Array, hrls: Array) -> None:
+    def fill(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> None:
         """The same in place: what is denoised is written behind the renders' own channels, which must have room for it.
 
         Args:
             lrhs: (h, w, 6).
             hrls: (s*h, s*w, 19).
+            low_aovs: see :func:`merged`.
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
         layers = layers_of(hrls)
-        self.both(self.merged(lrhs[..., :_OF_LRHS], layers), lrhs[..., _OF_LRHS:])
+        self.both(self.merged(lrhs[..., :_OF_LRHS], layers, low_aovs), lrhs[..., _OF_LRHS:])
         self.hrls(layers, hrls[..., _OF_HRLS:])
 
-    def together(self, lrhs: Array, hrls: Array) -> Array:
+    def together(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> Array:
         """Of the same arguments, both renders denoised together at the LRHS's resolution, network values (h, w, 3).
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
-        return self.both(self.merged(lrhs, layers_of(hrls)))
+        return self.both(self.merged(lrhs, layers_of(hrls), low_aovs))
 
-    def merged(self, lrhs: Array, layers: Layers) -> Layers:
-        """What is denoised together: the mean of both renders that has the least noise, and layers to go with it.
-
-        Args:
-            lrhs: (h, w, 3), transformed.
-            layers: of the HRLS, see :func:`layers_of`.
+    def merged(self, lrhs: Array, layers: Layers, low_aovs: Layers = NO_LAYERS) -> Layers:
+        """What is denoised together: as :func:`merged`, but with layers that have no noise.
 
         Raises:
             MssplError: Open Image Denoise failed.
         """
         scale = layers["colour"].shape[0] // lrhs.shape[0]
-        low = merged(lrhs, layers)
+        low = merged(lrhs, layers, low_aovs)
         del low["noise"]
         if scale == 2 and "albedo" in low:
             low["albedo"] = self.albedo({"albedo": low["albedo"]})
@@ -244,23 +248,25 @@ class Together:
     def __init__(self, threads: int = 0) -> None:
         self._network = EightBit("together", installed_weights("large"), threads)
 
-    def __call__(self, lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+    def __call__(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> tuple[Array, Array]:
         """Denoise a pair as the network sees it.
 
         Args:
             lrhs: (h, w, 3), transformed.
             hrls: (s*h, s*w, 9) or more, transformed: colour, albedo, normal.
+            low_aovs: see :func:`merged`.
 
         Returns:
             The LRHS with what was denoised as further channels, transformed colour: (h, w, 6); and the HRLS.
         """
         low = _with_room(lrhs)
-        self.fill(low, hrls)
+        self.fill(low, hrls, low_aovs)
         return low, hrls
 
-    def fill(self, lrhs: Array, hrls: Array) -> None:
+    def fill(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> None:
         """The same in place, of an LRHS (h, w, 6): what is denoised is written behind its own channels."""
-        self._network(**merged(lrhs[..., :_OF_LRHS], layers_of(hrls, complete=True)), out=lrhs[..., _OF_LRHS:])
+        low = merged(lrhs[..., :_OF_LRHS], layers_of(hrls, complete=True), low_aovs)
+        self._network(**low, out=lrhs[..., _OF_LRHS:])
 
 
 def for_model(mode: str, threads: int, *, exact: bool = False) -> Denoiser | Together | None:
@@ -270,16 +276,18 @@ def for_model(mode: str, threads: int, *, exact: bool = False) -> Denoiser | Tog
     return Denoiser(threads, exact=exact) if mode else None
 
 
-def merged(lrhs: Array, layers: Layers) -> Layers:
+def merged(lrhs: Array, layers: Layers, low_aovs: Layers = NO_LAYERS) -> Layers:
     """The mean of both renders that has the least noise, at the LRHS's resolution.
 
     Args:
         lrhs: (h, w, 3), transformed.
         layers: of the HRLS, see :func:`layers_of`.
+        low_aovs: the LRHS's own ``albedo`` and ``normal``, transformed, as far as they are there.
 
     Returns:
-        ``colour``; of the layers the means; and ``noise`` (h, w, 1), what the colour's is estimated to be: how far the
-        renders differ there, in network values times ``NOISE_GAIN``, at most 1.
+        ``colour``; the means of ``albedo`` and ``normal``, as far as the HRLS has them, with the LRHS's share in them;
+        and ``noise`` (h, w, 1), what the colour's is estimated to be: how far the renders differ there, in network
+        values times ``NOISE_GAIN``, at most 1.
     """
     scale = layers["colour"].shape[0] // lrhs.shape[0]
     radiance = transforms.box_downsample(transforms.expand(layers["colour"], 1.0), scale)
@@ -290,9 +298,29 @@ def merged(lrhs: Array, layers: Layers) -> Layers:
     # Of a difference, which has both renders' noise, so much is what their mean has
     gain = np.float32(NOISE_GAIN * (share * (1 - share)) ** 0.5)
     low["noise"] = np.minimum(gain * np.abs(lrhs - other).mean(axis=-1, keepdims=True), 1)
-    return low | {
-        name: transforms.box_downsample(layers[name], scale) for name in ("albedo", "normal") if name in layers
-    }
+    for name in ("albedo", "normal"):
+        if name in layers:
+            low[name] = transforms.box_downsample(layers[name], scale)
+            if name in low_aovs:
+                other = transforms.limited(low_aovs[name], -1.0, 1.0)  # there are albedos beyond 1
+                if _shows_the_same(other, low[name]):
+                    low[name] += share * (other - low[name])
+    return low
+
+
+def _shows_the_same(layer: Array, of_hrls: Array) -> bool:
+    """Whether a layer of the LRHS can be that of the HRLS, both (h, w, 3)."""
+    variance = float(of_hrls.var(axis=(0, 1)).mean())
+    return float(np.square(layer - of_hrls).mean()) <= _OTHER * (variance + _NOTHING)
+
+
+def aovs_of_lrhs(scale: int) -> tuple[str, ...]:
+    """Layers of the LRHS that are of use at a scale.
+
+    At x2 they are worth 0.1 to 0.3 dB. At x4 and x8 the HRLS's, as means of s x s pixels, have little noise, and where
+    the renderer's pixel filter is no box, the LRHS's show other means.
+    """
+    return (schema.ALBEDO, schema.NORMAL) if scale == 2 else ()
 
 
 def installed_library() -> Path | None:

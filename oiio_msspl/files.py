@@ -9,12 +9,12 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from oiio_msspl import assemble, preview
+from oiio_msspl import assemble, preview, schema
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs import Resolution, resolve
 from oiio_msspl.assemble import WriteOptions
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr import open_exr
+from oiio_msspl.exr import ExrFile, open_exr
 from oiio_msspl.fusion import MAX_MEMORY, Fused, fuse
 from oiio_msspl.output import check_target
 from oiio_msspl.pairing import pair
@@ -51,6 +51,8 @@ class Report:
     """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
     features: frozenset[str]
     """What the model reads of the HRLS."""
+    low_aovs: tuple[str, ...] = ()
+    """What it may read of the LRHS beside colour, if it is there."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -68,6 +70,10 @@ class Report:
                 row |= {"status": "unused"}
         return rows
 
+    def aovs_of_lrhs(self) -> dict[str, str]:
+        """Of the LRHS's features beside colour, those that the model reads, and the layers that they come from."""
+        return {name: self.lr.features[name].text for name in self.low_aovs if name in self.lr.features}
+
     def as_dict(self) -> dict[str, Any]:
         return {
             "lrhs": self.lr.name,
@@ -81,6 +87,7 @@ class Report:
             "model": self.model,
             "provider": self.provider,
             "aovs": self.aovs(),
+            "lrhs_aovs": self.aovs_of_lrhs(),
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "warnings": self.warnings,
@@ -91,7 +98,7 @@ class Report:
 
 
 def resolve_pair(lr_path: str | Path, hr_path: str | Path, inputs: Inputs) -> tuple[Resolution, Resolution]:
-    """Open and map both files. Of the LRHS the network reads the beauty alone, so nothing else is looked for there.
+    """Open and map both files. Of the LRHS, albedo and normal are welcome beside the beauty, and not missed.
 
     Raises:
         InputError: one of the files can't be used, or both are the same.
@@ -100,11 +107,14 @@ def resolve_pair(lr_path: str | Path, hr_path: str | Path, inputs: Inputs) -> tu
     if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
         raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
-    rgb_only = {k: v for k, v in inputs.mapping.items() if k == "rgb"}
-    return (
-        resolve(lr_file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=()),
-        resolve(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp),
-    )
+    return _resolve_lrhs(lr_file, inputs), resolve(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+
+
+def _resolve_lrhs(file: ExrFile, inputs: Inputs) -> Resolution:
+    """Map the LRHS. The user's mapping is the HRLS's: what it names need not be in the LRHS, or is another file."""
+    features = [name for name in (schema.ALBEDO, schema.NORMAL) if name not in inputs.mapping]
+    rgb_only = {name: layer for name, layer in inputs.mapping.items() if name == schema.RGB}
+    return resolve(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
 
 
 def fuse_files(
@@ -186,6 +196,7 @@ def report_on(
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.features),
+        low_aovs=session.low_aovs,
     )
 
 

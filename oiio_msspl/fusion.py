@@ -85,7 +85,7 @@ def fuse(
 
     with bands.threads(session.threads):
         lr_repaired: dict[str, int] = {}
-        low = _read_low(lr, pairing, grid, lr_repaired)
+        low = _read_low(lr, pairing, grid, lr_repaired, [schema.RGB, *session.low_aovs, "alpha"])
         frame = low[schema.RGB][pairing.grid.slices(grid)]
         exposure = transforms.exposure_of(frame)
         warnings = checks.check(frame, hr, pairing, lr.name)
@@ -103,6 +103,7 @@ def fuse(
         seconds = session.seconds
         for done, tile in enumerate(plan):
             area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
+            part = {name: values[tile.area.slices(grid)] for name, values in low.items()}
             target, inside = core.intersect(hr_data), tile.area.slices(grid)
             layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core, features=read)
             # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
@@ -112,7 +113,7 @@ def fuse(
                 empty = _settled(dark[inside], np.all(layers[schema.RGB] == 0, axis=-1, keepdims=True), scale)
                 empty &= _bare(layers) | _enlarged(far_dark[inside], scale)
             if empty is None or not empty.all():
-                lights, features = _without_fireflies(low[schema.RGB][inside], layers, scale)
+                lights, features = _without_fireflies(part[schema.RGB], layers, scale)
                 lrhs = tensors.pack(lights, schema.LRHS_FEATURES, exposure, len(contract.lrhs))
                 hrls = tensors.pack(features, contract.features, exposure, len(contract.hrls))
                 seen = tile.area.intersect(pairing.grid).slices(tile.area)  # what lies beyond is made up
@@ -120,7 +121,7 @@ def fuse(
                 if all(_converged(lrhs, features[schema.RGB], exposure, seen, step) for step in (32, 1)):
                     results: tuple[Array, Array | None] = hrls[..., :3], np.zeros_like(hrls[..., :1])
                 else:
-                    results = session.run(lrhs, hrls, error=error)
+                    results = session.run(lrhs, hrls, _low_aovs(part, session), error=error)
                 values, deviation = results
                 colour = rgb[target.slices(hr_data)]
                 transforms.expand(values[target.slices(area)], exposure, colour)
@@ -134,8 +135,7 @@ def fuse(
             if "alpha" in layers:
                 if alpha is None:
                     alpha = np.empty((hr_data.height, hr_data.width, 1), dtype=np.float32)
-                low_alpha = low["alpha"][inside] if "alpha" in low else None
-                alpha[target.slices(hr_data)] = _fuse_alpha(low_alpha, layers, session, scale)[target.slices(area)]
+                alpha[target.slices(hr_data)] = _fuse_alpha(part, layers, session, scale)[target.slices(area)]
             if progress is not None:
                 progress(done + 1, len(plan))
     if alpha is not None and "alpha" not in low:
@@ -160,9 +160,10 @@ def _linear_error(values: Array, deviation: Array, exposure: float) -> Array:
     return transforms.expand(middle + deviation, exposure) - transforms.expand(middle, exposure)
 
 
-def _read_low(lr: Source, pairing: Pairing, grid: Window, repaired: dict[str, int]) -> dict[str, Array]:
-    """Colour and alpha of the LRHS over ``grid``, resampled where an odd size was rounded."""
-    names = [schema.RGB, "alpha"]
+def _read_low(
+    lr: Source, pairing: Pairing, grid: Window, repaired: dict[str, int], names: list[str]
+) -> dict[str, Array]:
+    """Layers of the LRHS, those that are there, over ``grid``, resampled where an odd size was rounded."""
     if pairing.stretch == (1.0, 1.0):
         return tensors.read(lr, grid, pairing.lr_data, counts=repaired, counted=grid, features=names)
     whole = pairing.lr_data
@@ -236,24 +237,30 @@ def _ceiling(low: Array) -> Array:
         return np.where(highest > 0, highest * np.float32(BRIGHTEST), np.float32(np.inf))
 
 
-def _fuse_alpha(low: Array | None, high: dict[str, Array], session: Session, scale: int) -> Array:
-    """Coverage through the same network, as a grey picture with the HRLS's albedo and normal; (h, w, 1) in [0, 1].
+def _low_aovs(low: dict[str, Array], session: Session) -> dict[str, Array]:
+    """What the session reads of the LRHS's layers beside colour, transformed."""
+    return {name: transforms.forward(name, low[name], 1.0) for name in session.low_aovs if name in low}
+
+
+def _fuse_alpha(low: dict[str, Array], high: dict[str, Array], session: Session, scale: int) -> Array:
+    """Coverage through the same network, as a grey picture with albedo and normal; (h, w, 1) in [0, 1].
 
     Where both renders agree that a pixel and its surroundings are wholly covered, or wholly empty, it stays exactly so;
     a tile that is all one or all the other never reaches the network.
     """
     alpha = np.clip(high["alpha"], 0.0, 1.0)
-    if low is None:
+    if "alpha" not in low:
         return alpha
-    low = np.clip(low, 0.0, 1.0)
-    solid, empty = _settled(low == 1, alpha == 1, scale), _settled(low == 0, alpha == 0, scale)
+    of_low = np.clip(low["alpha"], 0.0, 1.0)
+    solid, empty = _settled(of_low == 1, alpha == 1, scale), _settled(of_low == 0, alpha == 0, scale)
     if (solid | empty).all():
         return solid.astype(np.float32)
     grey = {name: values for name, values in high.items() if name in (schema.ALBEDO, schema.NORMAL)}
     grey[schema.RGB] = np.repeat(alpha, 3, axis=-1)
     contract = session.contract
-    lrhs = tensors.pack({schema.RGB: np.repeat(low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0, len(contract.lrhs))
-    values, _ = session.run(lrhs, tensors.pack(grey, contract.features, 1.0, len(contract.hrls)))
+    lrhs = tensors.pack({schema.RGB: np.repeat(of_low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0, len(contract.lrhs))
+    hrls = tensors.pack(grey, contract.features, 1.0, len(contract.hrls))
+    values, _ = session.run(lrhs, hrls, _low_aovs(low, session))
     fused = np.clip(transforms.expand(values, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from oiio_msspl import runtime
 from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import eight_bits_work, for_model, installed_weights
+from oiio_msspl.denoiser import NO_LAYERS, Layers, aovs_of_lrhs, eight_bits_work, for_model, installed_weights
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.render import Array
 
@@ -115,13 +115,21 @@ class Session:
         if "log_error" not in self._outputs:
             raise InputError(f"model {self.contract.name} does not predict its error; choose another --model")
 
-    def run(self, lrhs: Array, hrls: Array, *, error: bool = False) -> tuple[Array, Array | None]:
+    @property
+    def low_aovs(self) -> tuple[str, ...]:
+        """Layers that are read of the LRHS, beside its colour."""
+        return aovs_of_lrhs(self.contract.scale) if self._denoiser is not None else ()
+
+    def run(
+        self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS, *, error: bool = False
+    ) -> tuple[Array, Array | None]:
         """Evaluate the network.
 
         Args:
             lrhs: (h, w, 3), transformed.
             hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.schema.HRLS_FEATURES`. What else the
                 contract lists for either is made here; in place, if both have room for it.
+            low_aovs: those of :attr:`low_aovs` that are there, transformed, (h, w, 3) each.
             error: also return the error, of a model that predicts it.
 
         Returns:
@@ -131,9 +139,9 @@ class Session:
         start = time.perf_counter()
         if self._denoiser is not None:
             if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
-                self._denoiser.fill(lrhs, hrls)
+                self._denoiser.fill(lrhs, hrls, low_aovs)
             else:
-                lrhs, hrls = self._denoiser(lrhs, hrls)
+                lrhs, hrls = self._denoiser(lrhs, hrls, low_aovs)
                 hrls = hrls[..., : len(self.contract.hrls)]
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),

@@ -120,3 +120,22 @@ def test_without_the_package_the_way_out_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     with pytest.raises(InputError, match="pip install pyoidn, or choose another --model"):
         Denoiser()
+
+
+def test_the_layers_of_the_lrhs_take_noise_out_of_the_means():
+    """By as many samples as it has; those of another picture, or of none, are left alone."""
+    clean = 0.3 + 0.4 * picture(192, 192).clip(0, 1)
+
+    def mean(image):
+        return transforms.box_downsample(image, 2)
+
+    layers = {"colour": transforms.compress(noisy(clean, 4), 1.0), "albedo": noisy(clean, 16, seed=2)}
+    lrhs = small(noisy(clean, 4, seed=1))
+    alone = merged(lrhs, layers)
+    both = merged(lrhs, layers, {"albedo": mean(noisy(clean, 16, seed=3)), "normal": mean(clean)})
+    assert "normal" not in both
+    error, before = (np.square(image["albedo"] - mean(clean)).mean() for image in (both, alone))
+    assert error == pytest.approx(before / 2, rel=0.15)
+    rng = np.random.default_rng(4)
+    for other in (mean(clean)[:, ::-1], rng.random((96, 96, 3), dtype=np.float32), np.zeros((96, 96, 3), np.float32)):
+        np.testing.assert_array_equal(merged(lrhs, layers, {"albedo": other})["albedo"], alone["albedo"])

@@ -9,9 +9,12 @@ import numpy as np
 import pytest
 
 from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, fuse_files, schema, session, transforms
+from oiio_msspl.aovs import resolve
 from oiio_msspl.contract import Contract
 from oiio_msspl.denoiser import Denoiser, Together, layers_of
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr import open_exr
+from oiio_msspl.files import Inputs
 from tests.conftest import noisy, picture, rgb, write_exr
 
 JOINT = [f"joint-x{scale}" for scale in schema.SCALES]
@@ -115,6 +118,36 @@ def test_what_it_does_not_read_is_said_to_be_unused(tmp_path):
     assert rows["albedo"][0] == "found" and rows["normal"][0] == "default"
     assert rows["diffuse"] == ("unused", "diffuse")
     assert rows["variance"] == ("unused", "")
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_albedo_and_normal_of_the_lrhs_are_read_at_x2(tmp_path, scale):
+    """And are said to be; but for what the user maps to a layer of the HRLS."""
+    pytest.importorskip("pyoidn")
+    clean = picture(64, 64)
+    albedo = clean.clip(0, 1)
+    low = transforms.box_downsample(noisy(clean, 4, seed=1), scale)
+    for name, more in (("bare", {}), ("lr", rgb(transforms.box_downsample(albedo, scale), "albedo."))):
+        write_exr(tmp_path / f"{name}.exr", rgb(low) | more)
+    write_exr(tmp_path / "hr.exr", rgb(noisy(clean, 4)) | rgb(noisy(albedo, 16, seed=2).clip(0, 1), "albedo."))
+
+    def fused(name, **mapping):
+        report = fuse_files(
+            tmp_path / f"{name}.exr",
+            tmp_path / "hr.exr",
+            tmp_path / "out.exr",
+            inputs=Inputs(mapping),
+            model="joint",
+            overwrite=True,
+        )
+        out = open_exr(tmp_path / "out.exr")
+        return report.as_dict()["lrhs_aovs"], resolve(out).read(out.parts[0].data_window, ["rgb"])["rgb"]
+
+    (none, bare), (found, helped), (unread, mapped) = fused("bare"), fused("lr"), fused("lr", albedo="albedo")
+    assert none == unread == {}
+    assert found == ({"albedo": "albedo"} if scale == 2 else {})
+    assert (helped != bare).any() == (scale == 2)
+    np.testing.assert_array_equal(mapped, bare)
 
 
 # Making them

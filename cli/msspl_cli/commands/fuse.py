@@ -214,6 +214,8 @@ def _print(report: Report, seconds: float) -> None:
     spp = report.spp_avg
     print(f"{report.hr.renderer} pair at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
     show.aov_table(report.aovs(), report.hr.notes)
+    if of_lrhs := report.aovs_of_lrhs():
+        print("  of the LRHS, too: " + ", ".join(f"{name} {layer}" for name, layer in of_lrhs.items()))
     if report.repaired:
         what = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())
         print(f"repaired values that were NaN, infinite or negative: {what}")

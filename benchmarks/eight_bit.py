@@ -18,17 +18,18 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from benchmarks import scenes
 from benchmarks.runtime import frame
 from oiio_msspl import Render, Session, find_model, fuse, metrics, schema, tensors, transforms
 from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser, layers_of
+from oiio_msspl.denoiser import NO_LAYERS, Denoiser, Layers, layers_of, merged
 from oiio_msspl.pairing import Source
 from oiio_msspl.render import Array
 from training import data, export
-from training.joint import with_mean
+from training.joint import JointFusion
 from training.train import to_tensor
 
 SPP = (1, 2, 4)
@@ -69,12 +70,18 @@ class InTorch(Session):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        self._network, _ = export.load(CHECKPOINT)
+        network, _ = export.load(CHECKPOINT)
+        assert isinstance(network, JointFusion)
+        self._network = network
 
-    def run(self, lrhs: Array, hrls: Array, *, error: bool = False) -> tuple[Array, Array | None]:
-        images = with_mean(lrhs[..., :3], hrls)
+    def run(
+        self, lrhs: Array, hrls: Array, *, low_aovs: Layers = NO_LAYERS, error: bool = False
+    ) -> tuple[Array, Array | None]:
+        light = lrhs[..., :3]
+        together = self._network.together.denoised(merged(light, layers_of(hrls, complete=True), low_aovs))
+        images = np.concatenate([light, together], axis=-1), hrls
         with torch.inference_mode():
-            fused, _ = self._network(*(to_tensor(image[None], torch.device("cpu")) for image in images))
+            fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
         return fused[0].permute(1, 2, 0).numpy(), None
 
 

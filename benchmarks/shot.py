@@ -16,7 +16,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import platform
 import statistics
 import tempfile
 import time
@@ -24,7 +23,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.runtime import in_process, peak_mb, write_frame
+from benchmarks.runtime import in_process, peak_mb, processor, write_frame
 
 
 def make_shot(folder: Path, count: int, width: int, height: int, scale: int) -> None:
@@ -132,7 +131,7 @@ def main() -> None:
         args.json.parent.mkdir(parents=True, exist_ok=True)
         summary = {"ratio": wall / alone[slowest], "wall": wall, "alone": alone, "peak_mb": [peak_early, peak_late]}
         settings = {k: getattr(args, k) for k in ("frames", "size", "scale", "device", "threads")}
-        machine = {"machine": platform.processor(), "cores": os.cpu_count()}
+        machine = {"machine": processor(), "cores": os.cpu_count()}
         args.json.write_text(json.dumps({**settings, **machine, **summary, "rounds": rounds}, indent=1))
 
 

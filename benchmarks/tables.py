@@ -85,7 +85,8 @@ def runtime() -> str:
     for name in [*models(), OIDN, "OIDN 2.5.1, quality fast"]:
         seconds = np.median(results[name]["seconds"])
         body.append([code(name), f"{seconds:.2f}", f"{seconds / base:.2f}", f"{results[name]['peak_mb']:.0f}"])
-    return table(["1024 x 1024, two CPU cores", "median s", "of OIDN's time", "peak MB"], body)
+    machine = result("runtime")["machine"]
+    return table([f"1024 x 1024, two cores of an {machine}", "median s", "of OIDN's time", "peak MB"], body)
 
 
 def scenes() -> str:

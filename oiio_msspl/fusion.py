@@ -121,7 +121,7 @@ def fuse(
                 if all(_converged(lrhs, features[schema.RGB], exposure, seen, step) for step in (32, 1)):
                     results: tuple[Array, Array | None] = hrls[..., :3], np.zeros_like(hrls[..., :1])
                 else:
-                    results = session.run(lrhs, hrls, _low_aovs(part, session), error=error)
+                    results = session.run(lrhs, hrls, low_aovs=_low_aovs(part, session), error=error)
                 values, deviation = results
                 colour = rgb[target.slices(hr_data)]
                 transforms.expand(values[target.slices(area)], exposure, colour)
@@ -260,7 +260,7 @@ def _fuse_alpha(low: dict[str, Array], high: dict[str, Array], session: Session,
     contract = session.contract
     lrhs = tensors.pack({schema.RGB: np.repeat(of_low, 3, axis=-1)}, schema.LRHS_FEATURES, 1.0, len(contract.lrhs))
     hrls = tensors.pack(grey, contract.features, 1.0, len(contract.hrls))
-    values, _ = session.run(lrhs, hrls, _low_aovs(low, session))
+    values, _ = session.run(lrhs, hrls, low_aovs=_low_aovs(low, session))
     fused = np.clip(transforms.expand(values, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 

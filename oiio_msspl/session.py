@@ -121,7 +121,7 @@ class Session:
         return aovs_of_lrhs(self.contract.scale) if self._denoiser is not None else ()
 
     def run(
-        self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS, *, error: bool = False
+        self, lrhs: Array, hrls: Array, *, low_aovs: Layers = NO_LAYERS, error: bool = False
     ) -> tuple[Array, Array | None]:
         """Evaluate the network.
 

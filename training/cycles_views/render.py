@@ -20,7 +20,7 @@ _ATTEMPTS, _RENDERS = 12, 2  # cameras tried, and how many of them are rendered 
 # Samples are added until a reference's own noise is this good [dB], up to some times `ref_spp`; one that is then still
 # worse than the second figure is not used. Noise in what a network learns from has no mean and many scenes teach more
 # than clean ones; what it is judged by must be clean.
-_REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (33.0, 30.0, 12)}
+_REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
 _LIGHT_PASSES = (
     "diffuse_direct",
     "diffuse_indirect",

@@ -69,14 +69,9 @@ def _reference(
 
 def _lrhs(scene: mi.Scene, camera: Camera, scale: int, seed: int, pixel_filter: PixelFilter) -> np.ndarray:
     """`lr` passes at 1/scale of the resolution, of scale² times the samples."""
-    groups = []
-    for spp in views.LR_SPP:
-        passes = render_passes(
-            scene, camera, views.SIZE // scale, scale**2 * spp, seed, layers=False, pixel_filter=pixel_filter
-        )
-        groups.append(passes.mean(0))
-        seed += 1
-    return np.stack(groups)
+    size, more = views.SIZE // scale, {"layers": False, "pixel_filter": pixel_filter}
+    renders = (render_passes(scene, camera, size, scale**2 * n, seed + i, **more) for i, n in enumerate(views.LR_SPP))
+    return np.stack([passes.mean(0) for passes in renders])
 
 
 def render_view(

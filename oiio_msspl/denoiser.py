@@ -5,8 +5,8 @@ optional.
 The HRLS is denoised as anyone would, with its albedo and normal. The LRHS has neither; but its light and the HRLS's are
 independent samples of the same scene, so at the LRHS's resolution their mean has less noise than either, and the
 HRLS's albedo and normal, averaged over s x s pixels, have hardly any: Open Image Denoise may be told that they are
-clean, which is worth 0.8 to 1.5 dB (at x2 the LRHS's own help, and the albedo is denoised first, or nothing is told).
-What it makes of these is
+clean, which is worth 0.8 to 1.5 dB (at x2, where but four pixels are averaged, the LRHS's own are, too, and the albedo
+is denoised first, or nothing is told). What it makes of these is
 better at that resolution than its result on the HRLS, for a fraction of the time. A network of ours that was made of
 Open Image Denoise's does the same without its help.
 """

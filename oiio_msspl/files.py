@@ -70,8 +70,8 @@ class Report:
                 row |= {"status": "unused"}
         return rows
 
-    def aovs_of_lrhs(self) -> dict[str, str]:
-        """Of the LRHS's features beside colour, those that the model reads, and the layers that they come from."""
+    def found_low_aovs(self) -> dict[str, str]:
+        """Those of ``low_aovs`` that the LRHS has, and the layers that they come from."""
         return {name: self.lr.features[name].text for name in self.low_aovs if name in self.lr.features}
 
     def as_dict(self) -> dict[str, Any]:
@@ -87,7 +87,7 @@ class Report:
             "model": self.model,
             "provider": self.provider,
             "aovs": self.aovs(),
-            "lrhs_aovs": self.aovs_of_lrhs(),
+            "lrhs_aovs": self.found_low_aovs(),
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "warnings": self.warnings,

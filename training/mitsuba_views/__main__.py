@@ -12,7 +12,10 @@ def main() -> int:
     parser = views.parser("training.mitsuba_views", ref_spp=96)
     parser.add_argument("--variant", default=mitsuba_start.VARIANT)
     parser.add_argument(
-        "--filter", choices=views.FILTERS, default="box", help="the LRHS's at its own resolution; 1 to 3.2 pixels wide"
+        "--filter",
+        choices=views.FILTERS,
+        default="box",
+        help="either render's; blackman-harris: 1 to 3.2 of its own pixels wide",
     )
     args = parser.parse_args()
     mitsuba_start.start(args.threads, args.variant)

@@ -214,7 +214,7 @@ def _print(report: Report, seconds: float) -> None:
     spp = report.spp_avg
     print(f"{report.hr.renderer} pair at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
     show.aov_table(report.aovs(), report.hr.notes)
-    if of_lrhs := report.aovs_of_lrhs():
+    if of_lrhs := report.found_low_aovs():
         print("  of the LRHS, too: " + ", ".join(f"{name} {layer}" for name, layer in of_lrhs.items()))
     if report.repaired:
         what = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())

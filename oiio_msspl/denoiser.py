@@ -317,7 +317,7 @@ def _shows_the_same(layer: Array, of_hrls: Array) -> bool:
 def aovs_of_lrhs(scale: int) -> tuple[str, ...]:
     """Layers of the LRHS that are of use at a scale.
 
-    At x2 they are worth 0.1 to 0.3 dB. At x4 and x8 the HRLS's, as means of s x s pixels, have little noise, and where
+    At x2 they are worth up to 0.3 dB. At x4 and x8 the HRLS's, as means of s x s pixels, have little noise, and where
     the renderer's pixel filter is no box, the LRHS's show other means.
     """
     return (schema.ALBEDO, schema.NORMAL) if scale == 2 else ()

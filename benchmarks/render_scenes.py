@@ -89,7 +89,7 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--filter", choices=views.FILTERS, default="blackman-harris")
-    parser.add_argument("--reference", type=int, default=2048, help="spp; with 320, nearly half of all error was their noise")
+    parser.add_argument("--reference", type=int, default=2048, help="spp")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
     mitsuba_start.start(args.threads)

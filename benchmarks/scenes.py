@@ -104,7 +104,7 @@ def of_view(view: data.View) -> Scene:
         passes = range(len(view.lr_spp))
         subsets = itertools.chain.from_iterable(itertools.combinations(passes, n) for n in range(1, len(passes) + 1))
         chosen = next((list(c) for c in subsets if view.lr_spp[list(c)].sum() == scale**2 * spp), None)
-        if chosen is None:
+        if chosen is None or 1 not in view.lr:  # rendered at 1/s of the resolution, it has no single pixels
             return None
         image = data.mean_lrhs(view, chosen, scale, nearest=True) * exposure
         return Render.from_arrays(f"{view.path.name}, x{scale} nearest", rgb=image)

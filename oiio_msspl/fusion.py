@@ -103,8 +103,8 @@ def fuse(
         seconds = session.seconds
         for done, tile in enumerate(plan):
             area, core = _scaled(tile.area, scale), _scaled(tile.core, scale)
-            part = {name: values[tile.area.slices(grid)] for name, values in low.items()}
             target, inside = core.intersect(hr_data), tile.area.slices(grid)
+            part = {name: values[inside] for name, values in low.items()}
             layers = tensors.read(hr, area, hr_data, counts=hr_repaired, counted=core, features=read)
             # Where neither render has any light, not even around, none is invented: a transparent film stays empty. A
             # surface may be so dark that hardly a sample finds light; there, that takes more to believe.

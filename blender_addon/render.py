@@ -107,8 +107,8 @@ def check(scene, options):
 
 
 def _common(scene, options):
-    """What is read of either render, and noise that is independent from pixel to pixel, unbiased and unfiltered, written
-    losslessly."""
+    """What is read of either render, and noise that is independent from pixel to pixel, unbiased and unfiltered; all of
+    it written losslessly."""
     image = scene.render.image_settings
     one = layer(scene, options)
     values = {f"{_path(each)}.use": each == one for each in scene.view_layers}

@@ -11,7 +11,7 @@ With arrays instead of files:
     hr = Render.from_arrays("hr", rgb=high, albedo=albedo)      # (s*h, s*w, 3)
     fused = fuse(lr, hr, Session(find_model(scale=4))).rgb
 
-Names are imported when they are first used: ``import oiio_msspl`` costs next to nothing.
+A name's module is imported when the name is first used, so that ``import oiio_msspl`` is fast.
 """
 
 from __future__ import annotations
@@ -22,50 +22,53 @@ from typing import TYPE_CHECKING, Any
 from oiio_msspl._version import __version__
 
 if TYPE_CHECKING:
-    from oiio_msspl.aovs import Resolution, resolve
-    from oiio_msspl.assemble import WriteOptions
-    from oiio_msspl.contract import Contract
+    from oiio_msspl.aovs.mapped_render import MappedRender
+    from oiio_msspl.aovs.matching import map_render
     from oiio_msspl.errors import InputError, MssplError
-    from oiio_msspl.exr import open_exr
-    from oiio_msspl.files import Inputs, Report, fuse_files
-    from oiio_msspl.fusion import Fused, fuse
-    from oiio_msspl.render import Render, Window
-    from oiio_msspl.session import Session, find_model, shipped_models
-    from oiio_msspl.shot import FrameResult, ShotReport, fuse_shot
+    from oiio_msspl.exr.reader import open_exr
+    from oiio_msspl.exr.render import Render, Window
+    from oiio_msspl.exr.write_options import WriteOptions
+    from oiio_msspl.fusion.fuse import FusedFrame, fuse
+    from oiio_msspl.jobs.frame import InputOptions, fuse_files
+    from oiio_msspl.jobs.report import FrameReport
+    from oiio_msspl.jobs.shot import FrameResult, ShotReport, fuse_shot
+    from oiio_msspl.model.catalogue import find_model, shipped_models
+    from oiio_msspl.model.contract import Contract
+    from oiio_msspl.model.session import Session
 
-_HOME = {
-    "Contract": "contract",
-    "FrameResult": "shot",
-    "Fused": "fusion",
+_MODULES = {
+    "Contract": "model.contract",
+    "FrameReport": "jobs.report",
+    "FrameResult": "jobs.shot",
+    "FusedFrame": "fusion.fuse",
     "InputError": "errors",
-    "Inputs": "files",
+    "InputOptions": "jobs.frame",
+    "MappedRender": "aovs.mapped_render",
     "MssplError": "errors",
-    "Render": "render",
-    "Report": "files",
-    "Resolution": "aovs",
-    "Session": "session",
-    "ShotReport": "shot",
-    "Window": "render",
-    "WriteOptions": "assemble",
-    "find_model": "session",
-    "fuse": "fusion",
-    "fuse_files": "files",
-    "fuse_shot": "shot",
-    "open_exr": "exr",
-    "resolve": "aovs",
-    "shipped_models": "session",
+    "Render": "exr.render",
+    "Session": "model.session",
+    "ShotReport": "jobs.shot",
+    "Window": "exr.render",
+    "WriteOptions": "exr.write_options",
+    "find_model": "model.catalogue",
+    "fuse": "fusion.fuse",
+    "fuse_files": "jobs.frame",
+    "fuse_shot": "jobs.shot",
+    "map_render": "aovs.matching",
+    "open_exr": "exr.reader",
+    "shipped_models": "model.catalogue",
 }
 
 __all__ = [
     "Contract",
+    "FrameReport",
     "FrameResult",
-    "Fused",
+    "FusedFrame",
     "InputError",
-    "Inputs",
+    "InputOptions",
+    "MappedRender",
     "MssplError",
     "Render",
-    "Report",
-    "Resolution",
     "Session",
     "ShotReport",
     "Window",
@@ -75,13 +78,13 @@ __all__ = [
     "fuse",
     "fuse_files",
     "fuse_shot",
+    "map_render",
     "open_exr",
-    "resolve",
     "shipped_models",
 ]
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOME:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"oiio_msspl.{_HOME[name]}"), name)
+    return getattr(import_module(f"oiio_msspl.{_MODULES[name]}"), name)

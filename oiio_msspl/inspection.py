@@ -9,11 +9,12 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs import Resolution, explain_unused, resolve
+from oiio_msspl.aovs.mapped_render import MappedRender, unread_layers
+from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr import ExrFile, open_exr
-from oiio_msspl.files import Inputs
-from oiio_msspl.render import Window
+from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.exr.render import Window
+from oiio_msspl.jobs.frame import InputOptions
 
 
 @dataclass
@@ -22,7 +23,7 @@ class Inspection:
 
     path: Path
     file: ExrFile | None = None
-    resolution: Resolution | None = None
+    resolution: MappedRender | None = None
     facts: list[str] = field(default_factory=list)
     passed_through: list[str] = field(default_factory=list)
     problems: list[str] = field(default_factory=list)
@@ -59,18 +60,18 @@ class Inspection:
         return result
 
 
-def inspect_file(path: Path, inputs: Inputs) -> Inspection:
+def inspect_file(path: Path, inputs: InputOptions) -> Inspection:
     """Open a file, map its layers and read its pixels once; what goes wrong is noted, never raised."""
     result = Inspection(path)
     try:
         file = result.file = open_exr(path)
         result.facts = _facts(file)
-        resolution = result.resolution = resolve(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+        resolution = result.resolution = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
         others = f"; also {', '.join(resolution.other_views)} (--view-layer)" if resolution.other_views else ""
         spp = "unknown spp" if resolution.spp is None else f"{resolution.spp:g} spp"
         view = f", {resolution.view}{others}" if resolution.view else others
         result.facts.append(f"renderer: {resolution.renderer}, {spp}{view}")
-        result.passed_through = explain_unused(file, resolution)
+        result.passed_through = unread_layers(file, resolution)
         result.facts += _pixels(resolution)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
@@ -97,7 +98,7 @@ def _facts(file: ExrFile) -> list[str]:
     return facts
 
 
-def _pixels(resolution: Resolution) -> list[str]:
+def _pixels(resolution: MappedRender) -> list[str]:
     """Read every feature once, in bands: is it there, finite and not black?"""
     window = resolution.data_window
     brightest: dict[str, float] = {}

@@ -11,8 +11,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.render import Array
-from oiio_msspl.transforms import luminance, srgb
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import luminance, srgb
 
 #: The paper's two conventions of RelMSE, (lambda_1, lambda_2): its BCR data set (after KPCN), and the Gharbi data set.
 RELMSE_BCR = (0.5, 0.01)

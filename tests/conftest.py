@@ -9,8 +9,11 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl import denoiser, schema
-from oiio_msspl.contract import METADATA_KEY, Contract
+from oiio_msspl.model import oidn, oidn_weights
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.oidn import eight_bits_work
+from oiio_msspl.model.oidn_weights import known_weights
+from oiio_msspl.model.contract import Contract, METADATA_KEY
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -95,7 +98,7 @@ def bilinear_models(tmp_path_factory):
 
     folder = tmp_path_factory.mktemp("models")
     made = {}
-    for scale in schema.SCALES:
+    for scale in SCALES:
         contract = Contract(name=f"bilinear-x{scale}", scale=scale, overlap=2, bytes_per_pixel=300)
         nodes = [
             helper.make_node("Resize", ["lrhs", "", "scales"], ["up"], mode="linear"),
@@ -137,8 +140,8 @@ def bilinear_models(tmp_path_factory):
 @pytest.fixture
 def forget():
     """What is known of the installed pyoidn, before and after."""
-    for known in (denoiser.known_weights, denoiser.eight_bits_work):
+    for known in (known_weights, eight_bits_work):
         known.cache_clear()
     yield
-    for known in (denoiser.known_weights, denoiser.eight_bits_work):
+    for known in (known_weights, eight_bits_work):
         known.cache_clear()

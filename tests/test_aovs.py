@@ -4,10 +4,11 @@ import re
 import numpy as np
 import pytest
 
-from oiio_msspl import schema
-from oiio_msspl.aovs import check_mapping, parse_map_options, read_map_file, renderers, resolve
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.aovs.mapping import check_mapping, parse_map_options, read_map_file
+from oiio_msspl.aovs.matching import map_render, renderers
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr import open_exr
+from oiio_msspl.exr.reader import open_exr
 from tests.conftest import SHARED, needs_shared, rgb, write_exr
 
 H = W = 8
@@ -24,7 +25,7 @@ def layer(name, value, names="RGB"):
 
 def resolved(tmp_path, channels, mapping=None, stem="hr", **options):
     attributes = options.pop("attributes", {})
-    return resolve(open_exr(write_exr(tmp_path / f"{stem}.exr", channels, **attributes)), mapping, **options)
+    return map_render(open_exr(write_exr(tmp_path / f"{stem}.exr", channels, **attributes)), mapping, **options)
 
 
 def found(resolution):
@@ -202,7 +203,7 @@ def test_mistakes_in_a_mapping_file_are_named(tmp_path, text, message):
 
 def test_the_shipped_table_has_no_mistakes():
     for renderer in renderers():
-        candidates = [(f, c) for f in schema.HRLS_FEATURES for c in renderer.get(f, [])]
+        candidates = [(f, c) for f in HRLS_FEATURES for c in renderer.get(f, [])]
         assert candidates
         for feature, candidate in candidates:
             check_mapping({feature: candidate}, renderer["name"])
@@ -256,7 +257,7 @@ def test_luxcores_files_are_layers_of_one_frame(tmp_path):
     assert values["albedo"][0, 0, 0] == 2
     assert values["diffuse"][0, 0, 0] == 7
     with pytest.raises(InputError, match="LuxCore's ALBEDO alone"):
-        resolve(open_exr(tmp_path / "ALBEDO.exr"))
+        map_render(open_exr(tmp_path / "ALBEDO.exr"))
 
 
 def test_view_layers_are_told_apart(tmp_path):
@@ -445,7 +446,7 @@ def test_every_real_file_is_expected_here():
 @pytest.mark.parametrize("name", REAL)
 def test_real_files_are_mapped(name):
     renderer, features = REAL[name]
-    resolution = resolve(open_exr(SHARED / "exr" / f"{name}.exr"))
+    resolution = map_render(open_exr(SHARED / "exr" / f"{name}.exr"))
     assert resolution.renderer == renderer
     assert found(resolution).keys() == features
 
@@ -454,13 +455,13 @@ def test_real_files_are_mapped(name):
 @pytest.mark.parametrize("name", UNUSABLE)
 def test_real_files_that_cannot_be_used_are_explained(name):
     with pytest.raises(InputError, match=UNUSABLE[name]):
-        resolve(open_exr(SHARED / "exr" / f"{name}.exr"))
+        map_render(open_exr(SHARED / "exr" / f"{name}.exr"))
 
 
 @needs_shared("exr")
 def test_cycles_layers_add_up_to_the_beauty():
     """The paper's equations: diffuse + gloss + transmission + emission + environment is the beauty."""
-    resolution = resolve(
+    resolution = map_render(
         open_exr(SHARED / "exr/cycles-5.0/cycles_viewlayer_zip32.exr"),
         {
             "albedo": {"sum": ["Transmission Direct", "Transmission Indirect"], "times": "Transmission Color"},

@@ -12,12 +12,12 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl import assemble
-from oiio_msspl.aovs import resolve
-from oiio_msspl.assemble import LAYOUTS, WriteOptions
+from oiio_msspl.exr.writer import WriteOptions, fused_channels, write_fused
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr import open_exr
-from oiio_msspl.output import check_target, replacing
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.atomic import check_target, replacing
 from tests.conftest import picture, read_bits, rgb, same_bits, write_exr
 
 H, W = 70, 40
@@ -44,13 +44,13 @@ def everything(seed=0):
 def written(tmp_path, parts, options=None, **attributes):
     """Write a fused frame over a file; returns the fused colour, and what OpenEXR reads back."""
     path = write_exr(tmp_path / "hr.exr", parts, **attributes)
-    hr = resolve(open_exr(path))
+    hr = map_render(open_exr(path))
     height, width = hr.data_window.height, hr.data_window.width
     fused = np.full((height, width, 3), 0.1, np.float32) + np.arange(3, dtype=np.float32)
     alpha = np.full((height, width, 1), 0.25, np.float32) if hr.alpha else None
     out = tmp_path / "out.exr"
     options = options or WriteOptions()
-    assemble.write(out, hr, fused, alpha, {"msspl/model": "test"}, options, overwrite=True)
+    write_fused(out, hr, fused, alpha, {"msspl/model": "test"}, options, overwrite=True)
     return fused, out, read_bits(out)
 
 
@@ -59,9 +59,9 @@ def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
     path = write_exr(tmp_path / "hr.exr", everything())
     error = np.arange(H * W, dtype=np.float32).reshape(H, W, 1)
     image = np.ones((H, W, 4), np.float32)
-    assemble.write(
+    write_fused(
         tmp_path / "out.exr",
-        resolve(open_exr(path)),
+        map_render(open_exr(path)),
         image[..., :3],
         image[..., 3:],
         {},
@@ -147,8 +147,8 @@ def test_layers_are_passed_on_bit_for_bit(tmp_path, layout, source):
     """Half, float, uint, NaN payloads, views, doubled names: nothing but the beauty changes, nothing is lost."""
     parts, attributes = SOURCES[source]
     _, _, after = written(tmp_path, parts, WriteOptions(layout=layout), **attributes)
-    hr = resolve(open_exr(tmp_path / "hr.exr"))
-    replaced = {(c.part, c.name) for c in assemble.fused_channels(hr)}
+    hr = map_render(open_exr(tmp_path / "hr.exr"))
+    replaced = {(c.part, c.name) for c in fused_channels(hr)}
 
     def planes(parts, leave=()):
         return sorted(
@@ -179,8 +179,8 @@ def test_tiled_parts_of_mixed_types_are_passed_on(tmp_path):
         parts.append(OpenEXR.Part(header, channels, name))
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "hr.exr"))
-    hr = resolve(open_exr(tmp_path / "hr.exr"))
-    assemble.write(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())
+    hr = map_render(open_exr(tmp_path / "hr.exr"))
+    write_fused(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())
     after = flat(read_bits(tmp_path / "out.exr"))
     assert same_bits(after[("m", "X")], plain(1).astype(np.float16))
     assert same_bits(after[("m", "id")], plain(2))
@@ -198,9 +198,9 @@ def test_a_damaged_layer_names_the_input(tmp_path):
     noise = np.random.default_rng(0).random((300, 64), dtype=np.float32)
     path = write_exr(tmp_path / "hr.exr", [("rgba", rgb(picture(300, 64)), (0, 0)), ("z", {"z.Z": noise}, (0, 0))])
     path.write_bytes(path.read_bytes()[:-20000])
-    hr = resolve(open_exr(path))
+    hr = map_render(open_exr(path))
     with pytest.raises(InputError, match=r"hr\.exr: part 1 \(z\).* can't be read"):
-        assemble.write(tmp_path / "out.exr", hr, np.ones((300, 64, 3), np.float32), None, {}, WriteOptions())
+        write_fused(tmp_path / "out.exr", hr, np.ones((300, 64, 3), np.float32), None, {}, WriteOptions())
     assert not (tmp_path / "out.exr").exists()
 
 
@@ -287,8 +287,8 @@ def test_lossy_sources_are_not_compressed_a_second_time(tmp_path):
     """Layers decoded from DWA are stored without loss: encoding them again would change them."""
     path = write_exr(tmp_path / "hr.exr", everything(), compression=OpenEXR.DWAA_COMPRESSION)
     decoded = dict(read_bits(path)[0][1])
-    hr = resolve(open_exr(path))
-    assemble.write(
+    hr = map_render(open_exr(path))
+    write_fused(
         tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), np.ones((H, W, 1), np.float32), {}, WriteOptions()
     )
     after = flat(read_bits(tmp_path / "out.exr"))
@@ -320,12 +320,12 @@ def test_multilayer_refuses_parts_of_different_windows(tmp_path):
 def test_what_spec_and_multilayer_write_is_read_as_the_same_features(tmp_path):
     for layout in ("spec", "multilayer"):
         _, out, _ = written(tmp_path, everything(), WriteOptions(layout=layout))
-        assert {"rgb", "albedo"} <= resolve(open_exr(out)).features.keys()
+        assert {"rgb", "albedo"} <= map_render(open_exr(out)).features.keys()
 
 
 def test_values_beyond_half_are_written_as_its_largest(tmp_path):
-    hr = resolve(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W).astype(np.float16)))))
-    assemble.write(tmp_path / "out.exr", hr, np.full((H, W, 3), 1e6, np.float32), None, {}, WriteOptions())
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W).astype(np.float16)))))
+    write_fused(tmp_path / "out.exr", hr, np.full((H, W, 3), 1e6, np.float32), None, {}, WriteOptions())
     assert (read_bits(tmp_path / "out.exr")[0][1]["R"] == 65504).all()
 
 
@@ -401,19 +401,19 @@ from pathlib import Path
 from oiio_msspl import assemble
 from oiio_msspl.aovs import resolve
 from oiio_msspl.errors import MssplError
-from oiio_msspl.exr import open_exr
+from oiio_msspl.exr.reader import open_exr
 limit = int(sys.argv[2])
 if limit:
     import signal
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # as a full disk: write() fails
     resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
 folder = Path(sys.argv[1])
-hr = resolve(open_exr(folder / "hr.exr"))
+hr = map_render(open_exr(folder / "hr.exr"))
 rgb = np.random.default_rng(0).random((hr.data_window.height, hr.data_window.width, 3), dtype=np.float32)
 print("writing", flush=True)
 try:
     for _ in range(int(sys.argv[3])):
-        assemble.write(folder / "out.exr", hr, rgb, None, {}, assemble.WriteOptions(), overwrite=True)
+        write_fused(folder / "out.exr", hr, rgb, None, {}, WriteOptions(), overwrite=True)
 except MssplError as error:
     print(error)
     sys.exit(error.exit_code)
@@ -454,7 +454,7 @@ def test_killed_half_way_the_old_file_is_whole(tmp_path):
 
 
 def test_an_unwritable_path_is_our_failure_not_a_traceback(tmp_path, monkeypatch):
-    hr = resolve(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W)))))
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W)))))
     monkeypatch.setattr(oiio.ImageOutput, "create", staticmethod(lambda path: None))
     with pytest.raises(MssplError, match="OpenImageIO can't write it"):
-        assemble.write(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())
+        write_fused(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())

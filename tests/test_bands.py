@@ -5,14 +5,17 @@ import threading
 import numpy as np
 import pytest
 
-from oiio_msspl import bands, transforms
+from oiio_msspl import parallel
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.parallel import _thread_limit, for_row_blocks, in_background, limit_threads
 from tests.conftest import picture
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])
 @pytest.mark.parametrize(("rows", "multiple"), [(0, 1), (1, 1), (100, 1), (96, 8), (8, 8)])
 def test_every_row_is_done_once(monkeypatch, count, rows, multiple):
-    monkeypatch.setattr(bands, "BAND", 300)
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 300)
     done = np.zeros(rows, dtype=int)
     parts = []
 
@@ -20,15 +23,15 @@ def test_every_row_is_done_once(monkeypatch, count, rows, multiple):
         done[part] += 1
         parts.append(part)
 
-    with bands.threads(count):
-        bands.each(work, rows, 100, multiple)
+    with limit_threads(count):
+        for_row_blocks(work, rows, 100, multiple)
     assert (done == 1).all()
     assert all(part.start % multiple == 0 for part in parts)
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_no_more_threads_than_allowed(monkeypatch, count):
-    monkeypatch.setattr(bands, "BAND", 1)
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 1)
     met = threading.Barrier(count, timeout=10)  # each thread waits until all of them are at work
     seen = set()
 
@@ -37,48 +40,48 @@ def test_no_more_threads_than_allowed(monkeypatch, count):
             seen.add(threading.get_ident())
             met.wait()
 
-    with bands.threads(count):
-        bands.each(work, 30, 1)
+    with limit_threads(count):
+        for_row_blocks(work, 30, 1)
     assert len(seen) == count
 
 
 def test_what_a_band_raises_is_raised(monkeypatch):
-    monkeypatch.setattr(bands, "BAND", 1)
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 1)
 
     def work(part):
         if part.start == 9:  # in another thread's share
             raise ValueError("band 9")
 
-    with bands.threads(2), pytest.raises(ValueError, match="band 9"):
-        bands.each(work, 10, 1)
+    with limit_threads(2), pytest.raises(ValueError, match="band 9"):
+        for_row_blocks(work, 10, 1)
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:.*fork:DeprecationWarning")
 def test_a_forked_process_has_threads_of_its_own(monkeypatch):
-    monkeypatch.setattr(bands, "BAND", 1)
-    with bands.threads(2):
-        bands.each(lambda part: None, 10, 1)
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 1)
+    with limit_threads(2):
+        for_row_blocks(lambda part: None, 10, 1)
         if (child := os.fork()) == 0:
-            bands.each(lambda part: None, 10, 1)
+            for_row_blocks(lambda part: None, 10, 1)
             os._exit(0)
     assert os.waitpid(child, 0)[1] == 0
 
 
 @pytest.mark.parametrize("planar", [False, True])
 def test_bands_change_no_value(monkeypatch, planar):
-    """However many threads and bands, and whichever way a picture lies in memory."""
+    """However many threads and parallel, and whichever way a picture lies in memory."""
     image = picture(64, 96)
     if planar:
         image = np.ascontiguousarray(image.transpose(2, 0, 1)).transpose(1, 2, 0)
 
     def results():
-        values = transforms.compress(image, 2.0)
-        return values, transforms.expand(values, 2.0), transforms.box_downsample(image, 4)
+        values = encode_radiance(image, 2.0)
+        return values, decode_radiance(values, 2.0), box_downsample(image, 4)
 
     whole = results()
-    monkeypatch.setattr(bands, "BAND", 1000)
-    with bands.threads(3):
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 1000)
+    with limit_threads(3):
         for one, other in zip(results(), whole, strict=True):
             np.testing.assert_array_equal(one, other)
 
@@ -90,10 +93,10 @@ def test_work_begins_aside_if_there_are_threads_for_it(count):
 
     def work():
         begun.set()
-        return threading.current_thread(), bands._threads.get()
+        return threading.current_thread(), _thread_limit.get()
 
-    with bands.threads(count):
-        result = bands.aside(work)
+    with limit_threads(count):
+        result = in_background(work)
         assert begun.wait(5 if count > 1 else 0) == (count > 1)
         thread, threads = result()
     assert (thread is threading.current_thread()) == (count == 1)

@@ -19,9 +19,11 @@ import pytest
 from msspl_cli.commands import render
 from msspl_cli.installed import find_msspl_fuse
 
-from oiio_msspl import __version__, aovs, exr
+from oiio_msspl import __version__
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.errors import InputError
-from oiio_msspl.pairing import pair
+from oiio_msspl.fusion.alignment import align
 from tests.conftest import EXAMPLES
 
 ADDON = Path(__file__).parents[1] / "blender_addon"
@@ -280,7 +282,7 @@ def results(python, tmp_path_factory):
 
 def layer(path, name, components):
     """float32 (height, width, components) of a layer of a single-part EXR."""
-    file = exr.open_exr(path)
+    file = open_exr(path)
     channels = {c.name: c for part in file.parts for c in part.channels}
     names = [name + component for component in components]
     return file.read([channels[n] for n in names], file.parts[0].data_window)
@@ -297,8 +299,8 @@ def test_the_composited_frame_is_the_file(results):
 def test_both_renders_show_the_same_frame_when_sizes_are_rounded(results):
     """A ramp has the same values at the edges of the frame: to a twentieth of an HRLS pixel, at x8."""
     for name in ("wide", "tall", "squeezed"):
-        low, high = (aovs.resolve(exr.open_exr(results / f"{name}_{kind}.exr"), features=()) for kind in ("lr", "hr"))
-        assert pair(low, high).scale == 8
+        low, high = (map_render(open_exr(results / f"{name}_{kind}.exr"), features=()) for kind in ("lr", "hr"))
+        assert align(low, high).scale == 8
         for axis in (0, 1):
             edges = []
             for render_ in (low, high):

@@ -12,8 +12,8 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.aovs import resolve
-from oiio_msspl.exr import open_exr
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.reader import open_exr
 from tests.conftest import EXAMPLES, SHARED, downsample, needs_shared, noisy, picture, rgb, write_exr
 
 
@@ -46,7 +46,7 @@ def test_the_main_job(files, bilinear_models):
     assert "albedo    found    albedo" in done.stdout
     assert "variance  default" in done.stdout
     assert done.stderr == ""
-    out = resolve(open_exr(files / "out.exr"))
+    out = map_render(open_exr(files / "out.exr"))
     values = out.read(out.data_window)
     assert values["rgb"].shape == (96, 128, 3)
     assert (values["alpha"] == 1).all()
@@ -283,10 +283,10 @@ def test_the_readmes_first_command_shows_a_result(tmp_path):
     assert done.returncode == 0, done.stderr
     report = json.loads(done.stdout)
     assert (report["scale"], report["spp"]["average"]) == (4, 2)
-    out = resolve(open_exr(tmp_path / "out.exr"))
+    out = map_render(open_exr(tmp_path / "out.exr"))
     values = out.read(out.data_window)["rgb"]
     assert np.isfinite(values).all()
-    low = resolve(open_exr(EXAMPLES / "lr.exr"))
+    low = map_render(open_exr(EXAMPLES / "lr.exr"))
     assert values.mean() == pytest.approx(low.read(low.data_window)["rgb"].mean(), rel=0.1)
     names = {p.name for p in out.file.parts}
     assert any("CryptoObject00" in n for n in names)

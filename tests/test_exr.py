@@ -4,8 +4,8 @@ import OpenEXR
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr import open_exr
-from oiio_msspl.render import Window
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.render import Window
 from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
 
 COMPRESSIONS = ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA", "DWAB"]

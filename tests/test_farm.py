@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot on many machines: as an Open Job Description job that openjd runs, and on the workers of a Dask cluster."""
+"""A shot on many machines: as an Open Job Description job that openjd runs, and on the workers of a Dask dask_cluster."""
 
 import json
 import os
@@ -15,7 +15,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from oiio_msspl import InputError, cluster, fuse_shot, preview, shot
+from oiio_msspl.exr import preview
+from oiio_msspl.jobs import dask_cluster, shot
+from oiio_msspl import InputError, fuse_shot
+from oiio_msspl.exr.preview import write_png
+from oiio_msspl.jobs.dask_cluster import _sessions
+from oiio_msspl.jobs.shot import Stages
 from tests.conftest import write_exr
 from tests.test_cli import fuse, run
 from tests.test_shot import contents, layers, low_layers
@@ -216,17 +221,17 @@ def hang_in_writing(marker):
     """In a worker: leave what there is in the middle of writing a frame, tell, and go no further."""
 
     def write(self, report, fused):
-        preview.write_png(report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
+        write_png(report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
         report.output.with_name(f".{report.output.stem}.{os.getpid()}.tmp.exr").write_bytes(b"half")
         marker.touch()
         time.sleep(1000)
 
-    shot.Stages.write = write
+    Stages.write = write
 
 
 def loaded_models():
     """In a worker: how often it has started to load models anew."""
-    return cluster._sessions.cache_info().misses
+    return _sessions.cache_info().misses
 
 
 def test_a_worker_killed_in_the_middle_of_a_frame_loses_nothing(tmp_path, bilinear_models, client):
@@ -290,7 +295,7 @@ def test_a_frame_that_kills_its_workers_is_given_up(tmp_path, bilinear_models, t
     def die(self, frame):
         os._exit(1)
 
-    client.run(partial(setattr, shot.Stages, "read"), die)
+    client.run(partial(setattr, Stages, "read"), die)
     try:
         report = fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", client=client)
     finally:

@@ -75,7 +75,7 @@ def test_knobs_their_kinds_and_defaults(nodes):
 
 
 def test_devices_are_those_of_the_program(nodes):
-    from oiio_msspl.session import PROVIDERS
+    from oiio_msspl.model.session import PROVIDERS
 
     device = next(k for k in nodes[1].user_knobs if k.name == "device")
     assert device.items == list(PROVIDERS)
@@ -386,7 +386,7 @@ def test_a_frame_is_fused_and_comes_back_as_a_read(host, tmp_path):
     assert (read.xpos(), read.ypos()) == (40, 300)
     out = tmp_path / "hr_fused.1002.exr"
     assert read.metadata("input/filename", 1002) == str(out)
-    from oiio_msspl.exr import open_exr
+    from oiio_msspl.exr.reader import open_exr
 
     names = [part.name for part in open_exr(out).parts]
     assert len(names) == 2

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.pairing import pair
-from oiio_msspl.render import Render, Window
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.exr.render import Render, Window
 
 
 def render(name, width, height, data=None, origin=(0, 0), aspect=1.0):
@@ -18,7 +18,7 @@ def render(name, width, height, data=None, origin=(0, 0), aspect=1.0):
 @pytest.mark.parametrize("rounding", ["up", "down"])
 def test_the_scale_follows_from_the_display_windows(scale, size, rounding):
     low = [(-(-n // scale) if rounding == "up" else n // scale) for n in size]
-    pairing = pair(render("lr", *low), render("hr", *size))
+    pairing = align(render("lr", *low), render("hr", *size))
     assert pairing.scale == scale
     assert pairing.grid.width * scale >= size[0] > (pairing.grid.width - 1) * scale
 
@@ -26,22 +26,22 @@ def test_the_scale_follows_from_the_display_windows(scale, size, rounding):
 def test_pixels_may_be_out_of_square_by_what_was_rounded():
     """2048 x 858 at x4 is 512 x 215: an LRHS whose pixels are 1.0023 wide shows the frame from edge to edge."""
     aspect = 2048 * 215 / (858 * 512)
-    assert pair(render("lr", 512, 215, aspect=aspect), render("hr", 2048, 858)).scale == 4
+    assert align(render("lr", 512, 215, aspect=aspect), render("hr", 2048, 858)).scale == 4
     with pytest.raises(InputError, match="pixel aspect"):
-        pair(render("lr", 512, 215, aspect=1.01), render("hr", 2048, 858))
+        align(render("lr", 512, 215, aspect=1.01), render("hr", 2048, 858))
 
 
 def test_crop_regions_and_overscan_are_mapped_to_low_resolution_pixels():
     """An HRLS region that starts between LRHS pixels needs the whole pixels around it."""
     high = render("hr", 64, 64, Window(-3, 10, 70, 33))
     low = render("lr", 16, 16, Window(-1, 2, 18, 9))
-    assert pair(low, high).grid == Window(-1, 2, 18, 9)
+    assert align(low, high).grid == Window(-1, 2, 18, 9)
 
 
 def test_display_windows_may_begin_anywhere():
     high = render("hr", 64, 64, Window(100, 100, 164, 164), origin=(100, 100))
     low = render("lr", 16, 16, Window(-5, 0, 11, 16), origin=(-5, 0))
-    pairing = pair(low, high)
+    pairing = align(low, high)
     assert pairing.grid == Window(0, 0, 16, 16)
     assert pairing.lr_data == Window(0, 0, 16, 16)
 
@@ -59,4 +59,4 @@ def test_display_windows_may_begin_anywhere():
 )
 def test_what_does_not_fit_is_explained(low, high, message):
     with pytest.raises(InputError, match=message):
-        pair(low, high)
+        align(low, high)

@@ -4,17 +4,18 @@ import json
 import numpy as np
 import pytest
 
-from oiio_msspl import schema
-from oiio_msspl.contract import METADATA_KEY, Contract
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import Contract, METADATA_KEY
 from oiio_msspl.errors import InputError
-from oiio_msspl.session import PROVIDERS, Session, find_model, shipped_models, usable_devices
+from oiio_msspl.model.catalogue import find_model, shipped_models
+from oiio_msspl.model.session import PROVIDERS, Session, usable_devices
 
 
 def test_a_model_ships_for_every_scale():
-    assert {f"{family}-x{s}" for family in ("paper", "pyramid") for s in schema.SCALES} <= shipped_models().keys()
+    assert {f"{family}-x{s}" for family in ("paper", "pyramid") for s in SCALES} <= shipped_models().keys()
 
 
-@pytest.mark.parametrize("scale", schema.SCALES)
+@pytest.mark.parametrize("scale", SCALES)
 def test_shipped_models_load_and_say_where_they_come_from(scale):
     session = Session(find_model(scale))
     assert session.contract.scale == scale

@@ -17,9 +17,14 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl import InputError, MssplError, fuse_files, fuse_shot, preview, session, shot
-from oiio_msspl.output import remove_leftovers, replacing
-from oiio_msspl.sequence import find_shot, format_frames
+from oiio_msspl.exr import preview
+from oiio_msspl.jobs import shot
+from oiio_msspl import InputError, MssplError, fuse_files, fuse_shot
+from oiio_msspl.exr.preview import write_png
+from oiio_msspl.jobs.shot import Stages, _fused_result, fuse, write_frame
+from oiio_msspl.model.session import Session
+from oiio_msspl.exr.atomic import remove_leftovers, replacing
+from oiio_msspl.jobs.sequence import find_shot, format_frames
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.test_cli import fuse
 
@@ -195,7 +200,7 @@ def test_frames_without_room_in_memory_are_read_as_they_are_fused(make, bilinear
     assert run(folder, bilinear_models[4]).exit_code == 0
     whole = contents(folder / "out")
     monkeypatch.setattr(shot, "_pixel_bytes", lambda render: 1 << 40)
-    monkeypatch.setattr("oiio_msspl.aovs.Resolution.load", pytest.fail)
+    monkeypatch.setattr("oiio_msspl.aovs.mapped_render.MappedRender.load", pytest.fail)
     assert run(folder, bilinear_models[4], overwrite=True).exit_code == 0
     assert contents(folder / "out") == whole
 
@@ -207,7 +212,7 @@ def test_the_three_stages_overlap_and_hold_one_frame_each(make, bilinear_models,
     began = {(stage, n): threading.Event() for stage in inside for n in range(1, 7)}
 
     def watched(stage, number_of, meanwhile):
-        real = getattr(shot.Stages, stage)
+        real = getattr(Stages, stage)
 
         def call(self, *arguments):
             number = number_of(arguments[0])
@@ -221,7 +226,7 @@ def test_the_three_stages_overlap_and_hold_one_frame_each(make, bilinear_models,
             inside[stage] -= 1
             return result
 
-        monkeypatch.setattr(shot.Stages, stage, call)
+        monkeypatch.setattr(Stages, stage, call)
 
     watched("read", lambda frame: frame.number, [])
     watched("fuse", lambda ready: ready.frame.number, [("read", 1), ("write", -1)])
@@ -233,8 +238,8 @@ def test_the_three_stages_overlap_and_hold_one_frame_each(make, bilinear_models,
 
 def test_a_long_shot_loads_the_model_once_and_keeps_no_file_open(make, bilinear_models, monkeypatch):
     loaded, handles = [], []
-    real = session.Session.__init__
-    monkeypatch.setattr(session.Session, "__init__", lambda self, *a, **k: (loaded.append(a), real(self, *a, **k))[1])
+    real = Session.__init__
+    monkeypatch.setattr(Session, "__init__", lambda self, *a, **k: (loaded.append(a), real(self, *a, **k))[1])
     folder = make(12)
     report = run(folder, bilinear_models[4], progress=lambda *_: handles.append(len(os.listdir("/proc/self/fd"))))
     assert report.exit_code == 0
@@ -472,7 +477,7 @@ def test_a_read_only_folder_is_said_at_once(make, bilinear_models):
 
 def test_a_fault_of_the_program_in_one_frame_does_not_stop_the_others(make, bilinear_models, monkeypatch):
     folder = make(3)
-    real = shot.fuse
+    real = fuse
 
     def faulty(lr, *arguments, **more):
         if "1002" in lr.name:
@@ -492,7 +497,7 @@ def test_a_picture_that_is_no_preview_of_ours_is_left_alone(make, bilinear_model
     mine = folder / "out/beauty.1001.png"
     oiio.ImageBuf(oiio.ImageSpec(4, 4, 3, "uint8")).write(str(mine))
     before = mine.read_bytes()
-    preview.write_png(folder / "out/beauty.1002.png", np.zeros((2, 2, 3)))  # of a run that was killed
+    write_png(folder / "out/beauty.1002.png", np.zeros((2, 2, 3)))  # of a run that was killed
     report = run(folder, bilinear_models[4], previews=True, skip_existing=True)
     assert [report.results[n].status for n in (1001, 1002)] == ["failed", "fused"]
     assert "beauty.1001.png: exists; pass --overwrite" in report.results[1001].message
@@ -504,7 +509,7 @@ def test_a_frame_that_stays_keeps_its_preview(make, bilinear_models, monkeypatch
     """An old frame that can't be replaced, and one that another run puts there meanwhile."""
     folder = make(1)
     assert run(folder, bilinear_models[4], previews=True).exit_code == 0
-    before, real = contents(folder / "out"), shot.write_frame
+    before, real = contents(folder / "out"), write_frame
 
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
@@ -584,7 +589,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(make, bilinear_models):
             assert not json.loads((folder / "r.json").read_text())["finished"]
     # What a kill in the middle of writing leaves, should the three moments have missed it.
     (folder / "out/.beauty.1100.99999.tmp.exr").write_bytes(b"half")
-    preview.write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
+    write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
 
     last = start(folder, bilinear_models[4])
     last.communicate()
@@ -596,7 +601,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(make, bilinear_models):
 
 
 def test_a_signal_between_writing_and_recording_loses_no_frame(make, bilinear_models, monkeypatch):
-    folder, recorded = make(4), shot._fused_result
+    folder, recorded = make(4), _fused_result
     moments = iter([None, KeyboardInterrupt])
 
     def interrupted(*arguments):

@@ -3,15 +3,15 @@ import numpy as np
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.render import Window
-from oiio_msspl.tiling import aligned, tiles
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.tiling import aligned_grid, plan_tiles
 
 
 @pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
 @pytest.mark.parametrize("largest", [4096, 20000, 10**9])
 def test_cores_cover_the_grid_once_and_areas_fit(grid, largest):
     covered = np.zeros((grid.height, grid.width), int)
-    for tile in tiles(grid, largest, overlap=8):
+    for tile in plan_tiles(grid, largest, overlap=8):
         covered[tile.core.slices(grid)] += 1
         assert tile.area.width * tile.area.height <= largest
         assert tile.area.intersect(grid) == tile.area
@@ -26,12 +26,12 @@ def test_cores_cover_the_grid_once_and_areas_fit(grid, largest):
 
 @pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
 def test_aligned_tiles_lie_on_the_blocks_of_the_whole_frame(grid):
-    wider = aligned(grid, 8)
+    wider = aligned_grid(grid, 8)
     assert grid.intersect(wider) == grid
     assert (wider.x0, wider.y0) == (grid.x0, grid.y0)
     assert wider.width - grid.width < 8 > wider.height - grid.height
     covered = np.zeros((wider.height, wider.width), int)
-    for tile in tiles(wider, 20000, overlap=24, alignment=8):
+    for tile in plan_tiles(wider, 20000, overlap=24, alignment=8):
         covered[tile.core.slices(wider)] += 1
         assert tile.area.width * tile.area.height <= 20000
         for window in (tile.core, tile.area):
@@ -42,4 +42,4 @@ def test_aligned_tiles_lie_on_the_blocks_of_the_whole_frame(grid):
 
 def test_too_little_memory_is_said():
     with pytest.raises(InputError, match="raise --max-memory"):
-        list(tiles(Window(0, 0, 500, 300), 100, overlap=16))
+        list(plan_tiles(Window(0, 0, 500, 300), 100, overlap=16))

@@ -2,7 +2,10 @@
 import numpy as np
 import pytest
 
-from oiio_msspl import schema, transforms
+from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
+from oiio_msspl.arrays import repair
+from oiio_msspl.colour import srgb
+from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_radiance, find_exposure
 from tests.conftest import picture
 
 
@@ -10,7 +13,7 @@ def test_compress_and_expand_are_inverse_over_the_whole_range():
     """Radiance -> network values -> radiance is a no-op from half's smallest step to its largest value."""
     radiance = np.concatenate([[0], np.logspace(-6, np.log10(65504), 200)]).astype(np.float32)
     np.testing.assert_allclose(
-        transforms.expand(transforms.compress(radiance, 1.0), 1.0), radiance, rtol=2e-4, atol=1e-7
+        decode_radiance(encode_radiance(radiance, 1.0), 1.0), radiance, rtol=2e-4, atol=1e-7
     )
 
 
@@ -18,35 +21,35 @@ def test_compress_and_expand_are_inverse_over_the_whole_range():
 def test_the_network_sees_a_scaled_scene_unchanged(factor):
     """Exposure cancels: scaling the scene by a power of two leaves the network's input as it was."""
     scene = picture(16, 16)
-    base = transforms.compress(scene, transforms.exposure_of(scene))
-    scaled = transforms.compress(scene * np.float32(factor), transforms.exposure_of(scene * np.float32(factor)))
+    base = encode_radiance(scene, find_exposure(scene))
+    scaled = encode_radiance(scene * np.float32(factor), find_exposure(scene * np.float32(factor)))
     np.testing.assert_allclose(scaled, base, rtol=1e-5, atol=1e-6)
 
 
 def test_exposure_brings_the_log_mean_to_mid_grey():
     scene = np.full((8, 8, 3), 0.02, np.float32)
-    assert transforms.exposure_of(scene) == pytest.approx(9.0, rel=1e-3)
+    assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
 
 
 def test_traces_of_light_do_not_decide_the_exposure():
     """What a pixel filter or a float leaves between small lights is no light."""
     scene = np.full((8, 8, 3), 1e-40, np.float32)
     scene[:2] = 0.02
-    assert transforms.exposure_of(scene) == pytest.approx(9.0, rel=1e-3)
+    assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
 
 
 def test_exposure_of_black_is_one():
-    assert transforms.exposure_of(np.zeros((4, 4, 3), np.float32)) == 1.0
+    assert find_exposure(np.zeros((4, 4, 3), np.float32)) == 1.0
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, -1.0, 1e6, 3e38])
-@pytest.mark.parametrize("feature", list(schema.HRLS_FEATURES))
+@pytest.mark.parametrize("feature", list(HRLS_FEATURES))
 def test_repaired_values_are_finite_after_the_transform(value, feature):
-    channels = schema.HRLS_FEATURES[feature]
+    channels = HRLS_FEATURES[feature]
     values = np.full((2, 2, channels), value, np.float32)
-    repaired, bad = transforms.repair(values, signed=feature == schema.NORMAL)
-    assert np.isfinite(transforms.forward(feature, repaired, 1.0)).all()
-    needs_repair = not np.isfinite(value) or (value < 0 and feature != schema.NORMAL)
+    repaired, bad = repair(values, signed=feature == NORMAL)
+    assert np.isfinite(encode_feature(feature, repaired, 1.0)).all()
+    needs_repair = not np.isfinite(value) or (value < 0 and feature != NORMAL)
     assert (bad is not None) == needs_repair
     if bad is not None:
         assert bad.sum() == values.size
@@ -54,21 +57,21 @@ def test_repaired_values_are_finite_after_the_transform(value, feature):
 
 def test_repair_returns_sound_input_itself():
     values = picture(4, 4)
-    repaired, bad = transforms.repair(values)
+    repaired, bad = repair(values)
     assert repaired is values
     assert bad is None
 
 
 def test_expand_stays_finite_for_whatever_a_network_says():
-    assert np.isfinite(transforms.expand(np.array([-1e9, 0, 1e9, 5.0], np.float32), 1e-6)).all()
+    assert np.isfinite(decode_radiance(np.array([-1e9, 0, 1e9, 5.0], np.float32), 1e-6)).all()
 
 
 def test_variance_is_transformed_as_a_standard_deviation():
     """A variance of x^2 looks to the network like a radiance of x."""
     x = np.array([[[0.5]]], np.float32)
-    np.testing.assert_allclose(transforms.forward("variance", x * x, 2.0), transforms.compress(x, 2.0), rtol=1e-6)
+    np.testing.assert_allclose(encode_feature("variance", x * x, 2.0), encode_radiance(x, 2.0), rtol=1e-6)
 
 
 def test_srgb_follows_the_papers_curve():
-    values = transforms.srgb(np.array([-1, 0, 0.001, 0.18, 1, 7], np.float32))
+    values = srgb(np.array([-1, 0, 0.001, 0.18, 1, 7], np.float32))
     np.testing.assert_allclose(values, [0, 0, 0.01292, 0.4613, 1, 1], atol=1e-4)

@@ -13,8 +13,8 @@ import typer
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from oiio_msspl.assemble import WriteOptions
-    from oiio_msspl.files import Inputs
+    from oiio_msspl.exr.writer import WriteOptions
+    from oiio_msspl.jobs.frame import InputOptions
 
 Map = Annotated[
     list[str],
@@ -49,19 +49,19 @@ def set_up_logging(verbose: int, quiet: bool) -> None:
 
 def make_inputs(
     mapping: list[str], map_file: Path | None, view_layer: str | None, lr_spp: float | None, hr_spp: float | None
-) -> Inputs:
-    """The shared options as the library's :class:`~oiio_msspl.files.Inputs`; ``--map`` wins over the file."""
-    from oiio_msspl.aovs import parse_map_options, read_map_file
-    from oiio_msspl.files import Inputs
+) -> InputOptions:
+    """The shared options as the library's :class:`~oiio_msspl.jobs.frame.InputOptions`; ``--map`` wins over the file."""
+    from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
+    from oiio_msspl.jobs.frame import InputOptions
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
-    return Inputs(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp)
+    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp)
 
 
 def make_write_options(
     layout: str, compression: str | None, half: bool | None, layers: list[str], error_layer: bool
 ) -> WriteOptions:
-    from oiio_msspl.assemble import WriteOptions
+    from oiio_msspl.exr.writer import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"
     return WriteOptions(layout, compression, pixel_type, tuple(layers), error_layer)

@@ -14,7 +14,7 @@ def table(rows: Sequence[Sequence[str]], indent: str = "  ") -> None:
 
 
 def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
-    """What each feature is read from: ``table()`` and ``notes`` of a :class:`~oiio_msspl.aovs.Resolution`."""
+    """What each feature is read from: ``table()`` and ``notes`` of a :class:`~oiio_msspl.aovs.mapped_render.MappedRender`."""
     table([(r["feature"], r["status"], r["source"] + (f" ({r['note']})" if r["note"] else "")) for r in rows])
     for note in notes:
         print(f"  note: {note}")

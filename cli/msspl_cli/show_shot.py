@@ -14,7 +14,7 @@ from msspl_cli import show
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from oiio_msspl.shot import FrameResult, ShotReport
+    from oiio_msspl.jobs.shot import FrameResult, ShotReport
 
 #: What --progress prints to standard output after each frame.
 PROGRESS = ("openjd", "json")
@@ -93,7 +93,7 @@ def _print_json(result: FrameResult, report: ShotReport) -> None:
 
 def print_table(report: ShotReport) -> None:
     """Which layers were read, and how many frames, and which, ended how and why."""
-    from oiio_msspl.sequence import format_frames
+    from oiio_msspl.jobs.sequence import format_frames
 
     if report.first is not None:
         print(

@@ -35,7 +35,7 @@ def compare(
 
     Images smaller than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
-    from oiio_msspl.comparison import check_error_map, compare_files, write_error_map
+    from oiio_msspl.compare import check_error_map, compare_files, write_error_map
 
     if error_map is not None:
         check_error_map(error_map, overwrite=overwrite)

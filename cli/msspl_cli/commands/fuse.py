@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
     from dask.distributed import Client
 
-    from oiio_msspl.files import Report
+    from oiio_msspl.jobs.report import FrameReport
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -121,8 +121,8 @@ def fuse(
     With folders or patterns, a shot: frames are paired by number, and a bad one does not stop the others.
     """
     options.set_up_logging(verbose, quiet)
-    from oiio_msspl.files import fuse_files
-    from oiio_msspl.sequence import is_sequence
+    from oiio_msspl.jobs.frame import fuse_files
+    from oiio_msspl.jobs.sequence import is_sequence
 
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp),
@@ -135,10 +135,10 @@ def fuse(
         "overwrite": overwrite,
     }
     if is_sequence(lr) or is_sequence(hr):
-        from oiio_msspl.shot import fuse_shot
+        from oiio_msspl.jobs.shot import fuse_shot
 
         if debug:
-            logging.getLogger("oiio_msspl.shot").setLevel(logging.DEBUG)
+            logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)
         printer = ShotPrinter(verbose, quiet, as_json, progress)
         try:
             with _cluster(scheduler) as client:
@@ -188,7 +188,7 @@ def fuse(
 def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
     if scheduler is None:
         return nullcontext()
-    from oiio_msspl.cluster import connect
+    from oiio_msspl.jobs.dask_cluster import connect
 
     return connect(scheduler)
 
@@ -210,7 +210,7 @@ def _bar(quiet: bool) -> Callable[[int, int], None]:
     return update
 
 
-def _print(report: Report, seconds: float) -> None:
+def _print(report: FrameReport, seconds: float) -> None:
     spp = report.spp_avg
     print(f"{report.hr.renderer} pair at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
     show.aov_table(report.aovs(), report.hr.notes)

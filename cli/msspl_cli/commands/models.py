@@ -16,8 +16,9 @@ EXAMPLES = """[bold]Examples[/bold]
 
 def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
     """List the models inside the package, and the devices that can run them."""
-    from oiio_msspl.contract import Contract
-    from oiio_msspl.session import PROVIDERS, shipped_models, usable_devices
+    from oiio_msspl.model.catalogue import shipped_models
+    from oiio_msspl.model.contract import Contract
+    from oiio_msspl.model.session import PROVIDERS, usable_devices
 
     rows: list[dict[str, Any]] = []
     for name, path in shipped_models().items():

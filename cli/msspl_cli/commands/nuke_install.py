@@ -9,7 +9,7 @@ import typer
 from msspl_cli import options
 from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError
-from oiio_msspl.output import replacing
+from oiio_msspl.exr.atomic import replacing
 
 EXAMPLES = """[bold]Examples[/bold]
 

@@ -20,8 +20,8 @@ import typer
 from msspl_cli import options, show
 from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.output import check_folder, check_target
-from oiio_msspl.schema import SCALES
+from oiio_msspl.exr.atomic import check_folder, check_target
+
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -195,7 +195,7 @@ def _render(
 
 
 def is_pattern(output: Path) -> bool:
-    from oiio_msspl.sequence import is_sequence
+    from oiio_msspl.jobs.sequence import is_sequence
 
     return is_sequence(output) and not output.is_dir()
 
@@ -206,7 +206,7 @@ def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Pat
     Raises:
         InputError: one name for several frames, or a pattern without frames.
     """
-    from oiio_msspl.sequence import parse_frames, parse_pattern
+    from oiio_msspl.jobs.sequence import parse_frames, parse_pattern
 
     numbers = [] if frames is None else parse_frames(frames)
     if is_pattern(output):

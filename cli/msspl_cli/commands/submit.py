@@ -48,20 +48,20 @@ def submit(
     """
     given, passed_on = _parse(context.args)
     options.set_up_logging(given["verbose"], given["quiet"])
-    from oiio_msspl import preview
-    from oiio_msspl.bundle import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
-    from oiio_msspl.contract import Contract
-    from oiio_msspl.schema import SCALES
-    from oiio_msspl.sequence import find_shot, format_frames, is_sequence
-    from oiio_msspl.session import ALWAYS, AUTO, PROVIDERS, find_model, shipped_models
-    from oiio_msspl.shot import check_no_input
+    from oiio_msspl.exr.preview import check_view
+    from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
+    from oiio_msspl.jobs.sequence import find_shot, format_frames, is_sequence
+    from oiio_msspl.jobs.shot import check_no_input
+    from oiio_msspl.model.catalogue import ALWAYS, AUTO, find_model, shipped_models
+    from oiio_msspl.model.contract import SCALES, Contract
+    from oiio_msspl.model.session import PROVIDERS
 
     # What is wrong for every frame is said here, not by every task.
     options.make_inputs(*(given[name] for name in ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp")))
     options.make_write_options(*(given[name] for name in ("layout", "compression", "half", "layers", "error_layer")))
     options.parse_bytes(given["max_memory"])
     if given["view"] is not None:
-        preview.check_view(given["view"])
+        check_view(given["view"])
     if given["device"] not in PROVIDERS:  # what is usable here need not be there, nor the other way round
         raise InputError(f"--device {given['device']!r}: use one of {', '.join(PROVIDERS)}")
     files = {"--map-file": given["map_file"]} if given["map_file"] else {}

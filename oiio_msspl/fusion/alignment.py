@@ -1,0 +1,92 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do these two renders show the same frame, and how do their pixels lie over each other?
+
+Everything follows from the display windows: the low-resolution frame spans the same picture with 1/s of the pixels.
+Data windows then say which part of the frame was rendered (overscan, crop regions).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.model.contract import SCALES
+
+
+@dataclass(frozen=True)
+class Alignment:
+    """Where the pixels of a pair lie. Both grids count from the top left of their display windows."""
+
+    scale: int
+    grid: Window
+    """LRHS pixels, relative to its display window, that cover the HRLS's data window: the area that is fused."""
+    lr_data: Window
+    """The LRHS's data window, relative to its display window."""
+    hr_data: Window
+    """The HRLS's data window, relative to its display window: what is written."""
+    stretch: tuple[float, float] = (1.0, 1.0)
+    """LRHS pixels a grid pixel, in x and y: 1 unless an odd size was rounded."""
+
+
+def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
+    """Match an LRHS and an HRLS.
+
+    An HRLS of odd size (1921 x 1081) may come with an LRHS rounded up or down (961 x 541 or 960 x 540). Renderers fit
+    the whole frame into either, so its pixels are not exactly s HRLS pixels wide: ``stretch`` says by how much. The
+    pixel aspects are the same, or differ by just that, so that both frames have one shape.
+
+    Raises:
+        InputError: swapped inputs, another pixel aspect, framing or ratio; the message says what was seen.
+    """
+    low, high = lr.display_window, hr.display_window
+    scale = _scale(low, high)
+    if scale is None:
+        raise _wrong_ratio(lr, hr)
+    if abs(lr.pixel_aspect - hr.pixel_aspect) > 1e-3 and abs(_shape(lr) / _shape(hr) - 1) > 1e-3:
+        raise InputError(
+            f"{lr.name} has pixel aspect {lr.pixel_aspect:g}, {hr.name} has {hr.pixel_aspect:g}; "
+            "render both with the same"
+        )
+    lr_data = lr.data_window.shift(-low.x0, -low.y0)
+    hr_data = hr.data_window.shift(-high.x0, -high.y0)
+    grid = Window(hr_data.x0 // scale, hr_data.y0 // scale, -(-hr_data.x1 // scale), -(-hr_data.y1 // scale))
+    missing = max(lr_data.x0 - grid.x0, lr_data.y0 - grid.y0, grid.x1 - lr_data.x1, grid.y1 - lr_data.y1)
+    if missing > 1:  # one pixel is rounding, of odd sizes and of crop regions
+        raise InputError(
+            f"framing differs: {hr.name} covers {hr_data} of its frame, which needs {grid} of the low-resolution "
+            f"frame, but {lr.name} covers only {lr_data}; render both with the same crop region and overscan"
+        )
+    stretch = (low.width * scale / high.width, low.height * scale / high.height)
+    return Alignment(scale, grid, lr_data, hr_data, stretch)
+
+
+def _shape(render: ReadableRender) -> float:
+    """Width by height of the frame as it is seen."""
+    return render.display_window.width * render.pixel_aspect / render.display_window.height
+
+
+def _scale(low: Window, high: Window) -> int | None:
+    for s in SCALES:
+        if all(
+            small in (large // s, -(-large // s))
+            for small, large in ((low.width, high.width), (low.height, high.height))
+        ):
+            return s
+    return None
+
+
+def _wrong_ratio(lr: ReadableRender, hr: ReadableRender) -> InputError:
+    low, high = lr.display_window, hr.display_window
+    if _scale(high, low) is not None:
+        return InputError(
+            f"the inputs look swapped: {lr.name} is {low.size} and {hr.name} is {high.size}; "
+            "give the low-resolution render first"
+        )
+    x, y = high.width / low.width, high.height / low.height
+    wanted = ", ".join(f"{-(-high.width // s)}x{-(-high.height // s)} (x{s})" for s in SCALES)
+    if abs(x - y) > 0.02 * max(x, y):
+        what = f"framing differs: the ratio is {x:.3g} in width and {y:.3g} in height"
+    else:
+        what = f"a ratio of {x:.3g} is not supported"
+    return InputError(f"{what} ({lr.name} is {low.size}, {hr.name} is {high.size}); render the LRHS at one of {wanted}")

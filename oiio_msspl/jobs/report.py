@@ -1,0 +1,129 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The main job on files: two EXRs in, one EXR and a preview out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from oiio_msspl._version import __version__
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.model.session import Session
+
+
+@dataclass
+class FrameReport:
+    """What was done, for the user and for machines."""
+
+    lr: MappedRender
+    hr: MappedRender
+    scale: int
+    model: str
+    provider: str
+    output: Path
+    preview: Path | None
+    repaired: dict[str, int]
+    warnings: list[str]
+    tiles: int
+    seconds: dict[str, float]
+    """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
+    features: frozenset[str]
+    """What the model reads of the HRLS."""
+    low_aovs: tuple[str, ...] = ()
+    """What it may read of the LRHS beside colour, if it is there."""
+
+    @property
+    def spp_avg(self) -> float | None:
+        """Average samples: spp_LRHS / s^2 + spp_HRLS (section 5.1), or None if a header does not say."""
+        if self.lr.spp is None or self.hr.spp is None:
+            return None
+        return self.lr.spp / self.scale**2 + self.hr.spp
+
+    def aovs(self) -> list[dict[str, str]]:
+        """As :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table`; but what the model does not read is ``unused``."""
+        rows = self.hr.table()
+        for row in rows:
+            if row["feature"] not in {*self.features, "alpha"}:
+                row |= {"source": ""} if row["status"] == "default" else {}
+                row |= {"status": "unused"}
+        return rows
+
+    def found_low_aovs(self) -> dict[str, str]:
+        """Those of ``low_aovs`` that the LRHS has, and the layers that they come from."""
+        return {name: self.lr.features[name].text for name in self.low_aovs if name in self.lr.features}
+
+    def as_dict(self) -> dict[str, Any]:
+        return {
+            "lrhs": self.lr.name,
+            "hrls": self.hr.name,
+            "output": str(self.output),
+            "preview": str(self.preview) if self.preview else None,
+            "renderer": self.hr.renderer,
+            "view": self.hr.view or None,
+            "scale": self.scale,
+            "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
+            "model": self.model,
+            "provider": self.provider,
+            "aovs": self.aovs(),
+            "lrhs_aovs": self.found_low_aovs(),
+            "notes": self.hr.notes,
+            "repaired": self.repaired,
+            "warnings": self.warnings,
+            "tiles": self.tiles,
+            "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
+            "version": __version__,
+        }
+
+
+def report_on(
+    lr: MappedRender, hr: MappedRender, session: Session, fused: FusedFrame, output: Path, preview_path: Path | None
+) -> FrameReport:
+    """The report of a frame that is fused and not yet written."""
+    return FrameReport(
+        lr=lr,
+        hr=hr,
+        scale=fused.pairing.scale,
+        model=session.contract.name,
+        provider=session.provider,
+        output=output,
+        preview=preview_path,
+        repaired=fused.repaired,
+        warnings=[*_spp_warnings(lr, hr, session), *fused.warnings],
+        tiles=fused.tiles,
+        seconds={},
+        features=frozenset(session.contract.features),
+        low_aovs=session.low_aovs,
+    )
+
+
+def _spp_warnings(lr: MappedRender, hr: MappedRender, session: Session) -> list[str]:
+    warnings = []
+    if lr.spp is not None and hr.spp is not None and lr.spp <= hr.spp:
+        warnings.append(
+            f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution render"
+        )
+    for name, key, spp in (("HRLS", "hrls", hr.spp), ("LRHS", "lrhs", lr.spp)):
+        seen = session.contract.training_spp.get(key)
+        if spp is not None and seen and not seen[0] <= spp <= seen[1]:
+            warnings.append(
+                f"the {name} has {spp:g} spp; {session.contract.name} was trained on {seen[0]} to {seen[1]}"
+            )
+    return warnings
+
+
+def _provenance(report: FrameReport) -> dict[str, str]:
+    """Attributes of the fused part: what it was made from."""
+    spp = report.spp_avg
+    return {
+        "msspl/version": __version__,
+        "msspl/model": report.model,
+        "msspl/scale": str(report.scale),
+        "msspl/lrhs": report.lr.name,
+        "msspl/hrls": report.hr.name,
+        "msspl/spp_lrhs": "unknown" if report.lr.spp is None else f"{report.lr.spp:g}",
+        "msspl/spp_hrls": "unknown" if report.hr.spp is None else f"{report.hr.spp:g}",
+        "msspl/spp_average": "unknown" if spp is None else f"{spp:g}",
+        "msspl/aovs": "; ".join(f"{row['feature']}: {row['status']} {row['source']}".strip() for row in report.aovs()),
+    }

@@ -1,0 +1,91 @@
+# SPDX-License-Identifier: Apache-2.0
+"""NumPy on several cores: an image is worked on in blocks of rows, several at a time.
+
+A block fits into a core's cache, so several in-place steps on it cost little more than one. NumPy releases the
+interpreter lock while it computes, so threads are enough.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import contextvars
+import functools
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import ContextVar
+from typing import TypeVar
+
+#: Values of a block: 512 KiB of float32.
+BLOCK_VALUES = 1 << 17
+
+T = TypeVar("T")
+
+_thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
+
+
+@contextlib.contextmanager
+def limit_threads(count: int) -> Iterator[None]:
+    """Use at most ``count`` threads inside the ``with`` block; 0 means one for each available core."""
+    token = _thread_limit.set(count)
+    try:
+        yield
+    finally:
+        _thread_limit.reset(token)
+
+
+def available_cores() -> int:
+    """Cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def for_row_blocks(work: Callable[[slice], object], rows: int, row_size: int, multiple: int = 1) -> None:
+    """Call ``work`` with slices that together cover ``rows`` rows, several at a time.
+
+    Args:
+        work: takes a slice of rows; what it raises is raised here.
+        row_size: values in a row.
+        multiple: the height of each slice, except the last, is a multiple of this.
+    """
+    step = max(BLOCK_VALUES // max(row_size, 1), 1)
+    step = -(-step // multiple) * multiple
+    slices = [slice(start, min(start + step, rows)) for start in range(0, rows, step)]
+    count = min(_thread_limit.get() or available_cores(), len(slices))
+    # Each thread gets its slices at once: to hand over a single slice takes a third of the time to compute it.
+    shares = [slices[len(slices) * i // count : len(slices) * (i + 1) // count] for i in range(count)]
+    others = [_row_pool(count).submit(_run_all, work, share) for share in shares[1:]]
+    _run_all(work, shares[0] if shares else [])
+    for other in others:
+        other.result()
+
+
+def in_background(work: Callable[[], T]) -> Callable[[], T]:
+    """Start ``work`` on another thread, if more than one may be used.
+
+    Returns:
+        A function that waits for the result and returns it.
+    """
+    if (_thread_limit.get() or available_cores()) == 1:
+        return work
+    return _background_pool().submit(contextvars.copy_context().run, work).result
+
+
+def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
+    for rows in slices:
+        work(rows)
+
+
+@functools.cache
+def _background_pool() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(thread_name_prefix="background")
+
+
+@functools.cache  # a process uses one or two different numbers of threads
+def _row_pool(count: int) -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(count, thread_name_prefix="rows")
+
+
+if hasattr(os, "register_at_fork"):
+    # A child process has none of its parent's threads.
+    for pool in (_row_pool, _background_pool):
+        os.register_at_fork(after_in_child=pool.cache_clear)

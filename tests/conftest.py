@@ -11,8 +11,8 @@ import pytest
 
 from oiio_msspl.model import oidn, oidn_weights
 from oiio_msspl.model.contract import SCALES
-from oiio_msspl.model.oidn import eight_bits_work
-from oiio_msspl.model.oidn_weights import known_weights
+from oiio_msspl.model.oidn import quantised_networks_work
+from oiio_msspl.model.oidn_weights import find_weights
 from oiio_msspl.model.contract import Contract, METADATA_KEY
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
@@ -138,10 +138,17 @@ def bilinear_models(tmp_path_factory):
 
 
 @pytest.fixture
-def forget():
-    """What is known of the installed pyoidn, before and after."""
-    for known in (known_weights, eight_bits_work):
+def quantised_networks():
+    """Skip where 8-bit networks cannot run: pyoidn is missing, or the processor has no VNNI instructions."""
+    if not quantised_networks_work():
+        pytest.skip("8-bit networks do not run here")
+
+
+@pytest.fixture
+def forget_pyoidn():
+    """Clear what is cached about the installed pyoidn, before and after."""
+    for known in (find_weights, quantised_networks_work):
         known.cache_clear()
     yield
-    for known in (known_weights, eight_bits_work):
+    for known in (find_weights, quantised_networks_work):
         known.cache_clear()

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do these two renders show the same frame, and how do their pixels lie over each other?
+"""How the pixels of a pair lie over each other.
 
-Everything follows from the display windows: the low-resolution frame spans the same picture with 1/s of the pixels.
-Data windows then say which part of the frame was rendered (overscan, crop regions).
+It follows from the display windows: the low-resolution frame shows the same picture with 1/s of the pixels. The data
+windows then say which part of the frame was rendered (overscan, crop region).
 """
 
 from __future__ import annotations
@@ -16,28 +16,28 @@ from oiio_msspl.model.contract import SCALES
 
 @dataclass(frozen=True)
 class Alignment:
-    """Where the pixels of a pair lie. Both grids count from the top left of their display windows."""
+    """How the pixels of a pair lie over each other. Windows count from the top left of the display window."""
 
     scale: int
     grid: Window
-    """LRHS pixels, relative to its display window, that cover the HRLS's data window: the area that is fused."""
-    lr_data: Window
-    """The LRHS's data window, relative to its display window."""
-    hr_data: Window
-    """The HRLS's data window, relative to its display window: what is written."""
+    """The LRHS pixels that cover the HRLS's data window: the area that is fused."""
+    lr_data_window: Window
+    """The LRHS's data window."""
+    hr_data_window: Window
+    """The HRLS's data window: the area that is written."""
     stretch: tuple[float, float] = (1.0, 1.0)
-    """LRHS pixels a grid pixel, in x and y: 1 unless an odd size was rounded."""
+    """Size of a grid pixel in LRHS pixels, x and y: 1 unless an odd size was rounded."""
 
 
 def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
-    """Match an LRHS and an HRLS.
+    """Find how the pixels of a pair lie over each other.
 
-    An HRLS of odd size (1921 x 1081) may come with an LRHS rounded up or down (961 x 541 or 960 x 540). Renderers fit
-    the whole frame into either, so its pixels are not exactly s HRLS pixels wide: ``stretch`` says by how much. The
-    pixel aspects are the same, or differ by just that, so that both frames have one shape.
+    An HRLS of odd size (1921 x 1081) may come with an LRHS that is rounded up or down (961 x 541 or 960 x 540).
+    Renderers fit the whole frame into either size, so an LRHS pixel is not exactly s HRLS pixels wide: ``stretch`` is
+    the ratio. The pixel aspects are equal, or differ by that ratio, so that both frames have one shape.
 
     Raises:
-        InputError: swapped inputs, another pixel aspect, framing or ratio; the message says what was seen.
+        InputError: the inputs are swapped, or their pixel aspects, framing or ratio do not fit.
     """
     low, high = lr.display_window, hr.display_window
     scale = _scale(low, high)
@@ -52,7 +52,7 @@ def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
     hr_data = hr.data_window.shift(-high.x0, -high.y0)
     grid = Window(hr_data.x0 // scale, hr_data.y0 // scale, -(-hr_data.x1 // scale), -(-hr_data.y1 // scale))
     missing = max(lr_data.x0 - grid.x0, lr_data.y0 - grid.y0, grid.x1 - lr_data.x1, grid.y1 - lr_data.y1)
-    if missing > 1:  # one pixel is rounding, of odd sizes and of crop regions
+    if missing > 1:  # odd sizes and crop regions may be rounded by one pixel
         raise InputError(
             f"framing differs: {hr.name} covers {hr_data} of its frame, which needs {grid} of the low-resolution "
             f"frame, but {lr.name} covers only {lr_data}; render both with the same crop region and overscan"
@@ -62,7 +62,7 @@ def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
 
 
 def _shape(render: ReadableRender) -> float:
-    """Width by height of the frame as it is seen."""
+    """Width by height of the frame as it is displayed."""
     return render.display_window.width * render.pixel_aspect / render.display_window.height
 
 

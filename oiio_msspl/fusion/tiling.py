@@ -1,57 +1,81 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cutting a frame into overlapping tiles, so that memory depends on the tile and not on the frame."""
+"""Cuts a frame into overlapping tiles, so that memory depends on the tile and not on the frame."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
+from oiio_msspl.model.contract import Contract
 
-#: Tiles of more HRLS pixels than this bring no more speed.
-LARGEST = 2048 * 2048
-#: Tiles with a core of fewer LRHS pixels a side would spend nearly all their work on the overlap.
+#: Memory that a run may use by default.
+MAX_MEMORY = 3 << 30
+#: Memory that does not grow with the frame: interpreter, libraries, weights.
+FIXED_MEMORY = 350 << 20
+#: HRLS pixels of the largest tile; larger ones are no faster.
+LARGEST_TILE = 2048 * 2048
+#: Shortest side of a tile's core, in LRHS pixels; smaller ones would spend nearly all work on the overlap.
 SMALLEST_CORE = 16
 
 
 @dataclass(frozen=True)
 class Tile:
-    """Both windows in LRHS pixels; ``core`` lies in ``area``."""
+    """Two windows in LRHS pixels; ``core`` is inside ``area``."""
 
     core: Window
-    """What the tile contributes: cores cover the grid once."""
+    """The pixels that the tile contributes to the frame. The cores cover the grid once."""
     area: Window
-    """What the network sees: the core and the overlap, as far as the grid goes."""
+    """The pixels that the network reads: the core plus the overlap, cut at the borders of the grid."""
 
 
 def aligned_grid(grid: Window, alignment: int) -> Window:
-    """``grid`` extended to the right and below until its sides are multiples of ``alignment``."""
+    """Extend ``grid`` to the right and to the bottom until its sides are multiples of ``alignment``."""
     width, height = (-(-side // alignment) * alignment for side in (grid.width, grid.height))
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
 
-def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> Iterator[Tile]:
-    """Cover ``grid`` by tiles whose area holds at most ``largest`` LRHS pixels.
+def largest_tile(contract: Contract, frame_bytes: int, max_memory: int) -> int:
+    """LRHS pixels of the largest tile that fits into memory.
 
-    The grid's own borders get no overlap: there the network sees the end of the picture, as in training. ``overlap``
-    and the grid's sides are multiples of ``alignment``, and so are all sides and offsets of the tiles: a network that
-    works on blocks of pixels divides every tile as it would divide the frame.
+    Args:
+        frame_bytes: memory for the whole frame: the result and the LRHS.
+        max_memory: memory for the whole process.
 
     Raises:
-        InputError: ``largest`` leaves no room for a core.
+        InputError: not even the frame fits.
+    """
+    left = max_memory - FIXED_MEMORY - frame_bytes
+    pixels = min(left // contract.bytes_per_pixel, LARGEST_TILE)
+    if pixels <= 0:
+        needed = (FIXED_MEMORY + frame_bytes) / 2**30
+        raise InputError(f"--max-memory: this frame alone takes {needed:.1f} GiB; allow at least {needed + 0.5:.1f}G")
+    return int(pixels) // contract.scale**2
+
+
+def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> list[Tile]:
+    """Cover ``grid`` by tiles, row by row, whose area has at most ``largest`` LRHS pixels.
+
+    There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
+    ``overlap`` and the sides of the grid are multiples of ``alignment``. So are the sides and offsets of all tiles, so
+    that a network that works on blocks of pixels divides a tile as it divides the frame.
+
+    Raises:
+        InputError: ``largest`` is too small for a core.
     """
     columns, rows = _split(grid, largest, overlap, alignment)
-    for y0, y1 in rows:
-        for x0, x1 in columns:
-            core = Window(x0, y0, x1, y1)
-            yield Tile(core, Window(x0 - overlap, y0 - overlap, x1 + overlap, y1 + overlap).intersect(grid))
+    return [
+        Tile(Window(x0, y0, x1, y1), Window(x0 - overlap, y0 - overlap, x1 + overlap, y1 + overlap).intersect(grid))
+        for y0, y1 in rows
+        for x0, x1 in columns
+    ]
 
 
 def _split(
     grid: Window, largest: int, overlap: int, alignment: int
 ) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Fewest cuts that fit, cutting the longer side first so that tiles stay near square."""
+    """Ranges of the columns and rows of tiles: the fewest that fit. The longer side is cut first, so tiles are nearly
+    square."""
     nx = ny = 1
     while True:
         width, height = _step(grid.width, nx, alignment), _step(grid.height, ny, alignment)
@@ -68,13 +92,13 @@ def _split(
             nx += 1
         else:
             ny += 1
-    return _cuts(grid.x0, grid.x1, width), _cuts(grid.y0, grid.y1, height)
+    return _ranges(grid.x0, grid.x1, width), _ranges(grid.y0, grid.y1, height)
 
 
 def _step(side: int, count: int, alignment: int) -> int:
-    """Smallest multiple of ``alignment`` of which ``count`` make up a side."""
+    """The smallest multiple of ``alignment`` with which ``count`` steps cover a side."""
     return -(-side // (count * alignment)) * alignment
 
 
-def _cuts(start: int, end: int, step: int) -> list[tuple[int, int]]:
+def _ranges(start: int, end: int, step: int) -> list[tuple[int, int]]:
     return [(a, min(a + step, end)) for a in range(start, end, step)]

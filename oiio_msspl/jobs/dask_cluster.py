@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.shot import Stages
-from oiio_msspl.model.catalogue import ALWAYS, AUTO, find_model
+from oiio_msspl.model.catalogue import AUTO, WITHOUT_OIDN, find_model
 from oiio_msspl.model.session import Session
 
 if TYPE_CHECKING:
@@ -65,7 +65,7 @@ def fuse_frames(
 
     neighbours = _most_on_a_machine(client)
     if stages.model in (None, AUTO):
-        stages = replace(stages, model=ALWAYS)  # the same for all frames and machines, whatever is installed
+        stages = replace(stages, model=WITHOUT_OIDN)  # the same for all frames and machines, whatever is installed
     elif Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))
     find_model(2, stages.model)  # if there is no such model, it is said here

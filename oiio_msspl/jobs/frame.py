@@ -18,7 +18,8 @@ from oiio_msspl.exr.preview import check_view, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.writer import WriteOptions, dropped_channels, write_fused
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import MAX_MEMORY, FusedFrame, fuse
+from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.tiling import MAX_MEMORY
 from oiio_msspl.jobs.report import FrameReport, _provenance, report_on
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session

@@ -84,7 +84,7 @@ def report_on(
     return FrameReport(
         lr=lr,
         hr=hr,
-        scale=fused.pairing.scale,
+        scale=fused.alignment.scale,
         model=session.contract.name,
         provider=session.provider,
         output=output,
@@ -94,7 +94,7 @@ def report_on(
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.features),
-        low_aovs=session.low_aovs,
+        low_aovs=session.lrhs_aovs,
     )
 
 

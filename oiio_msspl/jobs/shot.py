@@ -29,7 +29,8 @@ from oiio_msspl.exr.preview import check_view, is_our_preview
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.writer import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FIXED_MEMORY, MAX_MEMORY, FusedFrame, fuse
+from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
 from oiio_msspl.jobs.frame import InputOptions, map_pair, write_frame, write_frame_preview
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame, Shot, find_shot

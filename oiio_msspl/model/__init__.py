@@ -1,1 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
+"""Networks: what they read (contract, encoding), where they are (catalogue, weights/), what runs them (session)."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models, and what evaluates them."""
+"""The models inside the package, and which one a name means."""
 
 from __future__ import annotations
 
@@ -8,28 +8,35 @@ from importlib.util import find_spec
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.oidn import eight_bits_work
+from oiio_msspl.model.oidn import quantised_networks_work
 
-#: What ``--model`` is where no other is asked for: ``BEST`` where pyoidn is installed and its weights are of use in 8
-#: bits; ``BESIDE`` with any other pyoidn; otherwise ``ALWAYS``.
-AUTO, BEST, BESIDE, ALWAYS = "auto", "joint", "mix", "pyramid"
+#: The name that lets :func:`find_model` choose.
+AUTO = "auto"
+#: Families that ``auto`` chooses from: the best one needs OIDN's weights and a processor that computes 8-bit networks
+#: correctly, the second any pyoidn, the third nothing.
+BEST, WITH_OIDN, WITHOUT_OIDN = "joint", "mix", "pyramid"
 
 
 def shipped_models() -> dict[str, Path]:
-    """Name -> file of the models inside the package."""
+    """Name (``paper-x4``) -> ONNX file of each model inside the package."""
     folder = Path(str(resources.files("oiio_msspl.model").joinpath("weights")))
     return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
 
 
 def find_model(scale: int, name: str | None = None) -> Path:
-    """The model that a name means: ``auto`` (or None), a shipped model, a family of them such as ``paper``, or a file.
+    """The ONNX file of a model.
+
+    Args:
+        scale: 2, 4 or 8.
+        name: ``auto`` or None for the best family that runs here, a family (``paper``), a model (``paper-x4``), or an
+            ONNX file.
 
     Raises:
         InputError: there is no such model.
     """
     models = shipped_models()
     if name in (None, AUTO):
-        name = (BEST if eight_bits_work() else BESIDE) if find_spec("pyoidn") else ALWAYS
+        name = (BEST if quantised_networks_work() else WITH_OIDN) if find_spec("pyoidn") else WITHOUT_OIDN
     for known in (name, f"{name}-x{scale}"):
         if known in models:
             return models[known]

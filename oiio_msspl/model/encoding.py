@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between a render's values and the network's, and back: pure NumPy, used by training and by inference alike.
+"""Between scene-linear features and what the networks read: exposure and a log curve, each with its inverse.
 
-Radiance is first scaled by the exposure of the LRHS, so that the network sees every scene at the same brightness and
-scaling a scene scales its output; then compressed by a logarithm, so that errors in shadows and in highlights weigh
-alike. The paper feeds linear values clipped at 100; a log keeps highlights without letting them rule the loss.
+Training and inference share this file. Radiance is multiplied by the exposure of the LRHS, so every scene has the same
+brightness and a brighter scene gives the same picture, brighter. Then it is log-encoded, so errors in shadows and in
+highlights weigh alike. The paper clips linear values at 100; a log curve keeps highlights and does not let them
+dominate the loss.
 """
 
 from __future__ import annotations
@@ -11,73 +12,93 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
-from oiio_msspl.arrays import Array, clip, map_rows
+from oiio_msspl.arrays import HALF_MAX, Array, clip, map_rows
 from oiio_msspl.colour import luminance
 
 #: Log-mean luminance to which a scene is exposed: photographic mid-grey.
 KEY = 0.18
-#: Light below this share of a frame's bright parts is none: 33 stops.
-TRACE = 1e-10
-#: Slope parameter of the log curve. 16 puts mid-grey at 0.48 and white at 1, close to the sRGB curve below white.
+#: Slope of the log curve. 16 puts mid-grey at 0.48 and white at 1, close to the sRGB curve below white.
 MU = 16.0
-#: Largest exposed radiance that is told apart (log value 4.87); about what half floats hold.
-MAX_RADIANCE = 65504.0
-#: Reflectances above 1 exist (glass, wrong materials); beyond 2 they say nothing.
+#: Largest exposed radiance; brighter pixels are clipped. Log-encoded it is 4.87.
+MAX_RADIANCE = HALF_MAX
+#: Largest albedo; glass and wrong materials exceed 1.
 MAX_ALBEDO = 2.0
+#: Pixels darker than this share of a frame's bright pixels (33 stops below) do not count for its exposure.
+NO_LIGHT = 1e-10
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
+#: Log-encoded ``MAX_RADIANCE``, in the arithmetic of :func:`decode_radiance`.
+_MAX_ENCODED = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
 
 
-def find_exposure(lrhs_rgb: Array) -> float:
-    """Factor that brings a repaired LRHS (H, W, 3) to a log-mean luminance of ``KEY``; 1.0 for a black frame.
+def find_exposure(rgb: Array) -> float:
+    """Factor that brings a render to a log-mean luminance of ``KEY``.
 
-    Pixels without light carry no exposure and are left out, and so are traces: what a filter or a float left of light
-    elsewhere. Of the lit ones, the epsilon keeps a few almost black pixels from deciding. It comes from the median: a
-    single firefly of any size moves the result by next to nothing.
+    Only lit pixels count, because a black pixel has no exposure. The offset inside the logarithm keeps a few nearly
+    black pixels from deciding. It follows the median, which a firefly hardly changes.
+
+    Args:
+        rgb: (height, width, 3), scene linear, repaired.
+
+    Returns:
+        The factor; 1.0 for a black render.
     """
-    y = luminance(lrhs_rgb).astype(np.float64)
+    y = luminance(rgb).astype(np.float64)
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0
-    lit = lit[lit >= TRACE * np.quantile(lit, 0.99)]
-    epsilon = 1e-4 * float(np.median(lit))
-    return float(KEY / np.exp(np.mean(np.log(lit + epsilon))))
+    lit = lit[lit >= NO_LIGHT * np.quantile(lit, 0.99)]
+    offset = 1e-4 * float(np.median(lit))
+    return float(KEY / np.exp(np.mean(np.log(lit + offset))))
 
 
 def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) -> Array:
-    """Scene-linear radiance >= 0 to network values: ``log(1 + mu e x) / log(1 + mu)``; into ``out``, if given."""
+    """Log-encode scene-linear radiance: ``log(1 + MU e x) / log(1 + MU)``, with ``e x`` clipped to [0, MAX_RADIANCE].
 
-    def steps(values: Array) -> None:
+    Args:
+        radiance: any shape.
+        out: where to put the result; a new array if None.
+    """
+
+    def encode(values: Array) -> None:
         values *= np.float32(exposure)
         np.clip(values, 0.0, MAX_RADIANCE, out=values)
         values *= np.float32(MU)
         np.log1p(values, out=values)
         values *= _LOG_SCALE
 
-    return map_rows(steps, radiance, out)
+    return map_rows(encode, radiance, out)
 
 
-def decode_radiance(values: Array, exposure: float, out: Array | None = None) -> Array:
-    """Inverse of :func:`compress`. Values outside what ``compress`` yields are clipped, so the result is finite."""
-    top = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
+def decode_radiance(encoded: Array, exposure: float, out: Array | None = None) -> Array:
+    """Inverse of :func:`encode_radiance`. Input is clipped to its range, so the result is finite and >= 0."""
 
-    def steps(radiance: Array) -> None:
-        np.clip(radiance, 0.0, top, out=radiance)
-        radiance /= _LOG_SCALE
-        np.expm1(radiance, out=radiance)
-        radiance /= np.float32(MU)
-        radiance /= np.float32(exposure)
+    def decode(values: Array) -> None:
+        np.clip(values, 0.0, _MAX_ENCODED, out=values)
+        values /= _LOG_SCALE
+        np.expm1(values, out=values)
+        values /= np.float32(MU)
+        values /= np.float32(exposure)
 
-    return map_rows(steps, values, out)
+    return map_rows(decode, encoded, out)
 
 
 def encode_feature(feature: str, values: Array, exposure: float, out: Array | None = None) -> Array:
-    """Values of one feature of :mod:`oiio_msspl.aovs.features`, (..., C), to network values of the same shape; into ``out``,
-    if given."""
+    """Encode one feature of :mod:`oiio_msspl.aovs.features`, (..., channels), for the network.
+
+    Radiance is log-encoded. A variance becomes a standard deviation, which is a radiance, and is log-encoded too.
+    Albedo and normal are clipped.
+
+    Args:
+        exposure: see :func:`find_exposure`.
+        out: where to put the result; a new array if None.
+
+    Raises:
+        ValueError: there is no such feature.
+    """
     if feature in RADIANCE_FEATURES:
         return encode_radiance(values, exposure, out)
     if feature == VARIANCE:
-        # A standard deviation is a radiance: it goes through the same exposure and the same curve.
         return encode_radiance(np.sqrt(np.maximum(values, 0.0)), exposure, out)
     if feature == ALBEDO:
         return clip(values, 0.0, MAX_ALBEDO, out)
@@ -87,13 +108,15 @@ def encode_feature(feature: str, values: Array, exposure: float, out: Array | No
 
 
 def encode_features(layers: dict[str, Array], features: dict[str, int], exposure: float, channels: int = 0) -> Array:
-    """Stack repaired features (h, w, c) in the order of the schema, transformed; absent ones at their default.
+    """Encode features and stack them along the channel axis. A missing feature gets its default.
 
     Args:
-        channels: of the result, if more than the features have; what is in the rest is undefined.
+        layers: repaired features (h, w, c); ``rgb`` always.
+        features: names and numbers of channels, in the order of the stack.
+        channels: channels of the result, if it needs room for more; the additional ones are not initialised.
 
     Returns:
-        float32 (h, w, channels), one channel after the other in memory, as the network wants them.
+        (h, w, channels), float32. Each channel is contiguous in memory, as ONNX Runtime wants it.
     """
     height, width = layers[RGB].shape[:2]
     channels = max(channels, sum(features.values()))

@@ -1,14 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise on both renders, for models that read its results: the only module that imports pyoidn, which is
+"""Open Image Denoise (OIDN) on both renders, for the `mix` models, which read its results. It needs pyoidn, which is
 optional.
 
-The HRLS is denoised as anyone would, with its albedo and normal. The LRHS has neither; but its light and the HRLS's are
-independent samples of the same scene, so at the LRHS's resolution their mean has less noise than either, and the
-HRLS's albedo and normal, averaged over s x s pixels, have hardly any: Open Image Denoise may be told that they are
-clean, which is worth 0.8 to 1.5 dB (at x2, where but four pixels are averaged, the LRHS's own are, too, and the albedo
-is denoised first, or nothing is told). What it makes of these is
-better at that resolution than its result on the HRLS, for a fraction of the time. A network of ours that was made of
-Open Image Denoise's does the same without its help.
+OIDN denoises the HRLS with its albedo and normal, as anyone would. It also denoises the mean of both renders at the
+LRHS's resolution (:mod:`oiio_msspl.model.render_mean`). There, albedo and normal are averages of many pixels and nearly
+free of noise, so ``cleanAux`` is set. At x2 only four pixels are averaged, so the albedo is prefiltered first.
+
+Where ONNX Runtime computes OIDN's networks correctly in 8 bits on this processor, it replaces OIDN, which takes
+twice as long (:mod:`oiio_msspl.model.quantised`).
 """
 
 from __future__ import annotations
@@ -23,74 +22,83 @@ import numpy as np
 from oiio_msspl.aovs.features import HRLS_FEATURES, LRHS_FEATURES
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.model.contract import DENOISED_FEATURES
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.oidn_weights import find_weights
 from oiio_msspl.model.quantised import QuantisedDenoiser
+from oiio_msspl.model.render_mean import NO_IMAGES, Images, denoiser_images, mean_of_renders
 
 if TYPE_CHECKING:
     import pyoidn
-from oiio_msspl.model.oidn_weights import installed_weights, known_weights
-from oiio_msspl.model.render_mean import NO_LAYERS, Layers, denoiser_layers, mean_of_renders
 
 log = logging.getLogger(__name__)
 
-_OF_LRHS, _OF_HRLS = sum(LRHS_FEATURES.values()), sum(HRLS_FEATURES.values())
-#: Largest mean difference in network values between Open Image Denoise and itself in 8 bits, on a small picture.
+#: Largest mean difference, log-encoded, between OIDN and its network in 8 bits on the test image.
 TOLERANCE = 0.01
 
+_LRHS_CHANNELS, _HRLS_CHANNELS = sum(LRHS_FEATURES.values()), sum(HRLS_FEATURES.values())
 
-class Filter:
-    """One of Open Image Denoise's networks.
+
+class OidnFilter:
+    """One network of OIDN, in 8 bits where that works.
 
     Args:
-        device: of pyoidn, committed.
-        quality: fast or high.
-        hdr: denoises colour, not an albedo alone.
-        clean: albedo and normal have no noise.
-        network: its name in :mod:`oiio_msspl.model.quantised`, which is then used where it can be.
-        threads: of that; 0 for all.
+        device: committed pyoidn device.
+        quality: ``fast`` or ``high``.
+        hdr: denoise HDR colour; otherwise an albedo.
+        clean_aux: albedo and normal have no noise.
+        network: name of the network in 8 bits, a key of :data:`oiio_msspl.model.quantised.NETWORK_IMAGES`; empty: never
+            use 8 bits.
+        threads: CPU threads of the network in 8 bits; 0 for one a core.
     """
 
     def __init__(
-        self, device: pyoidn.Device, quality: str, *, hdr: bool, clean: bool, network: str, threads: int
+        self, device: pyoidn.Device, quality: str, *, hdr: bool, clean_aux: bool, network: str, threads: int
     ) -> None:
         import pyoidn
 
         self._device, self._format, self._hdr = device, pyoidn.OIDN_FORMAT_FLOAT3, hdr
         self._filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
         self._filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
-        self._filter.set_bool("cleanAux", clean)
+        self._filter.set_bool("cleanAux", clean_aux)
         if hdr:
             self._filter.set_bool("hdr", True)
-            # Network values are exposed by the LRHS. Left alone, it would expose every tile for itself.
+            # The renders are exposed already. Without this, OIDN would find another exposure for each tile.
             self._filter.set_float("inputScale", 1.0)
-        self._lock = threading.Lock()  # a filter remembers the images of one call at a time
+        self._lock = threading.Lock()  # a filter holds the images of one call at a time
         self._network, self._threads = network, threads
 
-    def __call__(self, layers: Layers, out: Array | None = None) -> Array:
-        """Of the layers, the colour denoised, network values (h, w, 3), or the albedo; into ``out``, if given.
+    def __call__(self, images: Images, out: Array | None = None) -> Array:
+        """Denoise the colour, or the albedo of a filter for albedos.
+
+        Args:
+            images: see :data:`oiio_msspl.model.render_mean.Images`, without ``noise``.
+            out: where to put the result; a new array if None.
+
+        Returns:
+            (h, w, 3): log-encoded colour, or albedo.
 
         Raises:
-            MssplError: Open Image Denoise failed.
+            MssplError: OIDN failed.
         """
-        if self._eight_bit is not None and layers.keys() == self._eight_bit.reads:
-            return self._eight_bit(**layers, out=out)
-        return self._exactly(layers, out)
+        if self._quantised is not None and images.keys() == self._quantised.images:
+            return self._quantised(**images, out=out)
+        return self.exact(images, out)
+
+    def exact(self, images: Images, out: Array | None = None) -> Array:
+        """The same by OIDN itself, in 32 bits."""
+        aovs = {name: images[name] for name in ("albedo", "normal") if name in images}
+        if not self._hdr:
+            return np.clip(self._execute(aovs), 0, 1, out=out)
+        radiance = decode_radiance(images["colour"], 1.0)
+        return encode_radiance(self._execute({"color": radiance} | aovs), 1.0, out)
 
     @property
-    def in_eight_bits(self) -> bool:
-        """Whether it is that network that does the work, where all layers that it needs are there."""
-        return self._eight_bit is not None
+    def is_quantised(self) -> bool:
+        """Whether the network in 8 bits is used (if all images that it needs are there)."""
+        return self._quantised is not None
 
-    def _exactly(self, layers: Layers, out: Array | None = None) -> Array:
-        images: dict[str, Array] = {name: layers[name] for name in ("albedo", "normal") if name in layers}
-        if not self._hdr:
-            return np.clip(self._executed(images), 0, 1, out=out)
-        radiance = decode_radiance(layers["colour"], 1.0)
-        return encode_radiance(self._executed({"color": radiance} | images), 1.0, out)
-
-    def _executed(self, images: dict[str, Array]) -> Array:
-        """What the network makes of the first of the images (h, w, 3), with the help of the others."""
+    def _execute(self, images: Images) -> Array:
+        """Run OIDN's filter; the first image is the one to denoise."""
         images = {name: np.ascontiguousarray(image, dtype=np.float32) for name, image in images.items()}
         images["output"] = np.empty_like(next(iter(images.values())))
         with self._lock:
@@ -106,38 +114,39 @@ class Filter:
         return images["output"]
 
     @functools.cached_property
-    def _eight_bit(self) -> QuantisedDenoiser | None:
+    def _quantised(self) -> QuantisedDenoiser | None:
         if not self._network:
             return None
-        weights = known_weights(self._network)
+        weights = find_weights(self._network)
         if weights is None:
-            log.info("the weights of this Open Image Denoise are unknown here; it does its work itself")
+            log.info("this version of Open Image Denoise has other weights, so it runs in 32 bits")
             return None
         try:
             network = QuantisedDenoiser(self._network, weights, self._threads)
         except InputError as error:  # an onnxruntime without these operators
-            log.info("%s; Open Image Denoise does its work itself", error)
+            log.info("%s; Open Image Denoise runs in 32 bits", error)
             return None
-        picture = {layer: image for layer, image in _picture_to_try().items() if layer in network.reads}
-        # Processors without instructions for it sum products of 8 bits in 16, which overflows
-        difference = float(np.abs(network(**picture) - self._exactly(picture)).mean())
+        # Processors without VNNI instructions add products of 8 bits in 16 bits, which overflows.
+        images = {name: image for name, image in _test_images().items() if name in network.images}
+        difference = float(np.abs(network(**images) - self.exact(images)).mean())
         if difference > TOLERANCE:
-            log.info("in 8 bits this processor computes Open Image Denoise's network wrongly, by %.3f", difference)
+            log.info("this processor computes 8-bit networks wrongly (difference %.3f)", difference)
             return None
         return network
 
 
 class OidnDenoiser:
-    """Open Image Denoise on both renders, on the CPU.
+    """OIDN on both renders, on the CPU.
 
     Args:
-        threads: 0 for all.
-        exact: never in 8 bits (:mod:`oiio_msspl.model.quantised`), which is otherwise done where it can be.
+        threads: CPU threads; 0 for one a core.
+        exact: use OIDN itself in 32 bits, never its networks in 8 bits.
 
     Attributes:
-        hrls: what denoises the HRLS.
-        both: what denoises both together.
-        albedo: what denoises the albedo for that, at x2.
+        hrls: denoises the HRLS.
+        mean: denoises the mean of both renders, by OIDN's large network.
+        albedo: prefilters the albedo of that mean at x2. Quality ``high`` would take four times as long and bring
+            nothing.
 
     Raises:
         InputError: pyoidn is not installed.
@@ -148,142 +157,79 @@ class OidnDenoiser:
             import pyoidn
         except (ImportError, OSError) as error:  # not installed, or without its library
             raise InputError(
-                "this model reads Open Image Denoise's result: pip install pyoidn, or choose another --model"
+                "this model reads results of Open Image Denoise: pip install pyoidn, or choose another --model"
             ) from error
         device = pyoidn.Device()
         device.set_int("numThreads", threads)
-        device.set_bool("setAffinity", False)  # other threads of the process want the cores too
+        device.set_bool("setAffinity", False)  # other threads of this process need the cores too
         device.commit()
 
-        def filter_(quality: str, network: str, *, hdr: bool = True, clean: bool = False) -> Filter:
+        def make(quality: str, network: str, *, hdr: bool = True, clean_aux: bool = False) -> OidnFilter:
             name = "" if exact else network
-            return Filter(device, quality, hdr=hdr, clean=clean, network=name, threads=threads)
+            return OidnFilter(device, quality, hdr=hdr, clean_aux=clean_aux, network=name, threads=threads)
 
-        self.hrls = filter_("high", "rt_hdr_alb_nrm")
-        # A larger network than the usual one
-        self.both = filter_("high", "rt_hdr_calb_cnrm_large", clean=True)
-        # Quality high would take four times as long and gain nothing
-        self.albedo = filter_("fast", "rt_alb", hdr=False)
+        self.hrls = make("high", "rt_hdr_alb_nrm")
+        self.mean = make("high", "rt_hdr_calb_cnrm_large", clean_aux=True)
+        self.albedo = make("fast", "rt_alb", hdr=False)
 
-    def __call__(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> tuple[Array, Array]:
-        """Denoise a pair as the network sees it.
+    def __call__(self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES) -> tuple[Array, Array]:
+        """Denoise an encoded pair.
 
         Args:
-            lrhs: (h, w, 3), transformed.
-            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.aovs.features.HRLS_FEATURES`.
-            low_aovs: see :func:`mean_of_renders`.
+            lrhs: (h, w, 3), encoded.
+            hrls: (s*h, s*w, 16), encoded, channels as in :data:`oiio_msspl.aovs.features.HRLS_FEATURES`.
+            lrhs_aovs: see :func:`oiio_msspl.model.render_mean.mean_of_renders`.
 
         Returns:
-            Both with what was denoised as further channels, transformed colour: (h, w, 6), the LRHS with both renders
-            together at its resolution; and (s*h, s*w, 19), the HRLS with itself denoised.
+            Copies with three more channels of log-encoded colour: the LRHS with the denoised mean of both renders,
+            (h, w, 6), and the HRLS with itself denoised, (s*h, s*w, 19).
 
         Raises:
-            MssplError: Open Image Denoise failed.
+            MssplError: OIDN failed.
         """
-        low, high = _with_room(lrhs), _with_room(hrls)
-        self.fill(low, high, low_aovs)
-        return low, high
+        lrhs, hrls = append_channels(lrhs, 3), append_channels(hrls, 3)
+        self.fill(lrhs, hrls, lrhs_aovs)
+        return lrhs, hrls
 
-    def fill(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> None:
-        """The same in place: what is denoised is written behind the renders' own channels, which must have room for it.
+    def fill(self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES) -> None:
+        """The same in place: fill the last three channels of (h, w, 6) and (s*h, s*w, 19)."""
+        images = denoiser_images(hrls)
+        self.mean(self.clean_mean(lrhs[..., :_LRHS_CHANNELS], images, lrhs_aovs), lrhs[..., _LRHS_CHANNELS:])
+        self.hrls(images, hrls[..., _HRLS_CHANNELS:])
 
-        Args:
-            lrhs: (h, w, 6).
-            hrls: (s*h, s*w, 19).
-            low_aovs: see :func:`mean_of_renders`.
+    def denoise_mean(self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES) -> Array:
+        """Denoise the mean of both renders only: log-encoded colour (h, w, 3)."""
+        return self.mean(self.clean_mean(lrhs, denoiser_images(hrls), lrhs_aovs))
 
-        Raises:
-            MssplError: Open Image Denoise failed.
-        """
-        layers = denoiser_layers(hrls)
-        self.both(self.merged(lrhs[..., :_OF_LRHS], layers, low_aovs), lrhs[..., _OF_LRHS:])
-        self.hrls(layers, hrls[..., _OF_HRLS:])
-
-    def together(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> Array:
-        """Of the same arguments, both renders denoised together at the LRHS's resolution, network values (h, w, 3).
-
-        Raises:
-            MssplError: Open Image Denoise failed.
-        """
-        return self.both(self.merged(lrhs, denoiser_layers(hrls), low_aovs))
-
-    def merged(self, lrhs: Array, layers: Layers, low_aovs: Layers = NO_LAYERS) -> Layers:
-        """What is denoised together: as :func:`mean_of_renders`, but with layers that have no noise.
-
-        Raises:
-            MssplError: Open Image Denoise failed.
-        """
-        scale = layers["colour"].shape[0] // lrhs.shape[0]
-        low = mean_of_renders(lrhs, layers, low_aovs)
-        del low["noise"]
-        if scale == 2 and "albedo" in low:
-            low["albedo"] = self.albedo({"albedo": low["albedo"]})
-        return low
-
-
-class MeanDenoiser:
-    """Both renders denoised together, by a network in 8 bits that was made of Open Image Denoise's larger one
-    (:mod:`training.together`).
-
-    Args:
-        threads: 0 for all.
-
-    Raises:
-        InputError: pyoidn is not installed, or has other weights.
-    """
-
-    def __init__(self, threads: int = 0) -> None:
-        self._network = QuantisedDenoiser("mean_denoiser", installed_weights("rt_hdr_calb_cnrm_large"), threads)
-
-    def __call__(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> tuple[Array, Array]:
-        """Denoise a pair as the network sees it.
-
-        Args:
-            lrhs: (h, w, 3), transformed.
-            hrls: (s*h, s*w, 9) or more, transformed: colour, albedo, normal.
-            low_aovs: see :func:`mean_of_renders`.
-
-        Returns:
-            The LRHS with what was denoised as further channels, transformed colour: (h, w, 6); and the HRLS.
-        """
-        low = _with_room(lrhs)
-        self.fill(low, hrls, low_aovs)
-        return low, hrls
-
-    def fill(self, lrhs: Array, hrls: Array, low_aovs: Layers = NO_LAYERS) -> None:
-        """The same in place, of an LRHS (h, w, 6): what is denoised is written behind its own channels."""
-        low = mean_of_renders(lrhs[..., :_OF_LRHS], denoiser_layers(hrls, complete=True), low_aovs)
-        self._network(**low, out=lrhs[..., _OF_LRHS:])
-
-
-def denoiser_for(mode: str, threads: int, *, exact: bool = False) -> OidnDenoiser | MeanDenoiser | None:
-    """What denoises for a model: nothing for an empty mode; ``high``: a :class:`Denoiser`; ``together``."""
-    if mode == "together":
-        return MeanDenoiser(threads)
-    return OidnDenoiser(threads, exact=exact) if mode else None
+    def clean_mean(self, lrhs: Array, hrls_images: Images, lrhs_aovs: Images = NO_IMAGES) -> Images:
+        """The mean of both renders with albedo and normal that are (nearly) free of noise."""
+        scale = hrls_images["colour"].shape[0] // lrhs.shape[0]
+        images = mean_of_renders(lrhs, hrls_images, lrhs_aovs)
+        del images["noise"]
+        if scale == 2 and "albedo" in images:
+            images["albedo"] = self.albedo({"albedo": images["albedo"]})
+        return images
 
 
 @functools.cache
-def eight_bits_work() -> bool:
-    """Whether pyoidn is installed, with weights that :mod:`oiio_msspl.model.quantised` knows, and this machine computes with
-    them in 8 bits what Open Image Denoise does in 32."""
+def quantised_networks_work() -> bool:
+    """Whether pyoidn is installed with known weights, and this machine computes its networks correctly in 8 bits."""
     try:
-        return OidnDenoiser().hrls.in_eight_bits
+        return OidnDenoiser().hrls.is_quantised
     except InputError:
         return False
 
 
-def _with_room(image: Array) -> Array:
-    """A copy with channels for what is denoised, too; they lie one behind the other in memory."""
+def append_channels(image: Array, count: int) -> Array:
+    """A copy of an image (h, w, c) with ``count`` more channels, not initialised; each channel is contiguous."""
     height, width, channels = image.shape
-    more = sum(DENOISED_FEATURES.values())
-    copy = np.empty((channels + more, height, width), dtype=np.float32).transpose(1, 2, 0)
+    copy = np.empty((channels + count, height, width), dtype=np.float32).transpose(1, 2, 0)
     copy[..., :channels] = image
     return copy
 
 
-def _picture_to_try() -> Layers:
-    """Something of everything: noise, edges, slopes, highlights; all numbers from a formula."""
+def _test_images() -> Images:
+    """A small picture with noise, edges, gradients and highlights, made by a formula."""
     y, x = np.mgrid[:64, :64].astype(np.float32) / 64
     noise = (np.modf(np.sin(np.arange(64 * 64 * 3, dtype=np.float64) * 12.9898) * 43758.5453)[0] ** 2).astype(
         np.float32
@@ -292,5 +238,5 @@ def _picture_to_try() -> Layers:
     normal = np.stack([np.where(x > y, 0.8, -0.6), np.where(x > y, 0.6, 0), np.where(x > y, 0, 0.8)], axis=-1)
     light = albedo * (0.05 + 4 * (x * y)[..., None] ** 3) + 50 * ((x - 0.3) ** 2 + (y - 0.6) ** 2 < 0.002)[..., None]
     radiance = light * -np.log(1e-3 + noise.reshape(64, 64, 3))
-    values = encode_radiance(radiance.astype(np.float32), 1.0)
-    return {"colour": values, "albedo": albedo.astype(np.float32), "normal": normal.astype(np.float32)}
+    colour = encode_radiance(radiance.astype(np.float32), 1.0)
+    return {"colour": colour, "albedo": albedo.astype(np.float32), "normal": normal.astype(np.float32)}

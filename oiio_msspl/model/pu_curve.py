@@ -1,13 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise's own networks in 8 bits, by ONNX Runtime: less than half of its time, and nearly its result.
+"""The curve by which Open Image Denoise encodes HDR colour for its networks, and its inverse.
 
-Nothing of them is in this package. Their weights are read from the library that the user has installed, and are taken
-only if they are, to the byte, those that :mod:`training.eight_bit` has seen; what is kept here is the graph, how its
-values are scaled, and by how many steps of 8 bits a weight differs from the nearest one. Whether the processor computes
-it right is tried out, against Open Image Denoise itself. Where any of that fails, Open Image Denoise does the work.
-
-Inputs and outputs are colours of a range of 2^30, and have to go through 8 bits, too. They go in parts: of equal slices
-of the range, one behind the other, each has a channel that says how far it is filled. Their sum is the value.
+It is a fit to the PU (perceptually uniform) encoding of Aydin et al. 2008, "Extending Quality Metrics to Full Luminance
+Range Images": linear near black, then a power, then a logarithm. The constants are those of ``core/color.h`` in Open
+Image Denoise.
 """
 
 from __future__ import annotations
@@ -15,36 +11,43 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.model.encoding import MAX_RADIANCE
+from oiio_msspl.model.encoding import MAX_RADIANCE, MU
 
-#: The curve that Open Image Denoise sees HDR colours by: a fit to the PU encoding of Aydin et al. 2008, "Extending
-#: Quality Metrics to Full Luminance Range Images", linear below the first bound, a power below the second, a logarithm
-#: beyond. Its numbers are from core/color.h of Open Image Denoise.
+#: Radiance at which the linear segment ends, and the power segment.
 BOUNDS = (1.57945760e-06, 3.22087631e-02)
 SLOPE = 1.41283765e03
 FACTOR, EXPONENT, OFFSET = 1.64593172e00, 4.31384981e-01, -2.94139609e-03
 LOG_FACTOR, LOG_SHIFT, LOG_OFFSET = 1.92653254e-01, 6.26026094e-03, 9.98620152e-01
 
+#: Value of the curve at ``MAX_RADIANCE``; dividing by it normalises the curve to [0, 1].
+PU_MAX = LOG_FACTOR * float(np.log(MAX_RADIANCE + LOG_SHIFT)) + LOG_OFFSET
+
 
 def pu_encode(radiance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Radiance in [0, 65504] as Open Image Denoise's networks see it, in [0, 1]."""
+    """Radiance in [0, 65504] to PU-encoded values in [0, 1]."""
     curve = np.where(
         radiance <= BOUNDS[1],
         FACTOR * radiance**EXPONENT + OFFSET,
         LOG_FACTOR * np.log(radiance + LOG_SHIFT) + LOG_OFFSET,
     )
-    return np.where(radiance <= BOUNDS[0], SLOPE * radiance, curve) / pu_top()
+    return np.where(radiance <= BOUNDS[0], SLOPE * radiance, curve) / PU_MAX
 
 
-def pu_decode(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Inverse of :func:`encode`."""
-    curve = values * pu_top()
-    low, middle = pu_encode(np.asarray(BOUNDS)) * pu_top()
+def pu_decode(encoded: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Inverse of :func:`pu_encode`."""
+    curve = encoded * PU_MAX
+    linear_end, power_end = pu_encode(np.asarray(BOUNDS)) * PU_MAX
     power = (np.maximum(curve - OFFSET, 0) / FACTOR) ** (1 / EXPONENT)
-    radiance = np.where(curve <= middle, power, np.exp((curve - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT)
-    return np.where(curve <= low, curve / SLOPE, radiance)
+    radiance = np.where(curve <= power_end, power, np.exp((curve - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT)
+    return np.where(curve <= linear_end, curve / SLOPE, radiance)
 
 
-def pu_top() -> float:
-    """What the curve ends at."""
-    return LOG_FACTOR * float(np.log(MAX_RADIANCE + LOG_SHIFT)) + LOG_OFFSET
+def largest_log_encoded() -> float:
+    """Log-encoded ``MAX_RADIANCE``, see :func:`oiio_msspl.model.encoding.encode_radiance`."""
+    return float(np.log1p(MU * MAX_RADIANCE) / np.log1p(MU))
+
+
+def pu_encode_log(entries: int) -> NDArray[np.float64]:
+    """PU-encoded values of ``entries`` evenly spaced log-encoded values, from 0 to the largest: (entries,)."""
+    radiance = np.expm1(np.linspace(0, largest_log_encoded(), entries) * np.log1p(MU)) / MU
+    return pu_encode(np.minimum(radiance, MAX_RADIANCE))

@@ -1,19 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise on both renders, for models that read its results: the only module that imports pyoidn, which is
-optional.
+"""The weighted mean of both renders at the LRHS's resolution: the input of the low-resolution denoisers.
 
-The HRLS is denoised as anyone would, with its albedo and normal. The LRHS has neither; but its light and the HRLS's are
-independent samples of the same scene, so at the LRHS's resolution their mean has less noise than either, and the
-HRLS's albedo and normal, averaged over s x s pixels, have hardly any: Open Image Denoise may be told that they are
-clean, which is worth 0.8 to 1.5 dB (at x2, where but four pixels are averaged, the LRHS's own are, too, and the albedo
-is denoised first, or nothing is told). What it makes of these is
-better at that resolution than its result on the HRLS, for a fraction of the time. A network of ours that was made of
-Open Image Denoise's does the same without its help.
+The LRHS and the HRLS are independent samples of one scene. At the LRHS's resolution, the mean of the LRHS and of the
+box-averaged HRLS therefore has less noise than either, and the box-averaged albedo and normal of the HRLS have hardly
+any.
 """
 
 from __future__ import annotations
-
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -21,106 +14,102 @@ from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RG
 from oiio_msspl.arrays import Array, box_downsample, clip
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 
-if TYPE_CHECKING:
-    pass
+#: Images that a denoiser reads: ``colour`` (h, w, 3), log-encoded at exposure 1; ``albedo`` (h, w, 3) in [0, 1];
+#: ``normal`` (h, w, 3) in [-1, 1]; ``noise`` (h, w, 1) in [0, 1].
+Images = dict[str, Array]
+NO_IMAGES: Images = {}
 
-
-#: A picture to denoise: ``colour`` in network values, ``albedo`` in [0, 1] and ``normal`` in [-1, 1]; (h, w, 3) each.
-Layers = dict[str, Array]
-NO_LAYERS: Layers = {}
-_FIRST = dict(zip(HRLS_FEATURES, np.cumsum([0, *HRLS_FEATURES.values()]), strict=False))
-
-
-#: Bounds of the LRHS's share in what is denoised at its resolution: an estimate that wants all or none may be wrong.
-_SHARE = (0.05, 0.95)
-#: Mean squared difference of an LRHS's layer from the HRLS's, as a share of the latter's variance (and so much more),
-#: above which it is another one. Of 60 views with 1 spp in either render one in ten has more than 0.2 (albedo) and 0.1
-#: (normal) at x2; with the LRHS's mirrored one in twenty is below 0.55.
-_OTHER, _NOTHING = 0.5, 4e-4
-#: What the noise of both renders' mean is written in.
+#: Factor that brings the estimated noise into [0, 1].
 NOISE_GAIN = 2.0
 
+#: Bounds of the LRHS's weight, because an estimate of "all" or "nothing" may be wrong.
+_WEIGHT_BOUNDS = (0.05, 0.95)
+#: An albedo or normal of the LRHS shows something else than that of the HRLS if their mean squared difference exceeds
+#: this share of the latter's variance plus ``_VARIANCE_OFFSET``. At x2 and 1 spp in both renders, one in ten of 60
+#: views exceeds 0.2 (albedo) or 0.1 (normal); with the LRHS mirrored, one in twenty is below 0.55.
+_DIFFERENT, _VARIANCE_OFFSET = 0.5, 4e-4
 
-def mean_of_renders(lrhs: Array, layers: Layers, low_aovs: Layers = NO_LAYERS) -> Layers:
-    """The mean of both renders that has the least noise, at the LRHS's resolution.
-
-    Args:
-        lrhs: (h, w, 3), transformed.
-        layers: of the HRLS, see :func:`layers_of`.
-        low_aovs: the LRHS's own ``albedo`` and ``normal``, transformed, as far as they are there.
-
-    Returns:
-        ``colour``; the means of ``albedo`` and ``normal``, as far as the HRLS has them, with the LRHS's share in them;
-        and ``noise`` (h, w, 1), what the colour's is estimated to be: how far the renders differ there, in network
-        values times ``NOISE_GAIN``, at most 1.
-    """
-    scale = layers["colour"].shape[0] // lrhs.shape[0]
-    radiance = box_downsample(decode_radiance(layers["colour"], 1.0), scale)
-    other = encode_radiance(radiance, 1.0)
-    share = lrhs_share(lrhs, other)
-    mean = share * decode_radiance(lrhs, 1.0) + (1 - share) * radiance
-    low = {"colour": encode_radiance(mean, 1.0)}
-    # Of a difference, which has both renders' noise, so much is what their mean has
-    gain = np.float32(NOISE_GAIN * (share * (1 - share)) ** 0.5)
-    low["noise"] = np.minimum(gain * np.abs(lrhs - other).mean(axis=-1, keepdims=True), 1)
-    for name in ("albedo", "normal"):
-        if name in layers:
-            low[name] = box_downsample(layers[name], scale)
-            if name in low_aovs:
-                other = clip(low_aovs[name], -1.0, 1.0)  # there are albedos beyond 1
-                if _shows_the_same(other, low[name]):
-                    low[name] += share * (other - low[name])
-    return low
+_FIRST_CHANNEL = dict(zip(HRLS_FEATURES, np.cumsum([0, *HRLS_FEATURES.values()]), strict=False))
 
 
-def _shows_the_same(layer: Array, of_hrls: Array) -> bool:
-    """Whether a layer of the LRHS can be that of the HRLS, both (h, w, 3)."""
-    variance = float(of_hrls.var(axis=(0, 1)).mean())
-    return float(np.square(layer - of_hrls).mean()) <= _OTHER * (variance + _NOTHING)
+def useful_lrhs_aovs(scale: int) -> tuple[str, ...]:
+    """AOVs of the LRHS that are worth reading at a scale.
 
-
-def lrhs_aovs_read(scale: int) -> tuple[str, ...]:
-    """Layers of the LRHS that are of use at a scale.
-
-    At x2 they are worth up to 0.3 dB. At x4 and x8 the HRLS's, as means of s x s pixels, have little noise, and where
-    the renderer's pixel filter is no box, the LRHS's show other means.
+    At x2 the average of four HRLS pixels still has noise, and the LRHS's AOVs halve it. At x4 and x8 the average of 16
+    or 64 pixels has little, and the LRHS's AOVs differ from it where the pixel filter is not a box.
     """
     return (ALBEDO, NORMAL) if scale == 2 else ()
 
 
-def denoiser_layers(hrls: Array, *, complete: bool = False) -> Layers:
-    """What Open Image Denoise reads of a transformed HRLS: colour, and albedo and normal as far as they are there.
+def denoiser_images(hrls: Array, *, complete: bool = False) -> Images:
+    """Colour, albedo and normal of an encoded HRLS, (h, w, 9 or more).
 
     Args:
-        complete: all of them; where one is absent, its default.
+        complete: keep albedo and normal that are absent, as their default. Open Image Denoise itself must not get
+            these, and takes no normal without an albedo.
     """
     colour, normal = {"colour": _feature(hrls, RGB)}, _feature(hrls, NORMAL)
     albedo = clip(_feature(hrls, ALBEDO), 0.0, 1.0)
-    if complete:
-        return colour | {"albedo": albedo, "normal": normal}
-    # A layer that is absent has its default everywhere; Open Image Denoise takes no normals without an albedo.
-    if normal.any():
+    if complete or normal.any():
         return colour | {"albedo": albedo, "normal": normal}
     return colour | ({"albedo": albedo} if (albedo != DEFAULTS[ALBEDO]).any() else {})
 
 
-def lrhs_share(lrhs: Array, hrls: Array) -> float:
-    """Share of the LRHS in the mean of both renders that has the least noise.
-
-    What one pixel differs by from its neighbours is picture and noise. The picture is the same in both renders, the
-    noise is not: their covariance is the picture's part, and what each has beyond that is its noise.
+def mean_of_renders(lrhs: Array, hrls_images: Images, lrhs_aovs: Images = NO_IMAGES) -> Images:
+    """Average both renders at the LRHS's resolution, weighted so that the colour has the least noise.
 
     Args:
-        lrhs, hrls: (h, w, 3) at the same resolution, transformed.
+        lrhs: (h, w, 3), log-encoded at exposure 1.
+        hrls_images: see :func:`denoiser_images`, at s times the size.
+        lrhs_aovs: the LRHS's own ``albedo`` and ``normal``, (h, w, 3), encoded, as far as it has them.
 
     Returns:
-        The share, within 0.05 and 0.95; 0.5 for equal noise, and for none.
+        ``colour``; ``albedo`` and ``normal`` as far as the HRLS has them; and ``noise``, the estimated standard
+        deviation of the log-encoded colour times ``NOISE_GAIN``, at most 1.
     """
-    one, other = (x[1:, 1:] - x[1:, :-1] - x[:-1, 1:] + x[:-1, :-1] for x in (lrhs, hrls))
-    common = np.mean(one * other)
-    noise, other_noise = (max(float(np.mean(x * x) - common), 1e-9) for x in (one, other))
-    return float(np.clip(other_noise / (noise + other_noise), *_SHARE))
+    scale = hrls_images["colour"].shape[0] // lrhs.shape[0]
+    hrls_radiance = box_downsample(decode_radiance(hrls_images["colour"], 1.0), scale)
+    hrls = encode_radiance(hrls_radiance, 1.0)
+    weight = lrhs_weight(lrhs, hrls)
+    mean = weight * decode_radiance(lrhs, 1.0) + (1 - weight) * hrls_radiance
+    result = {"colour": encode_radiance(mean, 1.0)}
+    # Scale |LRHS - HRLS| to the standard deviation of the weighted mean.
+    gain = np.float32(NOISE_GAIN * (weight * (1 - weight)) ** 0.5)
+    result["noise"] = np.minimum(gain * np.abs(lrhs - hrls).mean(axis=-1, keepdims=True), 1)
+    for name in (ALBEDO, NORMAL):
+        if name in hrls_images:
+            result[name] = box_downsample(hrls_images[name], scale)
+            if name in lrhs_aovs:
+                lrhs_aov = clip(lrhs_aovs[name], -1.0, 1.0)  # an encoded albedo may reach 2
+                if _show_the_same(lrhs_aov, result[name]):
+                    result[name] += weight * (lrhs_aov - result[name])
+    return result
+
+
+def lrhs_weight(lrhs: Array, hrls: Array) -> float:
+    """Weight of the LRHS in the mean of both renders that has the least noise.
+
+    High-pass filtered, each render is picture plus noise. The picture is the same in both and the noise is independent,
+    so their covariance is the variance of the picture. What each variance exceeds it by is noise.
+
+    Args:
+        lrhs, hrls: (h, w, 3), log-encoded, at one resolution.
+
+    Returns:
+        A weight in [0.05, 0.95]; 0.5 if both are equally noisy, or not noisy.
+    """
+    a, b = (x[1:, 1:] - x[1:, :-1] - x[:-1, 1:] + x[:-1, :-1] for x in (lrhs, hrls))
+    covariance = np.mean(a * b)
+    lrhs_noise, hrls_noise = (max(float(np.mean(x * x) - covariance), 1e-9) for x in (a, b))
+    return float(np.clip(hrls_noise / (lrhs_noise + hrls_noise), *_WEIGHT_BOUNDS))
+
+
+def _show_the_same(lrhs_aov: Array, hrls_aov: Array) -> bool:
+    """Whether two AOVs (h, w, 3) differ by no more than noise."""
+    variance = float(hrls_aov.var(axis=(0, 1)).mean())
+    return float(np.square(lrhs_aov - hrls_aov).mean()) <= _DIFFERENT * (variance + _VARIANCE_OFFSET)
 
 
 def _feature(hrls: Array, name: str) -> Array:
-    return hrls[..., _FIRST[name] : _FIRST[name] + HRLS_FEATURES[name]]
+    first = _FIRST_CHANNEL[name]
+    return hrls[..., first : first + HRLS_FEATURES[name]]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""ONNX Runtime, set up for frames in tiles: the only module of the package that imports it."""
+"""ONNX Runtime, set up for tiles of frames. No other module imports onnxruntime."""
 
 from __future__ import annotations
 
@@ -14,7 +14,6 @@ from oiio_msspl.errors import InputError
 if TYPE_CHECKING:
     import onnxruntime
 
-
 CPU = "CPUExecutionProvider"
 
 
@@ -26,7 +25,7 @@ def available_providers() -> list[str]:
 
 
 def runtime_version() -> str:
-    """Of the installed onnxruntime."""
+    """Version of the installed onnxruntime."""
     import onnxruntime
 
     return str(onnxruntime.__version__)
@@ -38,26 +37,26 @@ def load_network(
     providers: Sequence[str] = (CPU,),
     initializers: Mapping[str, NDArray[Any]] | None = None,
 ) -> onnxruntime.InferenceSession:
-    """A network, ready to run.
+    """Load a network.
 
     Args:
         path: an ONNX file.
-        threads: of the CPU; 0: one a core.
-        providers: execution providers, the first one that can takes a node.
-        initializers: by name, those that the file leaves open.
+        threads: CPU threads; 0 for one a core.
+        providers: execution providers; each node goes to the first one that supports it.
+        initializers: weights by name that the file does not hold itself.
 
     Raises:
-        InputError: it can't be loaded.
+        InputError: it cannot be loaded.
     """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
-    # With a memory pattern, every size of tile gets a block of its own, which holds all its buffers side by side.
-    # The arena alone reuses them within a run: less memory, and no pages that the system clears for every tile.
+    # A memory pattern allocates one block for each tile size, which holds all buffers side by side. The arena reuses
+    # buffers within a run: it needs less memory, and the system has no new pages to clear for each tile.
     options.enable_mem_pattern = False
-    # Threads that spin while they wait for the next run would take the cores from Open Image Denoise and NumPy
+    # Threads that spin while they wait take cores from NumPy and Open Image Denoise.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     if initializers:
         values = [onnxruntime.OrtValue.ortvalue_from_numpy(array) for array in initializers.values()]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Models, and what evaluates them."""
+"""A loaded model on a device."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ import numpy as np
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.model.contract import Contract
-from oiio_msspl.model.oidn import denoiser_for, eight_bits_work
-from oiio_msspl.model.oidn_weights import LEGACY_NAMES, installed_weights
-from oiio_msspl.model.render_mean import NO_LAYERS, Layers, lrhs_aovs_read
+from oiio_msspl.model.contract import MEAN_DENOISER, NO_DENOISER, Contract
+from oiio_msspl.model.mean_denoiser import MeanDenoiser
+from oiio_msspl.model.oidn import OidnDenoiser, quantised_networks_work
+from oiio_msspl.model.oidn_weights import require_weights
+from oiio_msspl.model.render_mean import NO_IMAGES, Images, useful_lrhs_aovs
 from oiio_msspl.model.runtime import CPU, available_providers, load_network, runtime_version
 
 log = logging.getLogger(__name__)
@@ -37,19 +38,25 @@ def usable_devices() -> list[str]:
     return [device for device, provider in PROVIDERS.items() if provider in available]
 
 
+def make_denoiser(mode: str, threads: int, *, exact: bool = False) -> OidnDenoiser | MeanDenoiser | None:
+    """The denoiser that runs before a model, for its contract's ``denoiser``."""
+    if mode == NO_DENOISER:
+        return None
+    return MeanDenoiser(threads) if mode == MEAN_DENOISER else OidnDenoiser(threads, exact=exact)
+
+
 class Session:
     """A loaded model on a device, with its contract.
 
     Args:
-        path: an ONNX file that carries a contract.
+        path: an ONNX file with a contract.
         device: a key of ``PROVIDERS``.
-        threads: CPU threads of onnxruntime, Open Image Denoise and NumPy alike; 0: one a core.
-        exact: Open Image Denoise itself, never its networks in 8 bits (:mod:`oiio_msspl.model.quantised`). What the model
-            computes in 8 bits stays so.
+        threads: CPU threads of ONNX Runtime, Open Image Denoise and NumPy alike; 0 for one a core.
+        exact: let Open Image Denoise run in 32 bits. The model's own 8-bit convolutions stay as they are.
 
     Raises:
-        InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that reads
-            another denoiser's result, or is made of its weights, and that is not installed, or is another version.
+        InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that needs
+            Open Image Denoise where it is not installed or has other weights.
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, exact: bool = False) -> None:
@@ -60,23 +67,23 @@ class Session:
                 f"--device {device}: the installed onnxruntime {runtime_version()} has no {PROVIDERS[device]}; "
                 f"usable here: {', '.join(usable_devices())}"
             )
-        providers = list(dict.fromkeys([PROVIDERS[device], PROVIDERS["cpu"]]))
+        providers = list(dict.fromkeys([PROVIDERS[device], CPU]))
         self.contract = Contract.of_file(path)
         weights = None
         if self.contract.weights:
-            weights = installed_weights(LEGACY_NAMES.get(self.contract.weights, self.contract.weights))
-            if not eight_bits_work():
+            weights = require_weights(self.contract.weights)
+            if not quantised_networks_work():
                 raise InputError(
-                    f"model {self.contract.name} is in 8 bits, which this machine computes wrongly; "
+                    f"model {self.contract.name} computes in 8 bits, which this processor does wrongly; "
                     "choose another --model"
                 )
         self._session = load_network(path, threads, providers, weights)
-        self._denoiser = denoiser_for(self.contract.denoiser, threads, exact=exact)
+        self._denoiser = make_denoiser(self.contract.denoiser, threads, exact=exact)
         self._outputs = [output.name for output in self._session.get_outputs()]
         self.path = Path(path)
         self.threads = threads
         self.seconds = 0.0
-        """Time spent in :meth:`run` so far, the denoiser's included."""
+        """Time spent in :meth:`run` so far, including the denoiser."""
         self.provider = self._session.get_providers()[0]
         if self.provider != PROVIDERS[device]:
             log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
@@ -88,32 +95,35 @@ class Session:
             raise InputError(f"model {self.contract.name} does not predict its error; choose another --model")
 
     @property
-    def low_aovs(self) -> tuple[str, ...]:
-        """Layers that are read of the LRHS, beside its colour."""
-        return lrhs_aovs_read(self.contract.scale) if self._denoiser is not None else ()
+    def lrhs_aovs(self) -> tuple[str, ...]:
+        """AOVs of the LRHS that are read if it has them."""
+        return useful_lrhs_aovs(self.contract.scale) if self._denoiser is not None else ()
 
     def run(
-        self, lrhs: Array, hrls: Array, *, low_aovs: Layers = NO_LAYERS, error: bool = False
+        self, lrhs: Array, hrls: Array, *, lrhs_aovs: Images = NO_IMAGES, error: bool = False
     ) -> tuple[Array, Array | None]:
-        """Evaluate the network.
+        """Run the denoiser, if the model has one, and the model.
 
         Args:
-            lrhs: (h, w, 3), transformed.
-            hrls: (s*h, s*w, 16), transformed, channels as in :data:`oiio_msspl.aovs.features.HRLS_FEATURES`. What else the
-                contract lists for either is made here; in place, if both have room for it.
-            low_aovs: those of :attr:`low_aovs` that are there, transformed, (h, w, 3) each.
-            error: also return the error, of a model that predicts it.
+            lrhs: (h, w, 3), encoded.
+            hrls: (s*h, s*w, 16), encoded, channels as in :data:`oiio_msspl.aovs.features.HRLS_FEATURES`. If both have
+                room for the denoised channels that the contract lists, these are filled in place; else in copies.
+            lrhs_aovs: those of :attr:`lrhs_aovs` that the LRHS has, encoded, (h, w, 3) each.
+            error: also return the expected error of a model that predicts it.
 
         Returns:
-            The fused image (s*h, s*w, 3), transformed; and, if asked for, its expected absolute error, mean of the
-            channels, (s*h, s*w, 1), in the same values.
+            The fused image, log-encoded (s*h, s*w, 3); and its expected absolute error in the same values, mean of the
+            channels, (s*h, s*w, 1), or None.
+
+        Raises:
+            MssplError: the model failed.
         """
         start = time.perf_counter()
         if self._denoiser is not None:
             if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
-                self._denoiser.fill(lrhs, hrls, low_aovs)
+                self._denoiser.fill(lrhs, hrls, lrhs_aovs)
             else:
-                lrhs, hrls = self._denoiser(lrhs, hrls, low_aovs)
+                lrhs, hrls = self._denoiser(lrhs, hrls, lrhs_aovs)
                 hrls = hrls[..., : len(self.contract.hrls)]
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
@@ -124,7 +134,7 @@ class Session:
         except Exception as cause:
             raise MssplError(
                 f"{self.contract.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "
-                "try --max-memory with a smaller value, or --device cpu"
+                "try a smaller --max-memory, or --device cpu"
             ) from cause
         self.seconds += time.perf_counter() - start
         images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}

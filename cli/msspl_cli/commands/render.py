@@ -96,6 +96,8 @@ def render(
     """
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
+    from oiio_msspl.model.contract import SCALES
+
     if scale not in SCALES:
         raise InputError(f"--scale {scale}: use one of {', '.join(map(str, SCALES))}")
     if pixel_filter not in ("box", "scene"):

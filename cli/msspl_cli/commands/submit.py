@@ -52,7 +52,7 @@ def submit(
     from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import find_shot, format_frames, is_sequence
     from oiio_msspl.jobs.shot import check_no_input
-    from oiio_msspl.model.catalogue import ALWAYS, AUTO, find_model, shipped_models
+    from oiio_msspl.model.catalogue import AUTO, WITHOUT_OIDN, find_model, shipped_models
     from oiio_msspl.model.contract import SCALES, Contract
     from oiio_msspl.model.session import PROVIDERS
 
@@ -66,7 +66,7 @@ def submit(
         raise InputError(f"--device {given['device']!r}: use one of {', '.join(PROVIDERS)}")
     files = {"--map-file": given["map_file"]} if given["map_file"] else {}
     # Tasks must not choose for themselves, each on its machine.
-    model = ALWAYS if given["model"] in (None, AUTO) else given["model"]
+    model = WITHOUT_OIDN if given["model"] in (None, AUTO) else given["model"]
     if shipped_models().keys() & {model, *(f"{model}-x{scale}" for scale in SCALES)}:
         passed_on += ["--model", model]
     else:

@@ -46,7 +46,7 @@ def test_tiled_and_untiled_agree_to_half_rounding(session, scale):
 
 
 def _memory_for_tiles(low, high, session, pixels):
-    from oiio_msspl.fusion.fuse import FIXED_MEMORY
+    from oiio_msspl.fusion.tiling import FIXED_MEMORY
 
     frame = high.layers["rgb"].nbytes * 4 // 3 + 2 * low.layers["rgb"].nbytes
     return FIXED_MEMORY + frame + pixels * session.contract.bytes_per_pixel
@@ -244,8 +244,8 @@ def test_a_shift_of_one_lrhs_pixel_is_noticed(session, scale, shift):
     warnings = fuse(low, high, session).warnings
     assert len(warnings) == (shift != (0, 0))
     if warnings:
-        found = re.search(r"([\d.]+) pixels (left|right) of and ([\d.]+) pixels (above|below)", warnings[0])
-        seen = (float(found[1]) * (-1) ** (found[2] == "left"), float(found[3]) * (-1) ** (found[4] == "above"))
+        found = re.search(r"([\d.]+) pixels to the (left|right) and ([\d.]+) pixels (up|down)", warnings[0])
+        seen = (float(found[1]) * (-1) ** (found[2] == "left"), float(found[3]) * (-1) ** (found[4] == "up"))
         assert seen == pytest.approx((x, y), abs=0.2 * scale)
 
 

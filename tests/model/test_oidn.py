@@ -7,8 +7,9 @@ import pytest
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance
-from oiio_msspl.model.oidn import MeanDenoiser, OidnDenoiser
-from oiio_msspl.model.render_mean import NOISE_GAIN, lrhs_share, mean_of_renders
+from oiio_msspl.model.mean_denoiser import MeanDenoiser
+from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.render_mean import NOISE_GAIN, lrhs_weight, mean_of_renders
 from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
 
@@ -81,7 +82,7 @@ def test_its_exposure_is_the_frames_not_the_tiles(denoiser):
 
 
 @pytest.mark.parametrize("layers", [(), (ALBEDO,), (ALBEDO, NORMAL)])
-def test_a_network_of_ours_denoises_both_together_as_well(denoiser, layers):
+def test_our_network_denoises_the_mean_as_well(denoiser, layers, quantised_networks):
     """With or without the layers, and where sides are no multiple of what it needs."""
     clean = picture(200, 200)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
@@ -111,12 +112,12 @@ def test_the_less_noisy_render_counts_more(spp, expected):
     """As much as the best mean of both wants: by their samples, if noise is all that they differ by."""
     clean = 0.5 + 0.3 * picture(192, 192)
     lrhs, hrls = (encode_radiance(noisy(clean, n, seed), 1.0) for seed, n in enumerate(spp))
-    assert lrhs_share(lrhs, hrls) == pytest.approx(expected, abs=0.07)
+    assert lrhs_weight(lrhs, hrls) == pytest.approx(expected, abs=0.07)
 
 
 def test_without_noise_both_renders_count_alike():
     image = encode_radiance(picture(64, 64), 1.0)
-    assert lrhs_share(image, image) == 0.5
+    assert lrhs_weight(image, image) == 0.5
 
 
 def test_without_the_package_the_way_out_is_named(monkeypatch):

@@ -18,9 +18,9 @@ def render(name, width, height, data=None, origin=(0, 0), aspect=1.0):
 @pytest.mark.parametrize("rounding", ["up", "down"])
 def test_the_scale_follows_from_the_display_windows(scale, size, rounding):
     low = [(-(-n // scale) if rounding == "up" else n // scale) for n in size]
-    pairing = align(render("lr", *low), render("hr", *size))
-    assert pairing.scale == scale
-    assert pairing.grid.width * scale >= size[0] > (pairing.grid.width - 1) * scale
+    alignment = align(render("lr", *low), render("hr", *size))
+    assert alignment.scale == scale
+    assert alignment.grid.width * scale >= size[0] > (alignment.grid.width - 1) * scale
 
 
 def test_pixels_may_be_out_of_square_by_what_was_rounded():
@@ -41,9 +41,9 @@ def test_crop_regions_and_overscan_are_mapped_to_low_resolution_pixels():
 def test_display_windows_may_begin_anywhere():
     high = render("hr", 64, 64, Window(100, 100, 164, 164), origin=(100, 100))
     low = render("lr", 16, 16, Window(-5, 0, 11, 16), origin=(-5, 0))
-    pairing = align(low, high)
-    assert pairing.grid == Window(0, 0, 16, 16)
-    assert pairing.lr_data == Window(0, 0, 16, 16)
+    alignment = align(low, high)
+    assert alignment.grid == Window(0, 0, 16, 16)
+    assert alignment.lr_data_window == Window(0, 0, 16, 16)
 
 
 @pytest.mark.parametrize(

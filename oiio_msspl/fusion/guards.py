@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Guards around the network: fireflies are dimmed, empty regions stay empty, noise-free tiles pass through."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import NORMAL, RADIANCE_FEATURES, RGB
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.fusion.tile_features import TilePair
+from oiio_msspl.model.encoding import encode_radiance
+from oiio_msspl.parallel import for_row_blocks
+
+Mask = NDArray[np.bool_]
+
+#: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
+#: render. The LRHS is the mean of s x s HRLS pixels, so s^2 would be the exact bound without noise; 64 leaves room for
+#: the noise of the LRHS.
+FIREFLY_FACTOR = 64.0
+#: A tile has no noise to remove if its renders differ nowhere by more than this, log-encoded: half a step of an 8-bit
+#: picture.
+NOISE_FREE = 1 / 512
+
+
+def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
+    """Limit the brightness of both renders to what the other one allows.
+
+    Returns:
+        The LRHS's colour (h, w, 3), and the HRLS's features with its radiance limited.
+    """
+    lrhs_rgb, hrls = pair.lrhs[RGB], pair.hrls
+    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale))
+    hrls_limit = _brightness_limit(lrhs_rgb).repeat(pair.scale, axis=1)[:, None]
+    dimmed = {name: _limit(hrls[name], hrls_limit, pair.scale) for name in RADIANCE_FEATURES if name in hrls}
+    return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
+
+
+def _limit(hrls: Array, limit: Array, scale: int) -> Array:
+    """HRLS values (s*h, s*w, c), at most the limit (h, 1, s*w, c) of their LRHS pixel."""
+    result = np.empty_like(hrls)
+
+    def work(rows: slice) -> None:
+        by_lrhs_row = hrls[rows].reshape(-1, scale, *hrls.shape[1:])
+        limits = limit[rows.start // scale : rows.stop // scale]
+        result[rows] = np.minimum(by_lrhs_row, limits).reshape(-1, *hrls.shape[1:])
+
+    for_row_blocks(work, len(hrls), hrls[0].size, multiple=scale)
+    return result
+
+
+def _brightness_limit(rgb: Array) -> Array:
+    """The largest values that the other render may have, (h, w, 3): none where this render is black."""
+    brightest = rgb.copy()
+    for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns
+        lines = brightest.swapaxes(0, axis)
+        before = lines.copy(order="K")
+        np.maximum(lines[1:], before[:-1], out=lines[1:])
+        np.maximum(lines[:-1], before[1:], out=lines[:-1])
+    with np.errstate(over="ignore"):  # a limit that overflows is no limit
+        return np.where(brightest > 0, brightest * np.float32(FIREFLY_FACTOR), np.float32(np.inf))
+
+
+def is_noise_free(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: float) -> bool:
+    """Whether the two renders of a tile agree so well that there is no noise to remove.
+
+    Args:
+        lrhs: encoded LRHS (h, w, 3 or more).
+        hrls_rgb: the HRLS's colour, scene linear.
+    """
+    # A few rows are enough to find noise; all rows are read only if these have none.
+    return all(_largest_difference(pair, lrhs, hrls_rgb, exposure, step) <= NOISE_FREE for step in (32, 1))
+
+
+def _largest_difference(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
+    """Largest log-encoded difference of the renders inside the grid, in one of ``step`` LRHS rows."""
+    rows = hrls_rgb.reshape(-1, pair.scale, *hrls_rgb.shape[1:])[pair.inside[0]][::step]
+    means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), pair.scale)
+    difference = encode_radiance(means, exposure)[:, pair.inside[1]] - lrhs[pair.inside][::step, :, :3]
+    return float(np.abs(difference).max())
+
+
+class EmptyRegions:
+    """Where neither render has any light, not even around: the result is black there, and a transparent film stays
+    empty.
+
+    A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only if its 15 x 15 LRHS
+    neighbourhood is black.
+
+    Args:
+        lrhs_rgb: the whole LRHS (h, w, 3).
+    """
+
+    def __init__(self, lrhs_rgb: Array) -> None:
+        self._black = np.all(lrhs_rgb == 0, axis=-1, keepdims=True)
+        self._black_far_around = _all_in_15x15(self._black) if self._black.any() else self._black
+
+    def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
+        """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
+
+        Args:
+            window: rows and columns of the tile's area in the whole LRHS.
+        """
+        if not self._black[window].any():
+            return None
+        hrls_black = np.all(pair.hrls[RGB] == 0, axis=-1, keepdims=True)
+        empty = holds_around(self._black[window], hrls_black, pair.scale)
+        empty &= _shows_no_surface(pair.hrls) | _enlarge(self._black_far_around[window], pair.scale)
+        return empty
+
+
+def holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
+    """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
+    return _enlarge(reduce(np.logical_and, _neighbours(lrhs)), scale) & hrls
+
+
+def _enlarge(lrhs: Mask, scale: int) -> Mask:
+    """(h, w, 1) to (s*h, s*w, 1)."""
+    return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _all_in_15x15(mask: Mask) -> Mask:
+    for distance in (1, 2, 4):
+        mask = reduce(np.logical_and, _neighbours(mask, distance))
+    return mask
+
+
+def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
+    """Where alpha or normal is zero, (h, w, 1); everywhere if the HRLS has neither."""
+    signs = [np.all(hrls[name] == 0, axis=-1, keepdims=True) for name in ("alpha", NORMAL) if name in hrls]
+    return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)
+
+
+def _neighbours(values: NDArray[Any], distance: int = 1) -> Iterator[NDArray[Any]]:
+    """The 3 x 3 neighbours of each pixel (h, w, c) at a distance, one (h, w, c) each; the edge pixel is repeated."""
+    height, width = values.shape[:2]
+    padded = np.pad(values, ((distance, distance), (distance, distance), (0, 0)), mode="edge")
+    for y, x in itertools.product(range(0, 3 * distance, distance), repeat=2):
+        yield padded[y : y + height, x : x + width]

@@ -13,7 +13,7 @@ import typer
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from oiio_msspl.exr.writer import WriteOptions
+    from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.jobs.frame import InputOptions
 
 Map = Annotated[
@@ -61,7 +61,7 @@ def make_inputs(
 def make_write_options(
     layout: str, compression: str | None, half: bool | None, layers: list[str], error_layer: bool
 ) -> WriteOptions:
-    from oiio_msspl.exr.writer import WriteOptions
+    from oiio_msspl.exr.write_options import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"
     return WriteOptions(layout, compression, pixel_type, tuple(layers), error_layer)

@@ -1,12 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the network reads, and in which order: the one place that fixes names and channels.
+"""The features that the network reads: names, channels, order and units.
 
-The paper's HRLS branch takes RGB, albedo, normal, diffuse, specular and variance (section 4);
-its LRHS branch takes RGB alone (section 5.3 finds that more does not help).
+In the paper the HRLS branch reads RGB, albedo, normal, diffuse, specular and variance (section 4). The LRHS branch
+reads RGB only; more did not help (section 5.3).
 
-Units: ``rgb``, ``diffuse`` and ``specular`` are scene-linear radiance, >= 0. ``albedo`` is a reflectance, mostly in
-[0, 1]. ``normal`` is a signed vector in [-1, 1], world or camera space, 0 where nothing was hit. ``variance`` is the
-variance of the pixel's *mean* luminance (radiance squared), >= 0.
+Units:
+
+- ``rgb``, ``diffuse``, ``specular``: scene-linear radiance, >= 0.
+- ``albedo``: reflectance, mostly in [0, 1].
+- ``normal``: signed vector in [-1, 1], in world or camera space; 0 where the camera ray hits nothing.
+- ``variance``: variance of the pixel's *mean* luminance (radiance squared), >= 0.
 """
 
 from __future__ import annotations
@@ -20,20 +23,25 @@ VARIANCE = "variance"
 
 #: Feature -> number of channels, in the order in which the network's HRLS branch stacks them.
 HRLS_FEATURES: dict[str, int] = {RGB: 3, ALBEDO: 3, NORMAL: 3, DIFFUSE: 3, SPECULAR: 3, VARIANCE: 1}
+#: The same for the LRHS branch.
 LRHS_FEATURES: dict[str, int] = {RGB: 3}
+#: All features, in order.
 FEATURES = tuple(HRLS_FEATURES)
-#: Those that are light, and scale with the scene.
+#: Features that are radiance: they scale with the brightness of the scene.
 RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
 
-#: Features that a render may lack; each then has the default below, in the network's own (transformed) values.
+#: Features that a render may lack. The network then reads the value in ``DEFAULTS``.
 OPTIONAL_FEATURES = (ALBEDO, NORMAL, DIFFUSE, SPECULAR, VARIANCE)
 
-#: The paper sets the variance layer to a constant for renders that have none (its Gharbi experiment) without giving
-#: the value. We take a standard deviation as large as a mid-grey pixel, about 0.5 after the transform: "assume noise".
+#: Value of a missing feature, encoded as the network reads it.
+#:
+#: The paper sets the variance of renders that have none to a constant (its Gharbi experiment), but does not give the
+#: value. Ours is the standard deviation of a pixel whose noise is as large as mid grey, about 0.5 when encoded: the
+#: network should expect noise.
 DEFAULTS: dict[str, float] = {ALBEDO: 0.5, NORMAL: 0.0, DIFFUSE: 0.0, SPECULAR: 0.0, VARIANCE: 0.5}
 
 
 def channel_names(features: dict[str, int]) -> list[str]:
-    """Flat channel names (``rgb.R``, ``normal.X``, ``variance.Y``) of a stack of features, in order."""
+    """Names such as ``rgb.R``, ``normal.X`` and ``variance.Y`` for each channel of a stack of features, in order."""
     suffixes = {1: "Y", 3: "RGB"}
     return [f"{name}.{c}" for name, count in features.items() for c in ("XYZ" if name == NORMAL else suffixes[count])]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files that appear whole or not at all."""
+"""Writing files atomically: a file appears whole or not at all."""
 
 from __future__ import annotations
 
@@ -14,10 +14,13 @@ from oiio_msspl.errors import InputError, MssplError
 
 
 def check_target(path: str | Path, *, overwrite: bool) -> Path:
-    """Fail before any work is done if a file could not be put here.
+    """Check that a file can be written at ``path``, before any work is done.
+
+    Returns:
+        ``path`` as a ``Path``.
 
     Raises:
-        InputError: it exists and may not be overwritten, or its folder is missing or read-only.
+        InputError: it exists and may not be overwritten, it is a folder, or its folder is missing or read-only.
     """
     path = Path(path)
     if path.is_dir():
@@ -29,7 +32,11 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
 
 
 def check_folder(path: Path) -> None:
-    """Raise InputError if the folder of ``path`` is missing or read-only."""
+    """Check the folder of ``path``.
+
+    Raises:
+        InputError: it is missing or read-only.
+    """
     folder = path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: the folder {folder} does not exist; create it first")
@@ -39,21 +46,29 @@ def check_folder(path: Path) -> None:
 
 @contextmanager
 def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """A temporary file beside ``path`` that takes its place when the block ends well, and vanishes otherwise.
+    """Give the ``with`` block a temporary file, and rename it to ``path`` when the block ends.
 
-    A link keeps pointing where it points, and a file that is replaced keeps its permissions.
+    If the block raises, the temporary file is deleted and ``path`` stays as it was. If ``path`` is a link, the file
+    that it points to is replaced. A replaced file keeps its permissions.
+
+    Args:
+        path: the file to write.
+        overwrite: replace an existing file.
+
+    Yields:
+        The path of the temporary file, in the same folder.
 
     Raises:
-        InputError: without ``overwrite``, somebody else has put a file there meanwhile.
-        MssplError: the file system refused (disk full, permissions); ``path`` is as it was.
+        InputError: without ``overwrite``, a file has appeared at ``path`` meanwhile.
+        MssplError: the file system refused, e.g. because the disk is full; ``path`` is as it was.
     """
     target = Path(os.path.realpath(path))
-    # As remove_leftovers knows it. Processes on two machines may have one number.
+    # remove_leftovers finds the file by this form of its name. Processes on two machines may have the same id.
     unique = f"{os.getpid()}{secrets.randbelow(10**9):09d}"
     temporary = target.with_name(f".{target.stem}.{unique}.tmp{target.suffix}")
     try:
         yield temporary
-        # On the disk before it gets its name: a crash must not leave a whole name on half a file.
+        # The pixels must be on the disk before the rename: a crash must not leave half a file under the final name.
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
         if overwrite:
@@ -73,7 +88,7 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 def remove_leftovers(targets: Iterable[Path]) -> None:
     """Delete the temporary files that killed runs left beside these files.
 
-    Should another process be writing one of them at this moment, it fails and says so.
+    If another process is writing one of them at this moment, that process fails with a message.
     """
     wanted = {Path(os.path.realpath(target)) if target.is_symlink() else target for target in targets}
     for folder in {target.parent for target in wanted}:
@@ -85,7 +100,7 @@ def remove_leftovers(targets: Iterable[Path]) -> None:
 
 
 def _name_if_free(temporary: Path, target: Path) -> None:
-    """Give a file its name in one step that fails if there is one: two jobs must not overwrite each other."""
+    """Rename a file in one step that fails if the target exists: two jobs must not overwrite each other."""
     try:
         os.link(temporary, target)
     except FileExistsError:

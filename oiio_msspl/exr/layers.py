@@ -1,19 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""From what a renderer calls its layers to the features of :mod:`oiio_msspl.aovs.features`.
-
-The knowledge is data (``aovs.toml``); this module matches it against the layers of a file, and reads features in the
-units of the schema: composites by the paper's equations, variances brought to the variance of the pixel's mean
-luminance, normals to signed vectors. Whatever it chose is kept as text for the user.
-"""
+"""Grouping the channels of a file into layers, by the names of channels, parts and views."""
 
 from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
 
-from oiio_msspl.exr.reader import Channel, ExrFile
+from oiio_msspl.exr.reader import Channel, ExrFile, Part
 
-#: Part names that say nothing about a layer: their channels without a prefix are plain R, G, B.
+#: Part names that do not name a layer: channels without a prefix in such a part are plain R, G, B.
 _PLAIN_PART = re.compile(r"(rgba?|main|default|image|part ?\d+|subimage ?\d+)?", re.IGNORECASE)
 _COMPONENTS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "a": "A", "alpha": "A"}
 _COMPONENTS |= {c: c.upper() for c in "xyz"}
@@ -22,48 +17,66 @@ _TRIPLES = (("R", "G", "B"), ("X", "Y", "Z"))
 
 @dataclass
 class Layer:
-    """Channels that belong together: one layer of one view, whatever parts they lie in."""
+    """The channels of one layer of one view. They may lie in several parts."""
 
     name: str
+    """Empty for plain R, G, B."""
     view: str
+    """Such as ``left``; empty in a file without views."""
     channels: dict[str, Channel] = field(default_factory=dict)
-    """By component: ``R``, ``G``, ``B``, ``A``, ``X``, ... or the stored name where it is none of these."""
+    """By component: ``R``, ``G``, ``B``, ``A``, ``X``, ``Y``, ``Z``, or else the last part of the stored name."""
 
     def triple(self) -> tuple[Channel, ...] | None:
+        """The channels R, G, B or X, Y, Z; None if one is missing."""
         for names in _TRIPLES:
             if all(n in self.channels for n in names):
                 return tuple(self.channels[n] for n in names)
         return None
 
     def scalar(self) -> tuple[Channel, ...] | None:
+        """The only channel, as a tuple of one; None if there are several."""
         return tuple(self.channels.values()) if len(self.channels) == 1 else None
-
-
-# ---------------------------------------------------------------------------------------------- layers of a file
 
 
 def layers_of(file: ExrFile) -> list[Layer]:
     """Group a file's channels into layers, in file order.
 
-    OpenEXR's rule is that the layer comes from the channel's name; Karma and Nuke put it in the part's name alone;
-    Blender 5 writes both. So: the channel's prefix where there is one, the part's name otherwise, without the view.
+    Renderers name layers in three ways. OpenEXR's rule puts the layer in front of the channel's name
+    (``diffuse.R``). Karma and Nuke put it in the part's name only. Blender 5 does both. So the prefix of the channel
+    names the layer, or else the part's name does.
+
+    If two channels have the same view, layer and component (``foo.R`` and ``foo.red``), the layer holds the first.
     """
-    multi_view = file.metadata.get("multiView") or ()
-    views = [str(v) for v in multi_view] if not isinstance(multi_view, str) else [multi_view]
+    views = _views(file)
     layers: dict[tuple[str, str], Layer] = {}
     for part in file.parts:
         for channel in part.channels:
-            prefix, _, component = channel.name.rpartition(".")
-            view = part.view or (views[0] if views else "")
-            if views and prefix.rpartition(".")[2] in views:
-                prefix, _, view = prefix.rpartition(".")
-            name = prefix or _part_layer(part.name, part.view)
+            view, name, component = _split_name(channel.name, part, views)
             layer = layers.setdefault((view, name), Layer(name, view))
-            layer.channels.setdefault(_COMPONENTS.get(component.lower(), component), channel)
+            layer.channels.setdefault(component, channel)
     return list(layers.values())
 
 
-def _part_layer(name: str, view: str) -> str:
-    if view:
-        name = re.sub(rf"[._ -]?{re.escape(view)}$", "", name)
+def _views(file: ExrFile) -> list[str]:
+    """Views of OpenEXR's ``multiView`` attribute, the default view first."""
+    views = file.metadata.get("multiView") or ()
+    return [views] if isinstance(views, str) else [str(view) for view in views]
+
+
+def _split_name(name: str, part: Part, views: list[str]) -> tuple[str, str, str]:
+    """View, layer and component of a channel.
+
+    In a ``multiView`` file the view stands between the layer and the component (``diffuse.left.R``); channels without
+    one belong to the default view.
+    """
+    prefix, _, component = name.rpartition(".")
+    view = part.view or (views[0] if views else "")
+    if views and prefix.rpartition(".")[2] in views:
+        prefix, _, view = prefix.rpartition(".")
+    return view, prefix or _part_layer(part), _COMPONENTS.get(component.lower(), component)
+
+
+def _part_layer(part: Part) -> str:
+    """The layer that a part's name means: without the view at its end, and empty for names such as ``rgba``."""
+    name = re.sub(rf"[._ -]?{re.escape(part.view)}$", "", part.name) if part.view else part.name
     return "" if _PLAIN_PART.fullmatch(name) else name

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture of the result for a quick look: 8-bit PNG."""
+"""Writing 8-bit PNG pictures: the preview of the result, and other pictures of display values."""
 
 from __future__ import annotations
 
@@ -13,24 +13,23 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.exr.reader import ROWS_PER_READ
 from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.strips import ROWS_PER_STRIP
 
 #: Pinned: OpenColorIO's "-latest" configurations change their default view between releases.
 OCIO_CONFIG = "ocio://cg-config-v2.2.0_aces-v1.3_ocio-v2.4"
 OCIO_DISPLAY = "sRGB - Display"
 OCIO_INPUT = "lin_rec709"
 
-
-#: What tells our pictures from others' of the same name.
+#: The PNG's "Software" entry. It tells our pictures from other pictures of the same name.
 SOFTWARE = "oiio_msspl"
 
 
 def is_our_preview(path: Path) -> bool:
-    """Is this a picture that was written here?"""
+    """Whether the file is a picture that this module wrote."""
     file = oiio.ImageInput.open(str(path))
     if file is None:
-        oiio.geterror()  # or OpenImageIO says it at its end
+        oiio.geterror()  # OpenImageIO prints an error that nobody asked for when the process ends
         return False
     ours: bool = file.spec().get_string_attribute("Software") == SOFTWARE
     file.close()
@@ -38,7 +37,11 @@ def is_our_preview(path: Path) -> bool:
 
 
 def check_view(view: str) -> None:
-    """Raise InputError if OpenColorIO's configuration has no such view."""
+    """Check the name of an OpenColorIO view.
+
+    Raises:
+        InputError: the configuration has no such view; the message lists those that it has.
+    """
     views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
     if view not in views:
         raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")
@@ -53,38 +56,53 @@ def write_preview(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write scene-linear ``rgb`` (height, width, 3) over ``data_window`` as it lies in the display window.
+    """Write a PNG of the frame, atomically. Pixels of the frame outside the data window are black.
 
     Args:
+        path: the PNG to write.
+        rgb: scene linear, (height, width, 3), over ``data_window``.
+        data_window: the pixels that ``rgb`` covers.
+        display_window: the frame, which the PNG shows.
         view: None for the paper's sRGB curve; otherwise a view of OpenColorIO's built-in CG configuration, e.g.
             ``Un-tone-mapped`` or ``ACES 1.0 - SDR Video``.
+        overwrite: replace an existing file.
 
     Raises:
-        InputError: no such view.
-        MssplError: it can't be written.
+        InputError: there is no such view, or ``path`` exists.
+        MssplError: the file can't be written.
     """
     if view is not None:
         check_view(view)
 
     def rows(start: int, stop: int) -> Array:
-        shown = display_window
-        band = Window(shown.x0, shown.y0 + start, shown.x1, shown.y0 + stop)
-        linear = np.zeros((band.height, band.width, 3), dtype=np.float32)
-        seen = data_window.intersect(band)
-        if seen.width and seen.height:
-            linear[seen.slices(band)] = rgb[seen.slices(data_window)]
+        y0 = display_window.y0
+        strip = Window(display_window.x0, y0 + start, display_window.x1, y0 + stop)
+        linear = np.zeros((strip.height, strip.width, 3), dtype=np.float32)
+        rendered = data_window.intersect(strip)
+        if rendered.width and rendered.height:
+            linear[rendered.slices(strip)] = rgb[rendered.slices(data_window)]
         return srgb(linear) if view is None else _through_ocio(linear, view)
 
     _write_png(path, display_window.width, display_window.height, rows, overwrite)
 
 
 def write_png(path: Path, display: Array, *, overwrite: bool = False) -> None:
-    """Write display values in [0, 1], (height, width, 3), as an 8-bit PNG, atomically."""
+    """Write a PNG of display values, atomically.
+
+    Args:
+        path: the PNG to write.
+        display: (height, width, 3), clipped to [0, 1].
+        overwrite: replace an existing file.
+
+    Raises:
+        InputError: ``path`` exists.
+        MssplError: the file can't be written.
+    """
     _write_png(path, display.shape[1], display.shape[0], lambda start, stop: display[start:stop], overwrite)
 
 
 def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], Array], overwrite: bool) -> None:
-    """``rows(start, stop)`` gives display values; asked for in bands, so that a large frame needs no second copy."""
+    """Write the rows that ``rows(start, stop)`` gives, a strip at a time: a large frame needs no second copy."""
     with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
         if writer is None:
@@ -93,8 +111,8 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], A
         spec.attribute("oiio:ColorSpace", "sRGB")
         spec.attribute("Software", SOFTWARE)
         ok = writer.open(str(temporary), spec)
-        for start in range(0, height, ROWS_PER_READ):
-            stop = min(start + ROWS_PER_READ, height)
+        for start in range(0, height, ROWS_PER_STRIP):
+            stop = min(start + ROWS_PER_STRIP, height)
             pixels = (np.clip(rows(start, stop), 0, 1) * 255 + 0.5).astype(np.uint8)
             ok = ok and writer.write_scanlines(start, stop, 0, np.ascontiguousarray(pixels))
         ok = writer.close() and ok
@@ -103,6 +121,7 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], A
 
 
 def _through_ocio(linear: Array, view: str) -> Array:
+    """Scene-linear values, (height, width, 3), to display values through an OpenColorIO view."""
     image = oiio.ImageBuf(np.ascontiguousarray(linear))
     result = oiio.ImageBufAlgo.ociodisplay(
         image, OCIO_DISPLAY, view, fromspace=OCIO_INPUT, unpremult=False, colorconfig=OCIO_CONFIG

@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading EXR files of any kind through OpenImageIO: headers first, pixels by rectangle when they are needed.
+"""Reading EXR files through OpenImageIO: headers when a file is opened, pixels by rectangle when they are needed.
 
-Nothing here knows what a layer means (:mod:`oiio_msspl.aovs` does), and no file is ever read whole: an 8K frame with
-sixty float channels is larger than most machines' memory.
+No file is read whole: an 8K frame with sixty float channels is larger than the memory of most machines. What a layer
+means is decided in :mod:`oiio_msspl.aovs`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -15,13 +16,12 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
-
-#: Rows decoded at once: a few chunks of any compression, so that wide files with many channels stay small in memory.
-ROWS_PER_READ = 64
+from oiio_msspl.exr.strips import ROWS_PER_STRIP, StripCache, StripKey, strip_rows
 
 
 @dataclass(frozen=True)
@@ -29,8 +29,11 @@ class Channel:
     """One channel of one part of one file."""
 
     path: Path
+    """The file."""
     part: int
+    """Index of the part in the file."""
     index: int
+    """Index of the channel in the part, in OpenImageIO's order."""
     name: str
     """As stored, e.g. ``ViewLayer.Combined.R``."""
     type: str
@@ -39,33 +42,44 @@ class Channel:
 
 @dataclass(frozen=True)
 class Part:
-    """One part (OpenImageIO: subimage) of a file."""
+    """One part of a file; OpenImageIO calls it a subimage."""
 
     index: int
     name: str
+    """Empty in files of a single part without a name."""
     view: str
+    """The view that the header names, e.g. ``left``; empty if it names none."""
     channels: tuple[Channel, ...]
     data_window: Window
     compression: str
+    """As OpenImageIO names it, e.g. ``zip`` or ``dwaa``."""
     tile: tuple[int, int]
-    """Tile width and height, (0, 0) for scan lines."""
+    """Width and height of a tile; (0, 0) for scan lines."""
     deep: bool
     spec: Any = field(repr=False, compare=False)
-    """OpenImageIO's own description, from which a copy of the part can be written."""
+    """OpenImageIO's ``ImageSpec``, from which a copy of the part can be written."""
+
+    @property
+    def strip_height(self) -> int:
+        """Rows that are decoded together: whole tiles, or whole chunks of scan lines."""
+        unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)
+        return unit * max(1, ROWS_PER_STRIP // unit)
 
 
 @dataclass(frozen=True)
 class ExrFile:
-    """An opened EXR file: headers are read, pixels come through :meth:`read`."""
+    """An EXR file whose headers were read by :func:`open_exr`. Read it from one thread at a time."""
 
     path: Path
     parts: tuple[Part, ...]
     display_window: Window
     pixel_aspect: float
+    """Width of a pixel divided by its height."""
     metadata: dict[str, Any]
-    """Attributes of all parts by their OpenImageIO names; the first part that has one wins."""
+    """Header attributes of all parts by their OpenImageIO names; if two parts differ, that of the first part."""
     siblings: dict[Path, ExrFile] = field(default_factory=dict, repr=False, compare=False)
-    """Other files that hold layers of the same frame (one file an AOV)."""
+    """Other files that hold layers of the same frame, for renderers that write one file for each AOV."""
+    _cache: StripCache = field(default_factory=StripCache, repr=False, compare=False)
 
     @cached_property
     def _input(self) -> Any:
@@ -77,60 +91,112 @@ class ExrFile:
     def read(self, channels: Sequence[Channel], window: Window) -> Array:
         """Channels over a rectangle, as float32 (height, width, len(channels)).
 
-        Pixels outside a part's data window are 0, as OpenEXR defines them. All channels of a part are decoded in one
-        pass, however many layers they belong to.
+        Pixels outside a part's data window are 0, as OpenEXR defines them. All channels of a part are decoded
+        together, whatever layers they belong to.
+
+        Args:
+            channels: of this file or of its ``siblings``.
+            window: in the coordinates of the data windows.
 
         Raises:
-            InputError: pixels can't be decoded (truncated or corrupt file).
+            InputError: pixels can't be decoded, because the file is truncated or corrupt.
         """
+        self._cache.drop_outside(window.y0, window.y1)
         result = np.zeros((window.height, window.width, len(channels)), dtype=np.float32)
         groups: dict[tuple[Path, int], list[int]] = {}
         for position, channel in enumerate(channels):
             groups.setdefault((channel.path, channel.part), []).append(position)
         for (path, part), positions in groups.items():
             owner = self if path == self.path else self.siblings[path]
-            owner._read_part(owner.parts[part], [channels[i].index for i in positions], window, result, positions)
+            indices = tuple(channels[i].index for i in positions)
+            owner._read_part(owner.parts[part], indices, window, result, positions, self._cache)
         return result
 
-    def _read_part(self, part: Part, indices: list[int], window: Window, result: Array, positions: list[int]) -> None:
+    @contextmanager
+    def cache_strips(self, max_bytes: int) -> Iterator[None]:
+        """Inside the ``with`` block, keep decoded rows from one :meth:`read` to the next.
+
+        Read windows from left to right and from top to bottom: every row is then decoded once for each row of windows.
+        The cache holds the rows of the last window over the full width, 2 bytes for each pixel of a channel if all
+        channels of its part that are read are half, otherwise 4.
+
+        Args:
+            max_bytes: the cache never holds more. Rows that do not fit are decoded again for each window.
+        """
+        self._cache.max_bytes = max_bytes
+        try:
+            yield
+        finally:
+            self._cache.max_bytes = 0
+            self._cache.clear()
+
+    def native_strips(self, part: Part, first: int, last: int) -> Iterator[tuple[int, int, NDArray[Any]]]:
+        """All rows of neighbouring channels in their stored pixel type, for copying them bit for bit.
+
+        Args:
+            first, last: indices of the first channel and of the one after the last. All have one pixel type.
+
+        Yields:
+            First row, last row (exclusive), and the strip (rows, width, channels).
+
+        Raises:
+            InputError: pixels can't be decoded.
+        """
+        window = part.data_window
+        for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
+            yield y0, y1, self._decode(part, y0, y1, first, last, part.channels[first].type)
+
+    def _read_part(
+        self,
+        part: Part,
+        indices: tuple[int, ...],
+        window: Window,
+        result: Array,
+        positions: list[int],
+        cache: StripCache,
+    ) -> None:
+        """Put some channels of one part at ``positions`` of the last axis of ``result``, which covers ``window``."""
         area = window.intersect(part.data_window)
         if area.width == 0 or area.height == 0:
             return
+        adjacent = positions == list(range(positions[0], positions[-1] + 1))
+        # A slice is copied several times as fast as a list of indices.
+        planes = slice(positions[0], positions[-1] + 1) if adjacent else positions
+        whole = part.data_window
+        for y0, y1 in strip_rows(area.y0, area.y1, whole.y0, part.strip_height, whole.y1):
+            key = StripKey(self.path, part.index, indices, y0, y1)
+            strip = cache.get(key)
+            if strip is None:
+                strip = self._decode_channels(part, y0, y1, indices)
+                cache.keep(key, strip)
+            shared = area.intersect(Window(area.x0, y0, area.x1, y1))
+            rows, columns = shared.slices(Window(whole.x0, y0, whole.x1, y1))
+            result[(*shared.slices(window), planes)] = strip[rows, columns]
+
+    def _decode_channels(self, part: Part, y0: int, y1: int, indices: tuple[int, ...]) -> NDArray[Any]:
+        """A strip of some channels: half if all of them are stored as half, otherwise float."""
         first, last = min(indices), max(indices) + 1
-        picks = [i - first for i in indices]
-        for y0, y1, rows in self._bands(part, area, first, last, "float"):
-            band = Window(part.data_window.x0, y0, part.data_window.x1, y1)
-            part_rows, columns = Window(area.x0, max(y0, area.y0), area.x1, min(y1, area.y1)).slices(band)
-            target = Window(area.x0, max(y0, area.y0), area.x1, min(y1, area.y1)).slices(window)
-            result[(*target, positions)] = rows[part_rows, columns][..., picks]
+        decoded = part.channels[first:last]
+        strip = self._decode(part, y0, y1, first, last, "half" if all(c.type == "half" for c in decoded) else "float")
+        if indices == tuple(range(first, last)):
+            return strip
+        dtype = np.float16 if all(part.channels[i].type == "half" for i in indices) else np.float32
+        return strip[..., [i - first for i in indices]].astype(dtype, copy=False)
 
-    def native_bands(self, part: Part, first: int, last: int) -> Any:
-        """All rows of the channels ``first`` to ``last`` (exclusive; one pixel type), in that type, a band at a time.
-
-        Yields (first row, last row exclusive, array (rows, width, channels)): for copying bit for bit.
-        """
-        return self._bands(part, part.data_window, first, last, part.channels[first].type)
-
-    def _bands(self, part: Part, area: Window, first: int, last: int, kind: str) -> Any:
-        window = part.data_window
-        tile_height = part.tile[1]
-        # Bands start on a multiple of their height from the part's first row: whole chunks, and OpenImageIO wants
-        # whole tiles.
-        step = tile_height * max(1, ROWS_PER_READ // tile_height) if tile_height else ROWS_PER_READ
-        start = window.y0 + (area.y0 - window.y0) // step * step
-        for y0 in range(start, area.y1, step):
-            y1 = min(y0 + step, window.y1)
-            if tile_height:
-                rows = self._input.read_tiles(part.index, 0, window.x0, window.x1, y0, y1, 0, 1, first, last, kind)
-            else:
-                rows = self._input.read_scanlines(part.index, 0, y0, y1, 0, first, last, kind)
-            if rows is None:
-                raise unreadable(self.path, part, self._input.geterror(), f", rows {y0} to {y1 - 1}")
-            yield y0, y1, rows
+    def _decode(self, part: Part, y0: int, y1: int, first: int, last: int, kind: str) -> NDArray[Any]:
+        """Rows of neighbouring channels over the full width, in pixel type ``kind``: (rows, width, channels)."""
+        if part.tile[1]:
+            x0, x1 = part.data_window.x0, part.data_window.x1
+            strip = self._input.read_tiles(part.index, 0, x0, x1, y0, y1, 0, 1, first, last, kind)
+        else:
+            strip = self._input.read_scanlines(part.index, 0, y0, y1, 0, first, last, kind)
+        if strip is None:
+            raise unreadable(self.path, part, self._input.geterror(), f", rows {y0} to {y1 - 1}")
+        return np.asarray(strip)
 
 
 def unreadable(path: Path, part: Part, reason: str, where: str = "") -> InputError:
-    """The error for pixels that can't be decoded."""
+    """The error for pixels that can't be decoded; ``where`` follows the part's name."""
     return InputError(
         f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read "
         f"({' '.join(reason.split()) or 'no reason given'}); the file is damaged or still being written"
@@ -141,9 +207,32 @@ def open_exr(path: str | Path) -> ExrFile:
     """Read the headers of an EXR file.
 
     Raises:
-        InputError: there is no such file, it is no EXR, or its headers are corrupt.
+        InputError: there is no such file, it is not an EXR, or its headers are corrupt.
     """
     path = Path(path)
+    handle = _open(path)
+    parts: list[Part] = []
+    metadata: dict[str, Any] = {}
+    while handle.seek_subimage(len(parts), 0):
+        spec = handle.spec()
+        parts.append(_part(path, len(parts), spec))
+        for attribute in spec.extra_attribs:
+            metadata.setdefault(attribute.name, attribute.value)
+    if not parts:
+        raise InputError(f"{path}: holds no image ({handle.geterror() or 'empty'})")
+    first = parts[0].spec
+    x, y = first.full_x, first.full_y
+    return ExrFile(
+        path=path,
+        parts=tuple(parts),
+        display_window=Window(x, y, x + first.full_width, y + first.full_height),
+        pixel_aspect=float(metadata.get("PixelAspectRatio", 1.0)),
+        metadata=metadata,
+    )
+
+
+def _open(path: Path) -> Any:
+    """OpenImageIO's ``ImageInput`` of an EXR file."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     if not path.is_file():
@@ -157,41 +246,25 @@ def open_exr(path: str | Path) -> ExrFile:
         raise InputError(
             f"{path}: is a {handle.format_name()} file; give an EXR, other formats lose what the network needs"
         )
-    parts: list[Part] = []
-    metadata: dict[str, Any] = {}
-    while handle.seek_subimage(len(parts), 0):
-        spec = handle.spec()
-        index = len(parts)
-        types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
-        parts.append(
-            Part(
-                index=index,
-                name=str(spec.getattribute("oiio:subimagename") or ""),
-                view=str(spec.getattribute("view") or ""),
-                channels=tuple(
-                    Channel(path, index, i, name, kind)
-                    for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
-                ),
-                data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
-                compression=str(spec.getattribute("compression") or "none").split(":")[0],
-                tile=(spec.tile_width, spec.tile_height),
-                deep=bool(spec.deep),
-                spec=oiio.ImageSpec(spec),
-            )
-        )
-        for attribute in spec.extra_attribs:
-            metadata.setdefault(attribute.name, attribute.value)
-    if not parts:
-        raise InputError(f"{path}: holds no image ({handle.geterror() or 'empty'})")
-    first = parts[0].spec
-    return ExrFile(
-        path=path,
-        parts=tuple(parts),
-        display_window=Window(
-            first.full_x, first.full_y, first.full_x + first.full_width, first.full_y + first.full_height
+    return handle
+
+
+def _part(path: Path, index: int, spec: Any) -> Part:
+    """Describe the part of which ``spec`` is the ``ImageSpec``."""
+    types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
+    return Part(
+        index=index,
+        name=str(spec.getattribute("oiio:subimagename") or ""),
+        view=str(spec.getattribute("view") or ""),
+        channels=tuple(
+            Channel(path, index, i, name, kind)
+            for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
         ),
-        pixel_aspect=float(metadata.get("PixelAspectRatio", 1.0)),
-        metadata=metadata,
+        data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
+        compression=str(spec.getattribute("compression") or "none").split(":")[0],
+        tile=(spec.tile_width, spec.tile_height),
+        deep=bool(spec.deep),
+        spec=oiio.ImageSpec(spec),
     )
 
 
@@ -199,5 +272,5 @@ def _last_error() -> str:
     """OpenImageIO's last error on one line: its messages repeat the path and break lines."""
     try:
         return " ".join(str(oiio.geterror()).split()) or "no reason given"
-    except UnicodeDecodeError:  # the message quotes the file, and OpenImageIO's binding takes it for UTF-8
+    except UnicodeDecodeError:  # the message quotes bytes of the file, and OpenImageIO's binding expects UTF-8
         return "its header is damaged"

@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The one in-memory type for a render: named float32 layers with their windows and metadata."""
+"""What a render is: a rectangle of pixels, layers in memory, and the protocol of everything that reads as layers."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -40,6 +41,7 @@ class Window:
         return Window(x0, y0, max(x0, min(self.x1, other.x1)), max(y0, min(self.y1, other.y1)))
 
     def shift(self, dx: int, dy: int) -> Window:
+        """The rectangle moved by ``dx`` pixels to the right and ``dy`` pixels down."""
         return Window(self.x0 + dx, self.y0 + dy, self.x1 + dx, self.y1 + dy)
 
     def slices(self, inside: Window) -> tuple[slice, slice]:
@@ -55,10 +57,11 @@ class Window:
 
 @dataclass
 class Render:
-    """A render, or a rectangle of one.
+    """A render in memory, or a rectangle of one.
 
-    ``layers`` maps a feature of :mod:`oiio_msspl.aovs.features` (``rgb`` always, the others when the render has them) or
-    ``alpha`` to float32 (height, width, channels) over ``data_window``, in the units that the schema states.
+    ``layers`` maps the name of a feature to float32 (height, width, channels) over ``data_window``. ``rgb`` is always
+    there; ``albedo``, ``normal``, ``diffuse``, ``specular``, ``variance`` and ``alpha`` are there if the render has
+    them. :mod:`oiio_msspl.aovs.features` states their units.
     """
 
     layers: dict[str, Array]
@@ -67,14 +70,18 @@ class Render:
     pixel_aspect: float = 1.0
     metadata: dict[str, Any] = field(default_factory=dict)
     name: str = "render"
-    """What messages call it: a file's path."""
+    """What messages call it, such as the path of its file."""
 
     @classmethod
     def from_arrays(cls, name: str = "render", **layers: Array) -> Render:
-        """A render without overscan from arrays (height, width, channels); ``rgb`` is needed.
+        """A render without overscan, from arrays.
+
+        Args:
+            name: what messages call it.
+            layers: float (height, width, channels) by feature; ``rgb`` is required.
 
         Raises:
-            ValueError: shapes differ, or ``rgb`` is absent.
+            ValueError: the shapes differ, or ``rgb`` is missing.
         """
         if "rgb" not in layers:
             raise ValueError(f"{name}: no 'rgb' among the layers {sorted(layers)}")
@@ -88,21 +95,52 @@ class Render:
         return cls({k: np.asarray(v, dtype=np.float32) for k, v in layers.items()}, window, window, name=name)
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """The layers (those in ``features``, or all) over a rectangle inside the data window."""
+        """Layers over a rectangle inside the data window, as views of the whole arrays.
+
+        Args:
+            window: the rectangle.
+            features: which layers; all if None. Those that the render lacks are left out.
+        """
         rows, columns = window.slices(self.data_window)
         names = self.layers if features is None else [f for f in features if f in self.layers]
         return {name: self.layers[name][rows, columns] for name in names}
 
+    def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
+        """Nothing to do: the layers are in memory already. See :meth:`ReadableRender.cache_strips`."""
+        return nullcontext()
+
 
 class ReadableRender(Protocol):
-    """A render that can be read by rectangles: a file with its layers mapped, or one in memory."""
+    """A render that is read by rectangles: a file with its layers mapped, or one in memory."""
 
     @property
-    def name(self) -> str: ...
+    def name(self) -> str:
+        """What messages call it."""
+
     @property
-    def display_window(self) -> Window: ...
+    def display_window(self) -> Window:
+        """The frame: what the camera shows."""
+
     @property
-    def data_window(self) -> Window: ...
+    def data_window(self) -> Window:
+        """The pixels that were rendered: smaller than the frame for a crop region, larger with overscan."""
+
     @property
-    def pixel_aspect(self) -> float: ...
-    def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]: ...
+    def pixel_aspect(self) -> float:
+        """Width of a pixel divided by its height."""
+
+    def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
+        """Layers over a rectangle inside the data window: float32 (height, width, channels) by feature.
+
+        Values are as stored: NaN and infinities may be among them.
+
+        Args:
+            window: the rectangle.
+            features: which layers; all if None. Those that the render lacks are left out.
+        """
+
+    def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
+        """Inside the ``with`` block, keep at most ``max_bytes`` of decoded rows from one :meth:`read` to the next.
+
+        A file stores rows as wide as the frame, so neighbouring tiles share them.
+        """

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the result is stored."""
+"""The user's choices about the output file: layout, compression, pixel type and layers."""
 
 from __future__ import annotations
 
@@ -7,13 +7,17 @@ from dataclasses import dataclass
 
 from oiio_msspl.errors import InputError
 
+#: Layouts by name, with their description.
 LAYOUTS = {
     "spec": "channels named layer.component in parts as the HRLS has them (OpenEXR's rule; most tools)",
-    "nuke": "a part a layer, the layer in the part's name alone, as Nuke writes",
+    "nuke": "one part for each layer, named after the layer, as Nuke writes",
     "multilayer": "a single part with all channels",
 }
+#: Compressions that keep every bit.
 LOSSLESS = ("none", "rle", "zip", "zips", "piz")
+#: All compressions of OpenEXR that can be written.
 COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab")
+#: Replaces a lossy compression of the source.
 DEFAULT_COMPRESSION = "zip"
 
 #: Name of the layer that holds the predicted error.
@@ -22,18 +26,23 @@ ERROR_LAYER = "error"
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How the result is stored."""
+    """How the result is stored.
+
+    Raises:
+        InputError: there is no such layout or compression.
+    """
 
     layout: str = "spec"
+    """One of ``LAYOUTS``."""
     compression: str | None = None
-    """Of the fused beauty; None: as the HRLS's beauty, or ``zip`` where that is lossy. Passed-on layers keep theirs, or
-    ``zip`` where it is lossy: they must not lose bits a second time."""
+    """One of ``COMPRESSIONS``, for the fused beauty. None keeps the compression of the HRLS's beauty, or takes ``zip``
+    where that is lossy. Other layers always keep theirs, or become ``zip``: they must not lose bits a second time."""
     pixel_type: str | None = None
-    """``half`` or ``float`` for the fused beauty; None: as the HRLS's."""
+    """``half`` or ``float``, for the fused beauty; None keeps the type of the HRLS's beauty."""
     layers: tuple[str, ...] = ()
-    """Patterns of the layers that are passed on beside the fused beauty, ``none`` for none; empty: all."""
+    """Patterns such as ``crypto*`` of the HRLS's layers to pass on; ``("none",)`` passes on none, ``()`` all."""
     error_layer: bool = False
-    """Add a layer ``error``: what the model expects the beauty to be off by."""
+    """Add a layer ``error``: the error that the model predicts for the fused beauty."""
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:

@@ -14,9 +14,11 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.exr.output import dropped_channels
 from oiio_msspl.exr.preview import check_view, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.exr.writer import WriteOptions, dropped_channels, write_fused
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import MAX_MEMORY
@@ -100,7 +102,9 @@ def fuse_files(
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
-    dropped_channels(hr, write)  # a layer that is not there shows before the work, not after
+    dropped_channels(
+        hr.file, hr.beauty_channels, write.layers
+    )  # a layer that is not there shows before the work, not after
     session = Session(find_model(align(lr, hr).scale, model), device, threads)
     opened = time.perf_counter()
 
@@ -123,7 +127,8 @@ def write_frame(report: FrameReport, fused: FusedFrame, options: WriteOptions, *
     """Write the EXR that the report names, and add what there is to say about it."""
     report.warnings += write_fused(
         report.output,
-        report.hr,
+        report.hr.file,
+        report.hr.beauty_channels,
         fused.rgb,
         fused.alpha,
         _provenance(report),

@@ -27,7 +27,7 @@ from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.atomic import check_folder, check_target, remove_leftovers, replacing
 from oiio_msspl.exr.preview import check_view, is_our_preview
 from oiio_msspl.exr.render import ReadableRender
-from oiio_msspl.exr.writer import WriteOptions
+from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY

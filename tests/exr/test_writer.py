@@ -12,46 +12,13 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.exr.writer import WriteOptions, fused_channels, write_fused
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.exr.atomic import check_target, replacing
+from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
+from oiio_msspl.exr.writer import write_fused
 from tests.conftest import picture, read_bits, rgb, same_bits, write_exr
-
-H, W = 70, 40
-
-
-def everything(seed=0):
-    """Layers of all types with every bit pattern that survives: NaN payloads, infinities, denormals, big integers."""
-    rng = np.random.default_rng(seed)
-    beauty = picture(H, W).astype(np.float16)
-    ids = rng.integers(0, 2**32, (H, W), dtype=np.uint32)
-    return rgb(beauty) | {
-        "A": np.ones((H, W), np.float16),
-        "Z": rng.integers(0, 2**32, (H, W), dtype=np.uint32).view(np.float32),
-        "crypto00.R": rng.integers(0, 2**32, (H, W), dtype=np.uint32).view(np.float32),
-        "crypto00.G": rng.random((H, W), dtype=np.float32),
-        "id.X": ids,
-        "mask.matte": rng.integers(0, 2**16, (H, W), dtype=np.uint16).view(np.float16),
-        "albedo.R": beauty[..., 0].astype(np.float32),
-        "albedo.G": beauty[..., 1],
-        "albedo.B": beauty[..., 2],
-    }
-
-
-def written(tmp_path, parts, options=None, **attributes):
-    """Write a fused frame over a file; returns the fused colour, and what OpenEXR reads back."""
-    path = write_exr(tmp_path / "hr.exr", parts, **attributes)
-    hr = map_render(open_exr(path))
-    height, width = hr.data_window.height, hr.data_window.width
-    fused = np.full((height, width, 3), 0.1, np.float32) + np.arange(3, dtype=np.float32)
-    alpha = np.full((height, width, 1), 0.25, np.float32) if hr.alpha else None
-    out = tmp_path / "out.exr"
-    options = options or WriteOptions()
-    write_fused(out, hr, fused, alpha, {"msspl/model": "test"}, options, overwrite=True)
-    return fused, out, read_bits(out)
+from tests.exr.sources import SOURCES, H, W, everything, flat, plain, stereo, written
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -59,9 +26,11 @@ def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
     path = write_exr(tmp_path / "hr.exr", everything())
     error = np.arange(H * W, dtype=np.float32).reshape(H, W, 1)
     image = np.ones((H, W, 4), np.float32)
+    hr = map_render(open_exr(path))
     write_fused(
         tmp_path / "out.exr",
-        map_render(open_exr(path)),
+        hr.file,
+        hr.beauty_channels,
         image[..., :3],
         image[..., 3:],
         {},
@@ -74,50 +43,6 @@ def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
     if layout != "multilayer":
         assert parts[1][0] == "error"
     assert len(layers) == len(everything()) + 1
-
-
-def flat(parts):
-    """{(layer, channel's last name): plane} whatever part it lies in."""
-    result = {}
-    for name, channels in parts:
-        for channel, plane in channels.items():
-            layer, _, component = channel.rpartition(".")
-            result[(layer or name, component)] = plane
-    return result
-
-
-def plain(seed):
-    return np.random.default_rng(seed).random((H, W), dtype=np.float32)
-
-
-def karma():
-    """Parts that carry the layer in their name alone."""
-    return [
-        ("C", rgb(picture(H, W)) | {"A": plain(0)}, (0, 0)),
-        ("albedo", rgb(picture(H, W) * 2), (0, 0)),
-        ("crypto00", {c: plain(i) for i, c in enumerate("RGBA")}, (0, 0)),
-        ("depth", {"Z": plain(9)}, (0, 0)),
-    ]
-
-
-def stereo():
-    """Two views in one part, as OpenEXR's multiView convention names them."""
-    return rgb(picture(H, W)) | {
-        "A": plain(0),
-        **{f"left.{c}": plain(i + 1) for i, c in enumerate("RGBA")},
-        "diffuse.right.R": plain(6),
-        "diffuse.left.R": plain(7),
-        "left.Z": plain(8),
-    }
-
-
-def doubles():
-    """Channels that mean the same to us: foo.r and foo.red beside foo.R."""
-    return rgb(picture(H, W)) | {"foo.R": plain(1), "foo.r": plain(2), "foo.red": plain(3)}
-
-
-SOURCES = {"everything": (everything(), {}), "karma": (karma(), {}), "doubles": (doubles(), {})}
-SOURCES["stereo"] = (stereo(), {"multiView": ["right", "left"]})
 
 
 @pytest.mark.parametrize("source", ["everything", "karma"])
@@ -148,7 +73,7 @@ def test_layers_are_passed_on_bit_for_bit(tmp_path, layout, source):
     parts, attributes = SOURCES[source]
     _, _, after = written(tmp_path, parts, WriteOptions(layout=layout), **attributes)
     hr = map_render(open_exr(tmp_path / "hr.exr"))
-    replaced = {(c.part, c.name) for c in fused_channels(hr)}
+    replaced = {(c.part, c.name) for c in hr.beauty_channels}
 
     def planes(parts, leave=()):
         return sorted(
@@ -180,7 +105,9 @@ def test_tiled_parts_of_mixed_types_are_passed_on(tmp_path):
     with OpenEXR.File(parts) as file:
         file.write(str(tmp_path / "hr.exr"))
     hr = map_render(open_exr(tmp_path / "hr.exr"))
-    write_fused(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())
+    write_fused(
+        tmp_path / "out.exr", hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, WriteOptions()
+    )
     after = flat(read_bits(tmp_path / "out.exr"))
     assert same_bits(after[("m", "X")], plain(1).astype(np.float16))
     assert same_bits(after[("m", "id")], plain(2))
@@ -200,7 +127,15 @@ def test_a_damaged_layer_names_the_input(tmp_path):
     path.write_bytes(path.read_bytes()[:-20000])
     hr = map_render(open_exr(path))
     with pytest.raises(InputError, match=r"hr\.exr: part 1 \(z\).* can't be read"):
-        write_fused(tmp_path / "out.exr", hr, np.ones((300, 64, 3), np.float32), None, {}, WriteOptions())
+        write_fused(
+            tmp_path / "out.exr",
+            hr.file,
+            hr.beauty_channels,
+            np.ones((300, 64, 3), np.float32),
+            None,
+            {},
+            WriteOptions(),
+        )
     assert not (tmp_path / "out.exr").exists()
 
 
@@ -289,7 +224,13 @@ def test_lossy_sources_are_not_compressed_a_second_time(tmp_path):
     decoded = dict(read_bits(path)[0][1])
     hr = map_render(open_exr(path))
     write_fused(
-        tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), np.ones((H, W, 1), np.float32), {}, WriteOptions()
+        tmp_path / "out.exr",
+        hr.file,
+        hr.beauty_channels,
+        np.ones((H, W, 3), np.float32),
+        np.ones((H, W, 1), np.float32),
+        {},
+        WriteOptions(),
     )
     after = flat(read_bits(tmp_path / "out.exr"))
     assert same_bits(after[("albedo", "G")], decoded["albedo.G"])
@@ -304,19 +245,6 @@ def test_nuke_layout_names_layers_by_part_alone(tmp_path):
     assert names["depth"] == {"Z"}
 
 
-def test_multilayer_layout_is_one_part(tmp_path):
-    _, _, parts = written(tmp_path, everything(), WriteOptions(layout="multilayer"))
-    assert len(parts) == 1
-    assert parts[0][1].keys() == everything().keys()
-
-
-def test_multilayer_refuses_parts_of_different_windows(tmp_path):
-    source = [("rgba", rgb(picture(H, W)), (0, 0)), ("mist", {"mist.Z": picture(20, 10)[..., 1]}, (5, 3))]
-    with pytest.raises(InputError, match=r"part 'mist' of .* one part can hold only one, use --layout spec"):
-        written(tmp_path, source, WriteOptions(layout="multilayer"))
-    assert not (tmp_path / "out.exr").exists()
-
-
 def test_what_spec_and_multilayer_write_is_read_as_the_same_features(tmp_path):
     for layout in ("spec", "multilayer"):
         _, out, _ = written(tmp_path, everything(), WriteOptions(layout=layout))
@@ -325,7 +253,9 @@ def test_what_spec_and_multilayer_write_is_read_as_the_same_features(tmp_path):
 
 def test_values_beyond_half_are_written_as_its_largest(tmp_path):
     hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W).astype(np.float16)))))
-    write_fused(tmp_path / "out.exr", hr, np.full((H, W, 3), 1e6, np.float32), None, {}, WriteOptions())
+    write_fused(
+        tmp_path / "out.exr", hr.file, hr.beauty_channels, np.full((H, W, 3), 1e6, np.float32), None, {}, WriteOptions()
+    )
     assert (read_bits(tmp_path / "out.exr")[0][1]["R"] == 65504).all()
 
 
@@ -336,72 +266,15 @@ def test_the_aces_container_flag_is_not_passed_on(tmp_path):
         assert "acesImageContainerFlag" not in open_exr(out).metadata
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [({"layout": "x"}, "use one of spec, nuke, multilayer"), ({"compression": "x"}, "use one of none")],
-)
-def test_unknown_options_are_refused(options, message):
-    with pytest.raises(InputError, match=message):
-        WriteOptions(**options)
-
-
-# ---------------------------------------------------------------------------------------------- whole or not at all
-
-
-def test_a_failing_block_leaves_the_old_file(tmp_path):
-    target = tmp_path / "out.exr"
-    target.write_text("old")
-    with pytest.raises(RuntimeError), replacing(target) as temporary:
-        temporary.write_text("half of the n")
-        raise RuntimeError
-    assert target.read_text() == "old"
-    assert os.listdir(tmp_path) == ["out.exr"]
-
-
-def test_two_jobs_do_not_overwrite_each_other(tmp_path):
-    """A file that appears while ours is computed stays, unless overwriting was asked for."""
-    target = tmp_path / "out.exr"
-    with pytest.raises(InputError, match="appeared while this was computed"), replacing(target) as temporary:
-        temporary.write_text("ours")
-        target.write_text("theirs")
-    assert target.read_text() == "theirs"
-    assert os.listdir(tmp_path) == ["out.exr"]
-
-
-@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX links and modes")
-def test_links_and_permissions_are_kept(tmp_path):
-    (tmp_path / "real.exr").write_text("old")
-    (tmp_path / "real.exr").chmod(0o640)
-    (tmp_path / "link.exr").symlink_to("real.exr")
-    with replacing(tmp_path / "link.exr", overwrite=True) as temporary:
-        temporary.write_text("new")
-    assert (tmp_path / "link.exr").is_symlink()
-    assert (tmp_path / "real.exr").read_text() == "new"
-    assert (tmp_path / "real.exr").stat().st_mode & 0o777 == 0o640
-    (tmp_path / "dangling.exr").symlink_to("nowhere.exr")
-    with pytest.raises(InputError, match="exists; pass --overwrite"):
-        check_target(tmp_path / "dangling.exr", overwrite=False)
-
-
-def test_targets_are_checked_before_any_work(tmp_path):
-    (tmp_path / "there.exr").write_text("old")
-    with pytest.raises(InputError, match="exists; pass --overwrite"):
-        check_target(tmp_path / "there.exr", overwrite=False)
-    assert check_target(tmp_path / "there.exr", overwrite=True)
-    with pytest.raises(InputError, match="does not exist; create it first"):
-        check_target(tmp_path / "nowhere" / "x.exr", overwrite=False)
-    with pytest.raises(InputError, match="is a folder"):
-        check_target(tmp_path, overwrite=True)
-
-
 _WRITE = """
 import resource, sys
 import numpy as np
 from pathlib import Path
-from oiio_msspl import assemble
-from oiio_msspl.aovs import resolve
+from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.writer import write_fused
 limit = int(sys.argv[2])
 if limit:
     import signal
@@ -413,7 +286,7 @@ rgb = np.random.default_rng(0).random((hr.data_window.height, hr.data_window.wid
 print("writing", flush=True)
 try:
     for _ in range(int(sys.argv[3])):
-        write_fused(folder / "out.exr", hr, rgb, None, {}, WriteOptions(), overwrite=True)
+        write_fused(folder / "out.exr", hr.file, hr.beauty_channels, rgb, None, {}, WriteOptions(), overwrite=True)
 except MssplError as error:
     print(error)
     sys.exit(error.exit_code)
@@ -457,4 +330,6 @@ def test_an_unwritable_path_is_our_failure_not_a_traceback(tmp_path, monkeypatch
     hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(picture(H, W)))))
     monkeypatch.setattr(oiio.ImageOutput, "create", staticmethod(lambda path: None))
     with pytest.raises(MssplError, match="OpenImageIO can't write it"):
-        write_fused(tmp_path / "out.exr", hr, np.ones((H, W, 3), np.float32), None, {}, WriteOptions())
+        write_fused(
+            tmp_path / "out.exr", hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, WriteOptions()
+        )

@@ -12,7 +12,7 @@ COMPRESSIONS = ["NO", "RLE", "ZIPS", "ZIP", "PIZ", "PXR24", "B44", "B44A", "DWAA
 
 
 def test_pixels_are_read_by_rectangle(tmp_path):
-    """Any rectangle of the data window equals that rectangle of the whole, whatever rows the bands begin on."""
+    """Any rectangle of the data window equals that rectangle of the whole, whatever rows the strips begin on."""
     image = picture(150, 40)
     file = open_exr(write_exr(tmp_path / "a.exr", [("", rgb(image), (-7, -100))]))
     part = file.parts[0]
@@ -53,7 +53,7 @@ def test_half_float_and_uint_keep_their_types(tmp_path):
         "id": "uint",
     }
     index = next(c.index for c in part.channels if c.name == "id")
-    (_, _, rows), *_ = file.native_bands(part, index, index + 1)
+    (_, _, rows), *_ = file.native_strips(part, index, index + 1)
     assert rows.dtype == np.uint32
     assert (rows == 2**32 - 5).all()
 

@@ -1,36 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-import re
-
 import numpy as np
 import pytest
 
-from oiio_msspl.aovs.features import HRLS_FEATURES
-from oiio_msspl.aovs.mapping import check_mapping, parse_map_options, read_map_file
-from oiio_msspl.aovs.matching import map_render, renderers
+from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
+from tests.aovs.renders import H, W, found, layer, mapped, plane
 from tests.conftest import SHARED, needs_shared, rgb, write_exr
-
-H = W = 8
-
-
-def plane(value):
-    return np.full((H, W), value, np.float32)
-
-
-def layer(name, value, names="RGB"):
-    """Channels of one layer, constant."""
-    return {f"{name}.{c}" if name else c: plane(value + i / 10) for i, c in enumerate(names)}
-
-
-def resolved(tmp_path, channels, mapping=None, stem="hr", **options):
-    attributes = options.pop("attributes", {})
-    return map_render(open_exr(write_exr(tmp_path / f"{stem}.exr", channels, **attributes)), mapping, **options)
-
-
-def found(resolution):
-    return {row["feature"]: row["source"] for row in resolution.table() if row["status"] in ("found", "computed")}
-
 
 CASES = {
     "Arnold": (
@@ -171,53 +149,24 @@ CASES = {
 @pytest.mark.parametrize("renderer", CASES)
 def test_each_renderers_layers_are_found(tmp_path, renderer):
     channels, attributes, expected = CASES[renderer]
-    resolution = resolved(tmp_path, channels, attributes=attributes)
-    assert resolution.renderer == renderer
-    assert found(resolution) == expected
+    render = mapped(tmp_path, channels, attributes=attributes)
+    assert render.renderer == renderer
+    assert found(render) == expected
 
 
 def test_every_renderer_of_the_table_is_tested():
     assert {r["name"] for r in renderers()} == CASES.keys() | {"Karma", "LuxCore", "unknown"}
 
 
-@pytest.mark.parametrize(
-    ("text", "message"),
-    [
-        ("albedo = 5", "5 is neither a layer's name nor a table"),
-        ('albedo = ["a", "b"]', "is neither a layer's name nor a table"),
-        ('variance = { halves = ["a"] }', "the two half buffers"),
-        ('albedo = { channels = ["a.R", "a.G"] }', "has 2 channels, not 3"),
-        ('albedo = { channels = "R" }', "channels must be a list of names"),
-        ('normal = { layer = "n", encoding = "foo" }', "encoding 'foo': of a normal, use one of signed"),
-        ('albedo = { layer = "a", kind = "mean" }', "kind 'mean': of a variance"),
-        ('albedo = { lay = "a" }', "has lay; give one of layer, sum"),
-        ('rgb = { sum = ["a", "b"] }', "must be a single layer"),
-        ("albedo =", "can't be read as a mapping"),
-    ],
-)
-def test_mistakes_in_a_mapping_file_are_named(tmp_path, text, message):
-    (tmp_path / "map.toml").write_text(text)
-    with pytest.raises(InputError, match=rf"map\.toml: .*{re.escape(message)}"):
-        read_map_file(tmp_path / "map.toml")
-
-
-def test_the_shipped_table_has_no_mistakes():
-    for renderer in renderers():
-        candidates = [(f, c) for f in HRLS_FEATURES for c in renderer.get(f, [])]
-        assert candidates
-        for feature, candidate in candidates:
-            check_mapping({feature: candidate}, renderer["name"])
-
-
 def test_integers_are_no_light(tmp_path):
     ids = {c: np.full((H, W), 4000, np.uint32) for c in "RGB"}
     with pytest.raises(InputError, match="rgb: R, G, B hold integers"):
-        resolved(tmp_path, ids)
+        mapped(tmp_path, ids)
 
 
 def test_a_single_unnamed_view_is_the_one_that_is_meant(tmp_path):
     """--view-layer goes to both files; an LRHS rendered alone may have no view name."""
-    assert resolved(tmp_path, layer("", 1), view="left").view == ""
+    assert mapped(tmp_path, layer("", 1), view="left").view == ""
 
 
 def test_karmas_layers_come_from_part_names_alone(tmp_path):
@@ -227,9 +176,9 @@ def test_karmas_layers_come_from_part_names_alone(tmp_path):
         ("N", {"x": plane(0), "y": plane(0), "z": plane(1)}, (0, 0)),
         ("combineddiffuse", layer("", 3), (0, 0)),
     ]
-    resolution = resolved(tmp_path, parts)
-    assert resolution.renderer == "Karma"
-    assert found(resolution) == {
+    render = mapped(tmp_path, parts)
+    assert render.renderer == "Karma"
+    assert found(render) == {
         "rgb": "C",
         "albedo": "albedo",
         "normal": "N",
@@ -241,9 +190,9 @@ def test_karmas_layers_come_from_part_names_alone(tmp_path):
 def test_blender_5_writes_the_layer_in_part_and_channel(tmp_path):
     names = ["Combined", "Diffuse Direct", "Diffuse Indirect", "Diffuse Color"]
     parts = [(f"ViewLayer.{n}", layer(f"ViewLayer.{n}", i + 1), (0, 0)) for i, n in enumerate(names)]
-    resolution = resolved(tmp_path, parts, attributes={"cycles.ViewLayer.samples": "16"})
-    assert resolution.spp == 16
-    values = resolution.read(resolution.data_window)
+    render = mapped(tmp_path, parts, attributes={"cycles.ViewLayer.samples": "16"})
+    assert render.spp == 16
+    values = render.read(render.data_window)
     np.testing.assert_allclose(values["diffuse"][0, 0], np.array([5, 5.2, 5.4]) * np.array([4, 4.1, 4.2]), rtol=1e-6)
 
 
@@ -251,9 +200,9 @@ def test_luxcores_files_are_layers_of_one_frame(tmp_path):
     """One file an AOV: the others are found beside the RGB, and each alone is explained."""
     for stem, value in (("ALBEDO", 2), ("DIRECT_DIFFUSE", 3), ("INDIRECT_DIFFUSE", 4)):
         write_exr(tmp_path / f"{stem}.exr", layer("", value))
-    resolution = resolved(tmp_path, layer("", 1), stem="RGB_IMAGEPIPELINE")
-    assert resolution.renderer == "LuxCore"
-    values = resolution.read(resolution.data_window)
+    render = mapped(tmp_path, layer("", 1), stem="RGB_IMAGEPIPELINE")
+    assert render.renderer == "LuxCore"
+    values = render.read(render.data_window)
     assert values["albedo"][0, 0, 0] == 2
     assert values["diffuse"][0, 0, 0] == 7
     with pytest.raises(InputError, match="LuxCore's ALBEDO alone"):
@@ -265,54 +214,29 @@ def test_view_layers_are_told_apart(tmp_path):
     channels = {}
     for i, name in enumerate(("Main.Beauty v1.2", "fg.chars")):
         channels |= layer(f"{name}.Combined", 10 * (i + 1)) | layer(f"{name}.Denoising Albedo", 10 * (i + 1) + 1)
-    first = resolved(tmp_path, channels)
+    first = mapped(tmp_path, channels)
     assert (first.view, first.other_views) == ("Main.Beauty v1.2", ["fg.chars"])
-    second = resolved(tmp_path, channels, view="fg.chars")
+    second = mapped(tmp_path, channels, view="fg.chars")
     values = second.read(second.data_window)
     assert values["rgb"][0, 0, 0] == 20
     assert values["albedo"][0, 0, 0] == 21
     with pytest.raises(InputError, match=r"no view or view layer 'bg'; the file has Main.Beauty v1.2, fg.chars"):
-        resolved(tmp_path, channels, view="bg")
+        mapped(tmp_path, channels, view="bg")
 
 
 def test_stereo_views_of_one_part(tmp_path):
     channels = layer("", 1, "RGBA") | layer("left", 2, "RGBA") | {"forward.left.u": plane(0)}
     attributes = {"multiView": ["right", "left"]}
-    assert resolved(tmp_path, channels, attributes=attributes).view == "right"
-    left = resolved(tmp_path, channels, attributes=attributes, view="left")
+    assert mapped(tmp_path, channels, attributes=attributes).view == "right"
+    left = mapped(tmp_path, channels, attributes=attributes, view="left")
     assert left.read(left.data_window)["rgb"][0, 0, 0] == 2
-
-
-@pytest.mark.parametrize(
-    ("entry", "expected"),
-    [
-        ({"layer": "v", "kind": "mean"}, 0.64),
-        ({"layer": "v", "kind": "per_sample"}, 0.16),
-        ({"layer": "v", "kind": "relative"}, 0.64 * 0.5 / 4),
-        ({"layer": "v", "kind": "second_moment"}, (0.64 - 0.25) / 4),
-        ({"layer": "v", "kind": "deviation"}, 0.64**2),
-        ({"halves": ["a", "b"]}, (0.6 - 0.2) ** 2 / 4),
-    ],
-)
-def test_every_kind_of_variance_becomes_that_of_the_mean(tmp_path, entry, expected):
-    """A grey pixel of 0.5 with 4 spp: all six descriptions give the variance of the mean luminance."""
-    channels = {c: plane(0.5) for c in "RGB"}
-    channels |= {f"{n}.{c}": plane(v) for n, v in (("v", 0.64), ("a", 0.6), ("b", 0.2)) for c in "RGB"}
-    resolution = resolved(tmp_path, channels, {"variance": entry}, spp=4)
-    np.testing.assert_allclose(resolution.read(resolution.data_window)["variance"], expected, rtol=1e-5)
-
-
-def test_a_luminance_variance_is_taken_as_it_is(tmp_path):
-    resolution = resolved(tmp_path, layer("", 1) | {"variance.Y": plane(0.25)})
-    assert resolution.read(resolution.data_window)["variance"].shape == (H, W, 1)
-    assert resolution.read(resolution.data_window)["variance"][0, 0, 0] == 0.25
 
 
 def test_a_variance_per_sample_without_spp_is_defaulted_and_said(tmp_path):
     channels = layer("", 1) | layer("Albedo", 2) | layer("Ns", 0, "XYZ") | layer("Variance", 3)
-    resolution = resolved(tmp_path, channels)
-    assert "variance" not in found(resolution)
-    assert "needs the samples per pixel" in resolution.notes[0]
+    render = mapped(tmp_path, channels)
+    assert "variance" not in found(render)
+    assert "needs the samples per pixel" in render.notes[0]
 
 
 def test_encoded_normals_are_recognised_by_their_pixels(tmp_path):
@@ -321,21 +245,21 @@ def test_encoded_normals_are_recognised_by_their_pixels(tmp_path):
     normal = rng.normal(size=(H, W, 3))
     normal = (normal / np.linalg.norm(normal, axis=-1, keepdims=True)).astype(np.float32)
     for stored in (normal, normal * 0.5 + 0.5):
-        resolution = resolved(tmp_path, layer("", 1) | rgb(stored, "normal."))
-        np.testing.assert_allclose(resolution.read(resolution.data_window)["normal"], normal, atol=1e-6)
+        render = mapped(tmp_path, layer("", 1) | rgb(stored, "normal."))
+        np.testing.assert_allclose(render.read(render.data_window)["normal"], normal, atol=1e-6)
 
 
 def test_the_users_mapping_wins(tmp_path):
     channels = layer("", 1) | layer("albedo", 2) | layer("my_albedo", 3)
-    resolution = resolved(tmp_path, channels, parse_map_options(["albedo=my_albedo"]))
-    assert resolution.read(resolution.data_window)["albedo"][0, 0, 0] == 3
+    render = mapped(tmp_path, channels, parse_map_options(["albedo=my_albedo"]))
+    assert render.read(render.data_window)["albedo"][0, 0, 0] == 3
 
 
 def test_a_mapping_may_add_layers_or_name_another_file(tmp_path):
     other = write_exr(tmp_path / "other.exr", layer("", 7))
     mapping = parse_map_options(["diffuse=direct+indirect", f"albedo={other}"])
-    resolution = resolved(tmp_path, layer("", 1) | layer("direct", 2) | layer("indirect", 3), mapping)
-    values = resolution.read(resolution.data_window)
+    render = mapped(tmp_path, layer("", 1) | layer("direct", 2) | layer("indirect", 3), mapping)
+    values = render.read(render.data_window)
     assert values["diffuse"][0, 0, 0] == 5
     assert values["albedo"][0, 0, 0] == 7
 
@@ -343,59 +267,33 @@ def test_a_mapping_may_add_layers_or_name_another_file(tmp_path):
 def test_a_mapping_file_takes_what_the_table_takes(tmp_path):
     (tmp_path / "map.toml").write_text('diffuse = { sum = ["a", "b"], times = "c" }\n')
     channels = layer("", 1) | layer("a", 2) | layer("b", 3) | layer("c", 4)
-    resolution = resolved(tmp_path, channels, read_map_file(tmp_path / "map.toml"))
-    assert resolution.read(resolution.data_window)["diffuse"][0, 0, 0] == 20
-
-
-def test_files_that_a_mapping_names_do_not_depend_on_the_working_directory(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    assert parse_map_options(["albedo=a/b.exr"]) == {"albedo": f"file:{tmp_path}/a/b.exr"}
-    (tmp_path / "maps").mkdir()
-    (tmp_path / "maps/map.toml").write_text('albedo = "file:b.exr"\ndiffuse = { sum = ["file:DIRECT", "file:/c.exr"] }')
-    assert read_map_file("maps/map.toml") == {
-        "albedo": f"file:{tmp_path}/maps/b.exr",
-        "diffuse": {"sum": ["file:DIRECT", "file:/c.exr"]},
-    }
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        (["albedo"], "write it as feature=layer"),
-        (["colour=x"], "'colour' is no feature; use one of rgb, albedo"),
-        (["rgb=a+b"], "must be a single layer"),
-        (["rgb=other.exr"], "must be a layer of the render itself"),
-        (["variance=a+b"], "variances don't add up"),
-    ],
-)
-def test_a_wrong_mapping_option_is_explained(options, message):
-    with pytest.raises(InputError, match=message):
-        parse_map_options(options)
+    render = mapped(tmp_path, channels, read_map_file(tmp_path / "map.toml"))
+    assert render.read(render.data_window)["diffuse"][0, 0, 0] == 20
 
 
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
     channels = layer("", 1) | {"mask.A": plane(1)}
     with pytest.raises(InputError, match="albedo is mapped to nothing, which is not there"):
-        resolved(tmp_path, channels, {"albedo": "nothing"})
+        mapped(tmp_path, channels, {"albedo": "nothing"})
     with pytest.raises(InputError, match=r"layer 'mask' has channels A, not R, G, B"):
-        resolved(tmp_path, channels, {"albedo": "mask"})
+        mapped(tmp_path, channels, {"albedo": "mask"})
 
 
 def test_an_aov_of_the_wrong_channel_count_is_not_used_silently(tmp_path):
-    resolution = resolved(tmp_path, layer("", 1) | {"albedo.R": plane(1), "albedo.G": plane(1)})
-    assert "albedo" not in found(resolution)
-    assert "albedo: layer 'albedo' has channels R, G" in resolution.notes[0]
+    render = mapped(tmp_path, layer("", 1) | {"albedo.R": plane(1), "albedo.G": plane(1)})
+    assert "albedo" not in found(render)
+    assert "albedo: layer 'albedo' has channels R, G" in render.notes[0]
 
 
 def test_no_beauty_names_what_is_there(tmp_path):
     with pytest.raises(InputError, match=r"no beauty \(R, G, B\) found among: crypto00, depth"):
-        resolved(tmp_path, layer("crypto00", 1, "RGBA") | {"depth.Z": plane(1)})
+        mapped(tmp_path, layer("crypto00", 1, "RGBA") | {"depth.Z": plane(1)})
 
 
 def test_beauty_spread_over_parts_with_odd_names(tmp_path):
     parts = [("part0", {"R": plane(1)}, (0, 0)), ("part1", {"G": plane(2)}, (0, 0)), ("part2", {"B": plane(3)}, (0, 0))]
-    resolution = resolved(tmp_path, parts)
-    np.testing.assert_array_equal(resolution.read(resolution.data_window)["rgb"][0, 0], [1, 2, 3])
+    render = mapped(tmp_path, parts)
+    np.testing.assert_array_equal(render.read(render.data_window)["rgb"][0, 0], [1, 2, 3])
 
 
 REAL = {
@@ -426,6 +324,8 @@ REAL = {
     "seesharp/rgb_variance_Y": ("unknown", {"rgb", "variance"}),
     "vray/rgba_z_crypto_diffuse_normals": ("V-Ray", {"rgb", "albedo", "normal", "alpha"}),
 }
+
+
 UNUSABLE = {
     "arnold/crypto_only": "no beauty",
     "arnold/deep": "deep data only",
@@ -446,9 +346,9 @@ def test_every_real_file_is_expected_here():
 @pytest.mark.parametrize("name", REAL)
 def test_real_files_are_mapped(name):
     renderer, features = REAL[name]
-    resolution = map_render(open_exr(SHARED / "exr" / f"{name}.exr"))
-    assert resolution.renderer == renderer
-    assert found(resolution).keys() == features
+    render = map_render(open_exr(SHARED / "exr" / f"{name}.exr"))
+    assert render.renderer == renderer
+    assert found(render).keys() == features
 
 
 @needs_shared("exr")
@@ -456,18 +356,3 @@ def test_real_files_are_mapped(name):
 def test_real_files_that_cannot_be_used_are_explained(name):
     with pytest.raises(InputError, match=UNUSABLE[name]):
         map_render(open_exr(SHARED / "exr" / f"{name}.exr"))
-
-
-@needs_shared("exr")
-def test_cycles_layers_add_up_to_the_beauty():
-    """The paper's equations: diffuse + gloss + transmission + emission + environment is the beauty."""
-    resolution = map_render(
-        open_exr(SHARED / "exr/cycles-5.0/cycles_viewlayer_zip32.exr"),
-        {
-            "albedo": {"sum": ["Transmission Direct", "Transmission Indirect"], "times": "Transmission Color"},
-            "normal": {"sum": ["Emission", "Environment"]},
-        },
-    )
-    values = resolution.read(resolution.data_window)
-    total = values["diffuse"] + values["specular"] + values["albedo"] + values["normal"]
-    np.testing.assert_allclose(total, values["rgb"], atol=1e-4)

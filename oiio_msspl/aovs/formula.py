@@ -1,0 +1,88 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How a feature is computed from the channels of a file.
+
+Composites follow the paper's equations, variances become the variance of the pixel's mean luminance, and normals become
+signed vectors.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import luminance
+from oiio_msspl.exr.reader import Channel
+
+#: Gives the pixels of some channels, (height, width, len(channels)).
+Take = Callable[[Sequence[Channel]], Array]
+
+
+@dataclass(frozen=True)
+class FeatureFormula:
+    """How one feature is computed: ``(sum of terms) * factor``, then a conversion to the feature's unit."""
+
+    terms: tuple[tuple[Channel, ...], ...]
+    """Groups of channels, three each, or one each for a variance in luminance."""
+    factor: tuple[Channel, ...] | None = None
+    kind: str = "mean"
+    """Of a variance: one of ``VARIANCE_KINDS`` in :mod:`oiio_msspl.aovs.mapping`, or ``halves``."""
+    encoding: str = "signed"
+    """Of a normal: ``signed`` or ``unsigned`` (n * 0.5 + 0.5)."""
+    text: str = ""
+    """The layers as stored, for the user."""
+    note: str = ""
+    """What else the user should know, e.g. ``camera space``."""
+
+    @property
+    def channels(self) -> list[Channel]:
+        """All channels that the formula reads."""
+        return [c for group in (*self.terms, self.factor or ()) for c in group]
+
+    @property
+    def is_computed(self) -> bool:
+        """Whether the feature is computed, rather than read from a layer that holds just this."""
+        return len(self.terms) > 1 or self.factor is not None or self.kind != "mean"
+
+    def evaluate(self, take: Take) -> Array:
+        """The feature, unless it is a variance: float32 (height, width, 3), in the units of the features."""
+        value = take(self.terms[0])
+        for term in self.terms[1:]:
+            value = value + take(term)
+        if self.factor is not None:
+            value = value * take(self.factor)
+        return value * 2 - 1 if self.encoding == "unsigned" else value
+
+    def evaluate_variance(self, take: Take, mean: Array, spp: float | None) -> Array:
+        """Variance of the pixel's mean luminance, (height, width, 1).
+
+        A variance of colours is turned into one of luminance as if the noise of R, G and B were fully correlated:
+        sigma_Y = sum of w_c sigma_c. Monte Carlo noise nearly is, because one path carries all three.
+
+        Args:
+            take: gives the pixels of channels.
+            mean: the pixel's colour, (height, width, 3).
+            spp: samples per pixel; needed for the kinds in ``NEEDS_SPP``.
+        """
+        if self.kind == "halves":
+            # The mean of two independent halves a and b of the samples has the variance (a - b)^2 / 4.
+            difference = (take(self.terms[0]) - take(self.terms[1])) / 2
+            return np.square(luminance(difference))[..., None]
+        value = take(self.terms[0])
+        if self.kind == "second_moment":
+            value = (value - np.square(mean)) / spp
+        elif self.kind == "relative":
+            value = value * (mean if value.shape[-1] == 3 else luminance(mean)[..., None]) / spp
+        elif self.kind == "per_sample":
+            value = value / spp
+        elif self.kind == "deviation":
+            value = np.square(value)
+        if value.shape[-1] == 1:
+            return value
+        return np.square(luminance(np.sqrt(np.maximum(value, 0))))[..., None]
+
+
+#: Kinds of variance that can be used only if the samples per pixel are known.
+NEEDS_SPP = ("per_sample", "relative", "second_moment")

@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The table of renderers (``renderers.toml``): which renderer wrote a file, and how it names its layers."""
+
+from __future__ import annotations
+
+import re
+import tomllib
+from fnmatch import fnmatchcase
+from functools import lru_cache
+from importlib import resources
+from typing import Any
+
+from oiio_msspl.exr.layers import Layer
+from oiio_msspl.exr.reader import ExrFile
+
+
+@lru_cache(maxsize=1)
+def renderers() -> list[dict[str, Any]]:
+    """The entries of ``renderers.toml``, most specific renderer first; the last one matches every file."""
+    text = resources.files("oiio_msspl.aovs").joinpath("renderers.toml").read_text(encoding="utf-8")
+    return list(tomllib.loads(text)["renderer"])
+
+
+def detect_renderer(file: ExrFile, layers: list[Layer]) -> dict[str, Any]:
+    """The entry of the renderer that wrote a file, by its layers, header attributes and file name."""
+    return next(
+        renderer for renderer in renderers() if any(_holds(condition, file, layers) for condition in renderer["detect"])
+    )
+
+
+def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) -> float | None:
+    """Samples per pixel as the header says, or None.
+
+    Args:
+        renderer: entry of the table.
+        file: the render.
+        view_layer: the one that was chosen: Blender writes one attribute for each.
+    """
+    for rule in renderer.get("spp", ()):
+        found = {key: value for key, value in file.metadata.items() if re.search(rule["attribute"], key)}
+        keys = [key for key in found if view_layer and view_layer in key] or list(found)
+        if keys:
+            try:
+                return float(found[keys[0]]) ** rule.get("power", 1)
+            except (TypeError, ValueError):
+                return None
+    return None
+
+
+def view_layer_of(layer: str, alias: str) -> str | None:
+    """The view layer in front of ``alias`` in a layer's name.
+
+    Names are compared without case, spaces, ``_`` and ``-``; ``*`` in the alias matches any text.
+
+    Returns:
+        ``ViewLayer`` for ``ViewLayer.Combined`` and the alias ``combined``; empty if the layer has just the alias as
+        its name; None if it is another layer.
+    """
+    name, wanted = _without_spelling(layer), _without_spelling(alias)
+    if name == wanted or ("*" in wanted and fnmatchcase(name, wanted)):
+        return ""
+    if wanted and name.endswith("." + wanted):
+        # Cut the stored name as many dots from its end as the alias takes.
+        return layer.rsplit(".", wanted.count(".") + 1)[0]
+    return None
+
+
+def _without_spelling(name: str) -> str:
+    return re.sub(r"[ _-]", "", name).lower()
+
+
+def _holds(condition: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:
+    """Whether all that an entry of ``detect`` asks for is true of a file."""
+    for alias in condition.get("layers", ()):
+        if all(view_layer_of(layer.name, alias) is None for layer in layers):
+            return False
+    for key, value in condition.get("attributes", {}).items():
+        if not any(re.search(key, k) and re.search(value, str(v)) for k, v in file.metadata.items()):
+            return False
+    return bool(re.search(condition.get("file", ""), file.path.stem))

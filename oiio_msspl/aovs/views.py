@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Finding the beauty, and choosing among the views and view layers of a file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+from oiio_msspl.aovs.renderers import view_layer_of
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.layers import Layer
+from oiio_msspl.exr.reader import ExrFile
+
+
+class Beauty(NamedTuple):
+    """The beauty layer of one view and view layer."""
+
+    view: str
+    """Such as ``left``; empty in a file without views."""
+    view_layer: str
+    """Such as ``ViewLayer``; empty in a file without view layers."""
+    layer: Layer
+
+    @property
+    def label(self) -> str:
+        """What the user calls it: ``left``, ``ViewLayer`` or ``left/ViewLayer``."""
+        return "/".join(name for name in (self.view, self.view_layer) if name)
+
+
+def find_beauties(layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty]:
+    """The beauties of all views and view layers: the layers that match the first candidate that matches any."""
+    for candidate in candidates:
+        alias = candidate if isinstance(candidate, str) else candidate.get("layer", "")
+        found = [
+            Beauty(layer.view, view_layer, layer)
+            for layer in layers
+            if (view_layer := view_layer_of(layer.name, alias)) is not None and layer.triple()
+        ]
+        if found:
+            return found
+    return []
+
+
+def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> Beauty:
+    """The beauty of the view or view layer that the user wants, or the first one if they don't say.
+
+    Raises:
+        InputError: the file has no such view or view layer.
+    """
+    if wanted is None:
+        return beauties[0]
+    if len(beauties) == 1 and not beauties[0].label:
+        return beauties[0]  # the only view, and it has no name
+    for beauty in beauties:
+        if wanted in (beauty.view, beauty.view_layer, beauty.label):
+            return beauty
+    known = ", ".join(dict.fromkeys(beauty.label or "(unnamed)" for beauty in beauties))
+    raise InputError(f"{file.path}: no view or view layer {wanted!r}; the file has {known}")

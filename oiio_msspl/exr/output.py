@@ -1,0 +1,116 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the output file holds: the fused pixels, and the channels of the HRLS that are passed on beside them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.arrays import HALF_MAX, Array
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.reader import Channel, ExrFile, Part
+from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOptions
+
+#: NumPy's type of each pixel type.
+DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}
+
+
+@dataclass(frozen=True)
+class FusedPixels:
+    """The fused beauty and its predicted error.
+
+    Rows are converted to the stored type as they are written: a second copy of an 8K frame takes half a gigabyte.
+    """
+
+    rgb: Array
+    """Scene linear, (height, width, 3)."""
+    alpha: Array | None
+    """(height, width, 1), if the HRLS has an alpha."""
+    error: Array | None
+    """(height, width, 1), if it was asked for."""
+    kind: str
+    """Pixel type in the file: ``half`` or ``float``."""
+
+    def rows(self, start: int, stop: int) -> NDArray[Any]:
+        """Rows of the beauty as stored, (stop - start, width, 3 or 4)."""
+        values = self.rgb[start:stop]
+        if self.alpha is not None:
+            values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
+        return self._stored(values)
+
+    def error_rows(self, start: int, stop: int) -> NDArray[Any]:
+        """Rows of the error as stored, (stop - start, width, 1)."""
+        assert self.error is not None
+        return self._stored(self.error[start:stop])
+
+    def _stored(self, values: Array) -> NDArray[Any]:
+        if self.kind == "half":
+            values = np.minimum(values, np.float32(HALF_MAX))
+        return np.ascontiguousarray(values, dtype=DTYPES[self.kind])
+
+
+@dataclass(frozen=True)
+class Output:
+    """Everything that a writer needs to know."""
+
+    source: ExrFile
+    """The HRLS."""
+    beauty: tuple[Channel, ...]
+    """Its channels R, G, B and perhaps A, which the fused pixels replace."""
+    dropped: frozenset[Channel]
+    """Its channels that are left out."""
+    pixels: FusedPixels
+    attributes: dict[str, str]
+    """Header attributes that are added to the part of the beauty."""
+    options: WriteOptions
+
+    @property
+    def home(self) -> Part:
+        """The HRLS's part that holds the beauty."""
+        return self.source.parts[self.beauty[0].part]
+
+    @property
+    def compression(self) -> str:
+        """Compression of the fused beauty."""
+        return self.options.compression or lossless(self.home)
+
+
+def lossless(part: Part) -> str:
+    """A part's compression, or a lossless one in place of a lossy one."""
+    return part.compression if part.compression in LOSSLESS else DEFAULT_COMPRESSION
+
+
+def widest_type(channels: Sequence[Channel]) -> str:
+    """``float`` if one of the channels is float, otherwise ``half``."""
+    return "float" if any(c.type == "float" for c in channels) else "half"
+
+
+def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequence[str]) -> frozenset[Channel]:
+    """The channels of the HRLS that are neither replaced nor passed on.
+
+    Args:
+        file: the HRLS.
+        beauty: its channels that the fused beauty replaces.
+        patterns: ``WriteOptions.layers``. A pattern matches the name of a layer or of a channel.
+
+    Raises:
+        InputError: a pattern matches nothing.
+    """
+    if not patterns:
+        return frozenset()
+    layers = {c: layer.name or c.name for layer in layers_of(file) for c in layer.channels.values()}
+    others = {c: layers.get(c, c.name) for part in file.parts for c in part.channels if c not in beauty}
+    kept: set[Channel] = set()
+    for pattern in patterns:
+        found = {c for c, layer in others.items() if fnmatchcase(layer, pattern) or fnmatchcase(c.name, pattern)}
+        if not found and pattern != "none":
+            names = ", ".join(sorted(set(others.values()))) or "no other layer"
+            raise InputError(f"--layers {pattern!r}: {file.path} has no such layer; it has: {names}")
+        kept |= found
+    return frozenset(others.keys() - kept)

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Descriptions of the parts of a multi-part file, as OpenImageIO's ``ImageSpec``.
+
+Each starts as a copy of the HRLS's part, so that windows and metadata are kept.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import OpenImageIO as oiio
+
+from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.output import Output, lossless
+from oiio_msspl.exr.reader import Channel, Part
+from oiio_msspl.exr.write_options import ERROR_LAYER
+
+#: Attributes that say how the source was stored. The writer sets them anew, or they have no meaning in the copy.
+_STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
+#: ST 2065-4 forbids compression and AOVs in a file that carries this flag.
+_ACES_FLAG = "acesImageContainerFlag"
+#: Attributes that must be the same in all parts of a file, and attributes that describe a single part.
+_KEPT_IN_EVERY_PART = (
+    "PixelAspectRatio",
+    "chromaticities",
+    "smpte:TimeCode",
+    "view",
+    "name",
+    "oiio:subimagename",
+    "compression",
+)
+
+
+@dataclass(frozen=True)
+class PassedOnPart:
+    """A part to be written, with pixels of the HRLS."""
+
+    spec: Any
+    source: Part
+    runs: tuple[tuple[Channel, ...], ...] | None
+    """Runs of neighbouring channels of one pixel type, in the order in which they are written. None copies the whole
+    part, in its mixed pixel types."""
+
+
+def beauty_spec(output: Output) -> Any:
+    """The part of the fused beauty."""
+    home = output.home
+    if output.options.layout == "nuke":
+        name, channels = _nuke_name("rgba", home.view), ["R", "G", "B", "A"][: len(output.beauty)]
+    else:
+        name, channels = home.name or "rgba", [channel.name for channel in output.beauty]
+    spec = _spec(home, name, channels, output.pixels.kind)
+    spec.attribute("compression", output.compression)
+    for key, value in output.attributes.items():
+        spec.attribute(key, value)
+    return spec
+
+
+def error_spec(output: Output, taken: set[str]) -> Any:
+    """The part of the predicted error; its name is not among ``taken`` and is added to them."""
+    channel = "Y" if output.options.layout == "nuke" else f"{ERROR_LAYER}.Y"
+    spec = _spec(output.home, _unique(ERROR_LAYER, taken), [channel], output.pixels.kind)
+    _drop_repeated_attributes(spec)
+    spec.attribute("compression", output.compression)
+    return spec
+
+
+def passed_on_parts(output: Output, taken: set[str]) -> Iterator[PassedOnPart]:
+    """The parts with all channels of the HRLS but the fused and the dropped ones.
+
+    A part stays whole if it can. The others are split into one part for each layer and pixel type.
+
+    Args:
+        output: what is written.
+        taken: names of the parts so far; those of the new parts are added.
+    """
+    layer_of = {c: layer for layer in layers_of(output.source) for c in layer.channels.values()}
+    for part in output.source.parts:
+        if part.deep:
+            continue
+        if _stays_whole(part, output):
+            yield _whole_part(part, taken)
+            continue
+        groups: dict[tuple[str, str, str], list[Channel]] = {}
+        for channel in part.channels:
+            if channel not in output.beauty and channel not in output.dropped:
+                layer = layer_of.get(channel)
+                # A channel in no layer means the same as another one (foo.r beside foo.R): it gets its own part.
+                key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
+                groups.setdefault(key, []).append(channel)
+        # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
+        repeats_metadata = not set(output.beauty).isdisjoint(part.channels)
+        for (view, layer_name, _), channels in groups.items():
+            yield _layer_part(output, part, view, layer_name, channels, taken, repeats_metadata)
+            repeats_metadata = True
+
+
+def _stays_whole(part: Part, output: Output) -> bool:
+    """Whether all channels of a part can be copied into one part of the same name."""
+    if output.options.layout == "nuke":
+        return False
+    if any(c in output.beauty or c in output.dropped for c in part.channels):
+        return False
+    # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. A part of a single pixel type
+    # is rewritten as scan lines; OpenImageIO can't do so with mixed types.
+    return _has_one_type(part) or part.tile == (0, 0)
+
+
+def _has_one_type(part: Part) -> bool:
+    return len({channel.type for channel in part.channels}) == 1
+
+
+def _whole_part(part: Part, taken: set[str]) -> PassedOnPart:
+    spec = oiio.ImageSpec(part.spec)
+    _name_and_compress(spec, _unique(part.name or f"part{part.index}", taken), lossless(part))
+    if not _has_one_type(part):
+        return PassedOnPart(spec, part, None)
+    spec.tile_width = spec.tile_height = spec.tile_depth = 0
+    return PassedOnPart(spec, part, (part.channels,))
+
+
+def _layer_part(
+    output: Output,
+    part: Part,
+    view: str,
+    layer: str,
+    channels: list[Channel],
+    taken: set[str],
+    repeats_metadata: bool,
+) -> PassedOnPart:
+    """A part for the channels of one layer and pixel type."""
+    nuke = output.options.layout == "nuke"
+    plain = layer or ("depth" if [c.name for c in channels] == ["Z"] else "other")
+    name = _unique(_nuke_name(plain, view) if nuke else plain, taken)
+    names = [c.name.rpartition(".")[2] for c in channels] if nuke else [c.name for c in channels]
+    spec = _spec(part, name, names, channels[0].type)
+    if repeats_metadata:
+        _drop_repeated_attributes(spec)
+    if nuke and view:
+        spec.attribute("view", view)
+    return PassedOnPart(spec, part, tuple(_runs(channels)))
+
+
+def _runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
+    """Cut channels of one pixel type where their indices are not neighbours: a run can be decoded in one call."""
+    run: list[Channel] = []
+    for channel in channels:
+        if run and channel.index != run[-1].index + 1:
+            yield tuple(run)
+            run = []
+        run.append(channel)
+    yield tuple(run)
+
+
+def _nuke_name(layer: str, view: str) -> str:
+    """Part name of a layer as Nuke writes it: no dot but the one before the view."""
+    return layer.replace(".", "_") + (f".{view}" if view else "")
+
+
+def _unique(name: str, taken: set[str]) -> str:
+    """Parts of one file need different names: add a number to ``name`` if it is taken."""
+    candidate, number = name, 2
+    while candidate in taken:
+        candidate, number = f"{name}{number}", number + 1
+    taken.add(candidate)
+    return candidate
+
+
+def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
+    """A part of scan lines with other channels than ``part``, keeping its windows and metadata."""
+    spec = oiio.ImageSpec(part.spec)
+    spec.tile_width = spec.tile_height = spec.tile_depth = 0
+    spec.nchannels = len(channels)
+    spec.channelnames = tuple(channels)
+    spec.channelformats = ()
+    spec.format = oiio.TypeDesc(kind)
+    _name_and_compress(spec, name, lossless(part))
+    return spec
+
+
+def _drop_repeated_attributes(spec: Any) -> None:
+    """Drop the metadata that one part holds for the whole file: a Cryptomatte manifest can take megabytes."""
+    for name in [attribute.name for attribute in spec.extra_attribs]:
+        if name not in _KEPT_IN_EVERY_PART:
+            spec.erase_attribute(name)
+
+
+def _name_and_compress(spec: Any, name: str, compression: str) -> None:
+    for attribute in (*_STRUCTURE, _ACES_FLAG):
+        spec.erase_attribute(attribute)
+    spec.attribute("oiio:subimagename", name)
+    spec.attribute("name", name)
+    spec.attribute("compression", compression)

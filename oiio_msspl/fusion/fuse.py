@@ -17,7 +17,7 @@ from oiio_msspl.fusion.alpha import fuse_alpha
 from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import MAX_MEMORY, aligned_grid, largest_tile, plan_tiles
+from oiio_msspl.fusion.tiling import MAX_MEMORY, aligned_grid, largest_tile, plan_tiles, spare_bytes
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
@@ -81,13 +81,14 @@ def fuse(
         tiles = plan_tiles(grid, largest, session.contract.overlap, session.contract.alignment)
         empty_regions, averages = EmptyRegions(lrhs[RGB]), HrlsAverages(alignment)
         hrls_repaired: dict[str, int] = {}
-        for done, tile in enumerate(tiles, start=1):
-            features = [*session.contract.features, "alpha"]
-            pair = read_tile(tile, lrhs, grid, hr, alignment, features, hrls_repaired)
-            averages.add(pair)
-            _fuse_tile(pair, empty_regions.mask(pair, tile.area.slices(grid)), session, frame)
-            if progress is not None:
-                progress(done, len(tiles))
+        with hr.cache_strips(spare_bytes(session.contract, tiles, frame_bytes, max_memory)):
+            for done, tile in enumerate(tiles, start=1):
+                features = [*session.contract.features, "alpha"]
+                pair = read_tile(tile, lrhs, grid, hr, alignment, features, hrls_repaired)
+                averages.add(pair)
+                _fuse_tile(pair, empty_regions.mask(pair, tile.area.slices(grid)), session, frame)
+                if progress is not None:
+                    progress(done, len(tiles))
         frame.warnings += check_pair(lrhs[RGB][alignment.grid.slices(grid)], averages, lr.name, hr.name)
     if frame.alpha is not None and "alpha" not in lrhs:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")

@@ -53,6 +53,12 @@ def largest_tile(contract: Contract, frame_bytes: int, max_memory: int) -> int:
     return int(pixels) // contract.scale**2
 
 
+def spare_bytes(contract: Contract, tiles: list[Tile], frame_bytes: int, max_memory: int) -> int:
+    """Memory that neither the frame nor a tile needs; at least 0."""
+    largest = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
+    return max(0, max_memory - FIXED_MEMORY - frame_bytes - largest * contract.bytes_per_pixel)
+
+
 def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> list[Tile]:
     """Cover ``grid`` by tiles, row by row, whose area has at most ``largest`` LRHS pixels.
 

@@ -54,7 +54,7 @@ class UserKnob:
     kind: int
     name: str
     options: dict[str, str]
-    """Option -> value: ``l`` label, ``t`` tooltip, ``T`` text or script, ``M`` menu. Flags such as ``+STARTLINE`` have none."""
+    """Option -> value: ``l`` label, ``t`` tooltip, ``T`` text or script, ``M`` menu. ``+STARTLINE`` has none."""
     items: list[str] = field(default_factory=list)
 
 

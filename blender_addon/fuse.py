@@ -10,6 +10,7 @@ from pathlib import Path
 
 from .errors import Failure
 
+#: msspl-fuse prints this after each tile if it runs with -v.
 _TILE = re.compile(r"tile (\d+) of (\d+)")
 #: Seconds that a cancelled msspl-fuse has to remove its temporary file.
 _GRACE = 10
@@ -35,7 +36,7 @@ def find_program(preference=""):
     return found
 
 
-def run(program, low, high, output, work, overwrite, threads):
+def run(program, lrhs, hrls, output, work, overwrite, threads):
     """Fuse two files. This is a generator that yields ``(current step, fraction of the frame done)``.
 
     Closing the generator ends the program.
@@ -47,7 +48,7 @@ def run(program, low, high, output, work, overwrite, threads):
         Failure: msspl-fuse failed. The message is its own.
     """
     # Blender's Image node shows all passes of a single-part file only.
-    command = [program, low, high, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
+    command = [program, lrhs, hrls, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
     command += ["--overwrite"] if overwrite else []
     command += ["--threads", threads] if threads else []
     # msspl-fuse runs in another Python, which must not get the variables of Blender's.

@@ -22,7 +22,7 @@ class Options:
     view_layer: str = ""
     """Empty: the only one that is enabled."""
     threads: int = 0
-    """0: as many as the scene uses."""
+    """0: Blender uses the number that the scene sets, and msspl-fuse uses one thread per core."""
 
     @property
     def lrhs_spp(self):

@@ -1,22 +1,22 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The fused frame as an Image node in the scene's compositor."""
+"""Showing the fused frame in the scene's compositor, as an Image node."""
 
 import bpy
 
-from .render import V5
+from .render_settings import BLENDER_5
 
 NODE = "MSSPL Fused"
 
 
 def show(scene, path, connect):
-    """Load a fused EXR into the node named ``MSSPL Fused``, which is made if it is not there; its links stay.
+    """Load a fused EXR into the node ``MSSPL Fused``. A new node is made if there is none; an old one keeps its links.
 
     Args:
-        path: as a user writes it, ``//`` being the .blend's folder.
-        connect: make it the compositor's output even if that comes from something else now.
+        path: may begin with ``//``, which stands for the folder of the .blend.
+        connect: connect the node to the compositor's output even if another node is connected there.
 
     Returns:
-        The node; its outputs are the file's passes.
+        The node. Its outputs are the passes of the file.
     """
     tree, fresh = _tree(scene)
     node = tree.nodes.get(NODE)
@@ -28,8 +28,8 @@ def show(scene, path, connect):
     else:
         node.image.filepath = path
         node.image.reload()
-        node.image = node.image  # its passes may be others now
-    # Raw: the file holds what the scene's own render would hold at this place.
+        node.image = node.image  # Blender then lists the passes of the new file.
+    # The file holds scene-linear values, as the scene's own render does, so no colour conversion is wanted.
     node.image.colorspace_settings.is_data = True
     output = _output(tree)
     if connect or fresh or not output.inputs[0].is_linked:
@@ -40,21 +40,23 @@ def show(scene, path, connect):
 
 
 def _tree(scene):
-    """The compositor's node tree, and whether there was none before."""
-    if V5:
+    """(the compositor's node tree, whether it was created now)."""
+    if BLENDER_5:
         fresh = scene.compositing_node_group is None
         if fresh:
             scene.compositing_node_group = bpy.data.node_groups.new("Compositing", "CompositorNodeTree")
         return scene.compositing_node_group, fresh
-    fresh = scene.node_tree is None  # nodes that are turned off are still the user's
+    fresh = scene.node_tree is None  # Nodes that are turned off still belong to the user.
     scene.use_nodes = True
     return scene.node_tree, fresh
 
 
 def _output(tree):
-    """The node whose first input becomes the picture: since Blender 5.0 the group's output."""
-    kind = "NodeGroupOutput" if V5 else "CompositorNodeComposite"
-    if V5 and not any(item.item_type == "SOCKET" and item.in_out == "OUTPUT" for item in tree.interface.items_tree):
+    """The node whose first input is the composited image. Since Blender 5.0, it is the output of a node group."""
+    kind = "NodeGroupOutput" if BLENDER_5 else "CompositorNodeComposite"
+    if BLENDER_5 and not any(
+        item.item_type == "SOCKET" and item.in_out == "OUTPUT" for item in tree.interface.items_tree
+    ):
         tree.interface.new_socket("Image", in_out="OUTPUT", socket_type="NodeSocketColor")
     outputs = [node for node in tree.nodes if node.bl_idname == kind]
     return next((node for node in outputs if getattr(node, "is_active_output", True)), None) or tree.nodes.new(kind)

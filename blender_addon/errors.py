@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""One sentence for the user."""
+"""How a job ends when it does not succeed."""
 
 
 class Failure(Exception):
-    """A job that can't be done; ``code`` is 2 for the caller's mistake, 1 for anything else."""
+    """One sentence for the user. ``code`` is 2 for the caller's mistake and 1 for any other failure."""
 
     def __init__(self, message, code=2):
         super().__init__(message)
@@ -11,4 +11,4 @@ class Failure(Exception):
 
 
 class Cancelled(Exception):
-    """The user stopped it."""
+    """The user cancelled the job."""

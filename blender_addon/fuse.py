@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The program msspl-fuse: where it is, and running it while Blender goes on."""
+"""Finding the program msspl-fuse, and running it while Blender goes on."""
 
 import json
 import os
@@ -10,44 +10,50 @@ from pathlib import Path
 
 from .errors import Failure
 
+#: msspl-fuse prints this after each tile if it runs with -v.
 _TILE = re.compile(r"tile (\d+) of (\d+)")
-_GRACE = 10  #: seconds that a cancelled msspl-fuse gets to remove its temporary file
+#: Seconds that a cancelled msspl-fuse has to remove its temporary file.
+_GRACE = 10
 
 
 def find_program(preference=""):
-    """msspl-fuse as the add-on's preferences, the variable MSSPL_FUSE or the path name it.
+    """Path of msspl-fuse: from the add-on's preferences, otherwise from ``MSSPL_FUSE``, otherwise from ``PATH``.
 
     Raises:
-        Failure: it is not where it was said to be, or nowhere.
+        Failure: no program is found there.
     """
     for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", os.environ.get("MSSPL_FUSE"))):
         if name:
             found = shutil.which(os.path.expanduser(name))
             if found is None:
-                raise Failure(f"{name}: no such program; correct it in {where}")
+                raise Failure(f"{name}: no such program; correct the path in {where}")
             return found
     found = shutil.which("msspl-fuse")
     if found is None:
-        raise Failure("msspl-fuse is not on the path; name it in the add-on's preferences or in MSSPL_FUSE")
+        raise Failure(
+            "msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE"
+        )
     return found
 
 
-def run(program, low, high, output, work, overwrite, threads):
-    """Fuse two files, as steps of :func:`.frame.make`; closing the steps ends the program.
+def run(program, lrhs, hrls, output, work, overwrite, threads):
+    """Fuse two files. This is a generator that yields ``(current step, fraction of the frame done)``.
+
+    Closing the generator ends the program.
 
     Returns:
-        msspl-fuse's report.
+        The report of msspl-fuse.
 
     Raises:
-        Failure: its error, in its own words.
+        Failure: msspl-fuse failed. The message is its own.
     """
-    # A single part is what Blender's Image node reads with all passes.
-    command = [program, low, high, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
+    # Blender's Image node shows all passes of a single-part file only.
+    command = [program, lrhs, hrls, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
     command += ["--overwrite"] if overwrite else []
     command += ["--threads", threads] if threads else []
-    # Its own Python must not inherit what was set for Blender's.
+    # msspl-fuse runs in another Python, which must not get the variables of Blender's.
     environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
-    environment["PYTHONUTF8"] = "1"  # so that names are read here as they are written there
+    environment["PYTHONUTF8"] = "1"  # Paths and messages are in UTF-8 on every platform.
     report, log = Path(work, "fuse.json"), Path(work, "fuse.log")
     with report.open("wb") as out, log.open("wb") as err:
         try:
@@ -60,7 +66,7 @@ def run(program, low, high, output, work, overwrite, threads):
                 creationflags=getattr(subprocess, "CREATE_NO_WINDOW", 0),
             )
         except OSError as error:
-            raise Failure(f"{program}: can't be started ({error.strerror}); is it msspl-fuse?") from error
+            raise Failure(f"{program}: can't be started ({error.strerror}); check that it is msspl-fuse") from error
         try:
             while process.poll() is None:
                 tiles = _TILE.findall(_read(log))
@@ -68,7 +74,7 @@ def run(program, low, high, output, work, overwrite, threads):
         finally:
             _end(process)
     if process.returncode:
-        lines = _read(log).strip().splitlines() or [f"it ended with code {process.returncode}"]
+        lines = _read(log).strip().splitlines() or [f"the program ended with code {process.returncode}"]
         said = next((line for line in lines if line.startswith("error: ")), lines[-1])
         raise Failure(f"msspl-fuse: {said.removeprefix('error: ')}", 2 if process.returncode == 2 else 1)
     return json.loads(_read(report))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The button: all of :func:`.frame.make`, step by step in a window, at once in a script."""
+"""The button "Render and Fuse". It runs step by step in a window and blocks in a script."""
 
 import re
 import tempfile
@@ -7,16 +7,17 @@ import time
 
 import bpy
 
-from . import compositor, frame, fuse, render
+from . import compositor, frame, fuse, overrides
 from .errors import Cancelled, Failure
 from .panel import status
 
-_MORE = {"PASS_THROUGH"}
-_SWALLOWED = {"RUNNING_MODAL"}
+#: Results of a modal operator: continue, and either let others see the event or keep it from them.
+_CONTINUE = {"PASS_THROUGH"}
+_CONSUME_EVENT = {"RUNNING_MODAL"}
 
 
 class MSSPL_OT_fuse(bpy.types.Operator):
-    """Render at low and at full resolution, fuse both with msspl-fuse, and load the frame into the compositor"""
+    """Render the frame at low and at full resolution, fuse the two renders, and show the result in the compositor"""
 
     bl_idname = "msspl.fuse"
     bl_label = "Render and Fuse"
@@ -27,10 +28,10 @@ class MSSPL_OT_fuse(bpy.types.Operator):
         return not status.text
 
     def execute(self, context):
-        status.text = "starting"  # at once: there is one job at a time
+        status.text = "starting"  # From now on, poll() refuses a second job.
         self._steps = self._job(context)
         try:
-            while (result := self._step()) == _MORE:
+            while (result := self._step()) == _CONTINUE:
                 time.sleep(0.02)
         finally:
             self._end()
@@ -49,20 +50,20 @@ class MSSPL_OT_fuse(bpy.types.Operator):
 
     def modal(self, context, event):
         if event.type == "ESC":
-            if bpy.app.is_job_running("RENDER"):  # Blender itself cancels a render
-                return _MORE
+            if bpy.app.is_job_running("RENDER"):  # Blender cancels its render itself.
+                return _CONTINUE
             self.cancel(context)
             return {"CANCELLED"}
         if event.type != "TIMER":
-            # The scene has settings of ours: nothing is to be changed, undone or saved now.
-            return _MORE if event.type.startswith("TIMER") else _SWALLOWED
+            # Settings of the scene are overridden: the user must not change, undo or save anything now.
+            return _CONTINUE if event.type.startswith("TIMER") else _CONSUME_EVENT
         result = {"CANCELLED"}
         try:
             result = self._step()
         finally:
-            if result != _MORE:
+            if result != _CONTINUE:
                 self.cancel(context)
-        if result == _MORE:
+        if result == _CONTINUE:
             status.text, status.fraction = self._doing
             context.workspace.status_text_set(f"MSSPL Fuse: {status.text} (Esc cancels)")
             for area in context.screen.areas:
@@ -70,7 +71,7 @@ class MSSPL_OT_fuse(bpy.types.Operator):
         return result
 
     def cancel(self, context):
-        """End the job where it stands; Blender calls this too, when another file is opened."""
+        """Cancel the job and clean up. Blender also calls this when another file is opened."""
         try:
             if self._timer is not None:
                 context.window_manager.event_timer_remove(self._timer)
@@ -85,7 +86,7 @@ class MSSPL_OT_fuse(bpy.types.Operator):
             status.text = ""
 
     def _step(self):
-        """Go on to the next step; the operator's result if there is none."""
+        """Run the job up to its next step and return the operator's result."""
         try:
             self._doing = next(self._steps)
         except StopIteration:
@@ -96,7 +97,7 @@ class MSSPL_OT_fuse(bpy.types.Operator):
         except Failure as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
-        return _MORE
+        return _CONTINUE
 
     def _job(self, context, window=False):
         scene, settings = context.scene, context.scene.msspl
@@ -104,14 +105,16 @@ class MSSPL_OT_fuse(bpy.types.Operator):
         addon = context.preferences.addons.get(__package__)
         program = fuse.find_program(bpy.path.abspath(addon.preferences.program) if addon else "")
         options = settings.options(context.view_layer.name)
-        # In the name alone: a folder may be called so.
+        # The frame number replaces # in the file name only, because a folder's name may contain #.
         path = re.sub(r"#+(?=[^/\\]*$)", lambda signs: f"{scene.frame_current:0{len(signs[0])}d}", settings.output)
         if path.startswith("//") and not bpy.data.filepath:
             raise Failure(f"{path}: save the .blend first, or give a full path")
         with tempfile.TemporaryDirectory(prefix="msspl-") as work:
             output = bpy.path.abspath(path)
-            report = yield from frame.make(scene, options, output, work, program, overwrite=overwrite, window=window)
-        scene = render.find_scene(*identity)
+            report = yield from frame.render_and_fuse(
+                scene, options, output, work, program, overwrite=overwrite, window=window
+            )
+        scene = overrides.find_scene(*identity)
         compositor.show(scene, path, scene.msspl.connect)
         for warning in report.warnings:
             self.report({"WARNING"}, warning)
@@ -120,13 +123,13 @@ class MSSPL_OT_fuse(bpy.types.Operator):
 
 def register():
     bpy.utils.register_class(MSSPL_OT_fuse)
-    bpy.app.handlers.save_pre.append(render.put_back)
+    bpy.app.handlers.save_pre.append(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
-        after.append(render.set_again)
+        after.append(overrides.override_after_save)
 
 
 def unregister():
-    bpy.app.handlers.save_pre.remove(render.put_back)
+    bpy.app.handlers.save_pre.remove(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
-        after.remove(render.set_again)
+        after.remove(overrides.override_after_save)
     bpy.utils.unregister_class(MSSPL_OT_fuse)

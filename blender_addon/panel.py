@@ -1,17 +1,20 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""What the user sets and sees: Render Properties > MSSPL Fuse, and the add-on's preferences."""
+"""The panel Render Properties > MSSPL Fuse, its settings, and the add-on's preferences."""
 
 from dataclasses import dataclass
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
 
-from .render import Options, high_size, low_size
+from .options import Options, hrls_size, lrhs_size
 
 
 @dataclass
 class Status:
-    """What a running job does now; the text is empty when none runs. No property: that would be saved in files."""
+    """The current step of the running job. The text is empty if no job runs.
+
+    This is no Blender property, because that would be saved in the .blend.
+    """
 
     text: str = ""
     fraction: float = 0.0
@@ -23,33 +26,41 @@ status = Status()
 class MSSPLSettings(bpy.types.PropertyGroup):
     scale: EnumProperty(
         name="Scale",
-        description="The LRHS has 1/scale of the frame's width and height",
+        description="The low-resolution render has 1/scale of the width and height of the frame",
         items=[("2", "2", ""), ("4", "4", ""), ("8", "8", "")],
         default="4",
     )
-    hr_spp: IntProperty(name="HRLS Samples", description="Samples a pixel at full resolution", default=1, min=1)
+    hr_spp: IntProperty(
+        name="HRLS Samples", description="Samples per pixel of the full-resolution render", default=1, min=1
+    )
     lr_spp: IntProperty(
         name="LRHS Samples",
-        description="Samples a pixel at low resolution; 0: in all, a third of those of the HRLS",
+        description="Samples per pixel of the low-resolution render. 0: a third of the total samples of the "
+        "full-resolution render, but at least scale x scale samples per pixel",
         default=0,
         min=0,
     )
     filter: EnumProperty(
         name="Pixel Filter",
         items=[
-            ("BOX", "Box", "An LRHS pixel is exactly the mean of its HRLS pixels: what the network expects"),
-            ("SCENE", "Scene", "The scene's own pixel filter"),
+            (
+                "BOX",
+                "Box",
+                "A low-resolution pixel is the mean of its full-resolution pixels, as the network expects",
+            ),
+            ("SCENE", "Scene", "The pixel filter of the scene"),
         ],
     )
     output: StringProperty(
         name="Output",
-        description="EXR to write; # is the frame number",
+        description="The EXR to write. # stands for the frame number",
         default="//fused_####.exr",
         subtype="FILE_PATH",
         options={"PATH_SUPPORTS_BLEND_RELATIVE"},
     )
     connect: BoolProperty(
-        name="Connect to Output", description="Make the fused frame the compositor's output, whatever that comes from"
+        name="Connect to Output",
+        description="Connect the fused frame to the compositor's output even if another node is connected there",
     )
 
     def options(self, view_layer):
@@ -61,7 +72,8 @@ class MSSPLPreferences(bpy.types.AddonPreferences):
 
     program: StringProperty(
         name="msspl-fuse",
-        description="The program; empty: as the variable MSSPL_FUSE or the path says",
+        description="Path of the program msspl-fuse. If empty, the environment variable MSSPL_FUSE names it, or else "
+        "it is looked up on PATH",
         subtype="FILE_PATH",
     )
 
@@ -88,9 +100,9 @@ class MSSPL_PT_fuse(bpy.types.Panel):
         for name in ("scale", "hr_spp", "lr_spp", "filter", "output", "connect"):
             layout.prop(settings, name)
         options = settings.options("")
-        sizes = low_size(scene, options.scale), high_size(scene)
+        sizes = lrhs_size(scene, options.scale), hrls_size(scene)
         layout.label(
-            text="{}x{} at {} spp, {}x{} at {} spp".format(*sizes[0], options.low_spp, *sizes[1], options.hr_spp)
+            text="{}x{} at {} spp, {}x{} at {} spp".format(*sizes[0], options.lrhs_spp, *sizes[1], options.hr_spp)
         )
         if status.text:
             layout.progress(text=status.text, factor=status.fraction)

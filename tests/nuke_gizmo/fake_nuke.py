@@ -1,146 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""As much of Nuke as the gizmo needs: its scripts, through a real Tcl interpreter, and the module ``nuke``.
+"""A stand-in for the module ``nuke``, with the part of its API that the gizmo uses.
 
-The fake module is stricter than Nuke where Nuke would crash or hang: nodes and knobs may be touched from the main
-thread alone, ``executeInMainThread`` from any other alone. Its names and parameters are those of types-nuke, which
-tests/test_nuke.py checks.
+It fails where Nuke would crash or hang: when a thread other than the main one touches a node or a knob, and when the
+main thread calls ``executeInMainThread``. test_python.py compares its names and parameters with types-nuke.
 """
 
 from __future__ import annotations
 
-import importlib.util
 import queue
-import shutil
-import subprocess
 import threading
 import time
 import types
-from dataclasses import dataclass, field
 from pathlib import Path
 
-# ---------------------------------------------------------------------------------------------- .gizmo and .nk files
-
-#: Node commands take knobs as a list, take their inputs from a stack of nodes and put themselves on it.
-_PRELUDE = r"""
-set lines {}; set stack {}; set groups {}; set count 0
-proc emit {args} {
-    foreach word $args { append ::lines x [binary encode hex [encoding convertto utf-8 $word]] " " }
-    append ::lines \n
-}
-proc push {node} { set ::stack [linsert $::stack 0 $node] }
-proc pop {} {
-    if {![llength $::stack]} { return 0 }
-    set node [lindex $::stack 0]
-    set ::stack [lrange $::stack 1 end]
-    return $node
-}
-proc stack {index} { lindex $::stack $index }
-proc version {args} { emit version $args }
-proc node {class body} {
-    set number [incr ::count]
-    emit node $number $class [lindex $::groups 0 0]
-    if {[llength $body] % 2} { error "$class: a knob without a value" }
-    set inputs 1
-    foreach {knob value} $body {
-        if {$knob eq "addUserKnob"} { emit user $number {*}$value } else { emit knob $number $knob $value }
-        if {$knob eq "inputs"} { set inputs [expr $value] }
-    }
-    for {set i 0} {$i < $inputs} {incr i} { emit input $number [pop] }
-    if {$class in {Gizmo Group}} {
-        set ::groups [linsert $::groups 0 [list $number $::stack]]
-        set ::stack {}
-    } else { push $number }
-}
-proc end_group {} {
-    lassign [lindex $::groups 0] number ::stack
-    set ::groups [lrange $::groups 1 end]
-    push $number
-}
-foreach class {Gizmo Group Input Output NoOp Dot Read Write Switch} { proc $class {body} "node $class \$body" }
-"""
+from tests.nuke_gizmo.gizmo_file import ScriptNode
 
 
-@dataclass
-class UserKnob:
-    """One ``addUserKnob``."""
-
-    kind: int
-    name: str
-    options: dict[str, str]
-    """``l`` label, ``t`` tooltip, ``T`` text or script, ``M`` menu; ``+STARTLINE`` and the like as keys."""
-    items: list[str] = field(default_factory=list)
-
-
-@dataclass
-class ScriptNode:
-    """One node of a script."""
-
-    kind: str
-    parent: int
-    knobs: dict[str, str] = field(default_factory=dict)
-    user_knobs: list[UserKnob] = field(default_factory=list)
-    inputs: list[int] = field(default_factory=list)
-    """Numbers of the nodes that are connected, 0 for none."""
-
-
-def tcl_interpreters():
-    """Names of the real Tcl interpreters that this machine has: Python's own, or the program."""
-    here = [("tkinter", importlib.util.find_spec("_tkinter")), ("tclsh", shutil.which("tclsh"))]
-    return [name for name, found in here if found]
-
-
-def evaluate(script: str, interpreter: str, code: str = "set lines") -> list[list[str]]:
-    """Run a script with the node commands registered; what was emitted, as lists of words."""
-    if interpreter == "tkinter":
-        import tkinter
-
-        tcl = tkinter.Tcl()
-        for text in (_PRELUDE, script):
-            tcl.eval(text)
-        lines = tcl.eval(code)
-    else:
-        # The script travels as data, so that what is read is exactly the file.
-        encoded = script.encode().hex()
-        program = (
-            f"{_PRELUDE}\neval [encoding convertfrom utf-8 [binary decode hex {encoded}]]\nputs -nonewline [{code}]"
-        )
-        done = subprocess.run(["tclsh"], input=program, capture_output=True, text=True)
-        if done.returncode or done.stderr:
-            raise ValueError(done.stderr)
-        lines = done.stdout
-    return [[bytes.fromhex(word[1:]).decode() for word in line.split()] for line in lines.splitlines()]
-
-
-def read_script(script: str, interpreter: str) -> dict[int, ScriptNode]:
-    """The nodes of a .gizmo or .nk file by number, in file order."""
-    nodes: dict[int, ScriptNode] = {}
-    for what, *words in evaluate(script, interpreter):
-        if what == "node":
-            nodes[int(words[0])] = ScriptNode(words[1], int(words[2] or 0))
-        elif what == "knob":
-            nodes[int(words[0])].knobs[words[1]] = words[2]
-        elif what == "input":
-            nodes[int(words[0])].inputs.append(int(words[1]))
-        elif what == "user":
-            nodes[int(words[0])].user_knobs.append(_user_knob(words[1:], interpreter))
-    return nodes
-
-
-def _user_knob(words: list[str], interpreter: str) -> UserKnob:
-    kind, name, *rest = words
-    knob, options = UserKnob(int(kind), name, {}), iter(rest)
-    for option in options:
-        knob.options[option] = "" if option[0] in "+-" else next(options)
-    if "M" in knob.options:
-        knob.items = evaluate(f"emit {{*}}{{{knob.options['M']}}}", interpreter)[0]
-    return knob
-
-
-# ---------------------------------------------------------------------------------------------- the module
-
-
-def _main_thread_alone() -> None:
-    assert threading.current_thread() is threading.main_thread(), "Nuke may crash: nodes belong to its main thread"
+def _require_main_thread() -> None:
+    assert threading.current_thread() is threading.main_thread(), "Nuke may crash: this thread is not its main thread"
 
 
 class Knob:
@@ -151,11 +28,11 @@ class Knob:
         return self._name
 
     def value(self):
-        _main_thread_alone()
+        _require_main_thread()
         return self._value
 
     def setValue(self, val):
-        _main_thread_alone()
+        _require_main_thread()
         self._value = val
 
     def toScript(self):
@@ -210,7 +87,7 @@ class Node:
         return self._kind
 
     def name(self):
-        _main_thread_alone()
+        _require_main_thread()
         if self._deleted:
             raise ValueError("A PythonObject is not attached to a node")
         return self._knobs["name"].value()
@@ -251,13 +128,15 @@ class Node:
         return [n for n in self.nuke.everything if self in n._inputs]
 
     def metadata(self, key, time):
-        """A Read at a frame: the file it finds, in the frame modes as Foundry's guide describes them."""
+        """The file that a Read reads at a frame. The frame modes follow Foundry's guide."""
         assert (self._kind, key) == ("Read", "input/filename")
         mode, text = self["frame_mode"].value(), str(self["frame"].value())
         number = (
             eval(text or "frame", {"frame": time}) if mode == "expression" else time - int(text) + self["first"].value()
         )
-        number = min(max(number, self["first"].value()), self["last"].value())  # before and after: hold
+        number = min(
+            max(number, self["first"].value()), self["last"].value()
+        )  # The modes "before" and "after" are "hold".
         path = self["file"].value()
         path = path % number if "%" in path else path
         return path if Path(path).exists() else None
@@ -295,7 +174,7 @@ class Root(Group):
 class ProgressTask:
     made: list[ProgressTask] = []  # noqa: RUF012
     cancel_at: str | None = None
-    """The test's finger on the cancel button: the message at which it presses."""
+    """The test cancels when this text appears in a message."""
 
     def __init__(self, name):
         self.name, self.progress, self.messages = name, [], []
@@ -324,7 +203,7 @@ class Menu:
 
 
 class FakeNuke(types.ModuleType):
-    """The module ``nuke`` of one session, and what a test does with it."""
+    """The module ``nuke`` of one session, and what a test needs to drive it."""
 
     INPUTS, HIDDEN_INPUTS, INVISIBLE = 1, 2, 1024
     EXE_PATH = "/opt/Nuke15.1v1/Nuke15.1"
@@ -342,7 +221,7 @@ class FakeNuke(types.ModuleType):
         self.frame_number, self._node = 1, None
         self.nodes = types.SimpleNamespace(Read=self._read)
 
-    # What types-nuke has, too.
+    # The API of Nuke.
 
     def root(self):
         return self._root
@@ -354,11 +233,11 @@ class FakeNuke(types.ModuleType):
         return self._node
 
     def message(self, prompt):
-        _main_thread_alone()
+        _require_main_thread()
         self.messages.append(prompt)
 
     def warning(self, message):
-        _main_thread_alone()
+        _require_main_thread()
         self.warnings.append(message)
 
     def tprint(self, *args):
@@ -385,7 +264,7 @@ class FakeNuke(types.ModuleType):
         n._deleted = True
 
     def createNode(self, typ):
-        """The gizmo, as its file defines it."""
+        """A gizmo with the knobs of its file."""
         assert typ == "MSSPLFuse"
         definition = self._gizmo[1]
         knobs = []
@@ -405,13 +284,13 @@ class FakeNuke(types.ModuleType):
         knobs = [File_Knob(k, value=v) if k == "file" else Knob(k, value=v) for k, v in values.items()]
         return self.add(Node("Read", "Read1", [*knobs, Script_Knob("reload")]))
 
-    # What only the tests use.
+    # For the tests only.
 
     def nodes_of(self, group):
         return [n for n in self.everything if n._parent is group]
 
     def add(self, node):
-        """Put a node into the current group, under a name that is free there."""
+        """Put a node into the current group and give it a free name."""
         node._parent = self.contexts[-1]
         taken = {n.name() for n in self.nodes_of(node._parent)}
         base, number = node.name().rstrip("0123456789"), 1
@@ -422,12 +301,12 @@ class FakeNuke(types.ModuleType):
         return node
 
     def press(self, node, knob):
-        """Press a button, as Nuke does: its script, in the main thread."""
+        """Press a button: run its script in the main thread."""
         self._node = node
         exec(compile(node[knob].value(), knob, "exec"), {"nuke": self})
 
     def wait(self, seconds=120):
-        """Nuke's event loop, until nothing runs in the background."""
+        """Run Nuke's event loop until no job runs in the background."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             busy = any(t.name.startswith("msspl-fuse for") for t in threading.enumerate())

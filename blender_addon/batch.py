@@ -1,0 +1,93 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Rendering and fusing a list of frames without a window, as :mod:`.headless` gets them from msspl-render."""
+
+import os
+import time
+from dataclasses import asdict
+from pathlib import Path
+
+import bpy
+
+from . import render_settings
+from .checks import check_animation
+from .errors import Failure
+from .frame import render_and_fuse, run_to_end
+from .options import Options
+from .overrides import override
+from .render import escape_path, render
+
+
+def run_job(job, send):
+    """Render and fuse every frame of a job.
+
+    Args:
+        job: the dictionary that :mod:`.headless` describes.
+        send: called with the progress and with the report of each frame, as keyword arguments.
+
+    Raises:
+        Failure: a frame failed. The frames before it are complete.
+    """
+    if bpy.app.version < (4, 5, 0):
+        raise Failure(f"Blender {bpy.app.version_string} is too old; use 4.5 or later")
+    if not bpy.data.filepath:
+        try:
+            bpy.ops.wm.open_mainfile(filepath=job["scene"])
+        except RuntimeError as error:
+            raise Failure(f"{job['scene']}: can't be opened ({str(error).strip()})") from error
+    scene, options = bpy.context.scene, Options(**job["options"])
+    for number, output in job["frames"]:
+        if number is not None:
+            scene.frame_set(number)
+        send(report=_run_frame(scene, options, job, Path(output), send))
+
+
+def _run_frame(scene, options, job, output, send):
+    number = scene.frame_current
+
+    def on_step(step, fraction):
+        send(frame=number, step=step, fraction=fraction)
+
+    on_step("start", 0.0)
+    steps = render_and_fuse(scene, options, output, job["work"], job["program"], overwrite=job["overwrite"])
+    report = run_to_end(steps, on_step)
+    result = {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
+    for each, suffix in ((report.lrhs, "lr"), (report.hrls, "hr")):
+        kept = _beside(output, suffix) if job["keep"] else None
+        if kept:
+            os.replace(each.file, kept)
+        else:
+            os.unlink(each.file)
+        result[each.name.lower()]["file"] = kept and str(kept)
+    if job["compare"]:
+        result["oidn"] = _render_plain(scene, options, report, on_step, Path(job["work"]))
+        os.replace(result["oidn"]["file"], _beside(output, "oidn"))
+        result["oidn"]["file"] = str(_beside(output, "oidn"))
+    return result
+
+
+def _beside(output, suffix):
+    """``frame.exr`` -> ``frame_suffix.exr``."""
+    return output.with_name(f"{output.stem}_{suffix}.exr")
+
+
+def _render_plain(scene, options, report, on_step, work):
+    """Render the frame the ordinary way with OIDN, in the time that the LRHS, the HRLS and the fusion took together.
+
+    Render times cannot be predicted well. Each attempt sets the spp of the next one from its own time, and the closest
+    of at most three attempts is kept.
+    """
+    attempts, samples = {}, report.plain_spp
+    while len(attempts) < 3 and (spp := max(1, round(samples))) not in attempts:
+        on_step(f"ordinary render with OIDN, {spp} spp", 1.0)
+        start = time.perf_counter()
+        file = work / f"oidn{spp}.exr"
+        values = render_settings.plain(scene, options, spp)
+        with override(scene, values | {"render.filepath": escape_path(str(file))}):
+            check_animation(scene, values)
+            list(render(scene, str(file)))
+        attempts[spp] = {"spp": spp, "seconds": time.perf_counter() - start, "file": str(file)}
+        ratio = report.seconds / attempts[spp]["seconds"]
+        if 0.9 < ratio < 1.1:
+            break
+        samples = spp * ratio
+    return min(attempts.values(), key=lambda each: abs(each["seconds"] - report.seconds))

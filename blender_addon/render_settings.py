@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""The scene settings of the LRHS, of the HRLS and of an ordinary render, as ``{data path: value}``.
+
+Dictionaries of data paths can be merged, read back and restored by code that knows none of the settings.
+"""
+
+import bpy
+
+from .options import find_view_layer, hrls_size, lrhs_size, view_layer_path
+
+BLENDER_5 = bpy.app.version >= (5, 0, 0)
+
+#: The passes that the network reads besides Combined. Other passes stay as the user has set them.
+_PASSES = (
+    "use_pass_combined",
+    "use_pass_normal",
+    "use_pass_diffuse_direct",
+    "use_pass_diffuse_indirect",
+    "use_pass_diffuse_color",
+    "use_pass_glossy_direct",
+    "use_pass_glossy_indirect",
+    "use_pass_glossy_color",
+    "cycles.denoising_store_passes",
+)
+#: Added to the scene's seed for the LRHS. With one seed, both renders would share samples and their noise.
+_LRHS_SEED = 1009
+
+
+def lrhs(scene, options):
+    """Settings of the LRHS."""
+    (width, height), (full_width, full_height) = lrhs_size(scene, options.scale), hrls_size(scene)
+    aspect_x, aspect_y = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
+    # The size is rounded up, so the pixel aspect is adjusted until the LRHS shows exactly the frame.
+    aspect_x *= (full_width * height) / (full_height * width)
+    least = min(aspect_x, aspect_y, 1.0)  # Blender accepts no aspect below 1.
+    return _common(scene, options) | {
+        "render.resolution_x": width,
+        "render.resolution_y": height,
+        "render.pixel_aspect_x": aspect_x / least,
+        "render.pixel_aspect_y": aspect_y / least,
+        "cycles.samples": options.lrhs_spp,
+        "cycles.seed": (scene.cycles.seed + _LRHS_SEED) % 2**31,
+        # The dicing rate is in pixels. Adaptive subdivision must give both renders the same surface.
+        "cycles.dicing_rate": max(0.1, scene.cycles.dicing_rate / options.scale),
+    }
+
+
+def hrls(scene, options):
+    """Settings of the HRLS."""
+    width, height = hrls_size(scene)
+    return _common(scene, options) | {
+        "render.resolution_x": width,
+        "render.resolution_y": height,
+        "cycles.samples": options.hr_spp,
+    }
+
+
+def plain(scene, options, spp):
+    """Settings of an ordinary render that Cycles denoises with OIDN at its highest quality."""
+    return hrls(scene, options) | {
+        "render.use_persistent_data": False,  # Its time includes loading the scene, as the time of the LRHS does.
+        "cycles.samples": spp,
+        "cycles.use_denoising": True,
+        f"{view_layer_path(find_view_layer(scene, options))}.cycles.use_denoising": True,
+        "cycles.denoiser": "OPENIMAGEDENOISE",
+        "cycles.denoising_input_passes": "RGB_ALBEDO_NORMAL",
+        "cycles.denoising_prefilter": "ACCURATE",
+        "cycles.denoising_quality": "HIGH",
+    }
+
+
+def _common(scene, options):
+    """Settings of both renders: the passes, unbiased and unfiltered noise, and a lossless multilayer EXR."""
+    image = scene.render.image_settings
+    chosen = find_view_layer(scene, options)
+    values = {f"{view_layer_path(each)}.use": each == chosen for each in scene.view_layers}
+    values |= {f"{view_layer_path(chosen)}.{name}": True for name in _PASSES}
+    values |= {
+        "cycles.use_denoising": False,
+        "cycles.use_adaptive_sampling": False,
+        "cycles.time_limit": 0.0,
+        "cycles.use_layer_samples": "IGNORE",
+        "cycles.use_sample_subset": False,
+        # Noise must be independent from pixel to pixel, and clamping would darken the two renders differently.
+        "cycles.sampling_pattern": "TABULATED_SOBOL",
+        "cycles.auto_scrambling_distance": False,
+        "cycles.scrambling_distance": 1.0,
+        "cycles.sample_clamp_direct": 0.0,
+        "cycles.sample_clamp_indirect": 0.0,
+        "render.resolution_percentage": 100,
+        "render.use_single_layer": False,
+        "render.use_compositing": False,
+        "render.use_sequencer": False,
+        "render.use_file_extension": True,
+    }
+    if options.filter == "BOX":
+        values["cycles.pixel_filter_type"] = "BOX"
+    if options.threads:
+        values |= {"render.threads_mode": "FIXED", "render.threads": options.threads}
+    if BLENDER_5:
+        values["render.image_settings.media_type"] = "MULTI_LAYER_IMAGE"
+    values |= {
+        "render.image_settings.file_format": "OPEN_EXR_MULTILAYER",
+        "render.image_settings.color_mode": "RGBA",
+        "render.image_settings.color_depth": image.color_depth if image.file_format.startswith("OPEN_EXR") else "16",
+        "render.image_settings.exr_codec": "ZIP",
+        "render.image_settings.color_management": "FOLLOW_SCENE",
+    }
+    if BLENDER_5:  # Blender 5.0 cannot write several parts if the pixels are not square.
+        values["render.image_settings.use_exr_interleave"] = True
+    return values

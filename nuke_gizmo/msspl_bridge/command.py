@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What to start: the program msspl-fuse, its command line and its environment."""
+
+from __future__ import annotations
+
+import os
+import shlex
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from msspl_bridge.errors import FuseError
+from msspl_bridge.frame_files import FrameFile, with_slashes
+
+#: Variables that the host sets for its own Python. Another Python may not start with them.
+_PYTHON_VARIABLES = ("PYTHONHOME", "PYTHONPATH", "PYTHONEXECUTABLE", "PYTHONPLATLIBDIR", "__PYVENV_LAUNCHER__")
+#: Search paths to which the host may add its own libraries.
+_LIBRARY_PATHS = (
+    "LD_LIBRARY_PATH",
+    "LD_PRELOAD",
+    "DYLD_LIBRARY_PATH",
+    "DYLD_FRAMEWORK_PATH",
+    "DYLD_INSERT_LIBRARIES",
+)
+
+
+@dataclass(frozen=True)
+class Settings:
+    """The values of the knobs, as text."""
+
+    model: str = ""
+    device: str = "cpu"
+    mapping: str = ""
+    """One ``feature=layer`` per line, such as ``albedo=my_albedo``."""
+    layers: str = ""
+    """Layer patterns, separated by commas."""
+    options: str = ""
+    """Further options, quoted as in a shell."""
+    overwrite: bool = True
+
+
+def build_command(
+    program: str,
+    lrhs: FrameFile,
+    hrls: FrameFile,
+    out: FrameFile,
+    settings: Settings,
+    numbers: tuple[int, int] | None = None,
+) -> list[str]:
+    """The command line for one frame or, given the first and last file number, for a range.
+
+    Raises:
+        FuseError: the mapping or the options cannot be parsed.
+    """
+    files = [each.path if numbers is None else each.pattern for each in (lrhs, hrls, out)]
+    command = [program, files[0], files[1], "-o", files[2], "--device", settings.device]
+    if numbers is not None:
+        command += ["--frames", f"{numbers[0]}-{numbers[1]}", "--progress", "openjd"]
+    # The layout of Nuke's own Write: one part per layer, named after the layer.
+    command += ["--layout", "nuke", "--no-preview"]
+    if settings.model:
+        command += ["--model", settings.model]
+    for line in filter(None, map(str.strip, settings.mapping.splitlines())):
+        feature, equals, layer = line.partition("=")
+        if not (feature.strip() and equals and layer.strip()):
+            raise FuseError(f"mapping {line!r}: write one feature=layer per line, such as albedo=my_albedo")
+        command += ["--map", f"{feature.strip()}={layer.strip()}"]
+    for pattern in filter(None, map(str.strip, settings.layers.split(","))):
+        command += ["--layers", pattern]
+    if settings.overwrite:
+        command.append("--overwrite")
+    elif numbers is not None:
+        command.append("--skip-existing")
+    try:
+        # shlex would remove the backslashes of Windows paths.
+        return command + shlex.split(with_slashes(settings.options))
+    except ValueError as error:
+        raise FuseError(f"options {settings.options!r}: {error}; quote them as in a shell") from error
+
+
+def find_program(chosen: str, environment: Mapping[str, str]) -> str:
+    """Path of msspl-fuse: the chosen one, otherwise ``MSSPL_FUSE``, otherwise the first on ``PATH``.
+
+    Raises:
+        FuseError: no program is found there.
+    """
+    search = environment.get("PATH")
+    for source, value in (("the program knob", chosen), ("MSSPL_FUSE", environment.get("MSSPL_FUSE", ""))):
+        if value:
+            found = shutil.which(os.path.expanduser(value), path=search)
+            if found is None:
+                raise FuseError(f"{source} names {value}, but there is no such program; give the path of msspl-fuse")
+            return found
+    found = shutil.which("msspl-fuse", path=search)
+    if found is None:
+        raise FuseError(
+            "msspl-fuse was not found; install oiio_msspl, and put the path of msspl-fuse into the program knob or "
+            "into the environment variable MSSPL_FUSE"
+        )
+    return found
+
+
+def clean_environment(environment: Mapping[str, str], host_folder: str) -> dict[str, str]:
+    """The environment without the host's Python and libraries, which would break another Python.
+
+    Library folders outside the host's folder stay, because drivers and the site's libraries may be found through them.
+    """
+    clean = {key: value for key, value in environment.items() if key not in _PYTHON_VARIABLES}
+    folder = os.path.join(os.path.realpath(host_folder), "")
+    for key in _LIBRARY_PATHS:
+        if key in clean:
+            paths = clean.pop(key).split(os.pathsep)
+            kept = [p for p in paths if p and not os.path.join(os.path.realpath(p), "").startswith(folder)]
+            if kept:
+                clean[key] = os.pathsep.join(kept)
+    # Messages arrive in UTF-8 on every platform, and without delay.
+    return {**clean, "PYTHONUTF8": "1", "PYTHONUNBUFFERED": "1"}

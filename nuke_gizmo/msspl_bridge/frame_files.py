@@ -1,0 +1,136 @@
+# SPDX-License-Identifier: Apache-2.0
+"""File names of numbered frames: finding the number, naming the output, checking a range."""
+
+from __future__ import annotations
+
+import os
+import posixpath
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from msspl_bridge.errors import FuseError
+
+_NUMBER = re.compile(r"%(0?)(\d*)d|#+")
+_VIEW = re.compile(r"%[vV]")
+
+
+@dataclass(frozen=True)
+class FrameFile:
+    """The file of one frame of a numbered sequence, or a still."""
+
+    head: str
+    """The path up to the number. For a still, the whole path."""
+    number: int | None = None
+    """None for a still."""
+    digits: int = 0
+    """The number is padded with zeros to this width."""
+    tail: str = ""
+
+    @property
+    def path(self) -> str:
+        return self.head if self.number is None else f"{self.head}{self.number:0{self.digits}d}{self.tail}"
+
+    @property
+    def pattern(self) -> str:
+        """The name of the whole sequence, such as ``/shot/hr.%04d.exr``. Nuke and msspl-fuse both read this form."""
+        return self.head if self.number is None else f"{self.head}%0{self.digits}d{self.tail}"
+
+
+@dataclass(frozen=True)
+class ReadRange:
+    """The files that a Read node reads at the first and at the last frame of a range."""
+
+    read: str
+    """Name of the node, for messages."""
+    first: FrameFile
+    last: FrameFile
+
+
+def find_number(pattern: str, path: str) -> FrameFile:
+    """Split the path of a frame into head, number and tail.
+
+    Args:
+        pattern: the file knob of the Read, with ``%04d`` or ``####`` for the number and ``%V`` or ``%v`` for the view.
+        path: the file that Nuke found through the pattern.
+
+    Raises:
+        FuseError: the path does not match the pattern.
+    """
+    path = with_slashes(path)
+    folder, name = posixpath.split(path)
+    expected = posixpath.basename(with_slashes(pattern))
+    tokens = list(_NUMBER.finditer(expected))
+    if not tokens:
+        return FrameFile(path)
+    token = tokens[-1]
+    head, tail = (_match_any_view(part) for part in (expected[: token.start()], expected[token.end() :]))
+    match = re.fullmatch(f"({head})(-?[0-9]+)({tail})", name)
+    if not match:
+        raise FuseError(f"{path}: does not match the pattern {pattern}; rename the file, or correct the Read's file")
+    return FrameFile(posixpath.join(folder, match[1]), int(match[2]), _digits(token), match[3])
+
+
+def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:
+    """The file to write.
+
+    Args:
+        text: the output knob. If it is empty, the output goes beside the HRLS, with ``_fused`` added to its name.
+        hrls: its number becomes the output's number.
+        frame: becomes the output's number if the HRLS is a still.
+
+    Raises:
+        FuseError: the path is relative, so every program would take it from another folder.
+    """
+    if not text:
+        if hrls.number is None:
+            return FrameFile("_fused".join(posixpath.splitext(hrls.head)))
+        plain = hrls.head.rstrip("._-")
+        return replace(hrls, head=f"{plain}_fused{hrls.head[len(plain) :]}")
+    if not os.path.isabs(text):
+        raise FuseError(f"output {text}: is a relative path; give the full path, folder included")
+    folder, name = posixpath.split(with_slashes(text))
+    tokens = list(_NUMBER.finditer(name))
+    if not tokens:
+        return FrameFile(with_slashes(text))
+    token, number = tokens[-1], frame if hrls.number is None else hrls.number
+    return FrameFile(posixpath.join(folder, name[: token.start()]), number, _digits(token), name[token.end() :])
+
+
+def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: int) -> tuple[int, int]:
+    """First and last number in the file names of a range, which need not be the host's frames.
+
+    msspl-fuse pairs the files of a range by number, so the files of all inputs must have the same numbers.
+
+    Args:
+        first, last: the range in the host's frames.
+
+    Raises:
+        FuseError: an input has no file per frame, the numbers of the inputs differ, or the output has no number.
+    """
+    for each in inputs:
+        begin, end = each.first.number, each.last.number
+        if begin is None or end is None or end - begin != last - first:
+            raise FuseError(
+                f"{each.read} does not have one numbered file per frame from {first} to {last}; "
+                "change the range or the Read"
+            )
+    if len({each.first.number for each in inputs}) > 1:
+        seen = " and ".join(f"{each.read} reads file number {each.first.number}" for each in inputs)
+        raise FuseError(f"at frame {first}, {seen}; for a range, both need the same numbers in their file names")
+    if out.number is None:
+        raise FuseError(f"output {out.path}: a range needs a frame number in the name, such as name.####.exr")
+    return out.number, out.number + last - first
+
+
+def with_slashes(path: str) -> str:
+    """Replace the separators of Windows, because a backslash is an escape character in Tcl and in a shell."""
+    return path.replace(os.sep, "/")
+
+
+def _match_any_view(text: str) -> str:
+    return ".+?".join(re.escape(part) for part in _VIEW.split(text))
+
+
+def _digits(token: re.Match[str]) -> int:
+    return len(token[0]) if token[0].startswith("#") else int(token[2] or 1)

@@ -1,0 +1,142 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The add-on and msspl-render with a real Blender, in every Python with bpy that is found.
+
+The variable MSSPL_TEST_BPY names these Pythons, separated as in PATH. Otherwise ~/venvs/bpy*/bin/python are used.
+"""
+
+import json
+import os
+import subprocess
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msspl_cli.installed import find_msspl_fuse
+
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.alignment import align
+from tests.blender_addon.conftest import posix, render_command
+from tests.conftest import EXAMPLES
+
+
+def pythons_with_bpy():
+    named = os.environ.get("MSSPL_TEST_BPY")
+    if named is not None:
+        return [Path(p) for p in named.split(os.pathsep) if p]
+    return sorted(Path.home().glob("venvs/bpy*/bin/python"))
+
+
+BPY = pythons_with_bpy()
+
+
+@pytest.fixture(scope="module", params=BPY or [None], ids=lambda p: p.parents[1].name if p else "none")
+def python(request):
+    if request.param is None:
+        pytest.skip("no Python with bpy; name some in MSSPL_TEST_BPY")
+    return request.param
+
+
+@pytest.fixture(scope="module")
+def results(python, tmp_path_factory):
+    """The folder with the files that the checks inside Blender have written."""
+    folder, resources = tmp_path_factory.mktemp("work"), tmp_path_factory.mktemp("resources")
+    environment = {
+        **os.environ,
+        "MSSPL_FUSE": find_msspl_fuse(),
+        "BLENDER_USER_RESOURCES": str(resources),
+        "PYTHONDONTWRITEBYTECODE": "1",
+    }
+    script = Path(__file__).with_name("in_blender")
+    done = subprocess.run([python, script, folder], env=environment, capture_output=True, text=True, timeout=600)
+    assert done.stdout.endswith("all is well\n"), done.stdout[-2000:] + done.stderr[-2000:]
+    return folder
+
+
+def layer(path, name, components):
+    """A layer of a single-part EXR as float32 (height, width, components)."""
+    file = open_exr(path)
+    channels = {c.name: c for part in file.parts for c in part.channels}
+    names = [name + component for component in components]
+    return file.read([channels[n] for n in names], file.parts[0].data_window)
+
+
+def test_the_composited_frame_equals_the_fused_file(results):
+    for name, components in (("Combined", "RGBA"), ("Mist", "ZZZ"), ("Normal", "XYZ")):
+        fused = layer(results / "fused_012.exr", f"ViewLayer.{name}.", components)
+        composited = layer(results / f"composited_{name}.exr", "", "RGBA"[: len(components)])
+        np.testing.assert_array_equal(composited, fused)
+        assert fused.std() > 0.01
+
+
+def test_both_renders_show_the_same_frame_if_the_size_is_rounded(results):
+    """At x8, a ramp has the same values at the edges of both renders, within a twentieth of an HRLS pixel."""
+    for name in ("wide", "tall", "squeezed"):
+        low, high = (map_render(open_exr(results / f"{name}_{kind}.exr"), features=()) for kind in ("lr", "hr"))
+        assert align(low, high).scale == 8
+        for axis in (0, 1):
+            edges = []
+            for render_ in (low, high):
+                values = render_.read(render_.data_window)["rgb"][..., 1 - axis].mean(1 - axis)
+                centres = (np.arange(len(values)) + 0.5) / len(values)
+                edges.append(np.polyval(np.polyfit(centres, values, 1), [0, 1]))
+            pixel = abs(edges[1][1] - edges[1][0]) / (high.data_window.width if axis else high.data_window.height)
+            assert np.abs(edges[0] - edges[1]).max() < 0.05 * pixel, (name, axis)
+
+
+def msspl_render(*arguments):
+    return subprocess.run(render_command(*arguments), capture_output=True, text=True)
+
+
+@posix
+def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_path):
+    """A script that reads its command line as Blender does runs in place of Blender's program."""
+    out = tmp_path / "out {frame}"  # Blender replaces such variables in paths.
+    blender = tmp_path / "blender"
+    blender.write_text(
+        f"#!{python}\nimport bpy, runpy, sys\n"
+        "assert sys.argv[1] + sys.argv[3] + sys.argv[5] == '--background' + '--python' + '--'\n"
+        "bpy.ops.wm.open_mainfile(filepath=sys.argv[2])\n"
+        "runpy.run_path(sys.argv[4], run_name='__main__')\n"
+    )
+    blender.chmod(0o755)
+    options = ["-s", "2", "--lr-spp", "8", "--view-layer", "ViewLayer", "--keep", "--compare", "--json"]
+    frames = ["--frames", "3-4", "-o", out / "out.##.exr"]
+    done = msspl_render(results / "scene.blend", "--blender", blender, *options, *frames)
+    assert done.returncode == 0, done.stderr
+    reports = json.loads(done.stdout)
+    assert [report["frame"] for report in reports] == [3, 4]
+    for report in reports:
+        assert (report["lrhs"]["size"], report["lrhs"]["spp"]) == ([51, 38], 8)
+        assert (report["hrls"]["size"], report["hrls"]["spp"]) == ([101, 75], 1)
+        stages = report["lrhs"]["seconds"], report["hrls"]["seconds"], report["fuse_seconds"]
+        assert report["seconds"] == pytest.approx(sum(stages))
+        assert report["plain_spp"] > 3
+        assert report["oidn"]["spp"] >= 1
+    names = [f"out.{n}{suffix}.exr" for n in ("03", "04") for suffix in ("", "_hr", "_lr", "_oidn")]
+    assert sorted(p.name for p in out.iterdir()) == sorted(names)
+    for name, components in (("CryptoObject00", "rgba"), ("Mist", "Z"), ("Combined_key", "RGB"), ("Matte", "RGB")):
+        both = [layer(out / f"out.03{s}.exr", f"ViewLayer.{name}.", components) for s in ("", "_hr")]
+        np.testing.assert_array_equal(*both)
+    means = [layer(out / f"out.03{suffix}.exr", "ViewLayer.Combined.", "RGB").mean() for suffix in ("", "_lr", "_oidn")]
+    assert means == pytest.approx([means[2]] * 3, rel=0.05)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["-s", "2"], "2 view layers are on (ViewLayer, Other.1); name the one to render"),
+        (["--view-layer", "Third"], "has no view layer 'Third'; it has ViewLayer, Other.1"),
+    ],
+)
+def test_a_scene_that_cannot_be_fused_is_refused_in_one_sentence(python, results, tmp_path, options, message):
+    done = msspl_render(results / "scene.blend", "--blender", python, *options, "-o", tmp_path / "out.exr")
+    assert (done.returncode, list(tmp_path.iterdir())) == (2, [])
+    assert message in done.stderr
+    assert done.stderr.count("\n") == 1
+
+
+def test_a_file_that_is_no_scene_is_named(python, tmp_path):
+    done = msspl_render(EXAMPLES / "README.md", "--blender", python, "-o", tmp_path / "out.exr")
+    assert done.returncode == 2
+    assert "README.md: can't be opened" in done.stderr

@@ -1,0 +1,58 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The gizmo's file, read by real Tcl interpreters."""
+
+import pytest
+
+from oiio_msspl.aovs.features import FEATURES
+from oiio_msspl.model.catalogue import shipped_models
+from oiio_msspl.model.session import PROVIDERS
+from tests.nuke_gizmo.conftest import GIZMO
+from tests.nuke_gizmo.gizmo_file import read_script, tcl_interpreters
+
+
+def knob(nodes, name):
+    return next(each for each in nodes[1].user_knobs if each.name == name)
+
+
+@pytest.mark.skipif(not tcl_interpreters(), reason="no Tcl interpreter: neither tkinter nor tclsh")
+def test_every_tcl_interpreter_reads_the_same_gizmo():
+    results = [read_script(GIZMO, interpreter) for interpreter in tcl_interpreters()]
+    assert all(result == results[0] for result in results)
+
+
+def test_inputs_are_in_order_and_the_output_is_the_hrls(nodes):
+    assert [node.kind for node in nodes.values()] == ["Gizmo", "Input", "Input", "Output"]
+    assert {node.parent for node in list(nodes.values())[1:]} == {1}
+    inputs = sorted((int(n.knobs.get("number", 0)), n.knobs["name"]) for n in nodes.values() if n.kind == "Input")
+    assert inputs == [(0, "LRHS"), (1, "HRLS")]
+    (connected,) = nodes[4].inputs
+    assert nodes[connected].knobs["name"] == "HRLS"
+
+
+def test_every_knob_has_its_kind_its_default_and_a_tooltip(nodes):
+    gizmo = nodes[1]
+    kinds = {k.name: k.kind for k in gizmo.user_knobs if k.name}
+    text, file, number, menu, tick, tab, button, lines = 1, 2, 3, 4, 6, 20, 22, 43
+    assert kinds == {
+        **{"msspl": tab, "output": file, "model": text, "device": menu, "mapping": lines, "layers": text},
+        **{"overwrite": tick, "fuse_frame": button, "first": number, "last": number, "fuse_range": button},
+        **{"setup": tab, "program": file, "options": text},
+    }
+    assert {name: gizmo.knobs[name] for name in kinds if name in gizmo.knobs} == {
+        "overwrite": "true",
+        "first": "{root.first_frame}",
+        "last": "{root.last_frame}",
+    }
+    assert all("t" in k.options for k in gizmo.user_knobs if k.kind not in (tab, 26)), "a knob without a tooltip"
+    assert "LRHS" in gizmo.knobs["help"]
+
+
+def test_the_device_menu_lists_the_devices_of_msspl_fuse(nodes):
+    assert knob(nodes, "device").items == list(PROVIDERS)
+
+
+def test_the_tooltips_name_every_model_family_and_every_feature(nodes):
+    model, mapping = (knob(nodes, name).options["t"] for name in ("model", "mapping"))
+    families = {name.rpartition("-x")[0] for name in shipped_models()}
+    assert {"auto", *families} <= set(model.replace(":", " ").split())
+    assert set(FEATURES) <= set(mapping.replace(",", " ").replace(".", " ").split())

@@ -1,0 +1,278 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pages keep their promises: their commands and snippets run, their links lead somewhere, their messages exist.
+
+A block of commands runs in a folder of its own, which holds the files that the pages name. Commands that need what a
+test machine lacks (Nuke, Blender, a GPU, hours of training) are listed in ``NOT_RUN`` with the reason. Of these, the
+program's own parser must accept every option.
+"""
+
+from __future__ import annotations
+
+import ast
+import contextlib
+import functools
+import io
+import os
+import re
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import tomllib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib.util import find_spec
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+PAGES = [
+    ROOT / "README.md",
+    EXAMPLES / "README.md",
+    *sorted((ROOT / "docs/guide").glob("*.md")),
+    *sorted((ROOT / "docs/design").glob("*.md")),
+]
+FRAMES = range(1001, 1004)
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+
+#: Beginning of a command -> why it is not run here.
+NOT_RUN = {
+    "pip": "continuous integration installs the package",
+    "python -m pytest": "a test does not run all tests",
+    "msspl-render": "needs Blender",
+    "blender": "needs Blender",
+    "dask": "runs until it is stopped; tests/test_farm.py starts a scheduler and workers",
+    "deadline": "needs a farm",
+    "python -m training": "needs rendered views and hours",
+    "python -m datagen": "renders for hours",
+    "python -m benchmarks": "needs rendered scenes and an hour",
+}
+#: An option and its value -> the same.
+NOT_RUN_WITH = {"--scheduler": "needs a running Dask scheduler", "--device cuda": "needs a GPU"}
+#: Options that name what is written.
+OUTPUTS = ("-o", "--bundle", "--report", "--error-map")
+#: Packages that pages install beside those of pyproject.toml.
+OTHER_PACKAGES = {
+    "onnxruntime-gpu": "takes the place of onnxruntime",
+    "bpy": "datagen.cycles, in an environment of its own",
+    "pillow": "datagen.cycles, in an environment of its own",
+}
+
+
+@dataclass(frozen=True)
+class Block:
+    """A fenced block of a page."""
+
+    page: Path
+    line: int
+    language: str
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.page.relative_to(ROOT)}:{self.line}"
+
+    @property
+    def commands(self) -> list[str]:
+        """Command lines, without comments; ``a && b`` is two."""
+        text = re.sub(r"(^|\s)#.*", "", self.text.replace("\\\n", " "), flags=re.MULTILINE)
+        return [shlex.join(words) for line in text.splitlines() for words in _split(shlex.split(line)) if words]
+
+
+def _split(words: list[str]) -> Iterator[list[str]]:
+    while "&&" in words:
+        yield words[: words.index("&&")]
+        words = words[words.index("&&") + 1 :]
+    yield words
+
+
+@functools.cache
+def blocks(language: str) -> list[Block]:
+    return [
+        Block(page, text.count("\n", 0, match.start()) + 1, language, match[1])
+        for page, text in ((page, page.read_text(encoding="utf-8")) for page in PAGES)
+        for match in re.finditer(rf"^```{language}\n(.*?)^```$", text, re.DOTALL | re.MULTILINE)
+    ]
+
+
+def why_not_run(command: str) -> str | None:
+    for start, why in NOT_RUN.items():
+        if f"{command} ".startswith((f"{start} ", f"{start}.")):
+            return why
+    return next((why for option, why in NOT_RUN_WITH.items() if option in command), None)
+
+
+def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
+    path = f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}"
+    environment = {**os.environ, "PATH": path, "HOME": str(folder), "COLUMNS": "120"}
+    return subprocess.run(shlex.split(command), cwd=folder, env=environment, capture_output=True, text=True)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """The files that pages name: a pair, its reference, a shot in folders and by patterns, and files shown on pages."""
+    shutil.copytree(EXAMPLES, tmp_path / "examples")
+    for name in ("lr", "hr"):
+        source = EXAMPLES / f"{name}.exr"
+        shutil.copy(source, tmp_path)
+        (tmp_path / name).mkdir()
+        for frame in FRAMES:
+            shutil.copy(source, tmp_path / name / f"{name}.{frame}.exr")
+            shutil.copy(source, tmp_path / f"{name}.{frame}.exr")
+    shutil.copy(EXAMPLES / "hr.exr", tmp_path / "ref.exr")  # any frame of that size
+    for block in blocks("toml"):
+        name = re.match(r"# (\S+\.toml)\n", block.text)
+        assert name is not None, f"{block}: begins with its file's name"
+        (tmp_path / name[1]).write_text(block.text, encoding="utf-8")
+    return tmp_path
+
+
+RUNNABLE = [block for block in blocks("sh") if any(why_not_run(command) is None for command in block.commands)]
+OTHERS = [
+    (block, command, why) for block in blocks("sh") for command in block.commands if (why := why_not_run(command))
+]
+
+
+@pytest.mark.parametrize("block", RUNNABLE, ids=str)
+def test_commands_run_and_write_what_they_name(block: Block, folder: Path) -> None:
+    """Every command of a block succeeds, in order; the files that its options name are new afterwards."""
+    for command in block.commands:
+        if why_not_run(command):
+            continue
+        words = shlex.split(command)
+        before = {path for path in folder.rglob("*") if path.is_file()}
+        done = run(command, folder)
+        assert done.returncode == 0, f"{command}\n{done.stdout}\n{done.stderr}"
+        new = {path for path in folder.rglob("*") if path.is_file()} - before
+        for option in OUTPUTS:
+            if option not in words or (option == "-o" and "--bundle" in words):  # a job's tasks write its output
+                continue
+            output = words[words.index(option) + 1]
+            pattern = re.sub(r"#+", "*", output) + ("*" if output.endswith("/") else "")
+            assert new & set(folder.glob(pattern)), f"{command}: wrote no {output}"
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")  # training's modules import each other
+@pytest.mark.parametrize(
+    ("block", "command", "why"), OTHERS, ids=[f"{block} {command} ({why})" for block, command, why in OTHERS]
+)
+def test_commands_that_are_not_run_are_accepted(block: Block, command: str, why: str, folder: Path) -> None:
+    """What can't be run here is at least a command that the program accepts."""
+    words = shlex.split(command)
+    if words[0] == "pip":
+        check_pip(words)
+    elif command == "python -m pytest":
+        assert find_spec("pytest") is not None
+    elif words[:2] == ["python", "-m"]:
+        check_module(words[2], words[3:])
+    elif words[0] == "blender":
+        assert (ROOT / words[words.index("--source-dir") + 1] / "blender_manifest.toml").is_file()
+    elif words[0] == "deadline":
+        bundles = [
+            shlex.split(other)[shlex.split(other).index("--bundle") + 1]
+            for other in block.commands
+            if "--bundle" in other
+        ]
+        assert words[-1] in bundles, f"{command}: no command above writes {words[-1]}"
+    else:  # click checks all options before it prints the help
+        done = run(f"{command} --help", folder)
+        assert done.returncode == 0, f"{command} --help\n{done.stdout}\n{done.stderr}"
+        assert "Usage" in done.stdout
+
+
+def check_pip(words: list[str]) -> None:
+    """``pip install`` names this folder, extras of pyproject.toml, or packages that are known here."""
+    known = {re.split(r"[<>=\[]", line)[0] for line in PROJECT["dependencies"]} | OTHER_PACKAGES.keys()
+    for extra in PROJECT["optional-dependencies"].values():
+        known |= {re.split(r"[<>=\[]", line)[0] for line in extra}
+    for word in words[2:]:
+        if word.startswith("-"):
+            continue
+        name, _, extras = word.rstrip("]").partition("[")
+        name = re.split(r"[<>=]", name)[0]
+        assert name == "." or name in known, f"{word}: neither this folder nor a known package"
+        for extra_name in filter(None, extras.split(",")):
+            assert extra_name in PROJECT["optional-dependencies"], f"{word}: no such extra"
+
+
+def check_module(name: str, arguments: list[str]) -> None:
+    """The module's argparse takes these values, and knows every option: they stand in its help."""
+    said = io.StringIO()
+    argv = sys.argv
+    sys.argv = [name, *arguments, "--help"]
+    try:
+        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), pytest.raises(SystemExit) as ended:
+            runpy.run_module(name, run_name="__main__", alter_sys=True)
+    finally:
+        sys.argv = argv
+    assert ended.value.code in (0, None), said.getvalue()
+    for option in (word for word in arguments if re.match(r"--?[a-z]", word)):
+        assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", said.getvalue()), f"{name} has no {option}"
+
+
+@pytest.mark.parametrize("block", blocks("python"), ids=str)
+def test_snippets_run(block: Block, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(folder)
+    exec(compile(block.text, str(block), "exec"), {"__name__": "__main__"})
+
+
+def anchors(page: Path) -> set[str]:
+    """What GitHub makes of the headings."""
+    headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
+def test_links_lead_somewhere(page: Path) -> None:
+    for target in re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8")):
+        if target.startswith("https://"):
+            continue
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        assert file.exists(), f"{page.name}: {target}"
+        if anchor:
+            assert anchor in anchors(file), f"{page.name}: {target} has no such heading"
+
+
+def test_every_renderer_of_the_table_is_on_the_page() -> None:
+    (table,) = (path for path in (ROOT / "oiio_msspl").rglob("*.toml") if "[[renderer]]" in path.read_text("utf-8"))
+    names = {each["name"] for each in tomllib.loads(table.read_text(encoding="utf-8"))["renderer"]} - {"unknown"}
+    page = (ROOT / "docs/guide/render.md").read_text(encoding="utf-8")
+    assert names == {name for name in re.findall(r"^\| ([^|]+?) \|", page, re.MULTILINE) if name in names}
+
+
+def literals() -> list[str]:
+    """All texts in the code of the programs."""
+    sources = [
+        path for name in ("oiio_msspl", "cli", "nuke_gizmo", "blender_addon") for path in (ROOT / name).rglob("*.py")
+    ]
+    return [
+        node.value
+        for source in sources
+        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8")))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    ]
+
+
+def test_the_messages_of_the_troubleshooting_page_are_those_of_the_code() -> None:
+    """Between ``...``, each message is text that stands in the code."""
+    page = (ROOT / "docs/guide/troubleshooting.md").read_text(encoding="utf-8")
+    messages = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)
+    assert len(messages) > 40
+    code = "\0".join(literals())
+    missing = [
+        f"{part!r} of {message!r}"
+        for message in messages
+        for part in map(str.strip, message.split("..."))
+        if part and part not in code
+    ]
+    assert not missing, missing
+
+
+def test_the_readme_has_two_set_up_commands() -> None:
+    """One for the main job, one for the tests."""
+    page = PAGES[0]
+    installs = [c for b in blocks("sh") if b.page == page for c in b.commands if c.startswith("pip ")]
+    assert installs == ["pip install .", "pip install -e '.[test]'"]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparing files with a reference."""
+"""Comparing EXR files with a reference: scores, and a picture of the error."""
 
 from __future__ import annotations
 
@@ -10,7 +10,6 @@ import numpy as np
 import OpenImageIO as oiio
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array, repair
 from oiio_msspl.errors import InputError, MssplError
@@ -22,7 +21,14 @@ from oiio_msspl.model.contract import SCALES
 
 
 def scores(image: Array, reference: Array) -> dict[str, float]:
-    """``psnr`` (dB), ``relmse`` (0.5, 0.01), ``relmse_gharbi`` (1, 1e-4) and ``ssim`` of two (h, w, 3) pictures."""
+    """All measures of :mod:`oiio_msspl.metrics`.
+
+    Args:
+        image, reference: scene linear, (height, width, 3).
+
+    Returns:
+        ``psnr`` in dB, ``relmse`` with the constants 0.5 and 0.01, ``relmse_gharbi`` with 1 and 1e-4, and ``ssim``.
+    """
     return {
         "psnr": psnr(image, reference),
         "relmse": relmse(image, reference),
@@ -32,34 +38,62 @@ def scores(image: Array, reference: Array) -> dict[str, float]:
 
 
 def compare_files(images: Sequence[Path], reference: Path) -> list[dict[str, float]]:
-    """Scores of each image. One that is smaller by x2, x4 or x8 is upsampled bicubically first.
+    """Score the beauty of each image against that of the reference.
+
+    Args:
+        images: EXR files. One that is smaller by x2, x4 or x8 is upsampled bicubically first.
+        reference: EXR file of what the images should be.
+
+    Returns:
+        :func:`scores` of each image.
 
     Raises:
-        InputError: a file can't be read, or its size does not fit the reference.
+        InputError: a file can't be read, an image's size does not fit the reference, or the reference is too small.
     """
-    truth_file = map_render(open_exr(reference))
-    truth = _beauty(truth_file)
-    if min(truth.shape[:2]) < SSIM_WINDOW:
-        size = truth_file.data_window.size
-        raise InputError(f"{reference}: is {size}; SSIM needs at least {SSIM_WINDOW} pixels each way")
-    return [scores(_fitted(map_render(open_exr(path)), truth, reference), truth) for path in images]
+    truth = _read_beauty(reference)
+    height, width = truth.shape[:2]
+    if min(height, width) < SSIM_WINDOW:
+        raise InputError(f"{reference}: is {width}x{height}; SSIM needs at least {SSIM_WINDOW} pixels each way")
+    return [scores(_read_at_size_of(truth, path, reference), truth) for path in images]
 
 
 def check_error_map(path: Path, *, overwrite: bool) -> None:
-    """Raise InputError if no error map could be written here."""
+    """Check that an error map can be written at ``path``.
+
+    Raises:
+        InputError: it is not named .png, it exists and may not be overwritten, or its folder is missing or read-only.
+    """
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the error map is a PNG; name it .png")
     check_target(path, overwrite=overwrite)
 
 
 def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool) -> None:
-    """See :func:`error_map`."""
-    truth = _beauty(map_render(open_exr(reference)))
-    write_png(path, error_map(_fitted(map_render(open_exr(image)), truth, reference), truth), overwrite=overwrite)
+    """Write the :func:`error_map` of an image as a PNG.
+
+    Args:
+        path: the PNG to write.
+        image, reference: EXR files, as for :func:`compare_files`.
+        overwrite: replace an existing file.
+
+    Raises:
+        InputError: a file can't be read, the image's size does not fit the reference, or ``path`` exists.
+        MssplError: the PNG can't be written.
+    """
+    truth = _read_beauty(reference)
+    write_png(path, error_map(_read_at_size_of(truth, image, reference), truth), overwrite=overwrite)
 
 
 def error_map(image: Array, truth: Array) -> Array:
-    """log10 RelMSE (0.5, 0.01) a pixel, from 1e-5 (black) to 1 (white) on OpenImageIO's "inferno" colours."""
+    """log10 of each pixel's RelMSE (0.5, 0.01), in OpenImageIO's "inferno" colours.
+
+    Args:
+        image, truth: scene linear, (height, width, 3).
+
+    Returns:
+        Display values in [0, 1], (height, width, 3). The darkest colour is an error of 1e-5 or less, the brightest 1
+        or more.
+    """
     error = relmse_map(image, truth).mean(axis=-1)
     grey = ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)
     mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(grey[..., None])), 0, "inferno")
@@ -69,27 +103,27 @@ def error_map(image: Array, truth: Array) -> Array:
 
 
 def upsample_bicubic(image: Array, width: int, height: int) -> Array:
-    """Bicubic (B-spline free, OpenImageIO's "cubic") resampling; negative lobes are cut at 0."""
+    """Bicubic resampling (OpenImageIO's "cubic"): (h, w, 3) to (height, width, 3); negative values become 0."""
     buffer = oiio.ImageBuf(np.ascontiguousarray(image))
     result = oiio.ImageBufAlgo.resize(buffer, filtername="cubic", roi=oiio.ROI(0, width, 0, height))
     return np.maximum(np.asarray(result.get_pixels(oiio.FLOAT), dtype=np.float32), 0)
 
 
-def _beauty(file: MappedRender) -> Array:
-    return repair(file.read(file.data_window, [RGB])[RGB])[0]
+def _read_beauty(path: Path) -> Array:
+    """The beauty of an EXR over its data window, without NaN and infinities: (height, width, 3)."""
+    render = map_render(open_exr(path), features=())
+    return repair(render.read(render.data_window, [RGB])[RGB])[0]
 
 
-def _fitted(file: MappedRender, truth: Array, reference: Path) -> Array:
-    image = _beauty(file)
-    height, width = truth.shape[:2]
-    if image.shape == truth.shape:
+def _read_at_size_of(truth: Array, path: Path, reference: Path) -> Array:
+    """The beauty of an EXR, upsampled to the size of the reference if it is smaller by a scale of ``SCALES``."""
+    image = _read_beauty(path)
+    size, wanted = image.shape[:2], truth.shape[:2]
+    if size == wanted:
         return image
-    if any(
-        image.shape[0] in (height // s, -(-height // s)) and image.shape[1] in (width // s, -(-width // s))
-        for s in SCALES
-    ):
-        return upsample_bicubic(image, width, height)
+    # An odd side may have been rounded up or down.
+    if any(all(a in (b // scale, -(-b // scale)) for a, b in zip(size, wanted, strict=True)) for scale in SCALES):
+        return upsample_bicubic(image, wanted[1], wanted[0])
     raise InputError(
-        f"{file.name} is {image.shape[1]}x{image.shape[0]}, but {reference} is {width}x{height}; "
-        "compare pictures of one size"
+        f"{path} is {size[1]}x{size[0]}, but {reference} is {wanted[1]}x{wanted[0]}; compare pictures of one size"
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a file holds and what the network would read of it, as facts for a person and for a machine."""
+"""Inspecting a render: what the file holds, and what the network would read of it."""
 
 from __future__ import annotations
 
@@ -9,26 +9,36 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.mapped_render import MappedRender, unread_layers
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.jobs.frame import InputOptions
 
+#: Rows whose pixels are read at a time.
+ROWS_PER_READ = 256
+
 
 @dataclass
 class Inspection:
-    """Result of :func:`inspect_file`. ``problems`` is empty for a file that can be used."""
+    """Result of :func:`inspect_file`."""
 
     path: Path
     file: ExrFile | None = None
-    resolution: MappedRender | None = None
+    """None if the headers can't be read."""
+    render: MappedRender | None = None
+    """None if the layers can't be mapped."""
     facts: list[str] = field(default_factory=list)
+    """What was found, one line each."""
     passed_through: list[str] = field(default_factory=list)
+    """Names of the layers and channels that the network does not read."""
     problems: list[str] = field(default_factory=list)
+    """Why the file can't be used, one sentence each; empty if it can."""
 
     def as_dict(self) -> dict[str, Any]:
+        """The inspection as it is written to JSON."""
         result: dict[str, Any] = {"file": str(self.path), "usable": not self.problems, "problems": self.problems}
         if self.file is not None:
             result |= {
@@ -47,74 +57,90 @@ class Inspection:
                     for part in self.file.parts
                 ],
             }
-        if self.resolution is not None:
+        if self.render is not None:
             result |= {
-                "renderer": self.resolution.renderer,
-                "view": self.resolution.view or None,
-                "other_views": self.resolution.other_views,
-                "spp": self.resolution.spp,
-                "aovs": self.resolution.table(),
-                "notes": self.resolution.notes,
+                "renderer": self.render.renderer,
+                "view": self.render.view or None,
+                "other_views": self.render.other_views,
+                "spp": self.render.spp,
+                "aovs": self.render.table(),
+                "notes": self.render.notes,
                 "passed_through": self.passed_through,
             }
         return result
 
 
 def inspect_file(path: Path, inputs: InputOptions) -> Inspection:
-    """Open a file, map its layers and read its pixels once; what goes wrong is noted, never raised."""
+    """Open a file, map its layers and read all pixels of its features once.
+
+    Args:
+        path: an EXR.
+        inputs: how its layers are to be understood; ``hr_spp`` says the samples per pixel.
+
+    Returns:
+        What was found. A file that can't be used is described in ``problems``; nothing is raised for it.
+    """
     result = Inspection(path)
     try:
         file = result.file = open_exr(path)
         result.facts = _facts(file)
-        resolution = result.resolution = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
-        others = f"; also {', '.join(resolution.other_views)} (--view-layer)" if resolution.other_views else ""
-        spp = "unknown spp" if resolution.spp is None else f"{resolution.spp:g} spp"
-        view = f", {resolution.view}{others}" if resolution.view else others
-        result.facts.append(f"renderer: {resolution.renderer}, {spp}{view}")
-        result.passed_through = unread_layers(file, resolution)
-        result.facts += _pixels(resolution)
+        render = result.render = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+        result.facts.append(_renderer_fact(render))
+        result.passed_through = render.unread_layers()
+        result.facts += _pixel_facts(render)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
     return result
 
 
+def _renderer_fact(render: MappedRender) -> str:
+    spp = "unknown spp" if render.spp is None else f"{render.spp:g} spp"
+    others = f"; also {', '.join(render.other_views)} (--view-layer)" if render.other_views else ""
+    view = f", {render.view}" if render.view else ""
+    return f"renderer: {render.renderer}, {spp}{view}{others}"
+
+
 def _facts(file: ExrFile) -> list[str]:
+    """Windows, and the types and storage of the parts; parts that are alike share a line."""
     aspect = "" if file.pixel_aspect == 1 else f", pixel aspect {file.pixel_aspect:g}"
     facts = [f"display window {file.display_window}{aspect}"]
-    shapes: dict[str, list[str]] = {}
+    alike: dict[str, list[str]] = {}
     for part in file.parts:
         kind = "deep" if part.deep else f"tiled {part.tile[0]}x{part.tile[1]}" if part.tile != (0, 0) else "scan lines"
         types = "/".join(sorted({c.type for c in part.channels}))
         window = "" if part.data_window == file.display_window else f", data window {part.data_window}"
-        shape = f"{types}, {part.compression}, {kind}{window}"
-        shapes.setdefault(shape, []).append(part.name or "unnamed")
-    for shape, names in shapes.items():
-        which = (
-            names[0]
-            if len(names) == 1
-            else f"{len(names)} parts ({', '.join(names[:4])}{', ...' if len(names) > 4 else ''})"
-        )
-        facts.append(f"{'part ' if len(names) == 1 else ''}{which}: {shape}")
+        alike.setdefault(f"{types}, {part.compression}, {kind}{window}", []).append(part.name or "unnamed")
+    for description, names in alike.items():
+        if len(names) == 1:
+            facts.append(f"part {names[0]}: {description}")
+        else:
+            some = ", ".join(names[:4]) + (", ..." if len(names) > 4 else "")
+            facts.append(f"{len(names)} parts ({some}): {description}")
     return facts
 
 
-def _pixels(resolution: MappedRender) -> list[str]:
-    """Read every feature once, in bands: is it there, finite and not black?"""
-    window = resolution.data_window
+def _pixel_facts(render: MappedRender) -> list[str]:
+    """Read every feature once: count what is not finite, and name what is all zero.
+
+    Raises:
+        InputError: the beauty is black everywhere.
+    """
+    window = render.data_window
     brightest: dict[str, float] = {}
-    unusable: dict[str, int] = {}
-    for y in range(window.y0, window.y1, 256):
-        for name, values in resolution.read(Window(window.x0, y, window.x1, min(y + 256, window.y1))).items():
+    not_finite: dict[str, int] = {}
+    for y in range(window.y0, window.y1, ROWS_PER_READ):
+        rows = Window(window.x0, y, window.x1, min(y + ROWS_PER_READ, window.y1))
+        for name, values in render.read(rows).items():
             finite = np.isfinite(values)
-            unusable[name] = unusable.get(name, 0) + int(values.size - np.count_nonzero(finite))
+            not_finite[name] = not_finite.get(name, 0) + int(values.size - np.count_nonzero(finite))
             brightest[name] = max(brightest.get(name, 0.0), float(np.abs(values[finite]).max(initial=0.0)))
-    facts = [
-        f"{name}: {count} values are NaN or infinite; fusing repairs them" for name, count in unusable.items() if count
+    if brightest[RGB] == 0:
+        others = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
+        hint = f", though {others} are not; check which layer it is (--map rgb=LAYER)" if others else ""
+        raise InputError(f"the beauty is black everywhere{hint}")
+    repaired = [
+        f"{name}: {count} values are NaN or infinite; fusing repairs them"
+        for name, count in not_finite.items()
+        if count
     ]
-    if brightest["rgb"] == 0:
-        filled = [name for name, value in brightest.items() if value > 0 and name != "alpha"]
-        raise InputError(
-            "the beauty is black everywhere"
-            + (f", though {', '.join(filled)} are not; check which layer it is (--map rgb=LAYER)" if filled else "")
-        )
-    return facts + [f"{name}: all zero" for name, value in brightest.items() if value == 0]
+    return repaired + [f"{name}: all zero" for name, value in brightest.items() if value == 0]

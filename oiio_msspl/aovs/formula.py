@@ -16,6 +16,9 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.reader import Channel
 
+#: Kinds of variance that can be used only if the samples per pixel are known.
+NEEDS_SPP = ("per_sample", "relative", "second_moment")
+
 #: Gives the pixels of some channels, (height, width, len(channels)).
 Take = Callable[[Sequence[Channel]], Array]
 
@@ -68,21 +71,18 @@ class FeatureFormula:
         """
         if self.kind == "halves":
             # The mean of two independent halves a and b of the samples has the variance (a - b)^2 / 4.
-            difference = (take(self.terms[0]) - take(self.terms[1])) / 2
-            return np.square(luminance(difference))[..., None]
+            first, second = (take(term) for term in self.terms)
+            return np.square(luminance((first - second) / np.float32(2)))[..., None]
         value = take(self.terms[0])
-        if self.kind == "second_moment":
-            value = (value - np.square(mean)) / spp
-        elif self.kind == "relative":
-            value = value * (mean if value.shape[-1] == 3 else luminance(mean)[..., None]) / spp
-        elif self.kind == "per_sample":
+        if self.kind in NEEDS_SPP:
+            assert spp is not None  # map_render drops such a variance otherwise
+            if self.kind == "second_moment":
+                value = value - np.square(mean)
+            elif self.kind == "relative":
+                value = value * (mean if value.shape[-1] == 3 else luminance(mean)[..., None])
             value = value / spp
         elif self.kind == "deviation":
             value = np.square(value)
         if value.shape[-1] == 1:
             return value
         return np.square(luminance(np.sqrt(np.maximum(value, 0))))[..., None]
-
-
-#: Kinds of variance that can be used only if the samples per pixel are known.
-NEEDS_SPP = ("per_sample", "relative", "second_moment")

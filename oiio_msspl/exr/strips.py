@@ -14,7 +14,8 @@ from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-#: Rows of a strip: several chunks of any compression but DWAB, which OpenImageIO decodes in parallel.
+#: Rows of a strip, which is at least one chunk. OpenImageIO decodes chunks in parallel; one chunk has 16 rows for ZIP,
+#: 32 for PIZ and DWAA, 256 for DWAB.
 ROWS_PER_STRIP = 64
 
 

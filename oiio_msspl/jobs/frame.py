@@ -102,9 +102,7 @@ def fuse_files(
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
-    dropped_channels(
-        hr.file, hr.beauty_channels, write.layers
-    )  # a layer that is not there shows before the work, not after
+    dropped_channels(hr.file, hr.beauty_channels, write.layers)  # raises before any work if a layer is missing
     session = Session(find_model(align(lr, hr).scale, model), device, threads)
     opened = time.perf_counter()
 

@@ -41,8 +41,8 @@ def inspect(
             print(inspection.path)
             for line in inspection.facts:
                 print(f"  {line}")
-            if inspection.resolution is not None:
-                show.aov_table(inspection.resolution.table(), inspection.resolution.notes)
+            if inspection.render is not None:
+                show.aov_table(inspection.render.table(), inspection.render.notes)
                 if inspection.passed_through:
                     print(f"  passed through: {', '.join(inspection.passed_through)}")
             for problem in inspection.problems:

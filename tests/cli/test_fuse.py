@@ -2,6 +2,7 @@
 """msspl-fuse on one pair, as a process: its exit code, what it prints, and what it wrote, reopened."""
 
 import json
+import re
 import signal
 import subprocess
 import sys
@@ -20,8 +21,10 @@ from tests.programs import fuse
 def test_the_main_job(files, bilinear_models):
     done = fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4])
     assert done.returncode == 0, done.stderr
-    assert "albedo    found    albedo" in done.stdout
-    assert "variance  default" in done.stdout
+    assert "albedo    found: albedo\n" in done.stdout
+    assert "variance  none found (optional)\n" in done.stdout
+    timing = r"Fused with bilinear-x4 on the CPU in \d+\.\d s \(\d\.\d s loading, \d\.\d s fusing, \d\.\d s writing\)\."
+    assert re.search(timing, done.stdout), done.stdout
     assert done.stderr == ""
     out = map_render(open_exr(files / "out.exr"))
     values = out.read(out.data_window)

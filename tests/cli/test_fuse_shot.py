@@ -78,7 +78,7 @@ def test_what_a_person_reads(tmp_path, bilinear_models):
     (folder / "hr/beauty.1003.exr").write_text("no EXR")
     done = fuse(folder / "lr", folder / "hr", "-o", folder / "out", "--model", bilinear_models[4], "-v", "--no-preview")
     assert done.returncode == 2
-    assert "  albedo    found    albedo\n" in done.stdout
+    assert "  albedo    found: albedo\n" in done.stdout
     assert "  fused   3  1001-1002,1004\n  failed  1  1003 " in done.stdout
     assert done.stderr.count("error: frame 1003:") == 1
     assert "frame 1004: fused (read " in done.stderr

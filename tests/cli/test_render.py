@@ -163,18 +163,21 @@ def test_a_shot_that_fails_midway_says_where_and_is_resumed(farm):
     assert "out.01.exr: exists" in run(*arguments)[2]
     code, out, _, _ = run(*arguments, "--skip-existing")
     assert (code, [report["frame"] for report in json.loads(out)]) == (0, [2, 3])
-    assert run(*arguments[:-1], "--skip-existing")[:3] == (0, "new/out.##.exr: all is there\n", "")
+    assert run(*arguments[:-1], "--skip-existing")[:3] == (0, "new/out.##.exr: every frame exists\n", "")
 
 
 @posix
-def test_the_status_line_is_wiped_before_an_error(farm):
+def test_the_progress_bar_is_wiped_before_an_error(farm, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
     start, _, _ = farm
     reader, terminal = os.openpty()
     with start(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
         process.wait()
         said = os.read(reader, 10000).decode()
-    assert "frame None: LRHS" in said
-    assert said.endswith("\r\033[Kerror: disk full\r\n")
+    assert "LRHS 16x9, 16 spp" in said
+    bar, error = said.rsplit("\033[2K", 1)  # the line of the bar is erased
+    assert "LRHS" not in error
+    assert error.endswith("error: disk full\r\n")
 
 
 @posix

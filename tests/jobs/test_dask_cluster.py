@@ -106,7 +106,7 @@ def test_the_program_says_of_a_cluster_what_it_says_of_a_local_run(tmp_path, bil
     for out, more in (("local", []), ("out", ["--scheduler", two_workers.scheduler_address])):
         done = fuse(tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / out, "--model", bilinear_models[4], *more)
         assert done.returncode == 2, done.stderr
-        table = re.sub(r"read as in frame \d+", "read", done.stdout.replace(f"/{out}/", "/"))
+        table = re.sub(r"layers of frame \d+", "layers", done.stdout.replace(f"/{out}/", "/"))
         said.append((re.sub(r"\d+\.\d s.*", "", table), sorted(done.stderr.splitlines())))
     assert said[0] == said[1]
     assert "fused    4  1001-1005x2,1006" in said[1][0]

@@ -109,4 +109,4 @@ def print_table(report: ShotReport) -> None:
     stages = ", ".join(
         f"{verbs[name]} {seconds:.1f} s" for name, seconds in report.stage_seconds.items() if name in verbs
     )
-    print(f"{report.shot.output}: {report.seconds:.1f} s" + (f" ({stages}, at the same time)" if stages else ""))
+    print(f"{report.shot.output}: {report.seconds:.1f} s" + (f" ({stages}; stages overlap)" if stages else ""))

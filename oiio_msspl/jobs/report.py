@@ -10,6 +10,7 @@ from typing import Any
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
 
 
@@ -98,7 +99,7 @@ def report_on(
         output=output,
         preview=preview_path,
         repaired=fused.repaired,
-        warnings=[*_spp_warnings(lr, hr, session), *fused.warnings],
+        warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings],
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.features),
@@ -106,7 +107,7 @@ def report_on(
     )
 
 
-def _spp_warnings(lr: MappedRender, hr: MappedRender, session: Session) -> list[str]:
+def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
     """Warn of spp that the method or the model was not made for."""
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp <= hr.spp:
@@ -114,11 +115,9 @@ def _spp_warnings(lr: MappedRender, hr: MappedRender, session: Session) -> list[
             f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution render"
         )
     for name, key, spp in (("HRLS", "hrls", hr.spp), ("LRHS", "lrhs", lr.spp)):
-        trained = session.contract.training_spp.get(key)
+        trained = contract.training_spp.get(key)
         if spp is not None and trained and not trained[0] <= spp <= trained[1]:
-            warnings.append(
-                f"the {name} has {spp:g} spp; {session.contract.name} was trained on {trained[0]} to {trained[1]}"
-            )
+            warnings.append(f"the {name} has {spp:g} spp; {contract.name} was trained on {trained[0]} to {trained[1]}")
     return warnings
 
 

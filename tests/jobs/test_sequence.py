@@ -84,3 +84,34 @@ def test_ranges_are_taken_in_their_order(tmp_path, frames, numbers):
 
 def test_frames_are_shown_as_ranges():
     assert format_frames([1001, 1002, 1003, 1007]) == "1001-1003,1007"
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("v2####.exr", "v20007.exr"),
+        ("take1-3_####.exr", "take1-3_0007.exr"),
+        ("a.####_v2.exr", "a.0007_v2.exr"),
+        ("a [left].####.exr", "a [left].0007.exr"),
+        ("####", "0007"),
+    ],
+)
+def test_names_that_fileseq_splits_differently(tmp_path, name, file):
+    """Digits before the number are no frame range, text after it needs no dot, and brackets are no wildcard."""
+    folder = touch(tmp_path / "lr#1.%04d", file)
+    assert parse_pattern(folder / name).path(7) == folder / file
+    found = find_shot(folder / name, folder / name, tmp_path / "out")
+    assert [frame.lr for frame in found.frames] == [folder / file]
+
+
+def test_a_hyphen_after_a_letter_is_a_separator_and_a_sign_elsewhere(tmp_path):
+    touch(tmp_path / "lr", "shot-0001.exr", "shot-0002.exr")
+    touch(tmp_path / "hr", "a.-001.exr", "a.0002.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert (found.lr.pattern.name, list(found.lr.files)) == ("shot-####.exr", [2, 1])
+    assert (found.hr.pattern.name, sorted(found.hr.files)) == ("a.####.exr", [-1, 2])
+
+
+def test_a_step_may_be_written_with_a_colon():
+    """As Houdini and Open Job Description write it. To fileseq a colon means a staggered range."""
+    assert parse_frames("1-9:4") == [1, 5, 9]

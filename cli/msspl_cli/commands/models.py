@@ -39,7 +39,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
     if as_json:
         print(json.dumps({"models": rows, "devices": devices}, indent=2))
         return
-    header = ("model", "scale", "size", "trained at LRHS spp", "HRLS spp", "needs")
+    header = ("model", "scale", "size", "trained LRHS spp", "trained HRLS spp", "needs")
     spans = [["{}-{}".format(*row["training_spp"].get(key, ("?", "?"))) for key in ("lrhs", "hrls")] for row in rows]
     console.table(
         [

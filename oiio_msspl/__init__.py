@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
     from oiio_msspl.jobs.frame import InputOptions, fuse_files
     from oiio_msspl.jobs.report import FrameReport
-    from oiio_msspl.jobs.shot import FrameResult, ShotReport, fuse_shot
+    from oiio_msspl.jobs.shot import fuse_shot
+    from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
     from oiio_msspl.model.catalogue import find_model, shipped_models
     from oiio_msspl.model.contract import Contract
     from oiio_msspl.model.session import Session
@@ -39,7 +40,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "Contract": "model.contract",
     "FrameReport": "jobs.report",
-    "FrameResult": "jobs.shot",
+    "FrameResult": "jobs.shot_report",
     "FusedFrame": "fusion.fuse",
     "InputError": "errors",
     "InputOptions": "jobs.frame",
@@ -47,7 +48,7 @@ _MODULES = {
     "MssplError": "errors",
     "Render": "exr.render",
     "Session": "model.session",
-    "ShotReport": "jobs.shot",
+    "ShotReport": "jobs.shot_report",
     "Window": "exr.render",
     "WriteOptions": "exr.write_options",
     "find_model": "model.catalogue",

@@ -29,7 +29,7 @@ app = typer.Typer(no_args_is_help=True, **_SETTINGS)
 
 @app.callback(invoke_without_command=True)
 def _main(version: bool = typer.Option(False, "--version", help="Print the version and exit.")) -> None:
-    """Look at renders and models, and compare results. To fuse a pair, see [bold]msspl-fuse --help[/bold]."""
+    """Inspect renders, list models and compare results. To fuse a pair, see [bold]msspl-fuse --help[/bold]."""
     if version:
         print(__version__)
         raise typer.Exit

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Exceptions to one sentence and an exit code: 2 for the caller's mistake, 1 for a failure of ours."""
+"""Turns an exception into one sentence and an exit code: 2 for the caller's mistake, 1 for any other failure."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from oiio_msspl.errors import explain
 
 
 def run(app: typer.Typer) -> None:
-    """Run a program and exit. Typer itself answers wrong usage with exit code 2; ``--debug`` lets exceptions pass."""
-    # A farm ends a job with SIGTERM: leave as on an exception, so that temporary files go.
+    """Run a program and exit. Typer itself ends wrong usage with exit code 2. ``--debug`` shows the traceback."""
+    # A farm ends a job with SIGTERM. Exit as on an exception, so that temporary files are removed.
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
     try:
         app()

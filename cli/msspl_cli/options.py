@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands share, and what they do to the process."""
+"""Options that several commands share, and how they become values of the library.
+
+``--help`` shows the options of everyday work. Those marked ``hidden`` appear in ``--help-all``.
+"""
 
 from __future__ import annotations
 
@@ -16,33 +19,65 @@ if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.jobs.frame import InputOptions
 
+#: Groups of options in the help text.
+INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
+
+
+def _show_all(context: typer.Context, wanted: bool) -> None:
+    """Print the help text with its hidden options, and exit."""
+    if wanted:
+        for parameter in context.command.params:
+            parameter.hidden = False  # type: ignore[attr-defined]
+        typer.echo(context.get_help())
+        raise typer.Exit
+
+
 Map = Annotated[
     list[str],
     typer.Option(
         "--map",
         metavar="FEATURE=LAYER",
-        help="Take a feature (rgb, albedo, normal, diffuse, specular, variance) from this layer, a sum of layers "
-        "(lighting+GI) or another EXR; rgb takes a single layer. May be repeated.",
+        help="Read a feature (rgb, albedo, normal, diffuse, specular, variance) from this layer, from a sum of layers "
+        "(lighting+GI) or from another EXR. rgb takes a single layer. May be repeated.",
+        rich_help_panel=INPUT,
     ),
 ]
 MapFile = Annotated[
-    Path | None, typer.Option("--map-file", metavar="TOML", help="A mapping as a file: feature = candidate lines.")
+    Path | None,
+    typer.Option(
+        "--map-file",
+        metavar="TOML",
+        help="The same in a file, with candidate layers for each feature.",
+        rich_help_panel=INPUT,
+        hidden=True,
+    ),
 ]
 ViewLayer = Annotated[
-    str | None, typer.Option("--view-layer", metavar="NAME", help="View (left) or view layer, if there are several.")
+    str | None,
+    typer.Option(
+        "--view-layer",
+        metavar="NAME",
+        help="View (left) or view layer, if the file has several.",
+        rich_help_panel=INPUT,
+    ),
 ]
-HrSpp = Annotated[
-    float | None, typer.Option("--hr-spp", min=0, help="Samples per pixel of the HRLS, if its header does not say.")
+Verbose = Annotated[
+    int, typer.Option("--verbose", "-v", count=True, metavar="", help="Print more; -vv prints all.", hidden=True)
 ]
-LrSpp = Annotated[float | None, typer.Option("--lr-spp", min=0, help="Samples per pixel of the LRHS, likewise.")]
-Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, help="Say more; twice for everything.")]
-Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]
-Json = Annotated[bool, typer.Option("--json", help="Print a report for machines on standard output.")]
-Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.")]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace files that exist.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.", hidden=True)]
+Json = Annotated[
+    bool, typer.Option("--json", help="Print a report as JSON on standard output.", rich_help_panel=OUTPUT)
+]
+Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.", hidden=True)]
+Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.", rich_help_panel=OUTPUT)]
+HelpAll = Annotated[
+    bool,
+    typer.Option("--help-all", help="Show all options and exit.", is_eager=True, callback=_show_all),
+]
 
 
 def set_up_logging(verbose: int, quiet: bool) -> None:
+    """Send the library's log to standard error: warnings, with -v information, with -vv all."""
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     logging.basicConfig(level=level, format="%(levelname)s: %(message)s", force=True)
 
@@ -50,7 +85,11 @@ def set_up_logging(verbose: int, quiet: bool) -> None:
 def make_inputs(
     mapping: list[str], map_file: Path | None, view_layer: str | None, lr_spp: float | None, hr_spp: float | None
 ) -> InputOptions:
-    """The shared options as the library's :class:`~oiio_msspl.jobs.frame.InputOptions`; ``--map`` wins over the file."""
+    """The options that describe the input files. ``--map`` wins over ``--map-file``.
+
+    Raises:
+        InputError: a mapping can't be read.
+    """
     from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
     from oiio_msspl.jobs.frame import InputOptions
 
@@ -61,6 +100,11 @@ def make_inputs(
 def make_write_options(
     layout: str, compression: str | None, half: bool | None, layers: list[str], error_layer: bool
 ) -> WriteOptions:
+    """The options that describe the result.
+
+    Raises:
+        InputError: an unknown layout or compression.
+    """
     from oiio_msspl.exr.write_options import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"
@@ -68,10 +112,10 @@ def make_write_options(
 
 
 def parse_bytes(text: str) -> int:
-    """``3G``, ``800M`` or plain bytes.
+    """The number of bytes that ``3G``, ``800M`` or a plain number means.
 
     Raises:
-        InputError: it is none of these.
+        InputError: the text can't be read.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", text.strip(), re.IGNORECASE)
     if not match:

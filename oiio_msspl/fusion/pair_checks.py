@@ -175,8 +175,8 @@ def _find_shift(low: Array, high: Array) -> NDArray[np.float64]:
     """How far the HRLS's picture is to the right of and below the LRHS's, in LRHS pixels: (2,), 0 where not certain.
 
     The method is Lucas and Kanade 1981, coarse to fine. It finds the shift whose first-order effect on the LRHS,
-    besides a gain and an offset, explains the difference best. The gradients are those of the LRHS, so noise of the HRLS makes
-    the estimate vary and does not bias it.
+    besides a gain and an offset, explains the difference best. The gradients are those of the LRHS, so noise of the
+    HRLS makes the estimate vary and does not bias it.
     """
     no_shift = np.zeros(2)
     if min(low.shape) < 8 * JACKKNIFE_PARTS:

@@ -1,7 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames on the workers of a Dask cluster: Dask gives them out, and gives those of a worker that died to another.
+"""A shot on the workers of a Dask cluster: each frame is a task.
 
-A task is a frame. An EXR gets its name last, so a task that is run again finds a whole frame or none.
+If a worker dies, Dask gives its frame to another one. An EXR gets its name last, so a task that runs again finds a
+complete frame or none.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.shot import Stages
+from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.model.catalogue import AUTO, WITHOUT_OIDN, find_model
 from oiio_msspl.model.session import Session
 
@@ -27,12 +28,18 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-#: How often a frame is tried again after a failure that is not the caller's, such as a file server that did not answer.
+#: How often a frame is tried again after a failure that may pass, such as a file server that did not answer.
 RETRIES = 2
 
 
 def connect(scheduler: str) -> Client:
-    """A client, to be closed, of the cluster whose scheduler has this address (``tcp://host:8786``) or scheduler file.
+    """Connect to a Dask cluster.
+
+    Args:
+        scheduler: address of its scheduler (``tcp://host:8786``), or a scheduler file.
+
+    Returns:
+        A client, which the caller closes.
 
     Raises:
         InputError: Dask is not installed, or no scheduler answers.
@@ -41,7 +48,7 @@ def connect(scheduler: str) -> Client:
         from dask.distributed import Client
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'oiio-msspl[farm]'") from error
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # tracebacks of what is said in a sentence here
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks repeat our messages
     try:
         return Client(scheduler_file=scheduler) if Path(scheduler).is_file() else Client(scheduler)
     except (OSError, ValueError) as error:
@@ -53,8 +60,14 @@ def fuse_frames(
 ) -> Iterator[tuple[Frame, dict[str, Any] | Exception | None]]:
     """Fuse frames on the workers.
 
+    Args:
+        client: of the cluster, whose workers see the same files.
+        stages: settings, which every worker gets.
+        frames: what to fuse. Frames end in any order.
+
     Yields:
-        A frame as soon as it ends, with its report as a dict, or why it failed, or None where its EXR was there.
+        Each frame as soon as it ends, with its report as a dict, the reason for its failure, or None if its EXR
+        already existed.
 
     Raises:
         InputError: there is no such model, or a worker takes several frames at a time.
@@ -63,18 +76,19 @@ def fuse_frames(
     from dask.distributed import CancelledError, KilledWorker, as_completed
     from distributed.comm import CommClosedError
 
-    neighbours = _most_on_a_machine(client)
+    neighbours = _most_workers_on_a_machine(client)
     if stages.model in (None, AUTO):
-        stages = replace(stages, model=WITHOUT_OIDN)  # the same for all frames and machines, whatever is installed
+        # `auto` depends on what a machine has installed. All frames of a shot need the same model.
+        stages = replace(stages, model=WITHOUT_OIDN)
     elif Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))
-    find_model(2, stages.model)  # if there is no such model, it is said here
+    find_model(2, stages.model)  # refuses an unknown model before any task is submitted
     address = client.scheduler.address
     run = uuid.uuid4().hex
     futures = {}
     for frame in frames:
         key = f"msspl-fuse-{frame.number}-{run}"
-        future = client.submit(_fuse, run, stages, _absolute(frame), neighbours, key=key, retries=RETRIES)
+        future = client.submit(_fuse_frame, run, stages, _absolute(frame), neighbours, key=key, retries=RETRIES)
         futures[future] = frame
     try:
         for future in as_completed(list(futures)):
@@ -91,8 +105,12 @@ def fuse_frames(
         client.cancel(list(futures))
 
 
-def _most_on_a_machine(client: Client) -> int:
-    """How many workers share the cores of one machine."""
+def _most_workers_on_a_machine(client: Client) -> int:
+    """The largest number of workers that share the cores of one machine.
+
+    Raises:
+        InputError: a worker takes several frames at a time.
+    """
     if not client.scheduler_info()["workers"]:
         log.warning("%s has no workers yet; waiting for the first", client.scheduler.address)
         client.wait_for_workers(1)
@@ -107,7 +125,7 @@ def _most_on_a_machine(client: Client) -> int:
 
 
 def _absolute(frame: Frame) -> Frame:
-    """Workers have other working directories."""
+    """The frame with absolute paths, because workers have other working directories."""
     assert frame.lr is not None and frame.hr is not None
     return replace(frame, lr=frame.lr.absolute(), hr=frame.hr.absolute(), output=frame.output.absolute())
 
@@ -117,25 +135,37 @@ def _absolute(frame: Frame) -> Frame:
 
 @lru_cache(maxsize=2)
 def _sessions(run: str) -> dict[Path, Session]:
-    """Models that this process has loaded for a run. A later run may mean another file by the same name."""
+    """The models that this worker has loaded for a run. A later run gets its own: a file may have been replaced."""
     return {}
 
 
-def _fuse(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict[str, Any] | Exception | None:
-    """Take a frame through all stages. A failure that another try could mend is raised, others are returned."""
+def _fuse_frame(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict[str, Any] | Exception | None:
+    """Take a frame through the three stages, in a worker.
+
+    Args:
+        run: identifies the run.
+        stages, frame: what to do, with absolute paths.
+        neighbours: workers on this machine, which share its cores.
+
+    Returns:
+        The frame's report as a dict; the caller's mistake, which another try can't mend; or None if the EXR exists.
+
+    Raises:
+        Exception: any other failure, which Dask answers with another try.
+    """
     from dask.system import CPU_COUNT
 
-    # When the run began there was no such EXR, or --overwrite was given.
+    # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
     if not stages.overwrite and frame.output.exists():
         return None
     threads = stages.threads or (max(1, CPU_COUNT // neighbours) if neighbours > 1 else 0)
-    # A preview without its EXR is what a worker left that died between the two.
+    # skip_existing lets this frame replace the preview that a dead worker left without its EXR.
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
     try:
-        ready = stages.read(frame)
-        report, fused = stages.fuse(ready, stages.session(ready))
+        loaded = stages.read(frame)
+        report, fused = stages.fuse(loaded, stages.session(loaded))
         stages.write(report, fused)
     except InputError as error:
-        # Dask also takes a worker for dead that it can't reach: another one may have been faster.
+        # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
         return None if not stages.overwrite and frame.output.exists() else error
     return report.as_dict()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on files: two EXRs in, one EXR and a preview out."""
+"""The main job on one frame: fuse a pair of EXRs into one EXR and its preview."""
 
 from __future__ import annotations
 
@@ -22,25 +22,34 @@ from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import MAX_MEMORY
-from oiio_msspl.jobs.report import FrameReport, _provenance, report_on
+from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 
 
 @dataclass(frozen=True)
 class InputOptions:
-    """How the two files are to be understood, where they do not say it themselves."""
+    """What the caller knows of the two files that they do not say themselves."""
 
     mapping: Mapping[str, Any] = field(default_factory=dict)
-    """The user's own layers by feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
+    """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
     view: str | None = None
     """View or view layer; the first one of each file if None."""
     lr_spp: float | None = None
+    """Samples per pixel of the LRHS; None to read them from its header."""
     hr_spp: float | None = None
+    """Samples per pixel of the HRLS; None to read them from its header."""
 
 
 def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
-    """Open and map both files. Of the LRHS, albedo and normal are welcome beside the beauty, and not missed.
+    """Open both files and map their layers to features.
+
+    Args:
+        lr_path, hr_path: the low-resolution and the high-resolution render.
+        inputs: mapping, view and spp.
+
+    Returns:
+        LRHS and HRLS. The LRHS has albedo and normal only if its file does.
 
     Raises:
         InputError: one of the files can't be used, or both are the same.
@@ -53,7 +62,11 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
 
 
 def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
-    """Map the LRHS. The user's mapping is the HRLS's: what it names need not be in the LRHS, or is another file."""
+    """Map the LRHS: its beauty, and albedo and normal where it has them.
+
+    The user's mapping is written for the HRLS. Of its entries only the beauty's applies here: the LRHS need not have
+    the other layers, and an entry may name an EXR of the HRLS's size.
+    """
     features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
     rgb_only = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
     return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
@@ -80,16 +93,24 @@ def fuse_files(
     Args:
         lr_path, hr_path: the low-resolution, high-spp render and the high-resolution, low-spp render of one frame.
         output: EXR to write.
-        inputs, write: how files are understood and stored.
-        model: name of a shipped model, a family of them (``paper``) or an ONNX file; None or ``auto``: see
+        inputs: mapping, view and spp of the two files.
+        write: layout, compression, pixel type and layers of the result.
+        model: a shipped model, a family of models (``paper``), or an ONNX file. None or ``auto`` chooses one, see
             :func:`oiio_msspl.model.catalogue.find_model`.
+        device: a key of :data:`oiio_msspl.model.session.PROVIDERS`, such as ``cpu`` or ``cuda``.
+        threads: CPU threads; 0 for one on each core.
+        max_memory: bytes that the process should stay below; tiles shrink to fit.
         preview_path: PNG to write, or None.
-        view_transform: OpenColorIO view of the preview; None for the paper's sRGB curve.
+        view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
         progress: called with (tiles done, tiles in all).
 
+    Returns:
+        What was read, fused and written.
+
     Raises:
-        InputError, MssplError: see their messages; nothing was written.
+        InputError: a file, an option or the pair can't be used. Nothing was written.
+        MssplError: the EXR can't be written. Nothing was written.
     """
     start = time.perf_counter()
     output = check_target(output, overwrite=overwrite)
@@ -102,7 +123,7 @@ def fuse_files(
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
-    dropped_channels(hr.file, hr.beauty_channels, write.layers)  # raises before any work if a layer is missing
+    dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
     session = Session(find_model(align(lr, hr).scale, model), device, threads)
     opened = time.perf_counter()
 
@@ -122,14 +143,14 @@ def fuse_files(
 
 
 def write_frame(report: FrameReport, fused: FusedFrame, options: WriteOptions, *, overwrite: bool) -> None:
-    """Write the EXR that the report names, and add what there is to say about it."""
+    """Write the EXR that the report names, and add the writer's warnings to the report."""
     report.warnings += write_fused(
         report.output,
         report.hr.file,
         report.hr.beauty_channels,
         fused.rgb,
         fused.alpha,
-        _provenance(report),
+        provenance(report),
         options,
         error=fused.error,
         overwrite=overwrite,
@@ -137,7 +158,10 @@ def write_frame(report: FrameReport, fused: FusedFrame, options: WriteOptions, *
 
 
 def write_frame_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, overwrite: bool) -> None:
-    """Write the PNG that the report names, if any. A frame without its preview is still a frame: that is a warning."""
+    """Write the PNG that the report names, if any.
+
+    A frame is good without its preview, so a failure is added to the report as a warning.
+    """
     if report.preview is None:
         return
     windows = (report.hr.data_window, report.hr.display_window)

@@ -1,73 +1,148 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot as an Open Job Description job: its template, and the values of its parameters, in the files of a job bundle.
+"""A shot as an Open Job Description job: a bundle with the job's template and the values of its parameters.
 
-A task is ``msspl-fuse`` on a chunk of the frames. Arguments are a list that no shell reads, so that names may hold
-spaces and quotes. Paths are parameters, so that a farm can map and copy them.
+Each task runs ``msspl-fuse`` on a chunk of the frames. Its arguments are a list that no shell reads, so names may
+contain spaces and quotes. Paths are job parameters, which a farm can map to its own folders or copy.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, replacing
-from oiio_msspl.jobs.sequence import Shot, format_frames
+from oiio_msspl.exr.preview import check_view
+from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
+from oiio_msspl.jobs.shot_checks import check_no_input
+from oiio_msspl.model.catalogue import AUTO, WITHOUT_OIDN, find_model, shipped_models
+from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.session import PROVIDERS
 
-#: Seconds that msspl-fuse gets between SIGTERM and SIGKILL, to end the frame that is being written.
+#: Seconds between SIGTERM and SIGKILL, in which msspl-fuse finishes the frame that it is writing.
 GRACE = 120
 
-#: What a job parameter may hold (Open Job Description 2023-09).
+#: The most characters that a job parameter may have (Open Job Description 2023-09).
 _LONGEST = 1024
 
-#: Of the files of a bundle: Deadline Cloud's names, and the values again as ``openjd run`` reads them.
+#: Files of a bundle. Deadline Cloud prescribes the first two names; ``openjd run`` reads the values from the third.
 TEMPLATE, VALUES, OPENJD_VALUES = "template.json", "parameter_values.json", "openjd_values.json"
+
+
+@dataclass(frozen=True)
+class Job:
+    """A shot described as a job."""
+
+    shot: Shot
+    template: dict[str, Any]
+    """The Open Job Description template."""
+    values: dict[str, Any]
+    """The value of each job parameter."""
+
+    @property
+    def missing(self) -> list[tuple[str, list[int]]]:
+        """Each pattern that lacks files of the shot, and the frames. Their tasks fail unless the files appear."""
+        sides = ((self.shot.lr, "lr"), (self.shot.hr, "hr"))
+        frames = [(str(found.pattern), [f.number for f in self.shot.frames if not getattr(f, k)]) for found, k in sides]
+        return [(pattern, sorted(numbers)) for pattern, numbers in frames if numbers]
+
+    @property
+    def existing(self) -> int:
+        """How many frames have a result already. Their tasks skip them."""
+        return sum(frame.output.exists() for frame in self.shot.frames)
 
 
 def make_job(
     lr: Path,
     hr: Path,
     output: Path,
-    shot: Shot,
     *,
+    frames: str | Iterable[int] | None = None,
+    model: str | None = None,
+    map_file: Path | None = None,
+    device: str = "cpu",
+    view: str | None = None,
     options: Sequence[str] = (),
-    files: dict[str, Path] | None = None,
     chunk: int = 10,
     timeout: int = 1800,
-) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Describe a shot as a job.
+) -> Job:
+    """Describe a shot as a job. A mistake that would fail every task is found here.
 
     Args:
-        lr, hr, output: the folders or patterns that ``shot`` was found by.
-        shot: which frames; those without a partner are left in, since it may come before their task does.
-        options: more arguments of ``msspl-fuse``, the same for all frames.
-        files: options of ``msspl-fuse`` (``--model``) that name a file.
-        chunk: frames a task.
-        timeout: seconds a frame.
+        lr, hr, output, frames: as in :func:`oiio_msspl.jobs.sequence.find_shot`. Frames without a partner are part of
+            the job, because the partner may exist when their task runs.
+        model: as in :func:`oiio_msspl.fuse_files`. None and ``auto`` mean the model that runs on every machine, because
+            all frames of a shot need the same one.
+        map_file: TOML file with the user's mapping.
+        device: a key of :data:`oiio_msspl.model.session.PROVIDERS`. It need not be usable on this machine.
+        view: None, or the OpenColorIO view of the previews.
+        options: more arguments of ``msspl-fuse``, for all frames. They are not checked.
+        chunk: frames per task.
+        timeout: seconds per frame.
 
     Returns:
-        The template, and the value of each job parameter.
+        The shot and its job.
 
     Raises:
-        InputError: something that a job can't hold.
+        InputError: a path, a file or an option can't be used, no frame has both renders, or a job can't contain it.
     """
+    if not (is_sequence(lr) or is_sequence(hr)):
+        raise InputError(f"{lr}: a job is for a shot: give folders, or patterns such as lr.####.exr")
+    if device not in PROVIDERS:
+        raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
+    if view is not None:
+        check_view(view)
+    options = [*(["--device", device] if device != "cpu" else []), *(["--view", view] if view else []), *options]
+    files = {"--map-file": map_file} if map_file else {}
+    name = WITHOUT_OIDN if model is None or model == AUTO else model
+    if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in SCALES)}:
+        options += ["--model", name]
+    else:
+        files["--model"] = find_model(0, name)
+        Contract.of_file(files["--model"])
+
+    shot = find_shot(lr, hr, output, frames)
+    if not any(frame.lr and frame.hr for frame in shot.frames):
+        raise InputError(f"no frame is in both {shot.lr.pattern} and {shot.hr.pattern}; nothing to submit")
+    check_no_input(shot)
+    folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
+    if not folder.is_dir():
+        raise InputError(f"{output}: the folder {folder} does not exist; create it first")
+    return _describe(lr, hr, output, shot, options, files, chunk, timeout)
+
+
+def _describe(
+    lr: Path,
+    hr: Path,
+    output: Path,
+    shot: Shot,
+    options: Sequence[str],
+    files: dict[str, Path],
+    chunk: int,
+    timeout: int,
+) -> Job:
+    """The job of a shot that was checked. ``files`` are options of ``msspl-fuse`` that name a file."""
     parameters: list[dict[str, Any]] = []
     values: dict[str, Any] = {}
 
     def add(name: str, value: str | int, description: str, **definition: Any) -> str:
+        """Define a job parameter and return the text that stands for its value."""
         if len(str(value)) > _LONGEST:
-            raise InputError(f"{name} has more than the {_LONGEST} characters that a job parameter may: {value}")
+            raise InputError(f"{name} has more than the {_LONGEST} characters that a job parameter may have: {value}")
         parameters.append({"name": name, "description": description, **definition})
         values[name] = value
         return f"{{{{Param.{name}}}}}"
 
     def add_sequence(name: str, path: Path, is_folder: bool, what: str, flow: str) -> str:
-        # A pattern is no file that a farm could copy; its folder is.
+        """Define two parameters, folder and pattern: a farm can copy a folder, but not a pattern."""
         folder = str((path if is_folder else path.parent).absolute())
         directory = add(f"{name}Folder", folder, what, type="PATH", objectType="DIRECTORY", dataFlow=flow)
-        pattern = add(f"{name}Name", "" if is_folder else path.name, "Pattern in it; empty: all of it", type="STRING")
+        pattern = add(
+            f"{name}Name", "" if is_folder else path.name, "Pattern in the folder; empty for all of it", type="STRING"
+        )
         return f"{directory}/{pattern}"
 
     arguments = [
@@ -76,11 +151,11 @@ def make_job(
         "--output",
         add_sequence("Out", output, shot.output.folder == output, "Fused frames", "OUT"),
     ]
-    # Sorted, because ranges of Open Job Description are; their step is a colon.
+    # Open Job Description writes ranges in rising order, and their step with a colon.
     numbers = format_frames(sorted(frame.number for frame in shot.frames)).replace("x", ":")
-    frames = add("Frames", numbers, "Frames of the shot: 1001-1100 or 1001-1099:2,1200", type="STRING")
-    size = add("FramesPerTask", chunk, "Frames of a chunk, which is a task", type="INT", minValue=1)
-    for option, path in (files or {}).items():
+    frame_range = add("Frames", numbers, "Frames of the shot: 1001-1100 or 1001-1099:2,1200", type="STRING")
+    size = add("FramesPerTask", chunk, "Frames per task", type="INT", minValue=1)
+    for option, path in files.items():
         name = option.removeprefix("--").title().replace("-", "")
         file = add(name, str(path.absolute()), f"{option} of msspl-fuse", type="PATH", objectType="FILE", dataFlow="IN")
         arguments += [option, file]
@@ -93,7 +168,7 @@ def make_job(
                 {
                     "name": "Frame",
                     "type": "CHUNK[INT]",
-                    "range": frames,
+                    "range": frame_range,
                     "chunks": {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"},
                 }
             ]
@@ -116,14 +191,14 @@ def make_job(
         "parameterDefinitions": parameters,
         "steps": [step],
     }
-    return template, values
+    return Job(shot, template, values)
 
 
-def write_bundle(folder: Path, template: dict[str, Any], values: dict[str, Any]) -> None:
-    """Write a folder that ``openjd run`` and Deadline Cloud take a job from.
+def write_bundle(folder: Path, job: Job) -> None:
+    """Write a new folder from which ``openjd run`` and Deadline Cloud read the job.
 
     Raises:
-        InputError: it exists already, or can't be made here.
+        InputError: the folder exists, or its parent is missing or read-only.
         MssplError: the file system refused.
     """
     check_folder(folder)
@@ -133,14 +208,14 @@ def write_bundle(folder: Path, template: dict[str, Any], values: dict[str, Any])
         raise InputError(f"{folder}: exists; name a new folder for the bundle") from error
     except OSError as error:
         raise MssplError(f"{folder}: can't be made ({error.strerror})") from error
-    for_deadline = {"parameterValues": [{"name": name, "value": value} for name, value in values.items()]}
-    for name, content in ((VALUES, for_deadline), (OPENJD_VALUES, values), (TEMPLATE, template)):
+    for_deadline = {"parameterValues": [{"name": name, "value": value} for name, value in job.values.items()]}
+    for name, content in ((VALUES, for_deadline), (OPENJD_VALUES, job.values), (TEMPLATE, job.template)):
         with replacing(folder / name) as temporary:
             temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
 def _literal(text: str) -> str:
-    """Text of the template itself; there is no other way to write two braces there."""
+    """Text that a template takes as it is. Two braces can't be escaped in a template, so they are refused."""
     if "{{" in text:
         raise InputError(f"{text!r}: a job template takes '{{{{' for the start of a parameter")
     return text

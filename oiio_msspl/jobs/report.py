@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on files: two EXRs in, one EXR and a preview out."""
+"""What is reported of a fused frame: its inputs, the layers used, warnings, and the attributes written into the EXR."""
 
 from __future__ import annotations
 
@@ -10,29 +10,34 @@ from typing import Any
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
 
 
 @dataclass
 class FrameReport:
-    """What was done, for the user and for machines."""
+    """What was done with one pair, for people and, as :meth:`as_dict`, for programs."""
 
     lr: MappedRender
     hr: MappedRender
     scale: int
     model: str
     provider: str
+    """The ONNX Runtime execution provider that ran the model."""
     output: Path
     preview: Path | None
+    """The PNG beside the EXR; None if none was written."""
     repaired: dict[str, int]
+    """Number of repaired values by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
     warnings: list[str]
     tiles: int
     seconds: dict[str, float]
-    """Wall time of ``read`` (headers and model), ``fuse`` (reading pixels included), ``network`` in it, ``write``."""
+    """Wall time in seconds: ``read`` opens both files and loads the model, ``fuse`` reads pixels and fuses them,
+    ``network`` is the part of ``fuse`` that the model's network took, and ``write`` writes EXR and preview."""
     features: frozenset[str]
-    """What the model reads of the HRLS."""
-    low_aovs: tuple[str, ...] = ()
-    """What it may read of the LRHS beside colour, if it is there."""
+    """Features of the HRLS that the model reads."""
+    lrhs_aovs: tuple[str, ...] = ()
+    """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -42,7 +47,10 @@ class FrameReport:
         return self.lr.spp / self.scale**2 + self.hr.spp
 
     def aovs(self) -> list[dict[str, str]]:
-        """As :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table`; but what the model does not read is ``unused``."""
+        """The rows of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` for the HRLS.
+
+        A feature that the model does not read has the status ``unused``.
+        """
         rows = self.hr.table()
         for row in rows:
             if row["feature"] not in {*self.features, "alpha"}:
@@ -50,11 +58,12 @@ class FrameReport:
                 row |= {"status": "unused"}
         return rows
 
-    def found_low_aovs(self) -> dict[str, str]:
-        """Those of ``low_aovs`` that the LRHS has, and the layers that they come from."""
-        return {name: self.lr.features[name].text for name in self.low_aovs if name in self.lr.features}
+    def found_lrhs_aovs(self) -> dict[str, str]:
+        """The features of ``lrhs_aovs`` that the LRHS has, with the layer of each."""
+        return {name: self.lr.features[name].text for name in self.lrhs_aovs if name in self.lr.features}
 
     def as_dict(self) -> dict[str, Any]:
+        """The report as JSON values."""
         return {
             "lrhs": self.lr.name,
             "hrls": self.hr.name,
@@ -67,7 +76,7 @@ class FrameReport:
             "model": self.model,
             "provider": self.provider,
             "aovs": self.aovs(),
-            "lrhs_aovs": self.found_low_aovs(),
+            "lrhs_aovs": self.found_lrhs_aovs(),
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "warnings": self.warnings,
@@ -80,7 +89,7 @@ class FrameReport:
 def report_on(
     lr: MappedRender, hr: MappedRender, session: Session, fused: FusedFrame, output: Path, preview_path: Path | None
 ) -> FrameReport:
-    """The report of a frame that is fused and not yet written."""
+    """The report of a frame that is fused and not yet written: ``seconds`` is still empty."""
     return FrameReport(
         lr=lr,
         hr=hr,
@@ -90,31 +99,30 @@ def report_on(
         output=output,
         preview=preview_path,
         repaired=fused.repaired,
-        warnings=[*_spp_warnings(lr, hr, session), *fused.warnings],
+        warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings],
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.features),
-        low_aovs=session.lrhs_aovs,
+        lrhs_aovs=session.lrhs_aovs,
     )
 
 
-def _spp_warnings(lr: MappedRender, hr: MappedRender, session: Session) -> list[str]:
+def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
+    """Warn of spp that the method or the model was not made for."""
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp <= hr.spp:
         warnings.append(
             f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution render"
         )
     for name, key, spp in (("HRLS", "hrls", hr.spp), ("LRHS", "lrhs", lr.spp)):
-        seen = session.contract.training_spp.get(key)
-        if spp is not None and seen and not seen[0] <= spp <= seen[1]:
-            warnings.append(
-                f"the {name} has {spp:g} spp; {session.contract.name} was trained on {seen[0]} to {seen[1]}"
-            )
+        trained = contract.training_spp.get(key)
+        if spp is not None and trained and not trained[0] <= spp <= trained[1]:
+            warnings.append(f"the {name} has {spp:g} spp; {contract.name} was trained on {trained[0]} to {trained[1]}")
     return warnings
 
 
-def _provenance(report: FrameReport) -> dict[str, str]:
-    """Attributes of the fused part: what it was made from."""
+def provenance(report: FrameReport) -> dict[str, str]:
+    """Attributes of the fused part: model, inputs, spp and layers that the frame was made from."""
     spp = report.spp_avg
     return {
         "msspl/version": __version__,

@@ -1,5 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which files are the frames of a shot: numbered EXRs, by pattern or folder, paired by frame number."""
+"""Which files are the frames of a shot: numbered EXRs, found by pattern or folder and paired by frame number.
+
+fileseq reads padding, frame ranges and the sequences of a folder. Where its reading differs from what compositors
+expect, a comment says so.
+"""
 
 from __future__ import annotations
 
@@ -9,33 +13,47 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import fileseq
+
 from oiio_msspl.errors import InputError
 
-#: Where a file name's frame number stands, as Nuke, Katana, Python and Houdini write it.
-_FIELD = re.compile(r"#+|@+|%\d*d|\$F\d*")
+#: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq understands each of these, but
+#: it splits the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no
+#: number in ``a.####_v2.exr``, it takes ``a.#.##.exr`` for subframes, and it refuses a folder named ``lr#1``.
+_NUMBER_FIELD = re.compile(r"#+|@+|%\d*d|\$F\d*")
+
+#: One digit for each ``#``, as in Nuke, Katana and RV. fileseq's default is four digits for each.
+_PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
 
 
 @dataclass(frozen=True)
 class Pattern:
-    """Names of numbered files."""
+    """The names of a sequence's files: ``head``, the padded frame number, ``tail``."""
 
     folder: Path
     head: str
-    width: int
-    """Digits that the number is padded to."""
+    number: fileseq.FileSequence
+    """The padding (``####``) as a sequence of its own, which formats frame numbers."""
     tail: str
 
+    @classmethod
+    def padded(cls, folder: Path, head: str, width: int, tail: str) -> Pattern:
+        """A pattern whose numbers have at least ``width`` digits."""
+        return cls(folder, head, fileseq.FileSequence("#" * width, pad_style=_PAD_STYLE), tail)
+
     def path(self, number: int) -> Path:
-        return self.folder / f"{self.head}{number:0{self.width}d}{self.tail}"
+        """The file of one frame."""
+        return self.folder / f"{self.head}{self.number.frame(number)}{self.tail}"
 
     @property
     def base(self) -> str:
-        """What a sequence is called: the name without number, separators and extension."""
+        """The sequence's name without number, separators and extension."""
         return (self.head.rstrip("._- ") + self.tail).removesuffix(".exr")
 
     @property
     def name(self) -> str:
-        return f"{self.head}{'#' * self.width}{self.tail}"
+        """The pattern without its folder, written with ``#``."""
+        return f"{self.head}{'#' * self.number.zfill()}{self.tail}"
 
     def __str__(self) -> str:
         return str(self.folder / self.name)
@@ -51,7 +69,7 @@ class Sequence:
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame of a shot."""
+    """One frame of a shot. ``lr`` or ``hr`` is None if that render is missing."""
 
     number: int
     lr: Path | None
@@ -61,7 +79,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class Shot:
-    """What is to be fused: frames in the order in which they are to be done."""
+    """Two sequences and the frames to fuse, in the order in which they are fused."""
 
     lr: Sequence
     hr: Sequence
@@ -70,20 +88,23 @@ class Shot:
 
 
 def is_sequence(path: Path) -> bool:
-    """Is this a folder or a pattern, and not a file?"""
-    return path.is_dir() or (_FIELD.search(path.name) is not None and not path.exists())
+    """Whether this is a folder or a pattern, and not a single file."""
+    return path.is_dir() or (_NUMBER_FIELD.search(path.name) is not None and not path.exists())
 
 
 def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | Iterable[int] | None = None) -> Shot:
     """Pair the frames of two sequences.
 
     Args:
-        lr, hr: folders, or patterns such as ``lr.####.exr``, ``lr.%04d.exr`` and ``lr.@@@@.exr``.
-        output: a pattern, or a folder that gets files named as the HRLS's.
-        frames: frame numbers, or a range such as ``1001-1100x2,1200``; None for every frame that either sequence has.
+        lr, hr: folders, or patterns such as ``lr.####.exr``, ``lr.%04d.exr``, ``lr.@@@@.exr`` and ``lr.$F4.exr``.
+        output: a pattern, or a folder, whose files are then named as those of the HRLS.
+        frames: frame numbers, or a range such as ``1001-1100x2,1200``; None for every frame of either sequence.
+
+    Returns:
+        The shot. A frame that only one of the sequences has is included.
 
     Raises:
-        InputError: no frames, no pattern, or a folder whose sequences can't be told apart.
+        InputError: there are no frames, a pattern can't be read, or several sequences in a folder could be meant.
     """
     lows, highs = _sequences(Path(lr)), _sequences(Path(hr))
     low, high = _choose(lows, highs, Path(lr), Path(hr))
@@ -93,18 +114,22 @@ def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | 
 
 
 def format_frames(numbers: Iterable[int]) -> str:
-    """``1001-1010,1020-1030x2``"""
-    import fileseq
-
+    """Frame numbers as a range: ``1001-1010,1020-1030x2``."""
     return str(fileseq.framesToFrameRange(numbers))
 
 
 def parse_frames(frames: str | Iterable[int]) -> list[int]:
-    import fileseq
+    """Frame numbers, each once, in the order given.
 
+    Args:
+        frames: numbers, or a range such as ``1001-1100x2,1200``.
+
+    Raises:
+        InputError: the range can't be read, names no frame, or names fractions of frames.
+    """
     if isinstance(frames, str):
         try:
-            # A step is x2, or :2 as Open Job Description and Houdini write it; fileseq has another meaning for that.
+            # Open Job Description and Houdini write a step as :2. fileseq takes that for a staggered range.
             parsed = list(fileseq.FrameSet(frames.replace(":", "x")))
         except ValueError as error:
             raise InputError(f"--frames {frames!r}: write it as 1001-1100, 1001-1100x2 or 1001,1005-1010") from error
@@ -118,19 +143,21 @@ def parse_frames(frames: str | Iterable[int]) -> list[int]:
 
 
 def parse_pattern(path: Path) -> Pattern:
-    import fileseq
+    """Read a pattern such as ``lr.####.exr``.
 
-    fields = list(_FIELD.finditer(path.name))
+    Raises:
+        InputError: the name has no frame number, or several.
+    """
+    fields = list(_NUMBER_FIELD.finditer(path.name))
     if len(fields) != 1:
         raise InputError(f"{path}: a pattern has its frame number in one place, such as name.####.exr or name.%04d.exr")
     start, end = fields[0].span()
-    # One digit a sign, as Nuke, Katana and RV read it; fileseq's own default takes # for four.
-    width = fileseq.FileSequence.getPaddingNum(fields[0].group(), pad_style=fileseq.constants.PAD_STYLE_HASH1)
-    return Pattern(path.parent, path.name[:start], width, path.name[end:])
+    number = fileseq.FileSequence(fields[0].group(), pad_style=_PAD_STYLE)
+    return Pattern(path.parent, path.name[:start], number, path.name[end:])
 
 
 def _sequences(path: Path) -> list[Sequence]:
-    """The sequence that a pattern means, or all of a folder."""
+    """The sequence that a pattern names, or all sequences of a folder."""
     if path.is_dir():
         found = _sequences_in(path)
         if not found:
@@ -141,35 +168,44 @@ def _sequences(path: Path) -> list[Sequence]:
     pattern = parse_pattern(path)
     if not pattern.folder.is_dir():
         raise InputError(f"{path}: there is no folder {pattern.folder}")
-    files = {}
-    for name in os.listdir(pattern.folder):
-        number = name.removeprefix(pattern.head).removesuffix(pattern.tail)
-        # Only names that the pattern itself would give: lr.####.exr means lr.0007.exr, not lr.7.exr.
-        if re.fullmatch(r"-?\d+", number) and pattern.path(int(number)).name == name:
-            files[int(number)] = pattern.folder / name
+    files = _files_of(pattern)
     if not files:
         there = ", ".join(str(s.pattern) for s in _sequences_in(pattern.folder)[:6]) or "no numbered EXRs"
         raise InputError(f"{path}: no file has such a name; the folder has {there}")
     return [Sequence(pattern, files)]
 
 
-def _sequences_in(folder: Path) -> list[Sequence]:
-    """The sequences of EXRs in a folder. Hidden files are none: they may be half written."""
-    import fileseq
+def _files_of(pattern: Pattern) -> dict[int, Path]:
+    """The files that a pattern names: ``lr.####.exr`` means lr.0007.exr and not lr.7.exr.
 
+    fileseq's ``findSequenceOnDisk`` is not used: it takes ``[`` in a name for a wildcard, finds nothing where the
+    number comes last (``hr.exr.####``), and fails where another padding is there as well.
+    """
+    files = {}
+    for name in os.listdir(pattern.folder):
+        text = name.removeprefix(pattern.head).removesuffix(pattern.tail)
+        if re.fullmatch(r"-?\d+", text) and pattern.path(int(text)).name == name:
+            files[int(text)] = pattern.folder / name
+    return files
+
+
+def _sequences_in(folder: Path) -> list[Sequence]:
+    """The sequences of EXRs in a folder, by name. Hidden files are left out because they may be half written."""
     names = [n for n in os.listdir(folder) if n.lower().endswith(".exr") and not n.startswith(".")]
     by_name: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
-    for found in fileseq.FileSequence.findSequencesInList(names):
+    for found in fileseq.FileSequence.findSequencesInList(names, pad_style=_PAD_STYLE):
         if found.frameSet() is None:
             continue
         for number, name in zip(map(int, found.frameSet() or ()), map(str, found), strict=True):
             head, width = found.basename(), found.zfill()
-            if number < 0 and head and head[-1].isalnum():  # shot-0001.exr: a hyphen, not a sign
+            # fileseq reads shot-0001.exr as frame -1. After a letter or digit the hyphen is a separator.
+            if number < 0 and head and head[-1].isalnum():
                 head, number, width = f"{head}-", -number, width - 1
+            # fileseq gives a sequence for each padding. One name with two paddings is refused below.
             by_name.setdefault((head, found.extension()), []).append((number, width, name))
     sequences = []
     for (head, tail), members in sorted(by_name.items()):
-        pattern = Pattern(folder, head, min(width for _, width, _ in members), tail)
+        pattern = Pattern.padded(folder, head, min(width for _, width, _ in members), tail)
         files = {number: folder / name for number, _, name in members}
         if len(files) < len(members):
             raise InputError(f"{pattern}: some numbers occur with and without zeros in front; give a pattern")
@@ -178,7 +214,7 @@ def _sequences_in(folder: Path) -> list[Sequence]:
 
 
 def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> tuple[Sequence, Sequence]:
-    """The two sequences that belong together: the only ones, or the only ones of the same name."""
+    """The two sequences that belong together: the only ones, or the only ones with the same name."""
     pairs = [(low, high) for low in lows for high in highs]
     if len(pairs) > 1:
         pairs = [(low, high) for low, high in pairs if low.pattern.base == high.pattern.base]
@@ -194,12 +230,13 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
 
 
 def _output_pattern(output: Path, hr: Pattern) -> Pattern:
-    if _FIELD.search(output.name) and not output.is_dir():
+    """The names of the fused frames."""
+    if _NUMBER_FIELD.search(output.name) and not output.is_dir():
         pattern = parse_pattern(output)
         if not pattern.tail.lower().endswith(".exr"):
             raise InputError(f"{output}: the results are EXRs; name them .exr")
         return pattern
     if output.suffix.lower() == ".exr" and not output.is_dir():
         raise InputError(f"{output}: one name for many frames; write {output.stem}.####.exr or name a folder")
-    # The HRLS may be named hr.exr.####; what is written must be known for an EXR.
-    return Pattern(output, hr.head, hr.width, hr.tail if hr.tail.lower().endswith(".exr") else f"{hr.tail}.exr")
+    # The HRLS may be named hr.exr.####. Programs know an EXR by its extension, so the result gets one.
+    return Pattern(output, hr.head, hr.number, hr.tail if hr.tail.lower().endswith(".exr") else f"{hr.tail}.exr")

@@ -86,7 +86,7 @@ class OidnFilter:
 
     def exact(self, images: Images, out: Array | None = None) -> Array:
         """The same by OIDN itself, in 32 bits."""
-        aovs = {name: images[name] for name in ("albedo", "normal") if name in images}
+        aovs: Images = {name: images[name] for name in ("albedo", "normal") if name in images}
         if not self._hdr:
             return np.clip(self._execute(aovs), 0, 1, out=out)
         radiance = decode_radiance(images["colour"], 1.0)

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""``msspl compare``."""
+
 from __future__ import annotations
 
 import json
@@ -8,7 +10,7 @@ from typing import Annotated
 
 import typer
 
-from msspl_cli import options, show
+from msspl_cli import console, options
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -19,21 +21,23 @@ EXAMPLES = """[bold]Examples[/bold]
 
 
 def compare(
-    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to judge.", show_default=False)],
+    images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to measure.", show_default=False)],
     reference: Annotated[
-        Path, typer.Option("--reference", "-r", metavar="EXR", help="What they should be.", show_default=False)
+        Path, typer.Option("--reference", "-r", metavar="EXR", help="The converged render.", show_default=False)
     ],
     error_map: Annotated[
         Path | None,
-        typer.Option(metavar="PNG", help="Write the first image's error as a picture (log RelMSE, dark is small)."),
+        typer.Option(metavar="PNG", help="Write a picture of the first image's error (log RelMSE; dark is small)."),
     ] = None,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     debug: options.Debug = False,
+    help_all: options.HelpAll = False,
 ) -> None:
-    """Measure images against a reference: PSNR (sRGB), RelMSE in both of the paper's conventions, SSIM.
+    """Measure images against a reference: PSNR (sRGB), RelMSE, SSIM.
 
-    Images smaller than the reference by x2, x4 or x8 are upsampled bicubically first.
+    RelMSE has two columns, one for each convention in the paper. Images smaller
+    than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
     from oiio_msspl.compare import check_error_map, compare_files, write_error_map
 
@@ -43,7 +47,7 @@ def compare(
     if error_map is not None:
         write_error_map(error_map, images[0], reference, overwrite=overwrite)
     if as_json:
-        # JSON has no infinity: equal pictures have no PSNR.
+        # The PSNR of equal pictures is infinite, which JSON can't express.
         rows = [{k: v if math.isfinite(v) else None for k, v in scores.items()} for scores in results]
         print(json.dumps([{"image": str(p), **row} for p, row in zip(images, rows, strict=True)], indent=2))
         return
@@ -58,4 +62,4 @@ def compare(
                 f"{scores['ssim']:.4f}",
             )
         )
-    show.table(table, "")
+    console.table(table, header=True, indent=0)

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""``msspl-fuse``."""
+
 from __future__ import annotations
 
 import json
@@ -11,12 +13,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from msspl_cli import options, show
-from msspl_cli.show_shot import ShotPrinter
+from msspl_cli import console, options
+from msspl_cli.shot_printer import ShotPrinter
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
     from contextlib import AbstractContextManager
 
     from dask.distributed import Client
@@ -39,8 +40,8 @@ EXAMPLES = """[bold]Examples[/bold]
 
 [bold]Exit code[/bold]
 
-  0: all is fused, or was there (--skip-existing). 2: a mistake in files or options. 1: any other failure, such as a
-  full disk. For a shot: 1 if any frame failed that way, otherwise 2 if any frame was not fused.
+  0: every frame is fused, or was there (--skip-existing). 2: a mistake in files or options. 1: any other failure, such
+  as a full disk. For a shot: 1 if any frame failed in that way, otherwise 2 if any frame was not fused.
 """
 
 
@@ -49,76 +50,187 @@ def fuse(
         Path,
         typer.Argument(
             metavar="LR",
-            help="Low-resolution, high-spp render: an EXR; of a shot a folder or a pattern (lr.####.exr, lr.%04d.exr).",
+            help="Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr.",
             show_default=False,
         ),
     ],
     hr: Annotated[
         Path,
-        typer.Argument(metavar="HR", help="High-resolution, low-spp render, likewise.", show_default=False),
+        typer.Argument(metavar="HR", help="High-resolution, low-spp render, in the same form.", show_default=False),
     ],
-    output: Annotated[
-        Path, typer.Option("--output", "-o", metavar="OUT", help="EXR, pattern or folder to write.", show_default=False)
-    ],
+    *,
+    # Input
     mapping: options.Map = [],  # noqa: B006
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
-    lr_spp: options.LrSpp = None,
-    hr_spp: options.HrSpp = None,
+    lr_spp: Annotated[
+        float | None,
+        typer.Option(
+            "--lr-spp",
+            min=0,
+            metavar="N",
+            help="Samples per pixel of LR, if its header does not say.",
+            rich_help_panel=options.INPUT,
+            hidden=True,
+        ),
+    ] = None,
+    hr_spp: Annotated[
+        float | None,
+        typer.Option(
+            "--hr-spp",
+            min=0,
+            metavar="N",
+            help="Samples per pixel of HR, if its header does not say.",
+            rich_help_panel=options.INPUT,
+            hidden=True,
+        ),
+    ] = None,
+    # Model
     model: Annotated[
-        str, typer.Option(help="auto, a family (paper), a shipped model (msspl models) or an ONNX file.")
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="auto, a family (paper), a shipped model (see msspl models) or an ONNX file.",
+            rich_help_panel=options.MODEL,
+        ),
     ] = "auto",
-    device: Annotated[str, typer.Option(help="cpu, cuda, tensorrt, openvino, coreml or directml.")] = "cpu",
-    threads: Annotated[int, typer.Option(min=0, max=1024, help="CPU threads; 0: one a core.")] = 0,
-    max_memory: Annotated[str, typer.Option(metavar="SIZE", help="Memory to stay below; tiles shrink to fit.")] = "3G",
-    layout: Annotated[str, typer.Option(help="spec, nuke or multilayer.")] = "spec",
+    device: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="cpu, cuda, tensorrt, openvino, coreml or directml.",
+            rich_help_panel=options.MODEL,
+        ),
+    ] = "cpu",
+    max_memory: Annotated[
+        str,
+        typer.Option(metavar="SIZE", help="Memory to stay below. Tiles shrink to fit.", rich_help_panel=options.MODEL),
+    ] = "3G",
+    threads: Annotated[
+        int,
+        typer.Option(
+            min=0,
+            max=1024,
+            metavar="N",
+            help="CPU threads. 0: one on each core.",
+            rich_help_panel=options.MODEL,
+            hidden=True,
+        ),
+    ] = 0,
+    # Output
+    output: Annotated[
+        Path,
+        typer.Option(
+            "--output",
+            "-o",
+            metavar="OUT",
+            help="EXR to write. For a shot: a pattern or a folder.",
+            show_default=False,
+            rich_help_panel=options.OUTPUT,
+        ),
+    ],
+    layout: Annotated[
+        str, typer.Option(metavar="NAME", help="spec, nuke or multilayer.", rich_help_panel=options.OUTPUT)
+    ] = "spec",
     layers: Annotated[
         list[str],
         typer.Option(
-            metavar="PATTERN", help="Pass on only these layers of HR (crypto*), or none. May be repeated. [all]"
+            metavar="PATTERN",
+            help="Copy only these layers of HR (crypto*), or none. May be repeated. \\[default: all]",
+            rich_help_panel=options.OUTPUT,
         ),
     ] = [],  # noqa: B006
     error_layer: Annotated[
-        bool, typer.Option("--error-layer", help="Add a layer 'error': how far off the model expects to be.")
+        bool,
+        typer.Option(
+            "--error-layer",
+            help="Add a layer 'error': the error that the model expects.",
+            rich_help_panel=options.OUTPUT,
+        ),
     ] = False,
     compression: Annotated[
-        str | None, typer.Option(help="Of the fused layer: zip, zips, piz, dwaa, ... [as the HR]")
+        str | None,
+        typer.Option(
+            metavar="NAME",
+            help="Compression of the fused layer: zip, zips, piz, dwaa, ... \\[default: as HR]",
+            rich_help_panel=options.OUTPUT,
+            hidden=True,
+        ),
     ] = None,
     half: Annotated[
-        bool | None, typer.Option("--half/--float", help="Pixel type of the fused layer. [as the HR]")
+        bool | None,
+        typer.Option(
+            "--half/--float",
+            help="Pixel type of the fused layer. \\[default: as HR]",
+            rich_help_panel=options.OUTPUT,
+            hidden=True,
+        ),
     ] = None,
-    preview: Annotated[bool, typer.Option(help="Write an sRGB PNG beside OUT.")] = True,
-    view: Annotated[str | None, typer.Option(metavar="VIEW", help="OpenColorIO view of the preview.")] = None,
+    preview: Annotated[
+        bool, typer.Option(help="Write an sRGB PNG beside OUT.", rich_help_panel=options.OUTPUT, hidden=True)
+    ] = True,
+    view: Annotated[
+        str | None,
+        typer.Option(
+            metavar="VIEW", help="OpenColorIO view of the preview.", rich_help_panel=options.OUTPUT, hidden=True
+        ),
+    ] = None,
     overwrite: options.Overwrite = False,
+    as_json: options.Json = False,
+    # Shot
     frames: Annotated[
-        str | None, typer.Option(metavar="RANGE", help="Of a shot: 1001-1100x2, 1001,1005-1010. [all]")
+        str | None,
+        typer.Option(
+            metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=options.SHOT
+        ),
     ] = None,
     skip_existing: Annotated[
-        bool, typer.Option("--skip-existing", help="Of a shot: leave frames that are there; resumes a run.")
+        bool,
+        typer.Option(
+            "--skip-existing", help="Skip frames that exist. This resumes a run.", rich_help_panel=options.SHOT
+        ),
     ] = False,
     report_file: Annotated[
-        Path | None, typer.Option("--report", metavar="FILE", help="Of a shot: JSON, kept up to date frame by frame.")
+        Path | None,
+        typer.Option(
+            "--report",
+            metavar="FILE",
+            help="JSON report, kept up to date frame by frame.",
+            rich_help_panel=options.SHOT,
+            hidden=True,
+        ),
     ] = None,
     progress: Annotated[
-        str | None, typer.Option(metavar="FORM", help="Of a shot: print lines for programs, openjd or json.")
+        str | None,
+        typer.Option(
+            metavar="FORM",
+            help="Print progress for programs: openjd or json.",
+            rich_help_panel=options.SHOT,
+            hidden=True,
+        ),
     ] = None,
     scheduler: Annotated[
         str | None,
         typer.Option(
-            metavar="ADDRESS", help="Of a shot: fuse on the workers of this Dask scheduler (tcp://HOST:8786)."
+            metavar="ADDRESS",
+            help="Fuse on the workers of this Dask scheduler (tcp://HOST:8786).",
+            rich_help_panel=options.SHOT,
+            hidden=True,
         ),
     ] = None,
     verbose: options.Verbose = 0,
     quiet: options.Quiet = False,
-    as_json: options.Json = False,
     debug: options.Debug = False,
+    help_all: options.HelpAll = False,
 ) -> None:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
 
-    OUT gets the fused beauty first and every other layer of HR as it was. The scale (x2, x4, x8) follows from the two
-    display windows; layers are found whatever the renderer calls them, and what was used is printed.
+    OUT gets the fused beauty first and then every other layer of HR, unchanged.
+    The scale (x2, x4, x8) follows from the two display windows. Layers are found
+    under the names that renderers give them; --map names others.
 
-    With folders or patterns, a shot: frames are paired by number, and a bad one does not stop the others.
+    With folders or patterns it fuses a shot: frames are paired by number, and a
+    bad frame does not stop the others.
     """
     options.set_up_logging(verbose, quiet)
     from oiio_msspl.jobs.frame import fuse_files
@@ -138,7 +250,7 @@ def fuse(
         from oiio_msspl.jobs.shot import fuse_shot
 
         if debug:
-            logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)
+            logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)  # the traceback of each failed frame
         printer = ShotPrinter(verbose, quiet, as_json, progress)
         try:
             with _cluster(scheduler) as client:
@@ -168,14 +280,20 @@ def fuse(
         if value:
             raise InputError(f"{option} is for shots: give folders, or patterns such as lr.####.exr")
     start = time.perf_counter()
-    report = fuse_files(
-        lr,
-        hr,
-        output,
-        preview_path=output.with_suffix(".png") if preview and output.name else None,
-        progress=_bar(quiet),
-        **common,
-    )
+    with console.ProgressBar(shown=not quiet and not verbose) as bar:
+
+        def show_tile(done: int, count: int) -> None:
+            logging.info("tile %d of %d", done, count)
+            bar.update("fusing", done, count)
+
+        report = fuse_files(
+            lr,
+            hr,
+            output,
+            preview_path=output.with_suffix(".png") if preview and output.name else None,
+            progress=show_tile,
+            **common,
+        )
     if as_json:
         print(json.dumps(report.as_dict(), indent=2))
     elif not quiet:
@@ -186,6 +304,7 @@ def fuse(
 
 
 def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
+    """A client of the Dask cluster that ``--scheduler`` names, or None without one."""
     if scheduler is None:
         return nullcontext()
     from oiio_msspl.jobs.dask_cluster import connect
@@ -193,33 +312,20 @@ def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
     return connect(scheduler)
 
 
-def _bar(quiet: bool) -> Callable[[int, int], None]:
-    """A progress bar on a terminal; in a pipe or a log, lines if they are asked for (-v)."""
-    if quiet or not sys.stderr.isatty():
-        return lambda done, count: logging.info("tile %d of %d", done, count)
-    bar: Any = None
-
-    def update(done: int, count: int) -> None:
-        nonlocal bar
-        if bar is None:
-            bar = typer.progressbar(length=count, label="fusing", file=sys.stderr)
-        bar.update(1)
-        if done == count:
-            bar.render_finish()
-
-    return update
-
-
 def _print(report: FrameReport, seconds: float) -> None:
+    """Print which layers were used, what was repaired, and the time of each step."""
     spp = report.spp_avg
     print(f"{report.hr.renderer} pair at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
-    show.aov_table(report.aovs(), report.hr.notes)
-    if of_lrhs := report.found_low_aovs():
-        print("  of the LRHS, too: " + ", ".join(f"{name} {layer}" for name, layer in of_lrhs.items()))
+    console.aov_table(report.aovs(), report.hr.notes)
+    if lrhs_aovs := report.found_lrhs_aovs():
+        print("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     if report.repaired:
-        what = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())
-        print(f"repaired values that were NaN, infinite or negative: {what}")
-    tiles = f", {report.tiles} tiles" if report.tiles > 1 else ""
-    network = report.seconds["network"]
-    print(f"{report.model} on {report.provider}{tiles}: {seconds:.1f} s, of which {network:.1f} s in the network")
-    print(f"wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))
+        counts = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())
+        print(f"Repaired values that were NaN, infinite or negative: {counts}")
+    provider = report.provider.removesuffix("ExecutionProvider")
+    where = "on the CPU" if provider == "CPU" else f"on {provider}"
+    tiles = f" in {report.tiles} tiles" if report.tiles > 1 else ""
+    steps = {"read": "loading", "fuse": "fusing", "write": "writing"}
+    times = ", ".join(f"{report.seconds[key]:.1f} s {step}" for key, step in steps.items())
+    print(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
+    print(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))

@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""``msspl inspect``."""
+
 from __future__ import annotations
 
 import json
@@ -7,7 +9,7 @@ from typing import Annotated
 
 import typer
 
-from msspl_cli import options, show
+from msspl_cli import console, options
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -24,10 +26,11 @@ def inspect(
     view_layer: options.ViewLayer = None,
     as_json: options.Json = False,
     debug: options.Debug = False,
+    help_all: options.HelpAll = False,
 ) -> None:
-    """Say what a render holds, and which of its layers the network would read.
+    """Print what a render contains, and which of its layers the model would read.
 
-    A file that can't be used is explained; the exit code is then 2.
+    If a file can't be used, the reason is printed and the exit code is 2.
     """
     from oiio_msspl.inspection import inspect_file
 
@@ -42,7 +45,7 @@ def inspect(
             for line in inspection.facts:
                 print(f"  {line}")
             if inspection.render is not None:
-                show.aov_table(inspection.render.table(), inspection.render.notes)
+                console.aov_table(inspection.render.table(), inspection.render.notes)
                 if inspection.passed_through:
                     print(f"  passed through: {', '.join(inspection.passed_through)}")
             for problem in inspection.problems:

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
+"""``msspl models``."""
+
 from __future__ import annotations
 
 import json
 from typing import Any
 
-from msspl_cli import options, show
+from msspl_cli import console, options
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -14,8 +16,8 @@ EXAMPLES = """[bold]Examples[/bold]
 """
 
 
-def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
-    """List the models inside the package, and the devices that can run them."""
+def models(as_json: options.Json = False, debug: options.Debug = False, help_all: options.HelpAll = False) -> None:
+    """List the models in the package, and the devices on which they can run."""
     from oiio_msspl.model.catalogue import shipped_models
     from oiio_msspl.model.contract import Contract
     from oiio_msspl.model.session import PROVIDERS, usable_devices
@@ -37,9 +39,9 @@ def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
     if as_json:
         print(json.dumps({"models": rows, "devices": devices}, indent=2))
         return
-    header = ("model", "scale", "size", "trained at LRHS spp", "HRLS spp", "needs")
+    header = ("model", "scale", "size", "trained LRHS spp", "trained HRLS spp", "needs")
     spans = [["{}-{}".format(*row["training_spp"].get(key, ("?", "?"))) for key in ("lrhs", "hrls")] for row in rows]
-    show.table(
+    console.table(
         [
             header,
             *(
@@ -47,6 +49,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False) -> None:
                 for r, s in zip(rows, spans, strict=True)
             ),
         ],
-        "",
+        header=True,
+        indent=0,
     )
     print(f"devices: {', '.join(devices)} (of {', '.join(PROVIDERS)})")

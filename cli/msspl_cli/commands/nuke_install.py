@@ -1,4 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
+"""``msspl nuke-install``."""
+
 from __future__ import annotations
 
 from pathlib import Path
@@ -20,18 +22,22 @@ EXAMPLES = """[bold]Examples[/bold]
   msspl nuke-install --uninstall
 """
 
-#: Ends the line that is ours in a file that is the user's.
+#: Marks our line in the user's file.
 MARKER = "# added by msspl nuke-install"
 
 
 def nuke_install(
-    folder: Annotated[Path, typer.Option("--dir", metavar="DIR", help="Nuke's folder of the user or the site.")] = Path(
+    folder: Annotated[Path, typer.Option("--dir", metavar="DIR", help="The user's or the site's Nuke folder.")] = Path(
         "~/.nuke"
     ),
-    uninstall: Annotated[bool, typer.Option("--uninstall", help="Take the line out again.")] = False,
+    uninstall: Annotated[bool, typer.Option("--uninstall", help="Remove the line.")] = False,
     debug: options.Debug = False,
+    help_all: options.HelpAll = False,
 ) -> None:
-    """Put the gizmo MSSPLFuse into Nuke: one line in DIR/init.py, which names its folder and msspl-fuse."""
+    """Add the gizmo MSSPLFuse to Nuke.
+
+    It adds one line to DIR/init.py, which names the gizmo's folder and msspl-fuse.
+    """
     target = folder.expanduser() / "init.py"
     line = None if uninstall else install_line(shipped_folder("nuke_gizmo"), find_msspl_fuse())
     changed = set_line(target, line)
@@ -43,19 +49,23 @@ def nuke_install(
 
 
 def install_line(gizmo: Path, program: str | None) -> str:
-    """What goes into init.py. A program that the environment or a knob names still wins."""
+    """The line for init.py. A program that the environment or a knob names has priority."""
     environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
     return f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
 
 
 def set_line(path: Path, line: str | None) -> bool:
-    """Make ``line`` the only line of ours in a file, at its end; None takes ours out. All else stays byte for byte.
+    """Make ``line`` our only line in a file, at its end. All other bytes stay.
+
+    Args:
+        path: init.py, which need not exist.
+        line: ends with ``MARKER``. None removes our line.
 
     Returns:
         Whether the file changed.
 
     Raises:
-        InputError: the folder is missing, or the file can't be read.
+        InputError: the folder's parent is missing, or the file can't be read.
     """
     if not path.parent.parent.is_dir():
         raise InputError(f"{path.parent}: there is no folder {path.parent.parent}; name Nuke's folder with --dir")

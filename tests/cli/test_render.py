@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""msspl-render, with a script in place of Blender."""
+"""msspl-render with a stand-in for Blender. The tests of the add-on run it with Blender itself."""
 
 import json
 import os
@@ -11,55 +11,56 @@ import time
 from pathlib import Path
 
 import pytest
-from msspl_cli.commands import render
+from msspl_cli.blender_process import command, find_blender
+from msspl_cli.commands.render import name_targets
+from msspl_cli.installed import shipped_folder
 
 from oiio_msspl.errors import InputError
-from tests.blender_addon.conftest import posix, render_command
 
-ADDON = Path(__file__).resolve().parents[2] / "blender_addon"
+posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
 
 
-def test_blender_and_a_python_with_bpy_are_started_differently():
-    job, script = Path("job.json"), str(ADDON / "headless.py")
+def test_a_blender_and_a_python_with_bpy_are_started_differently():
+    job, script = Path("job.json"), str(shipped_folder("blender_addon") / "headless.py")
     scene = Path("/a/scene.blend")
-    assert render.command("/opt/blender", scene, job) == [
+    assert command("/opt/blender", scene, job) == [
         *("/opt/blender", "--background", "/a/scene.blend", "--python", script, "--", "job.json")
     ]
-    assert render.command("/venv/bin/python3.11", scene, job) == ["/venv/bin/python3.11", "-P", script, "job.json"]
+    assert command("/venv/bin/python3.11", scene, job) == ["/venv/bin/python3.11", "-P", script, "job.json"]
 
 
 @posix
-def test_the_option_wins_over_the_variable_and_the_variable_over_path(tmp_path, monkeypatch):
+def test_blender_is_found_as_named_then_by_variable_then_on_the_path(tmp_path, monkeypatch):
     for name in ("named", "variable", "blender"):
         (tmp_path / name).write_text("#!/bin/sh\n")
         (tmp_path / name).chmod(0o755)
     monkeypatch.setenv("PATH", str(tmp_path))
     monkeypatch.delenv("MSSPL_BLENDER", raising=False)
-    assert render.find_blender(None) == str(tmp_path / "blender")
+    assert find_blender(None) == str(tmp_path / "blender")
     monkeypatch.setenv("MSSPL_BLENDER", str(tmp_path / "variable"))
-    assert render.find_blender(None) == str(tmp_path / "variable")
-    assert render.find_blender(str(tmp_path / "named")) == str(tmp_path / "named")
+    assert find_blender(None) == str(tmp_path / "variable")
+    assert find_blender(str(tmp_path / "named")) == str(tmp_path / "named")
     with pytest.raises(InputError, match="--blender /nothing: no such program"):
-        render.find_blender("/nothing")
+        find_blender("/nothing")
     monkeypatch.setenv("PATH", "")
     monkeypatch.delenv("MSSPL_BLENDER")
     with pytest.raises(InputError, match="name it with --blender or MSSPL_BLENDER"):
-        render.find_blender(None)
+        find_blender(None)
 
 
-def test_every_frame_gets_a_file_name():
-    assert render.name_targets(Path("a.exr"), None) == [(None, Path("a.exr"))]
-    assert render.name_targets(Path("a.exr"), "7") == [(7, Path("a.exr"))]
-    assert render.name_targets(Path("x/a.####.exr"), "8-12x2") == [
+def test_frames_and_names_belong_together():
+    assert name_targets(Path("a.exr"), None) == [(None, Path("a.exr"))]
+    assert name_targets(Path("a.exr"), "7") == [(7, Path("a.exr"))]
+    assert name_targets(Path("x/a.####.exr"), "8-12x2") == [
         (number, Path(f"x/a.{number:04d}.exr")) for number in (8, 10, 12)
     ]
     with pytest.raises(InputError, match="one name for 3 frames; write a"):
-        render.name_targets(Path("a.exr"), "1-3")
+        name_targets(Path("a.exr"), "1-3")
     with pytest.raises(InputError, match="name the frames with --frames"):
-        render.name_targets(Path("a.####.exr"), None)
+        name_targets(Path("a.####.exr"), None)
 
 
-#: Runs in place of Blender: sends the messages of headless.py without rendering.
+#: Stands in for Blender: does as headless.py would, without rendering.
 FAKE = """
 import json, sys, os, time
 from pathlib import Path
@@ -78,15 +79,16 @@ for number, output in job["frames"]:
 
 
 @pytest.fixture
-def fake_blender(tmp_path):
-    """(start, run, folder): msspl-render with a program in place of Blender that runs ``code`` for each frame."""
+def farm(tmp_path):
+    """Runs msspl-render with a stand-in for Blender that does ``code`` while it renders."""
     (tmp_path / "scene.blend").write_text("")
 
     def start(*arguments, code="pass", stderr=subprocess.PIPE):
         blender = tmp_path / "blender"
         blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}")
         blender.chmod(0o755)
-        command = render_command("scene.blend", "-o", "out.exr", "--blender", blender, *arguments)
+        main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
+        command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "--blender", str(blender), *arguments]
         return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=stderr, text=True)
 
     def run(*arguments, code="pass"):
@@ -99,8 +101,8 @@ def fake_blender(tmp_path):
 
 
 @posix
-def test_options_reach_blender_and_times_are_printed(fake_blender):
-    _, run, folder = fake_blender
+def test_options_reach_blender_and_times_are_printed(farm):
+    _, run, folder = farm
     code, out, err, left = run("-s", "8", "--hr-spp", "2", "--filter", "scene", "--threads", "3", "--frame", "7")
     assert (code, left) == (0, ["out.exr"]), err
     assert "7      1.00    1.00    0.50    2.50   about 2.2 spp" in out
@@ -116,8 +118,8 @@ def test_options_reach_blender_and_times_are_printed(fake_blender):
 
 
 @posix
-def test_a_shot_is_reported_as_json(fake_blender):
-    _, run, _ = fake_blender
+def test_a_shot_and_a_report_for_machines(farm):
+    _, run, _ = farm
     code, out, _, left = run("-o", "out.##.exr", "--frames", "1-2", "--json")
     assert (code, left) == (0, ["out.01.exr", "out.02.exr"])
     assert [report["frame"] for report in json.loads(out)] == [1, 2]
@@ -141,8 +143,8 @@ def test_a_shot_is_reported_as_json(fake_blender):
         (["--blender", "nothing"], "", 2, "--blender nothing: no such program"),
     ],
 )
-def test_a_mistake_or_a_failure_is_one_sentence_and_an_exit_code(fake_blender, arguments, code, status, message):
-    _, run, _ = fake_blender
+def test_what_goes_wrong_is_one_sentence_and_a_code(farm, arguments, code, status, message):
+    _, run, _ = farm
     returned, _, err, left = run(*arguments, code=code or "pass")
     assert (returned, left) == (status, [])
     assert err.count("\n") == 1
@@ -150,8 +152,8 @@ def test_a_mistake_or_a_failure_is_one_sentence_and_an_exit_code(fake_blender, a
 
 
 @posix
-def test_a_failed_shot_names_the_frame_and_can_be_resumed(fake_blender):
-    _, run, folder = fake_blender
+def test_a_shot_that_fails_midway_says_where_and_is_resumed(farm):
+    _, run, folder = farm
     arguments = ["-o", "new/out.##.exr", "--frames", "1-3", "--json"]
     code, out, err, left = run(*arguments, code="if number == 2: tell(error='disk full', code=1); sys.exit(1)")
     assert (code, left) == (1, ["new"])
@@ -161,23 +163,26 @@ def test_a_failed_shot_names_the_frame_and_can_be_resumed(fake_blender):
     assert "out.01.exr: exists" in run(*arguments)[2]
     code, out, _, _ = run(*arguments, "--skip-existing")
     assert (code, [report["frame"] for report in json.loads(out)]) == (0, [2, 3])
-    assert run(*arguments[:-1], "--skip-existing")[:3] == (0, "new/out.##.exr: all is there\n", "")
+    assert run(*arguments[:-1], "--skip-existing")[:3] == (0, "new/out.##.exr: every frame exists\n", "")
 
 
 @posix
-def test_the_status_line_is_wiped_before_an_error(fake_blender):
-    start, _, _ = fake_blender
+def test_the_progress_bar_is_wiped_before_an_error(farm, monkeypatch):
+    monkeypatch.setenv("TERM", "xterm")
+    start, _, _ = farm
     reader, terminal = os.openpty()
     with start(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
         process.wait()
         said = os.read(reader, 10000).decode()
-    assert "frame None: LRHS" in said
-    assert said.endswith("\r\033[Kerror: disk full\r\n")
+    assert "LRHS 16x9, 16 spp" in said
+    error = said.rpartition("\033[2K")[2]  # what follows after the bar's line is erased
+    assert "LRHS" not in error
+    assert error.endswith("error: disk full\r\n")
 
 
 @posix
-def test_a_program_that_cannot_be_started_is_named(fake_blender):
-    _, run, folder = fake_blender
+def test_a_program_that_cannot_be_started(farm):
+    _, run, folder = farm
     (folder / "no-program").write_text("text")
     (folder / "no-program").chmod(0o755)
     code, _, err, _ = run("--blender", str(folder / "no-program"))
@@ -186,8 +191,8 @@ def test_a_program_that_cannot_be_started_is_named(fake_blender):
 
 
 @posix
-def test_nothing_is_overwritten_without_the_option(fake_blender):
-    _, run, folder = fake_blender
+def test_nothing_is_overwritten_unasked(farm):
+    _, run, folder = farm
     (folder / "out_oidn.exr").write_text("old")
     code, _, err, _ = run("--compare")
     assert (code, err) == (2, "error: out_oidn.exr: exists; pass --overwrite to replace it\n")
@@ -196,8 +201,8 @@ def test_nothing_is_overwritten_without_the_option(fake_blender):
 
 @posix
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
-def test_cancelling_ends_blender_and_its_children(fake_blender, how):
-    start, _, folder = fake_blender
+def test_cancelling_ends_blender_and_what_it_started(farm, how):
+    start, _, folder = farm
     code = (
         "import subprocess; child = subprocess.Popen(['sleep', '60']); "
         "Path('pids').write_text(f'{os.getpid()} {child.pid}'); child.wait()"
@@ -212,7 +217,7 @@ def test_cancelling_ends_blender_and_its_children(fake_blender, how):
     assert process.returncode not in (0, None)
     for pid in pids:
         with pytest.raises(ProcessLookupError):
-            for _ in range(100):  # An ended child exists until its new parent reaps it.
+            for _ in range(100):  # an orphan is reaped by its new parent
                 os.kill(int(pid), 0)
                 time.sleep(0.02)
     assert sorted(p.name for p in folder.iterdir()) == ["blender", "pids", "scene.blend"]

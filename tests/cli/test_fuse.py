@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The programs as users run them: a process, its exit code, and what it wrote, reopened."""
+"""msspl-fuse on one pair, as a process: its exit code, what it prints, and what it wrote, reopened."""
 
 import json
-import shutil
+import re
 import signal
 import subprocess
 import sys
@@ -14,37 +14,17 @@ import pytest
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
-from tests.conftest import EXAMPLES, SHARED, downsample, needs_shared, noisy, picture, rgb, write_exr
-
-
-def run(program, *arguments, cwd=None):
-    code = f"import sys; from msspl_cli.app import {program} as main; sys.argv[0] = '{program}'; main()"
-    command = [sys.executable, "-c", code, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd)
-
-
-def fuse(*arguments):
-    return run("msspl_fuse", *arguments)
-
-
-@pytest.fixture
-def files(tmp_path):
-    """A x4 pair with albedo, alpha and a mask, and its reference."""
-    clean = picture(96, 128)
-    ones = np.ones((96, 128), np.float16)
-    channels = rgb(noisy(clean, 1).astype(np.float16)) | {"A": ones} | rgb((clean > 0.3).astype(np.float16), "albedo.")
-    write_exr(tmp_path / "hr.exr", channels | {"mask.X": ones * 7, "Z": ones})
-    low = noisy(downsample(clean, 4), 16).astype(np.float16)
-    write_exr(tmp_path / "lr.exr", rgb(low) | {"A": ones[::4, ::4]})
-    write_exr(tmp_path / "ref.exr", rgb(clean))
-    return tmp_path
+from tests.conftest import EXAMPLES
+from tests.programs import fuse
 
 
 def test_the_main_job(files, bilinear_models):
     done = fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4])
     assert done.returncode == 0, done.stderr
-    assert "albedo    found    albedo" in done.stdout
-    assert "variance  default" in done.stdout
+    assert "albedo    found: albedo\n" in done.stdout
+    assert "variance  none found (optional)\n" in done.stdout
+    timing = r"Fused with bilinear-x4 on the CPU in \d+\.\d s \(\d\.\d s loading, \d\.\d s fusing, \d\.\d s writing\)\."
+    assert re.search(timing, done.stdout), done.stdout
     assert done.stderr == ""
     out = map_render(open_exr(files / "out.exr"))
     values = out.read(out.data_window)
@@ -166,115 +146,6 @@ def test_opencolorio_views_of_the_preview(files, bilinear_models):
         pictures.append(np.asarray(oiio.ImageBuf(str(files / "out.png")).get_pixels(oiio.UINT8)).astype(int))
     assert np.abs(pictures[0] - pictures[1]).max() <= 2  # the paper's curve is sRGB, clipped at white
     assert np.abs(pictures[0] - pictures[2]).mean() > 5
-
-
-def test_inspect_tells_a_person_and_a_machine(files):
-    done = run("msspl", "inspect", files / "hr.exr")
-    assert done.returncode == 0
-    assert "display window 128x96+0+0" in done.stdout
-    assert "passed through: Z, mask" in done.stdout
-    data = json.loads(run("msspl", "inspect", files / "hr.exr", "--json").stdout)
-    assert data["usable"]
-    assert data["parts"][0]["channels"]["mask.X"] == "half"
-
-
-def test_inspect_explains_what_cannot_be_used(files):
-    write_exr(files / "black.exr", rgb(np.zeros((8, 8, 3), np.float32)) | rgb(picture(8, 8), "albedo."))
-    done = run("msspl", "inspect", files / "black.exr")
-    assert done.returncode == 2
-    assert "can't be used: the beauty is black everywhere, though albedo are not" in done.stdout
-
-
-@needs_shared("exr")
-@pytest.mark.parametrize("path", sorted(SHARED.glob("exr/**/*.exr")), ids=lambda p: f"{p.parent.name}/{p.stem}")
-def test_inspect_handles_every_real_file(path):
-    """Usable with a mapped beauty, or explained in a sentence: never a traceback."""
-    done = run("msspl", "inspect", path, "--json")
-    data = json.loads(done.stdout)
-    assert done.stderr == ""
-    assert done.returncode == (0 if data["usable"] else 2)
-    assert data["usable"] == (not data["problems"])
-    unusable = {
-        "crypto_only",
-        "deep",
-        "ALBEDO",
-        "AVG_SHADING_NORMAL",
-        "DEPTH",
-        "DIRECT_DIFFUSE",
-        "INDIRECT_GLOSSY",
-        "NOISE",
-    }
-    # Of the V-Ray file only the headers are there.
-    unusable |= {"rgba_z_crypto_diffuse_normals"}
-    assert data["usable"] == (path.stem not in unusable), data["problems"]
-
-
-def test_compare_prints_the_papers_measures(files, bilinear_models):
-    fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4])
-    names = ["out.exr", "hr.exr", "lr.exr"]
-    done = run(
-        "msspl",
-        "compare",
-        *(files / n for n in names),
-        "-r",
-        files / "ref.exr",
-        "--json",
-        "--error-map",
-        files / "e.png",
-    )
-    assert done.returncode == 0, done.stderr
-    scores = json.loads(done.stdout)
-    assert scores[0]["psnr"] > scores[1]["psnr"]
-    assert set(scores[0]) == {"image", "psnr", "relmse", "relmse_gharbi", "ssim"}
-    assert oiio.ImageBuf(str(files / "e.png")).spec().width == 128
-
-
-def test_compare_does_not_overwrite_its_reference(files):
-    before = (files / "ref.exr").read_bytes()
-    arguments = [files / "hr.exr", "-r", files / "ref.exr", "--error-map", files / "ref.exr", "--overwrite"]
-    done = run("msspl", "compare", *arguments)
-    assert done.returncode == 2
-    assert "the error map is a PNG" in done.stderr
-    assert (files / "ref.exr").read_bytes() == before
-
-
-def test_compare_of_equal_pictures_is_valid_json(files):
-    done = run("msspl", "compare", files / "ref.exr", "-r", files / "ref.exr", "--json")
-    assert json.loads(done.stdout, parse_constant=pytest.fail)[0]["psnr"] is None
-
-
-def test_compare_refuses_other_sizes(files):
-    write_exr(files / "small.exr", rgb(picture(50, 50)))
-    done = run("msspl", "compare", files / "small.exr", "-r", files / "ref.exr")
-    assert done.returncode == 2
-    assert "is 50x50, but" in done.stderr
-
-
-def test_models_lists_what_ships():
-    data = json.loads(run("msspl", "models", "--json").stdout)
-    assert {m["name"] for m in data["models"]} >= {"paper-x2", "paper-x4", "paper-x8"}
-    assert "cpu" in data["devices"]
-
-
-@pytest.mark.parametrize("program", ["msspl_fuse", "msspl_render", "msspl"])
-def test_help_imports_nothing_heavy_and_ends_with_examples(program):
-    """--help stays quick because NumPy, OpenImageIO and onnxruntime are not imported for it."""
-    code = (
-        f"import sys; from msspl_cli.app import {program} as main\n"
-        "sys.argv[1:] = ['--help']\n"
-        "try: main()\n"
-        "except SystemExit: pass\n"
-        "print('HEAVY', [m for m in ('numpy', 'OpenImageIO', 'onnxruntime', 'torch', 'OpenEXR') if m in sys.modules])"
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    assert done.stdout.endswith("HEAVY []\n"), done.stdout[-300:] + done.stderr
-    if program == "msspl_fuse":
-        assert "msspl-fuse lr.exr hr.exr -o out.exr" in done.stdout
-
-
-def test_installed_programs_are_on_the_path():
-    assert shutil.which("msspl-fuse"), "install the package: pip install -e '.[test]'"
-    assert shutil.which("msspl")
 
 
 def test_the_readmes_first_command_shows_a_result(tmp_path):

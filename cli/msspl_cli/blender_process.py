@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Blender as a process: finding it, starting it with the add-on's headless.py, and reading what that tells."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+from msspl_cli.installed import shipped_folder
+from oiio_msspl.errors import InputError, MssplError
+
+#: What Blender prints while it renders.
+_SAMPLES = re.compile(r"Sample (\d+)/(\d+)")
+#: Seconds that Blender, and the msspl-fuse that it runs, get to end.
+_GRACE = 15
+
+
+def find_blender(named: str | None) -> str:
+    """Blender's program, or a Python that has bpy.
+
+    Args:
+        named: a program or its name. None: the one that MSSPL_BLENDER names, or else ``blender`` on the path.
+
+    Raises:
+        InputError: there is no such program.
+    """
+    for where, name in (("--blender", named), ("MSSPL_BLENDER", os.environ.get("MSSPL_BLENDER"))):
+        if name:
+            found = shutil.which(os.path.expanduser(name))
+            if found is None:
+                raise InputError(f"{where} {name}: no such program")
+            return found
+    found = shutil.which("blender")
+    if found is None:
+        raise InputError("blender is not on the path; name it with --blender or MSSPL_BLENDER")
+    return found
+
+
+def render_frames(
+    program: str,
+    scene: Path,
+    job: dict[str, Any],
+    folder: Path,
+    on_event: Callable[[dict[str, Any]], None],
+    *,
+    verbose: bool = False,
+) -> None:
+    """Render and fuse the frames of a job.
+
+    Args:
+        program: Blender, or a Python that has bpy.
+        scene: a .blend.
+        job: what headless.py reads: frames and settings.
+        folder: of the results. Temporary files lie in it, so that a render that is kept is only renamed.
+        on_event: called with each event: a step that begins, the share of samples that is done, or the report of a
+            frame that ended.
+        verbose: print what Blender prints.
+
+    Raises:
+        InputError, MssplError: a frame failed. The message names it if the job has several.
+    """
+    count, reports, number = len(job["frames"]), 0, None
+    with tempfile.TemporaryDirectory(prefix=".msspl-", dir=folder.absolute()) as work:
+        path = Path(work, "job.json")
+        path.write_text(json.dumps({**job, "work": work}), encoding="utf-8")
+        try:
+            for event in run_blender(command(program, scene, path), verbose=verbose):
+                number = event.get("frame", number)
+                if "report" in event:
+                    reports += 1
+                    number = None
+                on_event(event)
+        except MssplError as error:
+            if number is None or count == 1:
+                raise
+            raise type(error)(f"frame {number}: {error}") from error
+    if reports < count:
+        raise MssplError(f"{program}: ended after {reports} of {count} frames (-v shows what it says)")
+
+
+def command(program: str, scene: Path, job: Path) -> list[str]:
+    """The arguments that make Blender, or a Python that has bpy, do the job of a file."""
+    script = str(shipped_folder("blender_addon") / "headless.py")
+    if Path(program).name.lower().startswith("python"):
+        return [program, "-P", script, str(job)]  # -P: modules beside the script must not hide others
+    return [program, "--background", str(scene.absolute()), "--python", script, "--", str(job)]
+
+
+def run_blender(arguments: Sequence[str], *, verbose: bool = False) -> Iterator[dict[str, Any]]:
+    """Run the add-on's headless.py. Leaving the loop ends Blender and every process that it started.
+
+    Args:
+        arguments: of :func:`command`.
+        verbose: print what Blender prints.
+
+    Yields:
+        The events that headless.py prints, and ``{"samples": share}`` for each line about samples.
+
+    Raises:
+        InputError, MssplError: the job failed. The message is that of headless.py or msspl-fuse.
+    """
+    posix = os.name == "posix"
+    try:
+        started = subprocess.Popen(
+            arguments,
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=posix,  # a process group, which can be ended as a whole
+        )
+    except OSError as refused:
+        raise InputError(
+            f"{arguments[0]}: can't be started ({refused.strerror}); name Blender, or a Python that has bpy, with "
+            "--blender or MSSPL_BLENDER"
+        ) from refused
+    with started as process:
+        assert process.stdout is not None
+        last: deque[str] = deque(maxlen=5)
+        error = None
+        try:
+            for line in process.stdout:
+                if line.startswith("MSSPL "):
+                    event = json.loads(line.removeprefix("MSSPL "))
+                    if "error" in event:
+                        error = event
+                    else:
+                        yield event
+                    continue
+                if verbose:
+                    print(line, end="", file=sys.stderr)
+                if samples := _SAMPLES.search(line):
+                    yield {"samples": int(samples[1]) / max(1, int(samples[2]))}
+                elif line.strip():
+                    last.append(line.strip())
+            process.wait()
+        finally:
+            if process.poll() is None:
+                _end(process, group=posix)
+    if error is not None:
+        raise (InputError if error["code"] == 2 else MssplError)(error["error"])
+    if process.returncode:
+        said = " | ".join(last)
+        raise MssplError(f"{arguments[0]}: ended with code {process.returncode}" + (f": {said}" if said else ""))
+
+
+def _end(process: subprocess.Popen[str], *, group: bool) -> None:
+    """End a process, or its whole group: first with SIGTERM, then with SIGKILL."""
+    for end in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
+        if group:
+            os.killpg(process.pid, end)
+        else:
+            process.send_signal(end)
+        try:
+            process.wait(_GRACE)
+            return
+        except subprocess.TimeoutExpired:
+            continue

@@ -1,0 +1,126 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Tables and progress bars, drawn by rich on a terminal.
+
+In a pipe or a file a table is plain text with aligned columns: no colours, no boxes, and no line is wrapped. A progress
+bar is drawn on a terminal only. Results go to standard output, messages and progress to standard error.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+#: Columns of a console that is no terminal: wider than any row.
+_UNLIMITED = 100_000
+
+#: Colours of the words that say how a frame ended.
+_STYLES = {"fused": "green", "failed": "red", "missing": "red", "not done": "yellow", "warning": "yellow"}
+
+#: What is printed of a feature that a render lacks. The others are optional.
+_NONE_FOUND = {"albedo": "none found: expect blur, render an albedo"}
+
+
+def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 2) -> None:
+    """Print rows with aligned columns on standard output.
+
+    Args:
+        rows: cells, equally many in each row.
+        header: whether the first row holds the columns' titles.
+        indent: spaces in front of each row.
+    """
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
+
+    console = _console(stderr=False)
+    grid = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
+    for _ in rows[0]:
+        grid.add_column(overflow="fold")
+    for index, row in enumerate(rows):
+        style = "bold" if header and index == 0 else ""
+        grid.add_row(*(Text(cell, style=_STYLES.get(cell, "")) for cell in row), style=style)
+    with console.capture() as captured:
+        console.print(Padding.indent(grid, indent))
+    for line in captured.get().splitlines():
+        print(line.rstrip())
+
+
+def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
+    """Print which layer each feature is read from.
+
+    Args:
+        rows: of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` or
+            :meth:`oiio_msspl.jobs.report.FrameReport.aovs`.
+        notes: sentences printed below.
+    """
+    table([(row["feature"], _origin(row)) for row in rows])
+    for note in notes:
+        print(f"  note: {note}")
+
+
+def _origin(row: Mapping[str, str]) -> str:
+    """Where a feature comes from, in words."""
+    status, source = row["status"], row["source"] + (f" ({row['note']})" if row["note"] else "")
+    if status == "default":
+        return _NONE_FOUND.get(row["feature"], "none found (optional)")
+    if status == "unused":
+        return f"found: {source}; this model does not read it" if source else "none found; this model does not read it"
+    return "none" if status == "absent" else f"{status}: {source}"
+
+
+class ProgressBar:
+    """A progress bar on standard error, for a ``with`` statement. It appears at the first update and then vanishes.
+
+    Args:
+        shown: whether it may appear. It also needs a terminal.
+    """
+
+    def __init__(self, shown: bool = True) -> None:
+        self.shown = shown and sys.stderr.isatty()
+        self._progress: Any = None
+        self._task: Any = None
+
+    def update(self, label: str, done: float, total: float) -> None:
+        """Show ``done`` of ``total`` beside a label."""
+        if not self.shown:
+            return
+        if self._progress is None:
+            from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
+
+            self._progress = Progress(
+                TextColumn("{task.description}", markup=False),
+                BarColumn(),
+                TaskProgressColumn(),
+                TimeRemainingColumn(compact=True),
+                console=_console(stderr=True),
+                transient=True,
+                redirect_stdout=False,  # standard output may be a file
+            )
+            self._task = self._progress.add_task(label)
+            self._progress.start()
+        self._progress.update(self._task, description=label, completed=done, total=total)
+
+    def hide(self) -> None:
+        """Remove the bar from the terminal. The next update draws it again."""
+        if self._progress is not None:
+            self._progress.stop()
+            self._progress = None
+
+    def __enter__(self) -> ProgressBar:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.hide()
+
+
+def _console(*, stderr: bool) -> Console:
+    """A console that prints text as it is: layer names may contain brackets, which rich would take for markup."""
+    from rich.console import Console
+
+    stream = sys.stderr if stderr else sys.stdout
+    width = None if stream.isatty() else _UNLIMITED
+    return Console(stderr=stderr, width=width, markup=False, highlight=False, emoji=False)

@@ -1,0 +1,112 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What is printed of a shot: progress for people and for programs while it runs, and a table at its end."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+from typing import TYPE_CHECKING
+
+from msspl_cli import console
+from oiio_msspl.errors import InputError
+
+if TYPE_CHECKING:
+    from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
+
+#: The forms of ``--progress``, which prints to standard output after each frame.
+PROGRESS = ("openjd", "json")
+
+
+class ShotPrinter:
+    """The ``progress`` of :func:`oiio_msspl.jobs.shot.fuse_shot`: prints errors and warnings as frames end.
+
+    A sentence that was printed for one frame is not printed for another one; the table counts its frames.
+
+    Raises:
+        InputError: an unknown form of progress, or one that would mix with ``--json``.
+    """
+
+    def __init__(self, verbose: int, quiet: bool, as_json: bool, progress: str | None) -> None:
+        if progress is not None and progress not in PROGRESS:
+            raise InputError(f"--progress {progress!r}: use one of {', '.join(PROGRESS)}")
+        if progress is not None and as_json:
+            raise InputError("--json and --progress both print to standard output; use --report FILE for the report")
+        self._verbose, self._quiet, self._as_json, self._progress = verbose, quiet, as_json, progress
+        self._bar = console.ProgressBar(shown=not verbose and not quiet and progress is None)
+        self._report: ShotReport | None = None
+        self._printed: set[str] = set()
+
+    def __call__(self, result: FrameResult, report: ShotReport) -> None:
+        """Print what there is to say of a frame that ended."""
+        self._report = report
+        if self._progress == "openjd":
+            _print_openjd(result, report)
+        elif self._progress == "json":
+            _print_json(result, report)
+        if result.message:
+            self._print_once("error", result.frame, result.message)
+        for warning in () if self._quiet else result.warnings:
+            self._print_once("warning", result.frame, warning)
+        if self._verbose:
+            times = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.seconds.items())
+            print(f"frame {result.frame}: {result.status}" + (f" ({times})" if times else ""), file=sys.stderr)
+        done, count = len(report.results), len(report.shot.frames)
+        bad = sum(bool(each.message) for each in report.results.values())
+        self._bar.update(f"{done} of {count} frames" + (f", {bad} not fused" if bad else ""), done, count)
+
+    def end(self) -> None:
+        """Print the table, or with ``--json`` the report, of the frames that were reached."""
+        self._bar.hide()
+        if self._report is None:
+            return
+        if self._as_json:
+            print(json.dumps(self._report.as_dict(), indent=2))
+        elif not self._quiet and self._progress != "json":
+            print_table(self._report)
+
+    def _print_once(self, kind: str, frame: int, text: str) -> None:
+        if text not in self._printed:
+            self._printed.add(text)
+            print(f"{kind}: frame {frame}: {text}", file=sys.stderr)
+
+
+def _print_openjd(result: FrameResult, report: ShotReport) -> None:
+    """Print lines that an Open Job Description worker understands."""
+    done, count = len(report.results), len(report.shot.frames)
+    print(f"openjd_progress: {100 * done / count:.1f}")
+    print(f"openjd_status: frame {result.frame} {result.status}, {done} of {count} done", flush=True)
+    if result.message:
+        print(f"openjd_fail: frame {result.frame}: {' '.join(result.message.split())}", flush=True)
+
+
+def _print_json(result: FrameResult, report: ShotReport) -> None:
+    """Print a frame as a line of JSON."""
+    line = {name: getattr(result, name) for name in ("frame", "status", "message", "warnings", "output")}
+    print(json.dumps({**line, "done": len(report.results), "count": len(report.shot.frames)}), flush=True)
+
+
+def print_table(report: ShotReport) -> None:
+    """Print which layers were read, and which frames ended in which way and why."""
+    from oiio_msspl.jobs.sequence import format_frames
+
+    if first := report.first:
+        print(f"{first['renderer']} pairs at x{first['scale']}; layers of frame {first['frame']}:")
+        console.aov_table(first["aovs"], first["notes"])
+    # Sentences that differ only in their numbers share a row, which shows the first of them.
+    groups: dict[tuple[str, str], tuple[list[int], str]] = {}
+    for frame in report.shot.frames:
+        result = report.results.get(frame.number)
+        rows = [(result.status, result.message)] if result else [("not done", "run again with --skip-existing")]
+        rows += [("warning", text) for text in (result.warnings if result else ())]
+        for kind, text in rows:
+            groups.setdefault((kind, re.sub(r"-?[\d.]+", "0", text)), ([], text))[0].append(frame.number)
+    order = ("fused", "skipped", "failed", "missing", "not done", "warning")
+    rows_in_order = sorted(groups.items(), key=lambda item: order.index(item[0][0]))
+    print("frames")
+    console.table([(kind, str(len(n)), format_frames(n), text) for (kind, _), (n, text) in rows_in_order])
+    verbs = {"read": "reading", "fuse": "fusing", "write": "writing"}
+    stages = ", ".join(
+        f"{verbs[name]} {seconds:.1f} s" for name, seconds in report.stage_seconds.items() if name in verbs
+    )
+    print(f"{report.shot.output}: {report.seconds:.1f} s" + (f" ({stages}; stages overlap)" if stages else ""))

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames through the three stages in this process: one is read and one written while another is fused.
+
+The calling thread fuses. A second thread reads the next frame, and a third writes the previous one. Each stage holds
+at most one frame, so memory does not grow with the shot.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from typing import Any
+
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.jobs.report import FrameReport
+from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.stages import Stages
+
+
+def run_pipeline(
+    stages: Stages,
+    frames: list[Frame],
+    record: Callable[[Frame, dict[str, Any] | Exception], None],
+    save: Callable[[], None],
+) -> None:
+    """Take frames through the stages. However this ends, the frame that is being written is finished and recorded.
+
+    Args:
+        stages: the stages and their settings.
+        frames: what to fuse, in this order.
+        record: called in the order of the frames, with a frame and its report as a dict, or the reason for its failure.
+        save: called after each frame, when the frames before it are recorded.
+
+    Raises:
+        InputError: the model can't be loaded, which no other frame would change.
+    """
+    writing: tuple[Frame, FrameReport, Future[None]] | None = None
+
+    def record_failure(frame: Frame, error: BaseException) -> None:
+        if not isinstance(error, Exception):
+            raise error
+        record(frame, error)
+
+    def finish_writing() -> None:
+        """Wait until the frame that is being written is on the disk, and record it."""
+        nonlocal writing
+        if writing is None:
+            return
+        frame, report, written = writing
+        error = written.exception()
+        if error is None:
+            record(frame, report.as_dict())
+        else:
+            record_failure(frame, error)
+        # Reset last: a signal may interrupt the lines above, and the frame is then recorded on the way out.
+        writing = None
+
+    with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
+        reads = [reader.submit(stages.read, frame) for frame in frames[:1]]
+        try:
+            for index, frame in enumerate(frames):
+                reading = reads.pop()
+                reads += [reader.submit(stages.read, following) for following in frames[index + 1 : index + 2]]
+                error = reading.exception()
+                if error is None:
+                    session = stages.session(reading.result())
+                    try:
+                        report, fused = stages.fuse(reading.result(), session)
+                    except Exception as caught:
+                        error = caught
+                # The previous frame is written before this one is handed over, so one is written at a time.
+                finish_writing()
+                if error is None:
+                    # `writing` is set before the hand-over: a signal may arrive during the hand-over.
+                    written: Future[None] = Future()
+                    writing = frame, report, written
+                    writer.submit(_write, stages, report, fused, written)
+                    del report, fused
+                else:
+                    record_failure(frame, error)
+                del reading, error  # frees the frame's pixels before those of the next frame arrive
+                save()
+        finally:
+            for reading in reads:
+                reading.cancel()
+            writer.shutdown()
+            if writing is not None and writing[2].done():  # not done means that it was never handed over
+                finish_writing()
+
+
+def _write(stages: Stages, report: FrameReport, fused: FusedFrame, written: Future[None]) -> None:
+    """Write a frame and settle ``written``."""
+    try:
+        stages.write(report, fused)
+    except BaseException as error:
+        written.set_exception(error)
+    else:
+        written.set_result(None)

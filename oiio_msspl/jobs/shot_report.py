@@ -1,0 +1,150 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What became of a shot and of each of its frames, in memory and as a JSON file."""
+
+from __future__ import annotations
+
+import json
+from collections import Counter
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Any
+
+from oiio_msspl._version import __version__
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import check_target, replacing
+from oiio_msspl.jobs.sequence import Frame, Shot
+
+FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
+
+
+@dataclass
+class FrameResult:
+    """What became of one frame."""
+
+    frame: int
+    status: str
+    """``fused``; ``skipped``: its EXR existed; ``failed``; ``missing``: its LRHS or HRLS does not exist."""
+    message: str = ""
+    """Why it was not fused."""
+    exit_code: int = 0
+    """0, 2 for the caller's mistake, or 1 for any other failure."""
+    warnings: list[str] = field(default_factory=list)
+    repaired: dict[str, int] = field(default_factory=dict)
+    """Number of repaired values by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """As in :class:`oiio_msspl.jobs.report.FrameReport`. Neighbouring frames overlap in time."""
+    lrhs: str | None = None
+    hrls: str | None = None
+    output: str = ""
+
+
+@dataclass
+class ShotReport:
+    """What became of a shot."""
+
+    shot: Shot
+    results: dict[int, FrameResult] = field(default_factory=dict)
+    """By frame number. A frame that the run has not reached has no entry."""
+    first: dict[str, Any] | None = None
+    """The whole report of the first fused frame: scale, model and the layers that were read."""
+    seconds: float = 0.0
+    """Wall time."""
+
+    @property
+    def exit_code(self) -> int:
+        """0 if every frame is fused or was skipped; otherwise 1 if any frame has exit code 1, and 2 if none has."""
+        codes = {result.exit_code for result in self.results.values()}
+        return 1 if 1 in codes else max(codes, default=0)
+
+    @property
+    def stage_seconds(self) -> dict[str, float]:
+        """Seconds spent in each stage, summed over the fused frames. Stages overlap: the sum exceeds the wall time."""
+        total: Counter[str] = Counter()
+        for result in self.results.values():
+            if result.status == FUSED:
+                total.update(result.seconds)
+        return dict(total)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The report as JSON values."""
+        counts = Counter(result.status for result in self.results.values())
+        return {
+            "lrhs": str(self.shot.lr.pattern),
+            "hrls": str(self.shot.hr.pattern),
+            "output": str(self.shot.output),
+            "finished": len(self.results) == len(self.shot.frames),
+            "exit_code": self.exit_code,
+            "counts": {"all": len(self.shot.frames), **{status: counts[status] for status in STATUSES}},
+            "seconds": {k: round(v, 3) for k, v in {"wall": self.seconds, **self.stage_seconds}.items()},
+            "first_fused": self.first,
+            "frames": [asdict(self.results[f.number]) for f in self.shot.frames if f.number in self.results],
+            "version": __version__,
+        }
+
+    def save(self, path: Path) -> None:
+        """Write the report as JSON, whole or not at all: a killed run leaves the report of its last saved frame.
+
+        Raises:
+            MssplError: the file system refused.
+        """
+        with replacing(path, overwrite=True) as temporary:
+            temporary.write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")
+
+
+def result_of(frame: Frame, status: str, message: str = "", exit_code: int = 0, **more: Any) -> FrameResult:
+    """The result of a frame with its three paths filled in; ``more`` are other fields of :class:`FrameResult`."""
+    lrhs, hrls = (None if path is None else str(path) for path in (frame.lr, frame.hr))
+    return FrameResult(frame.number, status, message, exit_code, lrhs=lrhs, hrls=hrls, output=str(frame.output), **more)
+
+
+def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport) -> FrameResult:
+    """The result of a fused frame. The first one becomes ``report.first``.
+
+    Args:
+        frame: the frame.
+        frame_report: its :meth:`oiio_msspl.jobs.report.FrameReport.as_dict`.
+        report: of the shot. A feature that the first fused frame read from elsewhere gives a warning.
+    """
+    first = report.first = report.first or {"frame": frame.number, **frame_report}
+    warnings = list(frame_report["warnings"])
+    if frame_report["repaired"]:
+        warnings.append(f"repaired values that were NaN, infinite or negative in {', '.join(frame_report['repaired'])}")
+    first_status = {row["feature"]: row["status"] for row in first["aovs"]}
+    warnings += [
+        f"{row['feature']} is {row['status']} here and {first_status[row['feature']]} in frame {first['frame']}: "
+        "it may flicker"
+        for row in frame_report["aovs"]
+        if row["status"] != first_status[row["feature"]]
+    ]
+    return result_of(
+        frame, FUSED, warnings=warnings, repaired=frame_report["repaired"], seconds=frame_report["seconds"]
+    )
+
+
+def read_earlier(
+    report: ShotReport, path: Path | None, overwrite: bool, skip_existing: bool
+) -> dict[int, dict[str, Any]]:
+    """Read the report of the run that ``skip_existing`` resumes, and check that a report can be written.
+
+    Args:
+        report: gets ``first`` from the earlier report.
+        path: the report's file; None for no report.
+        overwrite, skip_existing: whether the file may exist.
+
+    Returns:
+        ``warnings``, ``repaired`` and ``seconds`` of each frame in the earlier report.
+
+    Raises:
+        InputError: the file exists and may not be replaced, or it is no report of a shot.
+    """
+    if path is None:
+        return {}
+    check_target(path, overwrite=overwrite or skip_existing)
+    if not skip_existing or not path.exists():
+        return {}
+    try:
+        data = json.loads(path.read_text(encoding="utf-8"))
+        report.first = data["first_fused"]
+        return {entry["frame"]: {k: entry[k] for k in ("warnings", "repaired", "seconds")} for entry in data["frames"]}
+    except (ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path}: exists and is no report of a shot; name another file") from error

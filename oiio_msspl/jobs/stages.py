@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The three stages of a frame: read the pair, fuse it, write the result.
+
+A shot runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`); a Dask worker runs them one after the other.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.exr.preview import is_our_preview
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.jobs.frame import InputOptions, map_pair, write_frame, write_frame_preview
+from oiio_msspl.jobs.report import FrameReport, report_on
+from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.session import Session
+
+
+@dataclass(frozen=True)
+class LoadedFrame:
+    """A frame whose pair is open and mapped."""
+
+    frame: Frame
+    lr: MappedRender
+    hr: MappedRender
+    lr_pixels: ReadableRender
+    """The LRHS in memory, or ``lr`` itself if the pair does not fit."""
+    hr_pixels: ReadableRender
+    """The HRLS in memory, or ``hr`` itself if the pair does not fit."""
+    seconds: float
+    """Wall time of reading."""
+
+    @property
+    def in_memory(self) -> bool:
+        return self.hr_pixels is not self.hr
+
+
+@dataclass(frozen=True)
+class Stages:
+    """The stages and their settings, which are those of :func:`oiio_msspl.jobs.shot.fuse_shot`.
+
+    Each stage may run in a thread of its own, but not twice at the same time.
+    """
+
+    inputs: InputOptions = InputOptions()
+    write_options: WriteOptions = WriteOptions()
+    model: str | None = None
+    device: str = "cpu"
+    threads: int = 0
+    max_memory: int = MAX_MEMORY
+    previews: bool = False
+    view_transform: str | None = None
+    overwrite: bool = False
+    skip_existing: bool = False
+    sessions: dict[Path, Session] = field(default_factory=dict)
+    """Models that are loaded, by file."""
+
+    def read(self, frame: Frame) -> LoadedFrame:
+        """Open and map a pair, and read its pixels if two frames fit into half of the memory.
+
+        Raises:
+            InputError: a file can't be used, or the two renders don't fit together.
+        """
+        start = time.perf_counter()
+        assert frame.lr is not None and frame.hr is not None
+        lr, hr = map_pair(frame.lr, frame.hr, self.inputs)
+        align(lr, hr)  # refuses the pair before its pixels are read
+        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= (self.max_memory - FIXED_MEMORY) // 2:
+            return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start)
+        return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start)
+
+    def session(self, loaded: LoadedFrame) -> Session:
+        """The model for this pair's scale. Each model is loaded once.
+
+        Raises:
+            InputError: there is no such model, or it does not predict the error that is asked for.
+        """
+        path = find_model(align(loaded.lr_pixels, loaded.hr_pixels).scale, self.model)
+        if path not in self.sessions:
+            self.sessions[path] = Session(path, self.device, self.threads)
+        if self.write_options.error_layer:
+            self.sessions[path].require_error()
+        return self.sessions[path]
+
+    def fuse(self, loaded: LoadedFrame, session: Session) -> tuple[FrameReport, FusedFrame]:
+        """Fuse a pair. The report is complete but for the time and the warnings of writing."""
+        start = time.perf_counter()
+        # The pixels of the next frame and the result of the previous one are in memory at the same time.
+        result_channels = 5 if self.write_options.error_layer else 4
+        others = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
+        if loaded.in_memory:
+            others += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+        fused = fuse(
+            loaded.lr_pixels,
+            loaded.hr_pixels,
+            session,
+            error=self.write_options.error_layer,
+            max_memory=self.max_memory - others,
+        )
+        preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
+        report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
+        report.seconds = {"read": loaded.seconds, "fuse": time.perf_counter() - start, "network": fused.seconds}
+        return report, fused
+
+    def write(self, report: FrameReport, fused: FusedFrame) -> None:
+        """Write preview and EXR.
+
+        A new EXR gets its name after its preview, so an EXR that exists is a frame that is complete.
+
+        Raises:
+            InputError: another process has put a file there in the meantime.
+            MssplError: the file system refused. An old frame is as it was; of a new one nothing is left.
+        """
+        start = time.perf_counter()
+        if self.overwrite and report.output.exists():
+            # The EXR goes first: if it can't be replaced, the old frame keeps its preview.
+            write_frame(report, fused, self.write_options, overwrite=True)
+            write_frame_preview(report, fused, self.view_transform, overwrite=True)
+        else:
+            self._write_new(report, fused)
+        report.seconds["write"] = time.perf_counter() - start
+
+    def _write_new(self, report: FrameReport, fused: FusedFrame) -> None:
+        replaces = self.skip_existing and report.preview is not None and is_left_over(report.preview)
+        write_frame_preview(report, fused, self.view_transform, overwrite=self.overwrite or replaces)
+        try:
+            write_frame(report, fused, self.write_options, overwrite=self.overwrite)
+        except BaseException:
+            # If another run has put the frame there in the meantime, the preview belongs to that frame.
+            if report.preview is not None and not report.output.exists():
+                report.preview.unlink(missing_ok=True)
+            raise
+
+
+def is_left_over(png: Path) -> bool:
+    """Whether a PNG whose EXR does not exist is a preview that a killed run left, and not somebody's picture."""
+    return png.is_file() and is_our_preview(png)
+
+
+def _pixel_bytes(render: MappedRender) -> int:
+    """Bytes of a render's features in memory."""
+    channels = sum(HRLS_FEATURES[name] for name in render.features) + (render.alpha is not None)
+    return render.data_window.width * render.data_window.height * channels * 4

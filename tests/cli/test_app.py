@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What all programs have in common: --help, and that they are installed."""
+
+import re
+import shutil
+import subprocess
+import sys
+import sysconfig
+
+import pytest
+
+from tests.programs import run
+
+
+@pytest.mark.parametrize("program", ["msspl_fuse", "msspl_render", "msspl"])
+def test_help_imports_nothing_heavy_and_ends_with_examples(program):
+    """--help stays quick because NumPy, OpenImageIO and onnxruntime are not imported for it."""
+    code = (
+        f"import sys; from msspl_cli.app import {program} as main\n"
+        "sys.argv[1:] = ['--help']\n"
+        "try: main()\n"
+        "except SystemExit: pass\n"
+        "print('HEAVY', [m for m in ('numpy', 'OpenImageIO', 'onnxruntime', 'torch', 'OpenEXR') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.stdout.endswith("HEAVY []\n"), done.stdout[-300:] + done.stderr
+    if program == "msspl_fuse":
+        assert "msspl-fuse lr.exr hr.exr -o out.exr" in done.stdout
+
+
+def test_installed_programs_are_on_the_path():
+    for program in ("msspl-fuse", "msspl-render", "msspl"):
+        assert shutil.which(program, path=sysconfig.get_path("scripts")), (
+            "install the package: pip install -e '.[test]'"
+        )
+
+
+#: Options that --help shows, and how many more --help-all shows.
+SHOWN = {
+    "msspl_fuse": (
+        "--map --view-layer --model --device --max-memory --output --layout --layers --error-layer --overwrite --json "
+        "--frames --skip-existing --help --help-all",
+        14,
+    ),
+    "msspl_render": (
+        "--blender --scale --lr-spp --hr-spp --output --compare --overwrite --json --frames --skip-existing --help "
+        "--help-all",
+        7,
+    ),
+}
+
+
+def options_in(text):
+    """The long names that begin a row of the help text's tables. Of a pair (--half, --float) only the first counts."""
+    return set(re.findall(r"^│[ *]+(--[a-z-]+)", text, re.MULTILINE))
+
+
+@pytest.mark.parametrize("program", SHOWN)
+def test_help_shows_everyday_options_in_groups_and_help_all_shows_all(program):
+    expected, more = SHOWN[program]
+    short, full = (run(program, option).stdout for option in ("--help", "--help-all"))
+    assert options_in(short) == set(expected.split())
+    assert options_in(full) > options_in(short)
+    assert len(options_in(full)) == len(options_in(short)) + more
+    groups = [line.split()[1] for line in full.splitlines() if line.startswith("╭")]
+    assert groups == [line.split()[1] for line in short.splitlines() if line.startswith("╭")]
+    assert [group for group in groups if group != "Render"] == [
+        "Arguments",
+        "Options",
+        "Input",
+        *(["Model"] if program == "msspl_fuse" else []),
+        "Output",
+        "Shot",
+    ]
+
+
+def test_help_all_of_submit_lists_the_options_of_msspl_fuse():
+    done = run("msspl", "submit", "--bundle", "x", "--help-all")
+    assert done.returncode == 0
+    assert {"--scheduler", "--half", "--layout"} <= options_in(done.stdout)

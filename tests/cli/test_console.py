@@ -1,0 +1,64 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What people see on a terminal, and what a pipe gets."""
+
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from msspl_cli import console
+
+from tests.shots import make_shot
+
+LONG = "layer [bold] with a :smile: and a name that is much longer than the eighty columns of a terminal " * 2
+
+
+def test_a_piped_table_is_plain_text(capsys):
+    """Names are neither wrapped nor taken for rich's markup; columns are aligned, and no line ends in spaces."""
+    console.table([("name", "b"), (LONG, "warning"), ("", "x")])
+    lines = capsys.readouterr().out.splitlines()
+    width = len(LONG)
+    assert lines == [f"  {'name':{width}}  b", f"  {LONG}  warning", f"  {'':{width}}  x"]
+
+
+@pytest.mark.parametrize(
+    ("row", "text"),
+    [
+        (("albedo", "default", ""), "none found: expect blur, render an albedo"),
+        (("variance", "default", ""), "none found (optional)"),
+        (("normal", "found", "N"), "found: N"),
+        (("diffuse", "computed", "a + b"), "computed: a + b (scaled)"),
+        (("variance", "unused", "v"), "found: v; this model does not read it"),
+        (("variance", "unused", ""), "none found; this model does not read it"),
+        (("alpha", "absent", ""), "none"),
+    ],
+)
+def test_where_a_feature_comes_from_is_said_in_words(capsys, row, text):
+    feature, status, source = row
+    note = "scaled" if status == "computed" else ""
+    console.aov_table([{"feature": feature, "status": status, "source": source, "note": note}], ["n"])
+    assert capsys.readouterr().out == f"  {feature}  {text}\n  note: n\n"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")
+def test_progress_is_drawn_on_the_terminal_and_not_in_the_data(tmp_path, bilinear_models):
+    """With standard error on a terminal and standard output in a pipe: a bar, whole messages, and clean JSON."""
+    make_shot(tmp_path, 4)
+    (tmp_path / "hr/beauty.1003.exr").write_text("no EXR")
+    reader, terminal = os.openpty()
+    code = "import sys; from msspl_cli.app import msspl_fuse as main; sys.argv[0] = 'msspl-fuse'; main()"
+    options = ["--model", bilinear_models[4], "--no-preview", "--json"]
+    arguments = [tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / "out", *options]
+    with subprocess.Popen(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=terminal,
+        env={**os.environ, "TERM": "xterm", "COLUMNS": "200"},
+    ) as process:
+        out = process.stdout.read()
+    said = os.read(reader, 100_000).decode()
+    assert json.loads(out)["counts"]["fused"] == 3
+    assert "4 of 4 frames, 1 not fused" in said
+    assert said.count("error: frame 1003: ") == 1
+    assert said.rindex("\033[?25h") > said.index("\033[?25l")  # the cursor is shown again

@@ -1,0 +1,171 @@
+# SPDX-License-Identifier: Apache-2.0
+"""msspl-fuse on shots, as a process: what it prints, its exit code, and what is left when it is ended."""
+
+import json
+import re
+import resource
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from oiio_msspl.exr.preview import write_png
+from tests.conftest import read_bits, write_exr
+from tests.programs import fuse
+from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lr/#.##.exr", "hr", "-o", "out"], "has its frame number in one place"),
+        (["lr/x.####.exr", "hr", "-o", "out"], "no file has such a name; the folder has .*lr.####.exr"),
+        (["no/x.####.exr", "hr", "-o", "out"], "there is no folder"),
+        (["lr/lr.1001.exr", "hr", "-o", "out"], "is a single file, the other one is a folder"),
+        (["lr", "hr", "-o", "out.exr"], r"one name for many frames; write out.####.exr"),
+        (["lr", "hr", "-o", "out.####.png"], "the results are EXRs"),
+        (["lr", "hr", "-o", "no/such/folder"], "does not exist; create it first"),
+        (["lr", "hr", "-o", "hr", "--skip-existing"], "is one of the inputs"),
+        (["lr", "hr", "-o", "out", "--frames", "a-b"], "--frames 'a-b': write it as 1001-1100"),
+        (["lr", "hr", "-o", "out", "--frames", "1-2x0.5"], "whole frames only"),
+        (["lr", "hr", "-o", "out", "--frames", ""], "names no frame"),
+        (["lr", "hr", "-o", "out", "--overwrite", "--skip-existing"], "exclude each other"),
+        (["lr", "hr", "-o", "out", "--progress", "x"], "use one of openjd, json"),
+        (["lr", "hr", "-o", "out", "--progress", "json", "--json"], "both print to standard output"),
+        (["lr", "hr", "-o", "out", "--report", "no/r.json"], "does not exist; create it first"),
+        (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
+        (["lr", "hr", "-o", "out", "--view", "x"], "--view 'x'"),
+        (["lr", "hr", "-o", "out", "--model", "paper", "--error-layer"], "paper-x4 does not predict its error"),
+        (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "o.exr", "--skip-existing"], "--skip-existing is for shots"),
+    ],
+)
+def test_what_is_wrong_for_the_whole_shot_is_said_at_once(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(make_shot(tmp_path, 1))
+    done = fuse(*arguments)
+    assert done.returncode == 2
+    assert done.stderr.count("\n") == 1 and done.stdout == ""
+    assert re.search(message, done.stderr), done.stderr
+
+
+def test_progress_for_programs(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 3)
+    (folder / "lr/lr.1002.exr").unlink()
+    arguments = [folder / "lr", folder / "hr", "-o", folder / "out", "--model", bilinear_models[4], "--no-preview"]
+    lines = [json.loads(line) for line in fuse(*arguments, "--progress", "json").stdout.splitlines()]
+    assert [(line["frame"], line["status"], line["done"], line["count"]) for line in lines] == [
+        (1002, "missing", 1, 3),
+        (1001, "fused", 2, 3),
+        (1003, "fused", 3, 3),
+    ]
+    done = fuse(*arguments, "--progress", "openjd", "--skip-existing", "-q")
+    assert done.stdout.splitlines() == [
+        "openjd_progress: 33.3",
+        "openjd_status: frame 1001 skipped, 1 of 3 done",
+        "openjd_progress: 66.7",
+        "openjd_status: frame 1002 missing, 2 of 3 done",
+        f"openjd_fail: frame 1002: no LRHS ({folder}/lr/lr.####.exr) of this number",
+        "openjd_progress: 100.0",
+        "openjd_status: frame 1003 skipped, 3 of 3 done",
+    ]
+    assert done.returncode == 2
+
+
+def test_what_a_person_reads(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 4)
+    (folder / "hr/beauty.1003.exr").write_text("no EXR")
+    done = fuse(folder / "lr", folder / "hr", "-o", folder / "out", "--model", bilinear_models[4], "-v", "--no-preview")
+    assert done.returncode == 2
+    assert "  albedo    found: albedo\n" in done.stdout
+    assert "  fused   3  1001-1002,1004\n  failed  1  1003 " in done.stdout
+    assert done.stderr.count("error: frame 1003:") == 1
+    assert "frame 1004: fused (read " in done.stderr
+
+
+def test_a_full_disk_and_an_unwritable_target_are_failures_of_ours(tmp_path, bilinear_models):
+    """Exit code 1; neither a half frame nor a preview without its frame stays."""
+    folder = make_shot(tmp_path, 4)
+    noise = np.random.default_rng(0).integers(0, 2**31, (HEIGHT, WIDTH), dtype=np.uint32)
+    write_exr(folder / "hr/beauty.1002.exr", layers(0) | {f"id{i}.X": noise + i for i in range(40)})
+    (folder / "out").mkdir()
+    (folder / "out/beauty.1003.exr").symlink_to(folder / "gone" / "x.exr")
+
+    code = "import sys; from msspl_cli.app import msspl_fuse as main; main()"
+    arguments = [folder / "lr", folder / "hr", "-o", folder / "out", "--model", bilinear_models[4], "--overwrite"]
+    done = subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100_000, 100_000)),
+    )
+    assert done.returncode == 1
+    assert "error: frame 1002: " in done.stderr and "error: frame 1003: " in done.stderr
+    assert done.stderr.count("can't be written") == 2, done.stderr
+    names = {path.name for path in (folder / "out").iterdir() if path.is_file()}
+    assert names == {f"beauty.{n}.{e}" for n in (1001, 1004) for e in ("exr", "png")}
+
+
+def start(folder, model, *more):
+    code = "import sys; from msspl_cli.app import msspl_fuse; msspl_fuse()"
+    arguments = [folder / "lr", folder / "hr", "-o", folder / "out", "--model", model, "--report", folder / "r.json"]
+    command = [sys.executable, "-c", code, *map(str, arguments), "--skip-existing", *more]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def wait_for(folder, count, process):
+    """Until so many frames are there."""
+    while sum(1 for _ in folder.glob("out/beauty.*.exr")) < count:
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.001)
+
+
+def test_a_shot_killed_three_times_and_resumed_is_whole(tmp_path, bilinear_models):
+    """100 frames; every file is there, and bit for bit that of a run that nobody disturbed; nothing else is."""
+    folder = make_shot(tmp_path, 100)
+    undisturbed = start(folder, bilinear_models[4])
+    assert undisturbed.communicate() and undisturbed.returncode == 0
+    (folder / "out").rename(folder / "expected")
+    (folder / "r.json").unlink()
+
+    for count, delay in ((1, 0.0), (40, 0.003), (75, 0.007)):
+        process = start(folder, bilinear_models[4])
+        wait_for(folder, count, process)
+        time.sleep(delay)
+        process.kill()
+        process.communicate()
+        assert process.returncode == -signal.SIGKILL
+        expected = contents(folder / "expected")
+        half = {n: data for n, data in contents(folder / "out").items() if not n.startswith(".")}
+        assert half.items() <= expected.items()
+        if (folder / "r.json").exists():
+            assert not json.loads((folder / "r.json").read_text())["finished"]
+    # What a kill in the middle of writing leaves, should the three moments have missed it.
+    (folder / "out/.beauty.1100.99999.tmp.exr").write_bytes(b"half")
+    write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
+
+    last = start(folder, bilinear_models[4])
+    last.communicate()
+    assert last.returncode == 0
+    assert contents(folder / "out") == contents(folder / "expected")
+    report = json.loads((folder / "r.json").read_text())
+    assert report["finished"] and report["counts"]["fused"] + report["counts"]["skipped"] == 100
+    assert [path.name for path in folder.iterdir() if path.name.startswith(".")] == []
+
+
+@pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
+def test_ctrl_c_ends_with_the_table_and_whole_frames(tmp_path, bilinear_models, name, code):
+    folder = make_shot(tmp_path, 100)
+    process = start(folder, bilinear_models[4], "--no-preview")
+    wait_for(folder, 5, process)
+    process.send_signal(getattr(signal, name))
+    out, err = process.communicate()
+    assert process.returncode == code, err
+    assert "Traceback" not in err
+    report = json.loads((folder / "r.json").read_text())
+    files = sorted(path.name for path in (folder / "out").iterdir())
+    assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]]
+    assert 5 <= len(files) < 100 and not report["finished"]
+    assert f"  fused     {len(files)} " in out and "run again with --skip-existing" in out
+    read_bits(folder / "out" / files[-1])

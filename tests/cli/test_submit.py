@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""msspl submit, as a process: which mistakes it reports before any task runs."""
+
+import json
+
+import pytest
+
+from tests.programs import run
+from tests.shots import make_shot
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lr", "hr", "-o", "out", "--overwrite"], "--overwrite has no meaning in a job"),
+        (["lr", "hr", "-o", "out", "--json"], "--json has no meaning in a job"),
+        (["lr", "hr", "-o", "out", "--layout", "x"], "--layout 'x': use one of"),
+        (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
+        (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: can't be read as an ONNX file"),
+        (["lr", "hr", "-o", "out", "--device", "abacus"], "--device 'abacus': use one of cpu"),
+        (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
+        (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
+        (["lr", "hr", "-o", "text.onnx/out"], "the folder text.onnx does not exist"),
+        (["lr", "hr", "-o", "out", "--layers", "{{a}}"], "for the start of a parameter"),
+        (["lr", "hr", "-o", "out", "--frames", "5-7"], "no frame is in both"),
+        (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "out.exr"], "a job is for a shot"),
+        (["lr", "no", "-o", "out"], "no: is a single file"),
+        (["lr", "hr", "-o", "out", "--colour"], "No such option"),
+        (["lr", "hr"], "Missing option"),
+        (["lr", "hr", "-o", "out", "--bundle", "hr"], "hr: exists; name a new folder"),
+    ],
+)
+def test_what_no_task_could_do_is_said_at_submission(tmp_path, monkeypatch, arguments, message):
+    make_shot(tmp_path, 1)
+    (tmp_path / "text.onnx").write_text("no model")
+    monkeypatch.chdir(tmp_path)
+    done = run("msspl", "submit", "--bundle", "job", *arguments)
+    assert done.returncode == 2
+    assert message in done.stderr
+    assert not (tmp_path / "job").exists()
+
+
+@pytest.mark.parametrize(
+    ("given", "model"), [([], "pyramid"), (["--model", "auto"], "pyramid"), (["--model", "paper-x4"], "paper-x4")]
+)
+def test_a_shipped_model_goes_by_its_name_and_is_the_same_for_all_tasks(tmp_path, given, model):
+    make_shot(tmp_path, 1)
+    paths = (tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / "out", "--bundle", tmp_path / "job")
+    assert run("msspl", "submit", *paths, *given).returncode == 0
+    action = json.loads((tmp_path / "job/template.json").read_text())["steps"][0]["script"]["actions"]["onRun"]
+    assert action["args"][-2:] == ["--model", model]

@@ -1,0 +1,153 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A shot on the workers of a Dask cluster."""
+
+import json
+import os
+import re
+import signal
+import time
+from functools import partial
+
+import numpy as np
+import pytest
+
+from oiio_msspl import InputError, fuse_shot
+from oiio_msspl.exr.preview import write_png
+from oiio_msspl.jobs.dask_cluster import _sessions
+from oiio_msspl.jobs.stages import Stages
+from tests.programs import fuse
+from tests.shots import contents, make_shot
+
+
+@pytest.fixture(scope="module")
+def two_workers(tmp_path_factory):
+    """A cluster of two worker processes, as ``dask scheduler`` and ``dask worker --nthreads 1`` make it."""
+    distributed = pytest.importorskip("distributed")
+    with distributed.LocalCluster(
+        n_workers=2,
+        threads_per_worker=1,
+        memory_limit=0,
+        dashboard_address="127.0.0.1:0",
+        local_directory=tmp_path_factory.mktemp("dask"),
+        silence_logs=50,
+    ) as made:
+        yield made
+
+
+@pytest.fixture
+def client(two_workers):
+    from distributed import Client
+
+    with Client(two_workers) as made:
+        made.wait_for_workers(2)  # the cluster starts another one for one that died
+        yield made
+
+
+def hang_in_writing(marker):
+    """In a worker: leave what there is in the middle of writing a frame, tell, and go no further."""
+
+    def write(self, report, fused):
+        write_png(report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
+        report.output.with_name(f".{report.output.stem}.{os.getpid()}.tmp.exr").write_bytes(b"half")
+        marker.touch()
+        time.sleep(1000)
+
+    Stages.write = write
+
+
+def loaded_models():
+    """In a worker: how often it has started to load models anew."""
+    return _sessions.cache_info().misses
+
+
+def test_a_worker_killed_in_the_middle_of_a_frame_loses_nothing(tmp_path, bilinear_models, client):
+    """Another one takes the frame over, and every file is that of a local run; nothing else is there."""
+    make_shot(tmp_path, 10)
+    settings = {"model": str(bilinear_models[4]), "previews": True}
+    fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "local", **settings)
+    processes = client.run(os.getpid)
+    victim = next(iter(processes))
+    client.run(hang_in_writing, tmp_path / "writing", workers=[victim])
+    killed = []
+
+    def kill(result, report):
+        if not killed:
+            while not (tmp_path / "writing").exists():
+                time.sleep(0.01)
+            os.kill(processes[victim], signal.SIGKILL)
+            killed.append(len(report.results))
+
+    report_path = tmp_path / "r.json"
+    report = fuse_shot(
+        tmp_path / "lr",
+        tmp_path / "hr",
+        tmp_path / "out",
+        client=client,
+        progress=kill,
+        report_path=report_path,
+        **settings,
+    )
+    assert killed == [1]
+    assert report.exit_code == 0
+    assert [result.status for result in report.results.values()] == ["fused"] * 10
+    assert contents(tmp_path / "out") == contents(tmp_path / "local")
+    saved = json.loads(report_path.read_text())
+    assert saved["finished"] and saved["counts"]["fused"] == 10
+    assert [entry["frame"] for entry in saved["frames"]] == list(range(1001, 1011))
+
+
+def test_the_program_says_of_a_cluster_what_it_says_of_a_local_run(tmp_path, bilinear_models, two_workers, client):
+    """Table, messages, exit code; bad frames stop no others; each worker loads the model once."""
+    make_shot(tmp_path, 6)
+    (tmp_path / "hr/beauty.1002.exr").write_text("no EXR")
+    (tmp_path / "hr/beauty.1004.exr").unlink()
+    known = client.run(loaded_models)
+    said = []
+    for out, more in (("local", []), ("out", ["--scheduler", two_workers.scheduler_address])):
+        done = fuse(tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / out, "--model", bilinear_models[4], *more)
+        assert done.returncode == 2, done.stderr
+        table = re.sub(r"layers of frame \d+", "layers", done.stdout.replace(f"/{out}/", "/"))
+        said.append((re.sub(r"\d+\.\d s.*", "", table), sorted(done.stderr.splitlines())))
+    assert said[0] == said[1]
+    assert "fused    4  1001-1005x2,1006" in said[1][0]
+    assert contents(tmp_path / "out") == contents(tmp_path / "local")
+    assert all(after - known[address] <= 1 for address, after in client.run(loaded_models).items())
+
+
+def test_a_frame_that_kills_its_workers_is_given_up(tmp_path, bilinear_models, two_workers, client):
+    make_shot(tmp_path, 1)
+    two_workers.scheduler.allowed_failures, usual = 0, two_workers.scheduler.allowed_failures
+
+    def die(self, frame):
+        os._exit(1)
+
+    client.run(partial(setattr, Stages, "read"), die)
+    try:
+        report = fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", client=client)
+    finally:
+        two_workers.scheduler.allowed_failures = usual
+        client.restart()
+    assert report.exit_code == 1
+    assert "every worker that tried it died" in report.results[1001].message
+
+
+def test_a_worker_of_several_threads_is_refused(tmp_path):
+    distributed = pytest.importorskip("distributed")
+    make_shot(tmp_path, 1)
+    with (
+        distributed.LocalCluster(
+            n_workers=1, threads_per_worker=2, processes=False, dashboard_address="127.0.0.1:0", silence_logs=50
+        ) as made,
+        distributed.Client(made) as client,
+        pytest.raises(InputError, match="2 frames at a time; start it with --nthreads 1"),
+    ):
+        fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", client=client)
+
+
+def test_an_address_without_a_scheduler_is_a_mistake(tmp_path):
+    pytest.importorskip("distributed")
+    make_shot(tmp_path, 1)
+    done = fuse(tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / "out", "--scheduler", "nobody")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: --scheduler nobody: no Dask scheduler answers there")
+    assert done.stderr.count("\n") == 1

@@ -1,0 +1,117 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which files are the frames of a shot."""
+
+import pytest
+
+from oiio_msspl import InputError
+from oiio_msspl.jobs.sequence import find_shot, format_frames, parse_frames, parse_pattern
+
+
+def touch(folder, *names):
+    folder.mkdir(parents=True, exist_ok=True)
+    for name in names:
+        (folder / name).touch()
+    return folder
+
+
+@pytest.mark.parametrize("pattern", ["a.####.exr", "a.%04d.exr", "a.@@@@.exr", "a.$F4.exr"])
+def test_every_way_to_write_a_pattern_means_the_same_files(tmp_path, pattern):
+    """Four digits: 7 is 0007 and not 7, 10000 has five, -3 is -003; other names are others' files."""
+    names = ["a.0007.exr", "a.10000.exr", "a.-003.exr", "a.7.exr", "b.0007.exr", "a.0007.crypto.exr", "a.x.exr"]
+    folder = touch(tmp_path / "lr#1", *names)
+    found = find_shot(folder / pattern, folder / pattern, tmp_path / pattern)
+    assert [frame.number for frame in found.frames] == [-3, 7, 10000]
+    assert [frame.lr.name for frame in found.frames] == ["a.-003.exr", "a.0007.exr", "a.10000.exr"]
+    assert found.frames[1].output == tmp_path / "a.0007.exr"
+
+
+def test_folders_pair_by_number_whatever_names_and_padding(tmp_path):
+    """Blender's 0001.exr against name-1.exr; hidden files, pictures and unnumbered EXRs are no frames."""
+    touch(tmp_path / "lr", "0001.exr", "0002.exr", ".0003.exr", "0004.png", "single.exr")
+    touch(tmp_path / "hr", "shot-1.exr", "shot-2.exr", "shot-10.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert [(f.number, f.lr and f.lr.name, f.hr and f.hr.name, f.output.name) for f in found.frames] == [
+        (1, "0001.exr", "shot-1.exr", "shot-1.exr"),
+        (2, "0002.exr", "shot-2.exr", "shot-2.exr"),
+        (10, None, "shot-10.exr", "shot-10.exr"),
+    ]
+
+
+def test_of_several_sequences_those_of_one_name_are_paired(tmp_path):
+    touch(tmp_path / "lr", "beauty_0001.exr", "beauty_0002.exr", "ao.1.exr")
+    touch(tmp_path / "hr", "beauty.0001.exr", "beauty.0002.exr", "crypto.0001.exr", "beauty.0001.id.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert (found.lr.pattern.name, found.hr.pattern.name) == ("beauty_####.exr", "beauty.####.exr")
+
+
+def test_results_are_named_exr_whatever_the_hrls_is_named(tmp_path):
+    touch(tmp_path, "hr.exr.0001", "hr.exr.0002")
+    found = find_shot(tmp_path / "hr.exr.####", tmp_path / "hr.exr.####", tmp_path / "out")
+    assert [frame.output.name for frame in found.frames] == ["hr.exr.0001.exr", "hr.exr.0002.exr"]
+
+
+@pytest.mark.parametrize(
+    ("lr", "hr", "message"),
+    [
+        (["a.1.exr", "b.1.exr"], ["a.1.exr", "b.1.exr"], "2 sequences go by the same name in both; name the two"),
+        (["lr.1.exr"], ["a.1.exr", "b.1.exr"], "hr has a.#.exr, b.#.exr, and none has the same name in both"),
+        (["lr.1.exr", "lr.0001.exr"], ["a.1.exr"], "with and without zeros"),
+        (["lr.exr"], ["a.1.exr"], "lr: no numbered EXRs"),
+    ],
+)
+def test_folders_that_leave_a_doubt_are_explained(tmp_path, lr, hr, message):
+    touch(tmp_path / "lr", *lr), touch(tmp_path / "hr", *hr)
+    with pytest.raises(InputError, match=message):
+        find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+
+
+@pytest.mark.parametrize(
+    ("frames", "numbers"),
+    [
+        ("1001-1007x3", [1001, 1004, 1007]),
+        ("1004, 1001-1002", [1004, 1001, 1002]),
+        ("-2-1", [-2, -1, 0, 1]),
+        ([1003, 1001, 1003], [1003, 1001]),
+        (range(5, 7), [5, 6]),
+    ],
+)
+def test_ranges_are_taken_in_their_order(tmp_path, frames, numbers):
+    folder = touch(tmp_path / "a", "a.1001.exr")
+    found = find_shot(folder, folder, tmp_path / "out", frames)
+    assert [frame.number for frame in found.frames] == numbers
+    assert sum(frame.lr is not None for frame in found.frames) == numbers.count(1001)
+
+
+def test_frames_are_shown_as_ranges():
+    assert format_frames([1001, 1002, 1003, 1007]) == "1001-1003,1007"
+
+
+@pytest.mark.parametrize(
+    ("name", "file"),
+    [
+        ("v2####.exr", "v20007.exr"),
+        ("take1-3_####.exr", "take1-3_0007.exr"),
+        ("a.####_v2.exr", "a.0007_v2.exr"),
+        ("a [left].####.exr", "a [left].0007.exr"),
+        ("####", "0007"),
+    ],
+)
+def test_names_that_fileseq_splits_differently(tmp_path, name, file):
+    """Digits before the number are no frame range, text after it needs no dot, and brackets are no wildcard."""
+    folder = touch(tmp_path / "lr#1.%04d", file)
+    assert parse_pattern(folder / name).path(7) == folder / file
+    found = find_shot(folder / name, folder / name, tmp_path / "out")
+    assert [frame.lr for frame in found.frames] == [folder / file]
+
+
+def test_a_hyphen_after_a_letter_is_a_separator_and_a_sign_elsewhere(tmp_path):
+    touch(tmp_path / "lr", "shot-0001.exr", "shot-0002.exr")
+    touch(tmp_path / "hr", "a.-001.exr", "a.0002.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert (found.lr.pattern.name, list(found.lr.files)) == ("shot-####.exr", [2, 1])
+    assert (found.hr.pattern.name, sorted(found.hr.files)) == ("a.####.exr", [-1, 2])
+
+
+def test_a_step_may_be_written_with_a_colon():
+    """As Houdini and Open Job Description write it. To fileseq a colon means a staggered range."""
+    assert parse_frames("1-9:4") == [1, 5, 9]

@@ -1,0 +1,399 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shots: what becomes of good and bad frames, and of runs that are ended."""
+
+import json
+import os
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
+import numpy as np
+import OpenEXR
+import OpenImageIO as oiio
+import pytest
+
+from oiio_msspl import InputError, MssplError, fuse_files, fuse_shot
+from oiio_msspl.exr.atomic import remove_leftovers, replacing
+from oiio_msspl.exr.preview import write_png
+from oiio_msspl.jobs import shot, stages
+from oiio_msspl.jobs.frame import write_frame
+from oiio_msspl.jobs.shot_report import fused_result
+from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.model.session import Session
+from tests.conftest import picture, rgb, write_exr
+from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
+
+
+def run(folder, model, **more):
+    return fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(model), **more)
+
+
+# ------------------------------------------------------------------------------------------------ good frames
+
+
+def test_a_shot_is_what_its_frames_are_alone(tmp_path, bilinear_models):
+    """Read ahead and written behind, each frame is bit for bit what fuse_files makes of it; so is its preview."""
+    folder = make_shot(tmp_path, 3)
+    report = run(folder, bilinear_models[4], previews=True)
+    assert report.exit_code == 0
+    assert sorted(contents(folder / "out")) == sorted(
+        f"beauty.{n}.{e}" for n in (1001, 1002, 1003) for e in ("exr", "png")
+    )
+    (folder / "alone").mkdir()
+    for frame in (1001, 1002, 1003):
+        pair = (folder / f"lr/lr.{frame}.exr", folder / f"hr/beauty.{frame}.exr")
+        out = folder / f"alone/beauty.{frame}.exr"
+        fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=out.with_suffix(".png"))
+    assert contents(folder / "out") == contents(folder / "alone")
+
+
+def test_frames_without_room_in_memory_are_read_as_they_are_fused(tmp_path, bilinear_models, monkeypatch):
+    folder = make_shot(tmp_path, 2)
+    assert run(folder, bilinear_models[4]).exit_code == 0
+    whole = contents(folder / "out")
+    monkeypatch.setattr(stages, "_pixel_bytes", lambda render: 1 << 40)
+    monkeypatch.setattr("oiio_msspl.aovs.mapped_render.MappedRender.load", pytest.fail)
+    assert run(folder, bilinear_models[4], overwrite=True).exit_code == 0
+    assert contents(folder / "out") == whole
+
+
+def test_the_three_stages_overlap_and_hold_one_frame_each(tmp_path, bilinear_models, monkeypatch):
+    """Each frame waits in its stage until the neighbours are in theirs: a pipeline that did not overlap would hang."""
+    inside = {"read": 0, "fuse": 0, "write": 0}
+    most = dict(inside)
+    began = {(stage, n): threading.Event() for stage in inside for n in range(1, 7)}
+
+    def watched(stage, number_of, meanwhile):
+        real = getattr(Stages, stage)
+
+        def call(self, *arguments):
+            number = number_of(arguments[0])
+            inside[stage] += 1
+            most[stage] = max(most[stage], inside[stage])
+            began[stage, number].set()
+            for other, offset in meanwhile:
+                if (other, number + offset) in began:
+                    assert began[other, number + offset].wait(20), f"{other} of {number + offset} does not overlap"
+            result = real(self, *arguments)
+            inside[stage] -= 1
+            return result
+
+        monkeypatch.setattr(Stages, stage, call)
+
+    watched("read", lambda frame: frame.number, [])
+    watched("fuse", lambda ready: ready.frame.number, [("read", 1), ("write", -1)])
+    watched("write", lambda report: int(report.output.stem.split(".")[1]), [("fuse", 1)])
+    folder = make_shot(tmp_path, 6, first=1)
+    assert run(folder, bilinear_models[4]).exit_code == 0
+    assert most == {"read": 1, "fuse": 1, "write": 1}
+
+
+def test_a_long_shot_loads_the_model_once_and_keeps_no_file_open(tmp_path, bilinear_models, monkeypatch):
+    loaded, handles = [], []
+    real = Session.__init__
+    monkeypatch.setattr(Session, "__init__", lambda self, *a, **k: (loaded.append(a), real(self, *a, **k))[1])
+    folder = make_shot(tmp_path, 12)
+    report = run(folder, bilinear_models[4], progress=lambda *_: handles.append(len(os.listdir("/proc/self/fd"))))
+    assert report.exit_code == 0
+    assert len(loaded) == 1
+    assert max(handles[3:]) <= handles[2] + 2
+
+
+# ------------------------------------------------------------------------------------------------ bad frames
+
+
+def truncate(path, share=0.6):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(len(data) * share)])
+
+
+def black(lr, hr):
+    write_exr(hr, layers(0) | rgb(np.zeros((HEIGHT, WIDTH, 3), np.float16)))
+
+
+def both_black(lr, hr):
+    black(lr, hr)
+    write_exr(lr, rgb(np.zeros((HEIGHT // 4, WIDTH // 4, 3), np.float16)))
+
+
+def not_finite(value):
+    def spoil(lr, hr):
+        channels = layers(0)
+        channels["G"][3:5, 7] = value
+        write_exr(hr, channels)
+
+    return spoil
+
+
+def all_nan(lr, hr):
+    write_exr(hr, layers(0) | rgb(np.full((HEIGHT, WIDTH, 3), np.nan, np.float16)))
+
+
+def swapped(lr, hr):
+    low, high = lr.read_bytes(), hr.read_bytes()
+    lr.write_bytes(high), hr.write_bytes(low)
+
+
+def corrupt_header(lr, hr):
+    data = bytearray(hr.read_bytes())
+    data[8:60] = b"\xff" * 52
+    hr.write_bytes(data)
+
+
+def corrupt_pixels(lr, hr):
+    data = bytearray(hr.read_bytes())
+    data[-600:] = b"\xff" * 600
+    hr.write_bytes(data)
+
+
+def deep(lr, hr):
+    samples = np.empty((4, 4), dtype=object)
+    for index in np.ndindex(4, 4):
+        samples[index] = np.ones(2, np.float32)
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    with OpenEXR.File(header, {c: samples.copy() for c in "RGBZ"}) as file:
+        file.write(str(hr))
+
+
+def png(lr, hr):
+    image = oiio.ImageBuf(oiio.ImageSpec(WIDTH, HEIGHT, 3, "uint8"))
+    image.write(str(hr), "uint8", "png")
+
+
+def folder_instead(lr, hr):
+    hr.unlink()
+    hr.mkdir()
+
+
+def same_file(lr, hr):
+    lr.unlink()
+    os.link(hr, lr)
+
+
+def other_size(height, width):
+    def resize(lr, hr):
+        write_exr(lr, rgb(picture(height, width)))
+
+    return resize
+
+
+def dim(lr, hr):
+    write_exr(lr, {c: values / 8 for c, values in low_layers(0).items()})
+
+
+#: What is wrong -> (how it comes about, how the frame ends, what is said).
+SORTS = {
+    "truncated HRLS": (lambda lr, hr: truncate(hr), "failed", "damaged or still being written"),
+    "truncated LRHS": (lambda lr, hr: truncate(lr), "failed", "damaged or still being written"),
+    "corrupt header": (corrupt_header, "failed", "can't be opened as an EXR"),
+    "corrupt pixels": (corrupt_pixels, "failed", "damaged or still being written"),
+    "zero bytes": (lambda lr, hr: hr.write_bytes(b""), "failed", "can't be opened as an EXR"),
+    "text": (lambda lr, hr: lr.write_text("not an EXR " * 50), "failed", "can't be opened as an EXR"),
+    "PNG named .exr": (png, "failed", "is a png file; give an EXR"),
+    "deep": (deep, "failed", "holds deep data only"),
+    "folder": (folder_instead, "failed", "is a folder"),
+    "named pipe": (lambda lr, hr: (lr.unlink(), os.mkfifo(lr)), "failed", "no such file"),
+    "broken link": (lambda lr, hr: (lr.unlink(), lr.symlink_to("nowhere")), "failed", "no such file"),
+    "no beauty": (lambda lr, hr: write_exr(hr, {"Z": picture(8, 8)[..., 0]}), "failed", "no beauty"),
+    "ids for a beauty": (
+        lambda lr, hr: write_exr(hr, rgb(np.ones((HEIGHT, WIDTH, 3), np.uint32))),
+        "failed",
+        "hold integers",
+    ),
+    "missing LRHS": (lambda lr, hr: lr.unlink(), "missing", "no LRHS"),
+    "missing HRLS": (lambda lr, hr: hr.unlink(), "missing", "no HRLS"),
+    "swapped": (swapped, "failed", "the inputs look swapped"),
+    "one file twice": (same_file, "failed", "given twice"),
+    "other pixel aspect": (
+        lambda lr, hr: write_exr(hr, layers(0), pixelAspectRatio=2.0),
+        "failed",
+        "has pixel aspect 1",
+    ),
+    "unsupported ratio": (other_size(HEIGHT, WIDTH), "failed", "a ratio of 1 is not supported"),
+    "other framing": (other_size(8, 16), "failed", "framing differs"),
+    "other scale": (other_size(16, 24), "failed", "is for x4, but this pair is x2"),
+    "black HRLS": (black, "failed", "the beauty is black"),
+    "NaN everywhere": (all_nan, "failed", "the beauty is black"),
+    "both black": (both_black, "fused", "both renders are black"),
+    "some NaN": (not_finite(np.nan), "fused", "repaired values that were NaN"),
+    "some Inf": (not_finite(np.inf), "fused", "repaired values that were NaN"),
+    "no albedo": (
+        lambda lr, hr: write_exr(hr, {k: v for k, v in layers(0).items() if "albedo" not in k}),
+        "fused",
+        "albedo is default here and found in frame 1000",
+    ),
+    "other exposure": (dim, "fused", "times as bright as the LRHS"),
+    "existing target": ("{out}.exr", "failed", "the output exists; pass --skip-existing or --overwrite"),
+    "existing preview": ("{out}.png", "failed", "exists; pass --overwrite"),
+    "folder for a target": ("{out}.exr/", "failed", "is a folder"),
+}
+
+
+def test_every_sort_of_bad_frame_is_named_and_the_others_are_fused(tmp_path, bilinear_models):
+    """The bad ones stand between good ones, which come out as ever."""
+    folder = make_shot(tmp_path, 2 * len(SORTS) + 1, first=1000)
+    (folder / "out").mkdir()
+    bad = dict(zip(SORTS, range(1001, 10000, 2), strict=False))
+    for sort, number in bad.items():
+        how = SORTS[sort][0]
+        if callable(how):
+            how(folder / f"lr/lr.{number}.exr", folder / f"hr/beauty.{number}.exr")
+        elif how.endswith("/"):
+            (folder / f"out/beauty.{number}.exr").mkdir()
+        else:
+            (folder / how.format(out=f"out/beauty.{number}")).write_text("mine")
+    report_path = folder / "report.json"
+    report = run(folder, bilinear_models[4], previews=True, report_path=report_path)
+
+    results = {entry["frame"]: entry for entry in json.loads(report_path.read_text())["frames"]}
+    assert len(results) == 2 * len(SORTS) + 1
+    for sort, number in bad.items():
+        _, status, words = SORTS[sort]
+        entry = results[number]
+        said = entry["message"] or " ".join(entry["warnings"])
+        assert (sort, entry["status"], entry["exit_code"]) == (sort, status, 0 if status == "fused" else 2), said
+        assert words in said, (sort, said)
+        assert (folder / f"out/beauty.{number}.exr").is_file() == (status == "fused" or sort == "existing target")
+    good = set(results) - set(bad.values())
+    assert all(results[n]["status"] == "fused" and not results[n]["warnings"] for n in good)
+    assert {path.name for path in (folder / "out").iterdir() if path.name.startswith(".")} == set()
+    assert (folder / f"out/beauty.{bad['existing target']}.exr").read_text() == "mine"
+    assert (folder / f"out/beauty.{bad['existing preview']}.png").read_text() == "mine"
+    assert report.exit_code == 2
+
+
+@pytest.mark.skipif(os.geteuid() == 0, reason="root may write anywhere")
+def test_a_read_only_folder_is_said_at_once(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 1)
+    (folder / "out").mkdir(mode=0o555)
+    with pytest.raises(InputError, match="is not writable"):
+        run(folder, bilinear_models[4])
+
+
+def test_a_fault_of_the_program_in_one_frame_does_not_stop_the_others(tmp_path, bilinear_models, monkeypatch):
+    folder = make_shot(tmp_path, 3)
+    real = stages.fuse
+
+    def faulty(lr, *arguments, **more):
+        if "1002" in lr.name:
+            raise ZeroDivisionError("oh")
+        return real(lr, *arguments, **more)
+
+    monkeypatch.setattr(stages, "fuse", faulty)
+    report = run(folder, bilinear_models[4])
+    assert [result.status for result in report.results.values()] == ["fused", "failed", "fused"]
+    assert report.results[1002].message.startswith("unexpected ZeroDivisionError: oh")
+    assert report.exit_code == 1
+
+
+def test_a_picture_that_is_no_preview_of_ours_is_left_alone(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 2)
+    (folder / "out").mkdir()
+    mine = folder / "out/beauty.1001.png"
+    oiio.ImageBuf(oiio.ImageSpec(4, 4, 3, "uint8")).write(str(mine))
+    before = mine.read_bytes()
+    write_png(folder / "out/beauty.1002.png", np.zeros((2, 2, 3)))  # of a run that was killed
+    report = run(folder, bilinear_models[4], previews=True, skip_existing=True)
+    assert [report.results[n].status for n in (1001, 1002)] == ["failed", "fused"]
+    assert "beauty.1001.png: exists; pass --overwrite" in report.results[1001].message
+    assert mine.read_bytes() == before
+    assert oiio.ImageBuf(str(folder / "out/beauty.1002.png")).spec().width == WIDTH
+
+
+def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeypatch):
+    """An old frame that can't be replaced, and one that another run puts there meanwhile."""
+    folder = make_shot(tmp_path, 1)
+    assert run(folder, bilinear_models[4], previews=True).exit_code == 0
+    before, real = contents(folder / "out"), write_frame
+
+    def full_disk(*arguments, **more):
+        raise MssplError("disk full")
+
+    def too_late(report, *arguments, **more):
+        report.output.write_text("theirs")
+        real(report, *arguments, **more)
+
+    write_exr(folder / "lr/lr.1001.exr", {c: values / 2 for c, values in low_layers(1).items()})
+    monkeypatch.setattr(stages, "write_frame", full_disk)
+    assert run(folder, bilinear_models[4], previews=True, overwrite=True).results[1001].message == "disk full"
+    assert contents(folder / "out") == before
+    (folder / "out/beauty.1001.exr").unlink()
+    assert run(folder, bilinear_models[4], previews=True, skip_existing=True).results[1001].message == "disk full"
+    assert contents(folder / "out") == {}
+    monkeypatch.setattr(stages, "write_frame", too_late)
+    assert "appeared while" in run(folder, bilinear_models[4], previews=True).results[1001].message
+    assert (folder / "out/beauty.1001.png").exists()
+
+
+def test_what_is_done_is_skipped_and_its_report_kept(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 3)
+    not_finite(np.nan)(None, folder / "hr/beauty.1001.exr")
+    report_path = folder / "r.json"
+    run(folder, bilinear_models[4], frames="1001-1002", report_path=report_path)
+    before = contents(folder / "out")
+    with pytest.raises(InputError, match=r"r\.json: exists"):
+        run(folder, bilinear_models[4], report_path=report_path)
+    report = run(folder, bilinear_models[4], skip_existing=True, report_path=report_path)
+    assert [result.status for result in report.results.values()] == ["skipped", "skipped", "fused"]
+    assert before.items() <= contents(folder / "out").items()
+    saved = json.loads(report_path.read_text())
+    assert saved["frames"][0]["repaired"] == {"hrls.rgb": 2}
+    assert saved["counts"] == {"all": 3, "fused": 1, "skipped": 2, "failed": 0, "missing": 0}
+    assert saved["finished"] and saved["exit_code"] == 0
+    report_path.write_text("[]")
+    with pytest.raises(InputError, match="is no report of a shot"):
+        run(folder, bilinear_models[4], skip_existing=True, report_path=report_path)
+
+
+# ------------------------------------------------------------------------------------------------ runs that are ended
+
+
+def test_a_signal_between_writing_and_recording_loses_no_frame(tmp_path, bilinear_models, monkeypatch):
+    folder, recorded = make_shot(tmp_path, 4), fused_result
+    moments = iter([None, KeyboardInterrupt])
+
+    def interrupted(*arguments):
+        if moment := next(moments, None):
+            raise moment
+        return recorded(*arguments)
+
+    monkeypatch.setattr(shot, "fused_result", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, bilinear_models[4], report_path=folder / "r.json", previews=False)
+    report = json.loads((folder / "r.json").read_text())
+    files = sorted(path.name for path in (folder / "out").iterdir())
+    assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]] != []
+
+
+def test_a_frame_that_is_handed_over_as_the_signal_comes_is_reported(tmp_path, bilinear_models, monkeypatch):
+    folder = make_shot(tmp_path, 5)
+    submit, handed_over = ThreadPoolExecutor.submit, []
+
+    def interrupted(self, work, *arguments):
+        future = submit(self, work, *arguments)
+        if self._thread_name_prefix == "write":
+            handed_over.append(work)
+            if len(handed_over) == 3:
+                raise KeyboardInterrupt
+        return future
+
+    monkeypatch.setattr(ThreadPoolExecutor, "submit", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, bilinear_models[4], report_path=folder / "r.json", previews=False)
+    report = json.loads((folder / "r.json").read_text())
+    files = sorted(path.name for path in (folder / "out").iterdir())
+    assert files == [f"beauty.{entry['frame']}.exr" for entry in report["frames"]]
+    assert len(files) == 3
+
+
+def test_temporary_files_of_two_machines_have_two_names(tmp_path, monkeypatch):
+    """Where both have a process of one number; either is known as a leftover."""
+    monkeypatch.setattr(os, "getpid", lambda: 7)
+    target = tmp_path / "a.1001.exr"
+    with replacing(target, overwrite=True) as one, replacing(target) as other:
+        for path in (one, other):
+            path.touch()
+        assert len(list(tmp_path.iterdir())) == 2
+        remove_leftovers([target])
+        assert list(tmp_path.iterdir()) == []
+        for path in (one, other):
+            path.touch()

@@ -1,0 +1,36 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Small shots that the tests of several folders make for themselves."""
+
+import re
+
+import numpy as np
+
+from tests.conftest import downsample, noisy, picture, rgb, write_exr
+
+HEIGHT, WIDTH = 32, 48
+
+
+def layers(seed, spp=1):
+    """Channels of an HRLS."""
+    clean = picture(HEIGHT, WIDTH)
+    albedo = rgb((clean > 0.3).astype(np.float16), "albedo.")
+    return rgb(noisy(clean, spp, seed).astype(np.float16)) | albedo | {"Z": clean[..., 0]}
+
+
+def low_layers(seed, scale=4):
+    return rgb(noisy(downsample(picture(HEIGHT, WIDTH), scale), 16, seed).astype(np.float16))
+
+
+def make_shot(folder, count, lr="lr", hr="hr", first=1001):
+    """Write pairs at x4, named lr/lr.####.exr and hr/beauty.####.exr, and return ``folder``."""
+    for name in (lr, hr):
+        (folder / name).mkdir(parents=True)
+    for frame in range(first, first + count):
+        write_exr(folder / lr / f"lr.{frame}.exr", low_layers(frame))
+        write_exr(folder / hr / f"beauty.{frame}.exr", layers(frame))
+    return folder
+
+
+def contents(folder):
+    """{name: bytes}, without the date that OpenImageIO gives a file whose source has none."""
+    return {path.name: re.sub(rb"\d{4}(:\d\d){2} \d\d(:\d\d){2}", b"", path.read_bytes()) for path in folder.iterdir()}

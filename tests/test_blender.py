@@ -1,28 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Blender add-on and msspl-render: what needs no Blender always, the rest in every Python with bpy that is found.
+"""The Blender add-on in every Python with bpy that is found. tests/cli/test_render.py runs msspl-render without Blender.
 
 MSSPL_TEST_BPY names those Pythons, separated as in PATH; otherwise ~/venvs/bpy*/bin/python are tried.
 """
 
 import json
 import os
-import re
-import signal
 import subprocess
 import sys
-import time
 import tomllib
 from pathlib import Path
 
 import numpy as np
 import pytest
-from msspl_cli.commands import render
 from msspl_cli.installed import find_msspl_fuse
 
 from oiio_msspl import __version__
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.alignment import align
 from tests.conftest import EXAMPLES
 

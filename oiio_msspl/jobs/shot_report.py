@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of a shot and of each of its frames, in memory and as a JSON file."""
+"""Reports what became of a shot and of each of its frames, in memory and as a JSON file."""
 
 from __future__ import annotations
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The Blender add-on in every Python with bpy that is found. tests/cli/test_render.py runs msspl-render without Blender.
+"""The Blender add-on in every Python with bpy that is found. tests/cli/test_render.py has msspl-render without it.
 
 MSSPL_TEST_BPY names those Pythons, separated as in PATH; otherwise ~/venvs/bpy*/bin/python are tried.
 """

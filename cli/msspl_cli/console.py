@@ -20,7 +20,7 @@ _UNLIMITED = 100_000
 #: Colours of the words that say how a frame ended.
 _STYLES = {"fused": "green", "failed": "red", "missing": "red", "not done": "yellow", "warning": "yellow"}
 
-#: What is printed of a feature that a render lacks. The others are optional.
+#: Printed for a feature that the render lacks. All other features are optional.
 _NONE_FOUND = {"albedo": "none found: expect blur, render an albedo"}
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is printed of a shot: progress for people and for programs while it runs, and a table at its end."""
+"""Prints a shot: progress for people and for programs while it runs, and a table at its end."""
 
 from __future__ import annotations
 

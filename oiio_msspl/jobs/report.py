@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is reported of a fused frame: its inputs, the layers used, warnings, and the attributes written into the EXR."""
+"""Reports a fused frame: its inputs, the layers used, warnings, and the attributes written into the EXR."""
 
 from __future__ import annotations
 

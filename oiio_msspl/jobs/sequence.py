@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which files are the frames of a shot: numbered EXRs, found by pattern or folder and paired by frame number.
+"""Finds the frames of a shot: numbered EXRs, by pattern or folder, paired by frame number.
 
 fileseq reads padding, frame ranges and the sequences of a folder. Where its reading differs from what compositors
 expect, a comment says so.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is known of a shot before its first frame is read: whether results can be written, and which frames to skip."""
+"""Checks a shot before its first frame is read: whether results can be written, and which frames to skip."""
 
 from __future__ import annotations
 

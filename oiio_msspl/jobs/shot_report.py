@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What became of a shot and of each of its frames, in memory and as a JSON file."""
+"""Reports what became of a shot and of each of its frames, in memory and as a JSON file."""
 
 from __future__ import annotations
 
@@ -110,12 +110,12 @@ def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport)
     if frame_report["repaired"]:
         warnings.append(f"repaired values that were NaN, infinite or negative in {', '.join(frame_report['repaired'])}")
     first_status = {row["feature"]: row["status"] for row in first["aovs"]}
-    warnings += [
-        f"{row['feature']} is {row['status']} here and {first_status[row['feature']]} in frame {first['frame']}: "
-        "it may flicker"
-        for row in frame_report["aovs"]
-        if row["status"] != first_status[row["feature"]]
-    ]
+    words = {"default": "not found", "absent": "not found"}
+    for row in frame_report["aovs"]:
+        here, there = row["status"], first_status[row["feature"]]
+        if here != there:
+            here, there = words.get(here, here), words.get(there, there)
+            warnings.append(f"{row['feature']} is {here} here and {there} in frame {first['frame']}: it may flicker")
     return result_of(
         frame, FUSED, warnings=warnings, repaired=frame_report["repaired"], seconds=frame_report["seconds"]
     )

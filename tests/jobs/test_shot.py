@@ -219,7 +219,7 @@ SORTS = {
     "no albedo": (
         lambda lr, hr: write_exr(hr, {k: v for k, v in layers(0).items() if "albedo" not in k}),
         "fused",
-        "albedo is default here and found in frame 1000",
+        "albedo is not found here and found in frame 1000",
     ),
     "other exposure": (dim, "fused", "times as bright as the LRHS"),
     "existing target": ("{out}.exr", "failed", "the output exists; pass --skip-existing or --overwrite"),

@@ -2,10 +2,12 @@
 import numpy as np
 import pytest
 
+from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.render import Window
 from tests.aovs.renders import H, W, layer, mapped, plane
-from tests.conftest import SHARED, needs_shared
+from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
 
 
 @pytest.mark.parametrize(
@@ -46,3 +48,53 @@ def test_cycles_layers_add_up_to_the_beauty():
     values = render.read(render.data_window)
     total = values["diffuse"] + values["specular"] + values["albedo"] + values["normal"]
     np.testing.assert_allclose(total, values["rgb"], atol=1e-4)
+
+
+def test_the_table_says_what_each_feature_is_read_from(tmp_path):
+    channels = layer("", 1, "RGBA") | layer("denoise_albedo", 2) | layer("diffuse_direct", 3)
+    render = mapped(tmp_path, channels | layer("diffuse_indirect", 4))
+    rows = {row["feature"]: (row["status"], row["source"]) for row in render.table()}
+    assert rows == {
+        "rgb": ("found", "R G B"),
+        "albedo": ("found", "denoise_albedo"),
+        "normal": ("default", "none found (optional)"),
+        "diffuse": ("computed", "diffuse_direct + diffuse_indirect"),
+        "specular": ("default", "none found (optional)"),
+        "variance": ("default", "none found (optional)"),
+        "alpha": ("found", "A"),
+    }
+
+
+def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):
+    with_alpha = mapped(tmp_path, layer("C", 1, "ARGB") | layer("albedo", 2))
+    assert [c.name for c in with_alpha.beauty_channels] == ["C.R", "C.G", "C.B", "C.A"]
+    without = mapped(tmp_path, layer("", 1) | layer("albedo", 2))
+    assert [c.name for c in without.beauty_channels] == ["R", "G", "B"]
+
+
+def test_layers_that_no_feature_is_read_from_are_named(tmp_path):
+    """A layer that is read in part is named by its other channels."""
+    channels = layer("", 1) | layer("albedo", 2, "RGBA") | layer("mask", 3) | {"Z": plane(1)}
+    assert mapped(tmp_path, channels).unread_layers() == ["Z", "albedo.A", "mask"]
+
+
+def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):
+    """A file taller than what is loaded at a time, over its whole data window."""
+    values = picture(ROWS_PER_LOAD + 30, 20)
+    path = write_exr(tmp_path / "hr.exr", [("", rgb(values) | rgb(values * 2, "albedo."), (-3, -40))])
+    render = map_render(open_exr(path))
+    loaded = render.load()
+    assert loaded.data_window == render.data_window
+    window = Window(0, -10, 12, 240)
+    for name, pixels in render.read(window).items():
+        np.testing.assert_array_equal(loaded.read(window)[name], pixels)
+    np.testing.assert_array_equal(loaded.layers["rgb"], values)
+
+
+def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_path):
+    """Whoever reads tiles asks both kinds of render in the same way."""
+    render = mapped(tmp_path, layer("", 1))
+    for readable in (render, render.load()):
+        with readable.cache_strips(10**6):
+            first, second = (readable.read(Window(x, 0, x + 4, H), ["rgb"])["rgb"] for x in (0, 4))
+        np.testing.assert_array_equal(first, second)

@@ -7,7 +7,7 @@ import sys
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_target, replacing
+from oiio_msspl.exr.atomic import check_target, remove_leftovers, replacing
 
 
 def test_a_failing_block_leaves_the_old_file(tmp_path):
@@ -54,3 +54,16 @@ def test_targets_are_checked_before_any_work(tmp_path):
         check_target(tmp_path / "nowhere" / "x.exr", overwrite=False)
     with pytest.raises(InputError, match="is a folder"):
         check_target(tmp_path, overwrite=True)
+
+
+def test_leftovers_of_killed_runs_are_removed_and_nothing_else(tmp_path):
+    """The temporary file of a run that never ended goes; files that only look like one stay."""
+    target = tmp_path / "out.exr"
+    stack = replacing(target)
+    leftover = stack.__enter__()
+    leftover.write_text("half")
+    others = [tmp_path / name for name in (".other.12.tmp.exr", ".out.12.tmp.png", ".out.x.tmp.exr", "out.exr")]
+    for path in others:
+        path.write_text("kept")
+    remove_leftovers([target])
+    assert sorted(tmp_path.iterdir()) == sorted(others)

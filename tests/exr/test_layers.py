@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Channels are grouped into layers by OpenEXR's naming rule, by part names and by views."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.reader import open_exr
+from tests.conftest import write_exr
+
+
+def grouped(tmp_path, parts, **attributes):
+    """{(view, layer): components} of a file with these parts, ``{part name: channel names}``."""
+    plane = np.zeros((4, 4), np.float16)
+    made = [(name, dict.fromkeys(channels, plane), (0, 0)) for name, channels in parts.items()]
+    layers = layers_of(open_exr(write_exr(tmp_path / "a.exr", made, **attributes)))
+    return {(layer.view, layer.name): sorted(layer.channels) for layer in layers}
+
+
+def test_the_prefix_of_a_channel_names_its_layer(tmp_path):
+    channels = ["R", "G", "B", "diffuse.R", "diffuse.G", "diffuse.B", "scene.01.light.r"]
+    assert grouped(tmp_path, {"": channels}) == {
+        ("", ""): ["B", "G", "R"],
+        ("", "diffuse"): ["B", "G", "R"],
+        ("", "scene.01.light"): ["R"],
+    }
+
+
+def test_the_parts_name_names_the_layer_of_plain_channels(tmp_path):
+    parts = {"albedo": ["R", "G", "B"], "N": ["x", "y", "z"], "ViewLayer.Mist": ["ViewLayer.Mist.Z"]}
+    assert grouped(tmp_path, parts) == {
+        ("", "albedo"): ["B", "G", "R"],
+        ("", "N"): ["X", "Y", "Z"],
+        ("", "ViewLayer.Mist"): ["Z"],
+    }
+
+
+@pytest.mark.parametrize("name", ["rgba", "RGB", "main", "part 2", "Subimage0"])
+def test_some_part_names_name_no_layer(tmp_path, name):
+    assert grouped(tmp_path, {name: ["R", "G", "B"]}) == {("", ""): ["B", "G", "R"]}
+
+
+def test_a_layer_may_lie_in_several_parts(tmp_path):
+    assert grouped(tmp_path, {"part0": ["R"], "part1": ["G"], "part2": ["B"]}) == {("", ""): ["B", "G", "R"]}
+
+
+def test_views_stand_between_layer_and_component(tmp_path):
+    """OpenEXR's multiView convention; channels without a view belong to the first."""
+    channels = ["R", "left.R", "diffuse.left.R", "diffuse.right.R"]
+    assert grouped(tmp_path, {"": channels}, multiView=["right", "left"]) == {
+        ("right", ""): ["R"],
+        ("left", ""): ["R"],
+        ("left", "diffuse"): ["R"],
+        ("right", "diffuse"): ["R"],
+    }
+
+
+def test_of_two_channels_with_one_meaning_the_layer_holds_the_first(tmp_path):
+    plane = np.zeros((4, 4), np.float16)
+    file = open_exr(write_exr(tmp_path / "a.exr", {"foo.R": plane, "foo.red": plane}))
+    (layer,) = layers_of(file)
+    assert [channel.name for channel in layer.channels.values()] == ["foo.R"]
+
+
+def test_colours_and_vectors_are_triples_and_a_single_channel_is_a_scalar(tmp_path):
+    plane = np.zeros((4, 4), np.float16)
+    names = ["c.R", "c.G", "c.B", "c.A", "v.X", "v.Y", "v.Z", "d.Y", "two.R", "two.G"]
+    layers = {
+        layer.name: layer for layer in layers_of(open_exr(write_exr(tmp_path / "a.exr", dict.fromkeys(names, plane))))
+    }
+    assert [c.name for c in layers["c"].triple()] == ["c.R", "c.G", "c.B"]
+    assert [c.name for c in layers["v"].triple()] == ["v.X", "v.Y", "v.Z"]
+    assert [c.name for c in layers["d"].scalar()] == ["d.Y"]
+    assert layers["two"].triple() is layers["two"].scalar() is None

@@ -1,0 +1,60 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The preview shows the frame in display values."""
+
+import numpy as np
+import OpenImageIO as oiio
+import pytest
+
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.preview import check_view, is_our_preview, write_png, write_preview
+from oiio_msspl.exr.render import Window
+
+
+def png(path):
+    return np.asarray(oiio.ImageBuf(str(path)).get_pixels(oiio.UINT8))
+
+
+def test_the_preview_shows_the_display_window(tmp_path):
+    """Overscan is cut off, and what was not rendered is black."""
+    rgb = np.full((100, 20, 3), 10, np.float32)
+    write_preview(tmp_path / "a.png", rgb, Window(-5, 30, 15, 130), Window(0, 0, 40, 100))
+    picture = png(tmp_path / "a.png")
+    assert picture.shape == (100, 40, 3)
+    assert (picture[30:, :15] == 255).all()
+    assert not picture[:30].any()
+    assert not picture[:, 15:].any()
+
+
+def test_the_preview_has_the_srgb_curve(tmp_path):
+    rgb = np.full((4, 4, 3), 0.5, np.float32)
+    window = Window(0, 0, 4, 4)
+    write_preview(tmp_path / "a.png", rgb, window, window)
+    assert (png(tmp_path / "a.png") == round(255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055))).all()
+
+
+def test_display_values_are_written_as_they_are_and_clipped(tmp_path):
+    values = np.array([[[-1, 0, 0.5], [1, 2, 0.25]]], np.float32)
+    write_png(tmp_path / "a.png", values)
+    np.testing.assert_array_equal(png(tmp_path / "a.png"), [[[0, 0, 128], [255, 255, 64]]])
+
+
+def test_our_previews_are_told_from_other_pictures(tmp_path):
+    write_png(tmp_path / "ours.png", np.zeros((4, 4, 3), np.float32))
+    oiio.ImageBuf(np.zeros((4, 4, 3), np.float32)).write(str(tmp_path / "other.png"))
+    (tmp_path / "text.png").write_text("no picture")
+    assert is_our_preview(tmp_path / "ours.png")
+    assert not is_our_preview(tmp_path / "other.png")
+    assert not is_our_preview(tmp_path / "text.png")
+
+
+def test_an_unknown_view_is_refused_with_those_that_exist(tmp_path):
+    check_view("Un-tone-mapped")
+    with pytest.raises(InputError, match=r"--view 'sepia': .* has .*Un-tone-mapped"):
+        check_view("sepia")
+
+
+def test_a_picture_is_not_overwritten_without_being_told(tmp_path):
+    (tmp_path / "a.png").write_text("old")
+    with pytest.raises(InputError, match="pass --overwrite"):
+        write_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.float32))
+    assert (tmp_path / "a.png").read_text() == "old"

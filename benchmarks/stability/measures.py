@@ -55,14 +55,13 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     errors = relmse_map(image * grey, truth * grey).mean(axis=-1)
     row: dict[str, Any] = {
         "finite": finite,
-        "worst_ratio": float(((image + floor) / (brightest + floor)).max()),
-        "worst_error": float(np.abs(image - truth).max()),
+        "worst_pixel": float(((image + floor) / (brightest + floor)).max()),
         "relmse": float(errors.mean()),
         "relmse_trimmed": trimmed(errors),
         "relmse_enlarged": trimmed(relmse_map(enlarged * grey, truth * grey).mean(axis=-1)),
         "psnr": psnr(image * grey, truth * grey),
         "outside": float((beyond > EXCESS).mean()),
-        "excess": float(beyond.max()),
+        "range": float(beyond.max()),
         "warnings": warnings,
     }
     if clean is not None and case.clean is not None:
@@ -82,9 +81,9 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
     if not row["finite"] or not math.isfinite(row["relmse"]):
         return "fails", "NaN or Inf comes out."
     faults = []
-    if row["excess"] > EXCESS:
+    if row["range"] > EXCESS:
         faults.append(
-            f"leaves the inputs' range by up to x{row['excess']:.3g} in {100 * row['outside']:.2g} % of values"
+            f"leaves the inputs' range by up to x{row['range']:.3g} in {100 * row['outside']:.2g} % of values"
         )
     if row.get("deviation", 0) > DEVIATION:
         faults.append(f"does not scale: off by up to {100 * row['deviation']:.2g} %")

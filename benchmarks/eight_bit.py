@@ -67,7 +67,7 @@ def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
 
 
 class InTorch(Session):
-    """A joint network in 32 bits, from its checkpoint."""
+    """A joint model computed by PyTorch in 32 bits, from its checkpoint."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)

@@ -29,33 +29,41 @@ def denoise_prefiltered(color: Array, albedo: Array | None = None, normal: Array
     quality "high". See https://github.com/RenderKit/oidn, "prefiltering".
     """
     auxiliary = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
-    clean = {name: _filter({name: image}) for name, image in auxiliary.items()}
-    return _filter({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
+    clean = {name: _run({name: image}) for name, image in auxiliary.items()}
+    return _run({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
 
 
-def _filter(images: dict[str, Array], **flags: bool) -> Array:
+def _run(images: dict[str, Array], **flags: bool) -> Array:
     """The output of one OIDN filter. It denoises the color, or the only image that it gets."""
     import pyoidn
 
     images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
     output = np.empty_like(next(iter(images.values())))
-    device = _device()
-    with pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT) as oidn_filter:
-        for name, image in {**images, pyoidn.OIDN_IMAGE_OUTPUT: output}.items():
-            oidn_filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
-        oidn_filter.set_quality(pyoidn.OIDN_QUALITY_HIGH)
-        for flag, value in flags.items():
-            oidn_filter.set_bool(flag, value)
-        oidn_filter.commit()
-        oidn_filter.execute()
-    if error := device.get_error():
+    oidn_filter = _filter(tuple(images))
+    for name, image in {**images, pyoidn.OIDN_IMAGE_OUTPUT: output}.items():
+        oidn_filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+    for flag, value in flags.items():
+        oidn_filter.set_bool(flag, value)
+    oidn_filter.commit()
+    oidn_filter.execute()
+    if error := _device().get_error():
         raise RuntimeError(f"Open Image Denoise: {error}")
     return output
 
 
 @functools.cache
+def _filter(inputs: tuple[str, ...]) -> Any:
+    """A filter for these inputs. It is used again for the next picture, as in pyoidn's plain call."""
+    import pyoidn
+
+    oidn_filter = pyoidn.Filter(_device(), pyoidn.OIDN_FILTER_TYPE_RT)
+    oidn_filter.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+    return oidn_filter
+
+
+@functools.cache
 def _device() -> Any:
-    """One device for all filters of the process, as pyoidn's plain call has it."""
+    """One device for all filters of the process."""
     import pyoidn
 
     device = pyoidn.Device()

@@ -187,7 +187,12 @@ def mean_note(rows: Sequence[Row]) -> str:
 
 def cell(row: Row | None, *measures: str) -> str:
     """Some measures of a row; empty if there is none."""
-    return " / ".join(MEASURES[measure][1].format(row[measure]) for measure in measures) if row else ""
+    return " / ".join(_digits(measure, row[measure]) for measure in measures) if row else ""
+
+
+def _digits(measure: str, value: float) -> str:
+    """A value as text, with no more than the four digits that the table has."""
+    return f"{value:.4g}" if "relmse" in measure and value >= 1 else MEASURES[measure][1].format(value)
 
 
 def main() -> None:

@@ -46,7 +46,7 @@ def seconds_per_spp(path: Path, repeats: int) -> dict[str, float]:
             start = time.perf_counter()
             mi.render(scene, integrator=integrator, spp=spp, seed=seed).numpy()
             times.append(time.perf_counter() - start)
-        result[name] = statistics.median(times[1:]) * MEGAPIXEL / (crop[0] * crop[1] * spp)
+        result[name] = statistics.median(times[1:]) * MEGAPIXEL / float(crop[0] * crop[1] * spp)
     return result
 
 

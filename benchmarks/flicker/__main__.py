@@ -111,12 +111,12 @@ def run_all(args: argparse.Namespace) -> None:
     """
     if args.picture:
         check_target(args.picture, overwrite=True)
-    # More threads only wait for each other: the pictures are small.
-    sessions = [Session(find_model(SCALE, name), threads=1) for name in args.model or shipped_models()]
-    sessions = [session for session in sessions if args.model or session.contract.scale == SCALE]
     folders = [folder for camera in CAMERAS for folder in sorted(args.folder.glob(f"*/{camera}"))]
     if not folders:
         raise InputError(f"{args.folder}: holds no sequences; make them with python -m benchmarks.render.sequences")
+    # More threads only wait for each other: the pictures are small.
+    sessions = [Session(find_model(SCALE, name), threads=1) for name in args.model or shipped_models()]
+    sessions = [session for session in sessions if args.model or session.contract.scale == SCALE]
     shown = []
     for folder in sorted(folders, key=lambda folder: folder.parent):
         sequence = load(folder)

@@ -1,172 +1,165 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy against time, from what `benchmarks.quality`, `benchmarks.runtime` and `benchmarks.render_time` measured.
+"""Accuracy against time, from the tables of `benchmarks.quality`, `benchmarks.runtime` and `benchmarks.render_time`.
 
-    python -m benchmarks.chart -o docs/images/chart.png
-    python -m benchmarks.chart -o docs/chart.html              # also against render and all, and every scene
-    python -m benchmarks.chart --scene lamp --total -o lamp.svg
+    python -m benchmarks.chart -o docs/chart.html              # every scene; needs only a browser
+    python -m benchmarks.chart -o docs/images/chart.png        # the mean of the scenes
 
-A column an average spp; a point a model or peer. Left and up is better (errors are drawn downwards). Dashed: where the
-HRLS has as large a part of the samples as was measured, instead of half.
+There is a panel for each average spp. Left and up is better: axes of errors point downwards. Methods whose time was not
+measured are left out.
 """
 
 from __future__ import annotations
 
 import argparse
-import html
-import io
 import json
 import statistics
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.ticker import LogLocator
-
-from benchmarks.quality import UNEVEN
+from benchmarks import quality, results
+from benchmarks.results import MEAN
+from benchmarks.runtime import SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 
-#: Peer of `benchmarks.quality` -> marker, and what it runs as `benchmarks.runtime` names it. Families of models
-#: differ in colour.
-PEERS = {
-    "OIDN, same samples": ("*", "OIDN 2.5.1, quality high"),
-    "OIDN on the HRLS": ("D", "OIDN 2.5.1, quality high"),
-    "OIDN fast on the HRLS": ("d", "OIDN 2.5.1, quality fast"),
-}
-COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#56B4E9")
-#: What is drawn of what was measured, a row each.
-MEASURES = {"psnr": "PSNR (sRGB, dB)", "relmse": "RelMSE (0.5, 0.01)", "flip": "FLIP"}
+TEMPLATE = Path(__file__).parent / "chart_template.html"
+MEASURES = ("psnr", "relmse", "flip")
+PEERS = (
+    "OIDN, same samples",
+    "OIDN prefiltered, same samples",
+    "OIDN on the HRLS",
+    "OIDN prefiltered on the HRLS",
+    "OIDN fast on the HRLS",
+)
+#: How a series of models ends if most samples are in the HRLS, as far as that was measured.
+UNEVEN = ", most samples in the HRLS"
 
 
-@dataclass(frozen=True)
-class Timings:
-    """Seconds for 1024 x 1024."""
+def data() -> dict[str, Any]:
+    """What is drawn.
 
-    methods: dict[str, float]
-    samples: dict[str, float]
-    """For one sample a pixel, by scene."""
+    Returns:
+        ``measures``, column -> title. ``scenes``, name -> title. ``spp``, the averages. ``cost``, scene -> seconds for
+        one sample in each of 1024 x 1024 pixels. ``series``: for each its ``name``, whether it is a ``peer``, and its
+        ``points``, each with ``method``, ``spp``, ``seconds`` for 1024 x 1024 pixels, and for each scene its
+        ``values`` in the order of the measures.
+    """
+    rows = results.read("quality")
+    found = results.index(rows, *quality.KEYS)
+    times = results.index(results.read("runtime"), "method")
+    cost = {row["scene"]: row["hrls_s"] for row in results.read("render_time")}
+    cost[MEAN] = round(statistics.fmean(value for name, value in cost.items() if name not in NOISY_REFERENCE), 4)
+    names = [MEAN, *(name for name in dict.fromkeys(row["scene"] for row in rows) if name in cost and name != MEAN)]
 
-    def of_a_sample(self, scene: str | None) -> float:
-        """Of one scene, or the mean of those that are averaged."""
-        if scene is not None:
-            return self.samples[scene]
-        return statistics.fmean(value for name, value in self.samples.items() if name not in NOISY_REFERENCE)
+    def point(timed: str, method: str, spp: int) -> dict[str, Any]:
+        measured = {name: found[name, spp, method] for name in names if (name, spp, method) in found}
+        values = {name: [row[measure] for measure in MEASURES] for name, row in measured.items()}
+        return {"method": method, "spp": spp, "seconds": times[timed]["seconds"], "values": values}
 
-
-def mean(rows: list[dict[str, Any]], method: str, spp: int, measure: str, scene: str | None) -> float:
-    """Of one scene, or of all whose reference is clean."""
-    return statistics.fmean(
-        row[measure]
-        for row in rows
-        if row["method"] == method
-        and row["spp"] == spp
-        and (row["scene"] == scene if scene else row["scene"] not in NOISY_REFERENCE)
-    )
-
-
-def draw(rows: list[dict[str, Any]], timings: Timings, scene: str | None, *, total: bool) -> plt.Figure:
-    """Of one scene or the mean; against the time of the method, or of method and render together."""
-    seconds = timings.methods
-    models = [name for name in seconds if any(row["method"] == name for row in rows)]
     families: dict[str, list[str]] = {}
-    for name in models:
-        families.setdefault(name.rpartition("-x")[0], []).append(name)
-    averages = sorted({row["spp"] for row in rows})
-    measures = {measure: label for measure, label in MEASURES.items() if measure in rows[0]}
-    measured = {(row["method"], row["spp"]) for row in rows if scene in (None, row["scene"])}
-    figure, axes = plt.subplots(
-        len(measures),
-        len(averages),
-        figsize=(4.2 * len(averages), 3.5 * len(measures)),
-        sharex=not total,
-        sharey="row",
-        squeeze=False,
-    )
-    for line, (measure, label) in zip(axes, measures.items(), strict=True):
+    for name in times:
+        if "-x" in str(name):
+            families.setdefault(str(name).rpartition("-x")[0], []).append(str(name))
+    series = []
+    for family, members in families.items():
+        even = [point(name, name, spp) for spp in quality.AVERAGES for name in members]
+        uneven = [
+            point(name, f"{name}, {division}", spp)
+            for spp in quality.AVERAGES
+            if (division := _largest_share(found, members, spp))
+            for name in members
+        ]
+        series += [{"name": family, "points": even}, {"name": family + UNEVEN, "points": uneven}]
+    for peer in PEERS:
+        if SAME_WORK[peer] in times:
+            points = [point(SAME_WORK[peer], peer, spp) for spp in quality.AVERAGES]
+            series.append({"name": peer, "peer": True, "points": points})
+    return {
+        "measures": {measure: quality.MEASURES[measure][0] for measure in MEASURES},
+        "scenes": {name: _scene_title(name, names) for name in names},
+        "spp": quality.AVERAGES,
+        "cost": cost,
+        "series": [one for one in series if one["points"]],
+    }
+
+
+def _largest_share(found: dict[Any, Any], members: list[str], spp: int) -> str | None:
+    """The division with the most samples in the HRLS that was measured for all of these models."""
+    divisions = [f"{more}:{less}" for more, less in reversed(quality.UNEVEN)]
+    return next((d for d in divisions if all((MEAN, spp, f"{name}, {d}") in found for name in members)), None)
+
+
+def _scene_title(name: str, names: list[str]) -> str:
+    if name == MEAN:
+        return f"mean of {len({*names} - {MEAN} - NOISY_REFERENCE)} scenes"
+    return f"{name} (noisy reference)" if name in NOISY_REFERENCE else name
+
+
+def page(shown: dict[str, Any]) -> str:
+    """An HTML page that holds the data and draws it."""
+    return TEMPLATE.read_text().replace("DATA", json.dumps(shown, separators=(",", ":")))
+
+
+def draw(shown: dict[str, Any], path: Path) -> None:
+    """A picture of the mean: a row for each measure, a column for each average spp, against the method's own time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator
+
+    colours = dict(zip(_families(shown), ("#0072B2", "#D55E00", "#009E73", "#CC79A7"), strict=True))
+    markers = dict(zip(PEERS, "*XDPd", strict=True))
+    measures, averages = shown["measures"], shown["spp"]
+    size = (4.2 * len(averages), 3.5 * len(measures))
+    figure, axes = plt.subplots(len(measures), len(averages), figsize=size, sharex=True, sharey="row", squeeze=False)
+    for row, (line, (measure, title)) in enumerate(zip(axes, measures.items(), strict=True)):
         for axis, spp in zip(line, averages, strict=True):
-            before = spp * timings.of_a_sample(scene) if total else 0.0
-            for colour, (family, members) in zip(COLOURS, families.items(), strict=False):
-                points = [(before + seconds[name], mean(rows, name, spp, measure, scene)) for name in members]
-                axis.plot(*zip(*points, strict=True), "-o", color=colour, label=family, linewidth=1)
-                for more, less in reversed(UNEVEN):
-                    uneven = [f"{name}, {more}:{less}" for name in members]
-                    if all((name, spp) in measured for name in uneven):
-                        values = [mean(rows, name, spp, measure, scene) for name in uneven]
-                        axis.plot([x for x, _ in points], values, "--^", color=colour, linewidth=1, markersize=4)
-                        break
-                for name, point in zip(members, points, strict=True):
-                    axis.annotate(name.rpartition("-")[2], point, (4, 4), textcoords="offset points", fontsize=8)
-            for peer, (marker, run) in PEERS.items():
-                if run in seconds:
-                    value = mean(rows, peer, spp, measure, scene)
-                    axis.plot(
-                        before + seconds[run], value, marker, color="black", markersize=8, label=peer, linestyle="none"
-                    )
-            if not total:
-                axis.set_xscale("log")
-                axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-                axis.xaxis.set_major_formatter("{x:g}")
-                axis.xaxis.set_minor_formatter("")
+            for series in shown["series"]:
+                points = [point for point in series["points"] if point["spp"] == spp]
+                x, y = [p["seconds"] for p in points], [p["values"][MEAN][row] for p in points]
+                if series.get("peer"):
+                    style = {"marker": markers[series["name"]], "color": "black", "markersize": 8, "linestyle": "none"}
+                    axis.plot(x, y, label=series["name"], **style)
+                elif series["name"].endswith(UNEVEN):
+                    axis.plot(x, y, "--^", color=colours[series["name"].removesuffix(UNEVEN)], lw=1, markersize=4)
+                else:
+                    axis.plot(x, y, "-o", color=colours[series["name"]], label=series["name"], lw=1)
+                    for point, place in zip(points, zip(x, y, strict=True), strict=True):
+                        label = point["method"].rpartition("-")[2]
+                        axis.annotate(label, place, (4, 4), textcoords="offset points", fontsize=8)
+            axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter("")
             axis.grid(True, which="both", alpha=0.25)
-            if measure == "psnr":
+            if row == 0:
                 axis.set_title(f"{spp} spp on average")
-            else:
+            if measure != "psnr":
                 axis.set_yscale("log")
-            if measure == list(measures)[-1]:
-                axis.set_xlabel("seconds for 1024 x 1024" + (", render included" if total else ""))
-        line[0].set_ylabel(label)
+            if row == len(measures) - 1:
+                axis.set_xlabel("seconds for 1024 x 1024")
+        line[0].set_ylabel(title)
         if measure != "psnr":
             line[0].invert_yaxis()
-    figure.suptitle(f"Accuracy against time: {scene or 'mean of the scenes'} (left and up is better)")
+    figure.suptitle("Accuracy against time: mean of the scenes (left and up is better)")
     handles, labels = axes[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9)
     figure.tight_layout(rect=(0, 0.04, 1, 1))
-    return figure
+    figure.savefig(path, dpi=110)
 
 
-def page(rows: list[dict[str, Any]], timings: Timings) -> str:
-    """All charts, as an HTML page that needs nothing else."""
-    names = [None, *dict.fromkeys(row["scene"] for row in rows)]
-    parts = ["<!doctype html>", '<meta charset="utf-8">', "<title>Accuracy against time</title>"]
-    parts.append("<style>body {font-family: sans-serif; margin: 2em} svg {max-width: 100%; height: auto}</style>")
-    for name in names:
-        noisy = " (noisy reference)" if name in NOISY_REFERENCE else ""
-        parts.append(f"<h2>{html.escape(name or 'Mean of the scenes')}{noisy}</h2>")
-        for total in (False, True):
-            with plt.rc_context({"svg.fonttype": "none", "svg.hashsalt": "msspl"}):
-                text = io.StringIO()
-                figure = draw(rows, timings, name, total=total)
-                figure.savefig(text, format="svg", metadata={"Date": None})
-                plt.close(figure)
-            svg = text.getvalue()
-            parts.append(svg[svg.index("<svg") :])  # without the XML declaration
-    return "\n".join(parts) + "\n"
+def _families(shown: dict[str, Any]) -> list[str]:
+    return [s["name"] for s in shown["series"] if not s.get("peer") and not s["name"].endswith(UNEVEN)]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    results = Path(__file__).parent / "results"
-    parser.add_argument("--quality", type=Path, default=results / "quality.json")
-    parser.add_argument("--runtime", type=Path, default=results / "runtime.json")
-    parser.add_argument("--render-time", type=Path, default=results / "render_time.json")
-    parser.add_argument("--scene", help="one scene instead of the mean")
-    parser.add_argument("--total", action="store_true", help="against the time of render and method together")
-    parser.add_argument("-o", "--output", type=Path, required=True, help="PNG, SVG or PDF; or HTML: every chart")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="an HTML page, or a PNG, SVG or PDF picture")
     args = parser.parse_args()
-    rows = json.loads(args.quality.read_text())["rows"]
-    runtimes = json.loads(args.runtime.read_text())["results"]
-    samples = json.loads(args.render_time.read_text())["seconds_per_spp"]
-    timings = Timings(
-        {name: statistics.median(entry["seconds"]) for name, entry in runtimes.items()},
-        {name: entry["hrls"] for name, entry in samples.items()},
-    )
     if args.output.suffix == ".html":
-        args.output.write_text(page(rows, timings))
+        args.output.write_text(page(data()))
     else:
-        draw(rows, timings, args.scene, total=args.total).savefig(args.output, dpi=110)
+        draw(data(), args.output)
 
 
 if __name__ == "__main__":

@@ -1,36 +1,39 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is the predicted error (`msspl-fuse --error-layer`) that of the result?
+"""Compares the error that a model predicts for its own result (`msspl-fuse --error-layer`) with the actual error.
 
-    python -m benchmarks.confidence ../shared/renders --model mix --json results/confidence.json \
-        --picture docs/images/confidence.png
+    python -m benchmarks.confidence RENDERS --table benchmarks/results/confidence.csv
+    python -m benchmarks.confidence --picture docs/images/confidence.png        # draws the table
 
-Pixels of all scenes of :mod:`benchmarks.scenes` whose reference is clean, at every scale and 2, 4 and 8 average spp,
-are sorted by their predicted error into bins of equal number. Printed: the mean of prediction and actual error, in
-network values (about those of the sRGB picture); how much of all error lies in the tenth of the pixels with the largest
-prediction; and how the two correlate over squares of 8 x 8 pixels. The references' own noise counts as error.
+Both errors are in log-encoded radiance, which is close to sRGB. All pixels of the development scenes with a clean
+reference are used, at every scale and at 2, 4 and 8 spp on average. They are sorted by their predicted error into bins
+of equal size. Three figures say how good the prediction is: its mean beside the mean actual error; the share of all
+error that lies in the tenth of the pixels with the largest prediction; and the correlation of the logarithms of both
+over squares of 8 x 8 pixels. The noise of the references counts as error.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from benchmarks import scenes
+from benchmarks import results, scenes
 from benchmarks.quality import AVERAGES
+from benchmarks.results import Row
 from oiio_msspl import fuse, transforms
 from oiio_msspl.render import Array
 from oiio_msspl.schema import SCALES
 from oiio_msspl.session import Session, find_model
 
-BINS, SQUARE = 20, 8
+#: In the column `bin`: all pixels. Bins have the numbers 1 to `BINS`.
+ALL, BINS = 0, 20
+SQUARE = 8
 
 
 def errors(scene: scenes.Scene, session: Session, spp: int) -> tuple[Array, Array]:
-    """Predicted and actual error of the fused frame (H, W, 1), in network values."""
+    """Predicted and actual error of the fused frame, each (h, w, 1), in log-encoded radiance."""
     pair = scene.lrhs(session.contract.scale, spp // 2), scene.hrls(spp // 2)
     fused = fuse(*pair, session, error=True)
     assert fused.error is not None
@@ -41,22 +44,26 @@ def errors(scene: scenes.Scene, session: Session, spp: int) -> tuple[Array, Arra
     return transforms.compress(brighter, fused.exposure) - middle, actual
 
 
-def measure(pairs: list[tuple[Array, Array]]) -> dict[str, Any]:
-    """What is printed, of predictions and actual errors."""
+def measure(model: str, pairs: list[tuple[Array, Array]]) -> list[Row]:
+    """A row for all pixels and one for each bin, from predicted and actual errors."""
     predicted, actual = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in range(2))
     order = np.argsort(predicted)
-    bins = [(float(predicted[part].mean()), float(actual[part].mean())) for part in np.array_split(order, BINS)]
     worst = order[-len(order) // 10 :]
     squares = [
         np.concatenate([transforms.box_downsample(_cropped(pair[i]), SQUARE).ravel() for pair in pairs])
         for i in range(2)
     ]
-    return {
-        "bins": bins,
-        "share_of_worst_tenth": float(actual[worst].sum() / actual.sum()),
+    quality = {
+        "worst_tenth": float(actual[worst].sum() / actual.sum()),
         "correlation": float(np.corrcoef(*np.log(np.maximum(squares, 1e-4)))[0, 1]),
-        "mean": (float(predicted.mean()), float(actual.mean())),
     }
+
+    def means(number: int, pixels: NDArray[np.intp]) -> Row:
+        errors = {"predicted": float(predicted[pixels].mean()), "actual": float(actual[pixels].mean())}
+        return {"method": model, "bin": number, **errors}
+
+    bins = [means(number, pixels) for number, pixels in enumerate(np.array_split(order, BINS), 1)]
+    return [means(ALL, order) | quality, *bins]
 
 
 def _cropped(image: Array) -> Array:
@@ -64,28 +71,36 @@ def _cropped(image: Array) -> Array:
     return image[:height, :width]
 
 
-def print_table(results: dict[str, dict[str, Any]]) -> None:
-    """A line a model."""
-    print("| model | predicted | actual | error in the worst tenth | correlation |\n|---|---|---|---|---|")
-    for name, result in results.items():
-        predicted, actual = result["mean"]
-        print(
-            f"| {name} | {predicted:.4f} | {actual:.4f} | {result['share_of_worst_tenth']:.0%} | "
-            f"{result['correlation']:.2f} |"
-        )
+def layout(rows: list[Row]) -> str:
+    """A line for each model."""
+    body = [
+        [
+            f"`{row['method']}`",
+            f"{row['predicted']:.4f}",
+            f"{row['actual']:.4f}",
+            f"{row['worst_tenth']:.0%}",
+            f"{row['correlation']:.2f}",
+        ]
+        for row in rows
+        if row["bin"] == ALL
+    ]
+    return results.markdown(["model", "predicted", "actual", "error in the worst tenth", "correlation"], body)
 
 
-def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
-    """Predicted against actual error, a line a scale."""
+def draw(rows: list[Row], path: Path) -> None:
+    """Actual against predicted error, a line for each model."""
     import matplotlib
 
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
     figure, axis = plt.subplots(figsize=(5, 4.6))
-    for name, result in results.items():
-        axis.loglog(*zip(*result["bins"], strict=True), "-o", markersize=3, label=name)
-    ends = [min(min(r["bins"][0]) for r in results.values()), max(max(r["bins"][-1]) for r in results.values())]
+    bins = [row for row in rows if row["bin"] != ALL]
+    for model in dict.fromkeys(row["method"] for row in bins):
+        errors = [(row["predicted"], row["actual"]) for row in bins if row["method"] == model]
+        axis.loglog(*zip(*errors, strict=True), "-o", markersize=3, label=model)
+    values = [row[error] for row in bins for error in ("predicted", "actual")]
+    ends = [min(values), max(values)]
     axis.plot(ends, ends, color="grey", linewidth=1, label="as predicted")
     axis.set_xlabel("predicted error")
     axis.set_ylabel("actual error")
@@ -97,22 +112,25 @@ def draw(results: dict[str, dict[str, Any]], path: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folder", type=Path, help="renders or views")
+    parser.add_argument("folder", type=Path, nargs="?", help="renders or views; without it nothing is measured")
     parser.add_argument("--model", default="auto", help="a family of models")
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--picture", type=Path)
+    parser.add_argument("--picture", type=Path, help="draw a PNG")
+    results.add_option(parser)
     args = parser.parse_args()
-    clean = [scene for scene in scenes.load(args.folder) if scene.name not in scenes.NOISY_REFERENCE]
-    results = {}
-    for scale in SCALES:
-        session = Session(find_model(scale, args.model))
-        pairs = [errors(scene, session, spp) for scene in clean for spp in AVERAGES]
-        results[session.contract.name] = measure(pairs)
-    print_table(results)
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=1) + "\n")
+    rows: list[Row] = []
+    if args.folder:
+        clean = [scene for scene in scenes.load(args.folder) if scene.name not in scenes.NOISY_REFERENCE]
+        for scale in SCALES:
+            session = Session(find_model(scale, args.model))
+            pairs = [errors(scene, session, spp) for scene in clean for spp in AVERAGES]
+            rows += measure(session.contract.name, pairs)
+        if args.table:
+            results.write(args.table, rows)
+    else:
+        rows = results.read(args.table or "confidence")
+    print(layout(rows))
     if args.picture:
-        draw(results, args.picture)
+        draw(rows, args.picture)
 
 
 if __name__ == "__main__":

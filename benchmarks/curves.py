@@ -1,45 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The logs of the networks that ship, as curves.
+"""Draws the training logs of the shipped networks.
 
     python -m benchmarks.curves docs/images/training.png
 
-A column a log, `benchmarks/results/training_*.csv`; runs that went on from one another stand side by side. What they
-gained is PSNR since each began: from run to run views, references and losses changed, and with them every figure.
+There is a column for each log, `benchmarks/results/training_*.csv`. Runs that continued each other stand side by side.
+The upper row shows how much PSNR each run gained since its start: views, references and losses changed from run to run,
+so absolute values cannot be compared.
 """
 
 from __future__ import annotations
 
 import argparse
-import csv
 import itertools
 from pathlib import Path
 
-RESULTS = Path(__file__).parent / "results"
+from benchmarks import results
+
 Curve = tuple[list[float], list[float]]
 
 
 def read(path: Path) -> dict[str, tuple[Curve, Curve]]:
-    """Of every run: gain in PSNR on held-out views, and training loss, by minutes of the log."""
+    """For each run the gain in PSNR on held-out views and the training loss, against the minutes of the log."""
     runs: dict[str, tuple[Curve, Curve]] = {}
     before = 0.0
-    with path.open(newline="") as file:
-        for name, rows in itertools.groupby(csv.DictReader(file), key=lambda row: row.get("run", "")):
-            psnr, loss = runs.setdefault(name, (([], []), ([], [])))
-            minutes, start = before, None
-            for row in rows:
-                minutes = before + float(row["minutes"])
-                start = float(row["psnr"]) if start is None else start
-                psnr[0].append(minutes)
-                psnr[1].append(float(row["psnr"]) - start)
-                if float(row["loss"]):  # none yet before the first step
-                    loss[0].append(minutes)
-                    loss[1].append(float(row["loss"]))
-            before = minutes
+    for name, rows in itertools.groupby(results.read(path), key=lambda row: str(row.get("run", ""))):
+        psnr, loss = runs.setdefault(name, (([], []), ([], [])))
+        minutes, start = before, None
+        for row in rows:
+            minutes = before + row["minutes"]
+            start = row["psnr"] if start is None else start
+            psnr[0].append(minutes)
+            psnr[1].append(row["psnr"] - start)
+            if row["loss"]:  # there is none before the first step
+                loss[0].append(minutes)
+                loss[1].append(row["loss"])
+        before = minutes
     return runs
 
 
 def draw(logs: list[Path], picture: Path) -> None:
-    """PSNR above, loss below."""
+    """Draw PSNR above and loss below."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -57,7 +57,7 @@ def draw(logs: list[Path], picture: Path) -> None:
             axis.tick_params(labelsize=8)
         if lower.get_legend_handles_labels()[1]:
             lower.legend(fontsize=6, ncol=2)
-    axes[0][0].set_ylabel("gained on held-out views, dB")
+    axes[0][0].set_ylabel("PSNR gained on held-out views, dB")
     axes[1][0].set_ylabel("training loss")
     figure.tight_layout()
     figure.savefig(picture, dpi=100)
@@ -68,7 +68,7 @@ def main() -> None:
     parser.add_argument("picture", type=Path)
     parser.add_argument("logs", type=Path, nargs="*", help="default: those of the networks that ship")
     args = parser.parse_args()
-    draw(args.logs or sorted(RESULTS.glob("training_*.csv")), args.picture)
+    draw(args.logs or sorted(results.FOLDER.glob("training_*.csv")), args.picture)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise's networks in 8 bits beside itself: time, and what it costs in accuracy.
+"""Time and accuracy of the networks in 8 bits beside the same networks in 32 bits.
 
     python -m benchmarks.eight_bit VIEWS
 
-Of the views for validation (:mod:`training.views`), every third, at 1, 2 and 4 spp in either render: PSNR in sRGB
-against the reference of the HRLS denoised, and of what the models make of both. In 32 bits, Open Image Denoise works
-itself, and a joint network by PyTorch. Times are taken in turn, in one process, on a frame of 1024 x 1024 pixels; the
-medians.
+Open Image Denoise on the HRLS, on both renders, and the models that contain it. PSNR is of sRGB pictures, with 1, 2 and
+4 spp in either render, over every third validation view (:mod:`training.views`). In 32 bits the work is done by Open
+Image Denoise itself, and for `joint` by PyTorch. Times are medians for a frame of 1024 x 1024 pixels; both take turns
+in one process.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ from __future__ import annotations
 import argparse
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 
-from benchmarks import scenes
+from benchmarks import results, scenes
+from benchmarks.results import Row
 from benchmarks.runtime import frame
 from oiio_msspl import Render, Session, find_model, fuse, metrics, schema, tensors, transforms
 from oiio_msspl.contract import Contract
@@ -38,7 +39,7 @@ CHECKPOINT = Path(__file__).parents[1] / "training/checkpoints/joint.pt"
 
 
 def medians(ways: list[Callable[[], object]]) -> list[float]:
-    """Seconds of each, taken in turn."""
+    """Median seconds of each call. They take turns, after one round that warms up."""
     seconds: list[list[float]] = [[] for _ in ways]
     for repeat in range(REPEATS + 1):
         for way, taken in zip(ways, seconds, strict=True):
@@ -50,7 +51,7 @@ def medians(ways: list[Callable[[], object]]) -> list[float]:
 
 
 def accuracy(views: list[scenes.Scene], scale: int, ways: list[Callable[[Source, Source], Array]]) -> list[float]:
-    """Mean PSNR of what each way makes of LRHS and HRLS, for each number of samples."""
+    """Mean PSNR of each way to use LRHS and HRLS: for each of `SPP`, all ways."""
     return [
         statistics.fmean(metrics.psnr(way(view.lrhs(scale, spp), view.hrls(spp)), view.reference) for view in views)
         for spp in SPP
@@ -59,14 +60,14 @@ def accuracy(views: list[scenes.Scene], scale: int, ways: list[Callable[[Source,
 
 
 def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
-    """The HRLS alone, exposed as fusion would."""
+    """The denoised HRLS, with the exposure that fusion would choose."""
     exposure = transforms.exposure_of(scenes.beauty(lr))
     layers = tensors.pack(tensors.read(hr, hr.data_window, hr.data_window), schema.HRLS_FEATURES, exposure)
     return transforms.expand(denoiser.hrls(layers_of(layers)), exposure)
 
 
 class InTorch(Session):
-    """A joint network in 32 bits, from its checkpoint."""
+    """A joint model computed by PyTorch in 32 bits, from its checkpoint."""
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
@@ -86,14 +87,48 @@ class InTorch(Session):
 
 
 def in_32_bits(name: str) -> Session:
-    """A model of which nothing that can be otherwise is computed in 8 bits."""
+    """A model that computes everything in 32 bits, as far as it can."""
     path = find_model(0, name)
     return InTorch(path) if Contract.of_file(path).weights else Session(path, exact=True)
 
 
-def row(name: str, seconds: list[float], psnr: list[float]) -> None:
-    cells = [f"{s:.2f}" for s in seconds] + ([f"{value:.2f}" for value in psnr] or [""] * (2 * len(SPP)))
-    print(f"| {name} | " + " | ".join(cells) + " |", flush=True)
+def row(name: str, seconds: list[float], psnr: Sequence[float] = ()) -> Row:
+    """One row, from pairs of figures in 32 and in 8 bits."""
+    columns = [f"psnr_{spp}spp_{bits}bit" for spp in SPP for bits in (32, 8)]
+    return {
+        "method": name,
+        "seconds_32bit": seconds[0],
+        "seconds_8bit": seconds[1],
+        **dict(zip(columns, psnr, strict=False)),
+    }
+
+
+def layout(rows: list[Row]) -> str:
+    """A line for each method. OIDN on both has times only."""
+    head = ["", "seconds", "in 8 bits", *(cell for spp in SPP for cell in (f"PSNR at {spp} spp", "in 8 bits"))]
+    columns = [column for column in rows[0] if column != "method"]
+    body = [[r["method"], *(f"{r[c]:.2f}" if c in r else "" for c in columns)] for r in rows]
+    return results.markdown(head, body)
+
+
+def measure(views: list[scenes.Scene], models: list[str]) -> Iterator[Row]:
+    """A row for each method."""
+    layers = frame(SIZE, SIZE)
+    hrls = tensors.pack(layers, schema.HRLS_FEATURES, 1.0)
+    both = [Denoiser(exact=exact) for exact in (True, False)]
+    seconds = medians([partial(denoiser.hrls, layers_of(hrls)) for denoiser in both])
+    yield row("OIDN on the HRLS", seconds, accuracy(views, 2, [partial(denoised, denoiser) for denoiser in both]))
+    for scale in schema.SCALES[:2]:
+        low = tensors.pack({schema.RGB: layers[schema.RGB][::scale, ::scale]}, schema.LRHS_FEATURES, 1.0)
+        yield row(f"OIDN on both, x{scale}", medians([partial(denoiser.together, low, hrls) for denoiser in both]))
+    hr = Render.from_arrays("hr", **layers)
+    for name in models:
+        sessions = [in_32_bits(name), Session(find_model(0, name))]
+        scale = sessions[0].contract.scale
+        lr = Render.from_arrays("lr", rgb=layers[schema.RGB][::scale, ::scale].copy())
+        seconds = medians([partial(fuse, lr, hr, session) for session in sessions])
+        ways = [lambda lr, hr, session=session: fuse(lr, hr, session).rgb for session in sessions]
+        yield row(name, seconds, accuracy(views, scale, ways))
 
 
 def main() -> None:
@@ -102,27 +137,13 @@ def main() -> None:
     parser.add_argument(
         "--models", nargs="+", default=[f"{family}-x{scale}" for family in ("mix", "joint") for scale in schema.SCALES]
     )
+    results.add_option(parser)
     args = parser.parse_args()
     views = [scenes.of_view(view) for view in data.Folder(args.views).split("validation")[::3]]
-    print("| | seconds | in 8 bits |" + "".join(f" PSNR at {spp} spp | in 8 bits |" for spp in SPP))
-    print("|---|---|---|" + "---|---|" * len(SPP))
-    layers = frame(SIZE, SIZE)
-    hrls = tensors.pack(layers, schema.HRLS_FEATURES, 1.0)
-    both = [Denoiser(exact=exact) for exact in (True, False)]
-    seconds = medians([partial(denoiser.hrls, layers_of(hrls)) for denoiser in both])
-    row("OIDN on the HRLS", seconds, accuracy(views, 2, [partial(denoised, denoiser) for denoiser in both]))
-    for scale in schema.SCALES[:2]:
-        low = tensors.pack({schema.RGB: layers[schema.RGB][::scale, ::scale]}, schema.LRHS_FEATURES, 1.0)
-        seconds = medians([partial(denoiser.together, low, hrls) for denoiser in both])
-        row(f"OIDN on both together, x{scale}", seconds, [])
-    hr = Render.from_arrays("hr", **layers)
-    for name in args.models:
-        sessions = [in_32_bits(name), Session(find_model(0, name))]
-        scale = sessions[0].contract.scale
-        lr = Render.from_arrays("lr", rgb=layers[schema.RGB][::scale, ::scale].copy())
-        seconds = medians([partial(fuse, lr, hr, session) for session in sessions])
-        ways = [lambda lr, hr, session=session: fuse(lr, hr, session).rgb for session in sessions]
-        row(f"`{name}`", seconds, accuracy(views, scale, ways))
+    rows = list(measure(views, args.models))
+    print(layout(rows))
+    if args.table:
+        results.write(args.table, rows)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures side by side, and an enlarged detail of each below, as a PNG.
+"""Puts pictures side by side, with an enlarged detail of each below, into a PNG.
 
     python -m benchmarks.panel docs/images/example.png examples/lr.exr examples/hr.exr fused.exr ref.exr \\
         --detail 0.2,0.35,0.25
 
-Smaller pictures are enlarged without interpolation. --detail: left edge, top edge and width, as shares of the picture.
+Smaller pictures are enlarged without interpolation. `--detail` takes the left edge, the top edge and the width of the
+detail, as shares of the picture. Before such a picture is committed, `pngquant` reduces it to below 300 KB.
 """
 
 from __future__ import annotations
@@ -21,12 +22,13 @@ from oiio_msspl.transforms import repair, srgb
 
 
 def display(path: Path) -> np.ndarray:
+    """The beauty of an EXR file in sRGB, (h, w, 3)."""
     file = resolve(open_exr(path))
     return srgb(repair(file.read(file.data_window, ["rgb"])["rgb"])[0])
 
 
 def enlarged(image: np.ndarray, height: int) -> np.ndarray:
-    """Repeat pixels until the picture has about this height, exactly for whole factors."""
+    """Repeat pixels until the picture has about this height, or exactly this height if it is a whole factor larger."""
     factor = max(1, round(height / image.shape[0]))
     return image.repeat(factor, 0).repeat(factor, 1)
 

@@ -1,44 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy on scenes that nothing was trained on, at equal average samples.
+"""Accuracy on the development scenes, for every method at equal average samples.
 
-    python -m benchmarks.quality RENDERS --flip --json results/quality.json
-    python -m benchmarks.quality VIEWS --flip --json results/quality_cycles.json
+    python -m benchmarks.quality RENDERS --flip --table benchmarks/results/quality.csv
+    python -m benchmarks.quality VIEWS --flip --table benchmarks/results/quality_cycles.csv
+    python -m benchmarks.quality RENDERS --flip --methods '*prefiltered*' --table benchmarks/results/quality.csv
 
-Folders are those of :mod:`benchmarks.scenes`. For 2, 4 and 8 average samples (spp_LRHS / s^2 + spp_HRLS) each method
-gets its renders. From an LRHS and an HRLS: our models; OIDN (if pyoidn is installed) on the HRLS with albedo and
-normal, at quality high and fast; OIDN on the LRHS, upsampled; "OIDN on both": the first brought to the second's local
-brightness; and "together": to that of both renders denoised as :mod:`oiio_msspl.denoiser` does. From one
-full-resolution render of the same average: OIDN. "Nearest" marks the paper's LRHS, of every s x s pixels one; others
-are averages of s x s pixels, as renderers make them. "3:1" marks pairs whose HRLS has three quarters of the samples,
-others are halved, as in the paper. Printed: PSNR in sRGB and RelMSE (0.5, 0.01), per scene and mean;
-and the mean of these, RelMSE (1, 1e-4), SSIM and FLIP. Scenes whose own reference is noisy are listed, not averaged.
+:mod:`benchmarks.scenes` says what the folders hold. A frame has 2, 4 or 8 spp on average: spp_LRHS / s^2 + spp_HRLS.
+
+Methods that get an LRHS and an HRLS, each with half of the samples as in the paper:
+
+- the models of this project, by name. "joint-x2, 3:1" has three quarters of the samples in the HRLS.
+  "joint-x2, nearest" has the paper's LRHS, which keeps one of s x s pixels; a renderer averages them.
+- "OIDN on both x2": OIDN on the HRLS, with the local means of OIDN on the LRHS.
+- "OIDN on both x2, together": the same with the local means of :func:`benchmarks.peers.oidn_on_average`.
+
+Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), "full resolution" and
+"OIDN, same samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
+:func:`benchmarks.oidn.denoise_prefiltered`. All others are OIDN's plain call with the quality "high".
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import platform
+import fnmatch
+import functools
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from benchmarks import scenes
+from benchmarks import results, scenes
+from benchmarks.peers import match_local_means, oidn, oidn_on_average, oidn_prefiltered
+from benchmarks.results import MEAN, Row
 from benchmarks.scenes import NOISY_REFERENCE, beauty
-from oiio_msspl import fuse, schema, tensors, transforms
+from oiio_msspl import fuse, schema
 from oiio_msspl.comparison import scores, upsample_bicubic
-from oiio_msspl.denoiser import Denoiser, aovs_of_lrhs
-from oiio_msspl.errors import InputError
+from oiio_msspl.contract import Contract
 from oiio_msspl.pairing import Source
+from oiio_msspl.render import Array
 from oiio_msspl.session import Session, find_model, shipped_models
-from oiio_msspl.transforms import box_downsample, repair, srgb
+from oiio_msspl.transforms import srgb
 
-#: Average spp; half of it is in the HRLS, half in the LRHS, as in the paper's tables.
+#: Average spp. The HRLS and the LRHS have half of it each, as in the paper's tables.
 AVERAGES = (2, 4, 8)
-#: Other ways to divide it, HRLS to LRHS, where it divides.
+#: Other divisions of the samples, HRLS : LRHS. They are measured where they give whole numbers.
 UNEVEN = ((3, 1), (7, 1))
-#: Key of a row -> what it is called, and how it is printed.
+#: Column -> its title and its format.
 MEASURES = {
     "psnr": ("PSNR (sRGB, dB)", "{:.2f}"),
     "relmse": ("RelMSE (0.5, 0.01)", "{:.4f}"),
@@ -46,147 +53,169 @@ MEASURES = {
     "ssim": ("SSIM", "{:.4f}"),
     "flip": ("FLIP", "{:.4f}"),
 }
+#: Columns that tell the rows apart.
+KEYS = ("scene", "spp", "method")
 
 
-def oidn(file: Source, quality: str = "high") -> np.ndarray | None:
-    """OIDN with albedo and normal, if there; None without pyoidn."""
-    try:
-        import pyoidn
-    except ImportError:
-        return None
-    layers = file.read(file.data_window)
-    layers = {k: np.ascontiguousarray(repair(v, signed=k == "normal")[0]) for k, v in layers.items()}
-    # OIDN takes no normal without an albedo.
-    guides = {k: layers[k] for k in ("albedo", "normal") if k in layers and "albedo" in layers}
-    return np.asarray(pyoidn.denoise(layers["rgb"], hdr=True, quality=quality, **guides))
+def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Iterator[tuple[str, Callable[[], Array]]]:
+    """Every method's name, and a function that computes its picture (h, w, 3) for this scene and average spp."""
+    height, width = scene.reference.shape[:2]
+    hr, full = scene.hrls(spp // 2), scene.hrls(spp)
+
+    def fused(session: Session, lr: Source, hr: Source) -> Array:
+        return fuse(lr, hr, session).rgb
+
+    denoised = functools.cache(lambda: oidn(hr))
+    yield "HRLS", lambda: beauty(hr)
+    yield "OIDN on the HRLS", denoised
+    yield "OIDN fast on the HRLS", lambda: oidn(hr, "fast")
+    yield "OIDN prefiltered on the HRLS", lambda: oidn_prefiltered(hr)
+    yield "full resolution", lambda: beauty(full)
+    yield "OIDN, same samples", lambda: oidn(full)
+    yield "OIDN prefiltered, same samples", lambda: oidn_prefiltered(full)
+    for scale in schema.SCALES:
+        lr, nearest = scene.lrhs(scale, spp // 2), scene.nearest(scale, spp // 2)
+        denoised_low = functools.cache(functools.partial(oidn, lr))
+        yield f"LRHS x{scale} nearest", lambda lr=lr, s=scale: beauty(lr).repeat(s, 0).repeat(s, 1)
+        yield f"LRHS x{scale} bicubic", lambda lr=lr: upsample_bicubic(beauty(lr), width, height)
+        yield (
+            f"OIDN on the LRHS x{scale}, bicubic",
+            lambda low=denoised_low: upsample_bicubic(low(), width, height),
+        )
+        yield f"OIDN on both x{scale}", lambda low=denoised_low: match_local_means(denoised(), low())
+        yield (
+            f"OIDN on both x{scale}, together",
+            lambda lr=lr: match_local_means(denoised(), oidn_on_average(lr, hr)),
+        )
+        for session in sessions:
+            if session.contract.scale == scale:
+                name = session.contract.name
+                yield name, functools.partial(fused, session, lr, hr)
+                if nearest is not None:
+                    yield f"{name}, nearest", functools.partial(fused, session, nearest, hr)
+    for more, less in UNEVEN:
+        share, rest = divmod(spp, more + less)
+        if rest or not scene.has(share * more):
+            continue
+        hr_more, division = scene.hrls(share * more), f"{more}:{less}"
+        yield f"OIDN on the HRLS, {division}", functools.partial(oidn, hr_more)
+        for session in sessions:
+            lr = scene.lrhs(session.contract.scale, share * less)
+            yield f"{session.contract.name}, {division}", functools.partial(fused, session, lr, hr_more)
 
 
-def brought_to(detail: np.ndarray, low: np.ndarray) -> np.ndarray:
-    """An image times the smooth ratio that gives it the local means of a smaller one."""
-    height, width = detail.shape[:2]
-    means = box_downsample(detail, height // low.shape[0])
-    return detail * upsample_bicubic(((low + 1e-3) / (means + 1e-3)).astype(np.float32), width, height)
+def load_models(names: Sequence[str], pattern: str) -> list[Session]:
+    """Sessions of the models for which :func:`methods` has a name that matches the pattern."""
+    endings = ("", ", nearest", *(f", {more}:{less}" for more, less in UNEVEN))
+    paths = {path: Contract.of_file(path).name for path in (find_model(0, name) for name in names)}
+    return [
+        Session(path)
+        for path, name in paths.items()
+        if any(fnmatch.fnmatchcase(name + ending, pattern) for ending in endings)
+    ]
 
 
-def denoised_together(lrhs: Source, hrls: Source) -> np.ndarray | None:
-    """Both renders, denoised together at the LRHS's resolution; None without pyoidn."""
-    try:
-        denoiser = Denoiser(exact=True)
-    except InputError:
-        return None
-    low = beauty(lrhs)
-    exposure = transforms.exposure_of(low)
-    layers = tensors.read(hrls, hrls.data_window, hrls.data_window)
-    packed = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
-    names = aovs_of_lrhs(packed.shape[0] // low.shape[0])
-    low_aovs = tensors.read(lrhs, lrhs.data_window, lrhs.data_window, features=names) if names else {}
-    return transforms.expand(denoiser.together(transforms.compress(low, exposure), packed, low_aovs), exposure)
+def measure(scene: scenes.Scene, sessions: Sequence[Session], *, flip: bool = False, pattern: str = "*") -> list[Row]:
+    """A row for each average spp and each method whose name matches the pattern."""
+    rows = []
+    for spp in AVERAGES:
+        for method, picture in methods(scene, sessions, spp):
+            if fnmatch.fnmatchcase(method, pattern):
+                image = picture()
+                row: Row = {"scene": scene.name, "spp": spp, "method": method, **scores(image, scene.reference)}
+                rows.append(row | ({"flip": mean_flip(image, scene.reference)} if flip else {}))
+    return rows
 
 
-def flip_of(image: np.ndarray, reference: np.ndarray) -> float:
-    """Mean FLIP of two pictures in sRGB, seen from where a degree has 67 pixels."""
+def mean_flip(image: Array, reference: Array) -> float:
+    """Mean FLIP of two sRGB pictures, seen at 67 pixels per degree."""
     import flip_evaluator
 
     return float(flip_evaluator.evaluate(srgb(reference), srgb(image), "LDR", applyMagma=False)[1])
 
 
-def run_scene(scene: scenes.Scene, sessions: list[Session], flip: bool = False) -> list[dict[str, Any]]:
-    """One row a method and case: ``scene, spp, method, psnr, relmse, relmse_gharbi, ssim``, and ``flip`` if asked."""
-    height, width = scene.reference.shape[:2]
-    rows = []
+def with_means(rows: list[Row]) -> list[Row]:
+    """One row for each scene, average spp and method, and means over all scenes whose reference is clean.
 
-    def add(spp: int, method: str, image: np.ndarray | None) -> None:
-        if image is not None:
-            measured = scores(image, scene.reference) | ({"flip": flip_of(image, scene.reference)} if flip else {})
-            rows.append({"scene": scene.name, "spp": spp, "method": method, **measured})
-
-    for spp in AVERAGES:
-        hr = scene.hrls(spp // 2)
-        add(spp, "HRLS", beauty(hr))
-        denoised = oidn(hr)
-        add(spp, "OIDN on the HRLS", denoised)
-        add(spp, "OIDN fast on the HRLS", oidn(hr, "fast"))
-        for scale in schema.SCALES:
-            lr, nearest = scene.lrhs(scale, spp // 2), scene.nearest(scale, spp // 2)
-            low = beauty(lr)
-            add(spp, f"LRHS x{scale} nearest", low.repeat(scale, 0).repeat(scale, 1))
-            add(spp, f"LRHS x{scale} bicubic", upsample_bicubic(low, width, height))
-            denoised_low, together = oidn(lr), denoised_together(lr, hr)
-            if denoised is not None and denoised_low is not None and together is not None:
-                add(spp, f"OIDN on the LRHS x{scale}, bicubic", upsample_bicubic(denoised_low, width, height))
-                add(spp, f"OIDN on both x{scale}", brought_to(denoised, denoised_low))
-                add(spp, f"OIDN on both x{scale}, together", brought_to(denoised, together))
-            for session in sessions:
-                if session.contract.scale == scale:
-                    add(spp, session.contract.name, fuse(lr, hr, session).rgb)
-                    if nearest is not None:
-                        add(spp, f"{session.contract.name}, nearest", fuse(nearest, hr, session).rgb)
-        for more, less in UNEVEN:
-            share, rest = divmod(spp, more + less)
-            if rest or not scene.has(share * more):
-                continue
-            hr, divided = scene.hrls(share * more), f"{more}:{less}"
-            add(spp, f"OIDN on the HRLS, {divided}", oidn(hr))
-            for session in sessions:
-                lr = scene.lrhs(session.contract.scale, share * less)
-                add(spp, f"{session.contract.name}, {divided}", fuse(lr, hr, session).rgb)
-        full = scene.hrls(spp)
-        add(spp, "full resolution", beauty(full))
-        add(spp, "OIDN, same samples", oidn(full))
-    return rows
-
-
-def mean_of(rows: list[dict[str, Any]], method: str, spp: int, measure: str) -> float:
-    """Over all scenes whose reference is clean; those of several views count once."""
-    values: dict[str, list[float]] = {}
+    A scene with several views counts once. A method that was not measured on all of these scenes gets no mean.
+    """
+    views: dict[tuple[int, str, str], list[Row]] = {}
     for row in rows:
-        if row["method"] == method and row["spp"] == spp and row["scene"] not in NOISY_REFERENCE:
-            values.setdefault(row["scene"], []).append(row[measure])
-    return float(np.mean([np.mean(of_scene) for of_scene in values.values()]))
+        views.setdefault((row["spp"], row["method"], row["scene"]), []).append(row)
+    of_scenes = [_mean(members, members[0]["scene"]) for members in views.values()]
+    clean = {row["scene"] for row in rows} - NOISY_REFERENCE
+    by_method: dict[tuple[int, str], list[Row]] = {}
+    for row in of_scenes:
+        if row["scene"] in clean:
+            by_method.setdefault((row["spp"], row["method"]), []).append(row)
+    return [_mean(members, MEAN) for members in by_method.values() if len(members) == len(clean)] + of_scenes
 
 
-def print_tables(rows: list[dict[str, Any]]) -> None:
-    """A table a measure and average spp: methods down, scenes across."""
-    names = list(dict.fromkeys(row["scene"] for row in rows))
-    cases = list(dict.fromkeys(row["spp"] for row in rows))
-    for spp in cases:
-        for measure in ("psnr", "relmse"):
-            unit, form = MEASURES[measure]
-            print(f"\n### {unit} at {spp} spp on average\n")
-            print("| method | mean | " + " | ".join(f"{s}{'*' if s in NOISY_REFERENCE else ''}" for s in names) + " |")
-            print("|---|" + "---|" * (len(names) + 1))
-            for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
-                cells = [form.format(mean_of(rows, method, spp, measure))]
-                for name in names:
-                    case = (method, spp, name)
-                    values = [row[measure] for row in rows if (row["method"], row["spp"], row["scene"]) == case]
-                    cells.append(form.format(np.mean(values)) if values else "")
-                print(f"| {method} | " + " | ".join(cells) + " |")
-    if NOISY_REFERENCE & set(names):
-        print("\n\\* noisy reference, not in the mean")
-    measured = {measure: form for measure, form in MEASURES.items() if measure in rows[0]}
-    for spp in cases:
-        print(f"\n### All measures at {spp} spp on average, mean\n")
-        print("| method | " + " | ".join(unit for unit, _ in measured.values()) + " |\n|---|" + "---|" * len(measured))
-        for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
-            cells = [form.format(mean_of(rows, method, spp, measure)) for measure, (_, form) in measured.items()]
-            print(f"| {method} | " + " | ".join(cells) + " |")
+def _mean(rows: Sequence[Row], scene: str) -> Row:
+    measured = {measure: float(np.mean([row[measure] for row in rows])) for measure in MEASURES if measure in rows[0]}
+    return {"scene": scene, "spp": rows[0]["spp"], "method": rows[0]["method"], **measured}
+
+
+def layout(rows: Sequence[Row]) -> str:
+    """For each average spp a table of PSNR and RelMSE by scene, and one of the means of all measures."""
+    names = list(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
+    found = results.index(rows, *KEYS)
+    shown = {measure: title for measure, (title, _) in MEASURES.items() if measure in rows[0]}
+    text = mean_note(rows) + "\n"
+    for spp in dict.fromkeys(row["spp"] for row in rows):
+        listed = list(dict.fromkeys(row["method"] for row in rows if row["spp"] == spp))
+        text += f"\n### PSNR and RelMSE at {spp} spp on average\n\n"
+        body = [
+            [method, *(cell(found.get((name, spp, method)), "psnr", "relmse") for name in (MEAN, *names))]
+            for method in listed
+        ]
+        text += results.markdown(["PSNR / RelMSE", MEAN, *names], body)
+        text += f"\n### All measures at {spp} spp on average, means\n\n"
+        body = [[method, *(cell(found.get((MEAN, spp, method)), m) for m in shown)] for method in listed]
+        text += results.markdown(["", *shown.values()], body)
+    return text
+
+
+def mean_note(rows: Sequence[Row]) -> str:
+    """A sentence that says what the means are over."""
+    names = list(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
+    clean = [name for name in names if name not in NOISY_REFERENCE]
+    left_out = [name for name in names if name in NOISY_REFERENCE]
+    note = f"Means are over {len(clean)} scenes: {', '.join(clean)}."
+    return note + f" Not over {', '.join(left_out)}, whose reference is noisy." * bool(left_out)
+
+
+def cell(row: Row | None, *measures: str) -> str:
+    """Some measures of a row; empty if there is none."""
+    return " / ".join(_digits(measure, row[measure]) for measure in measures) if row else ""
+
+
+def _digits(measure: str, value: float) -> str:
+    """A value as text, with no more than the four digits that the table has."""
+    return f"{value:.4g}" if "relmse" in measure and value >= 1 else MEASURES[measure][1].format(value)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="renders or views")
-    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; all if none")
-    parser.add_argument("--flip", action="store_true", help="also FLIP, which takes longer than all the rest")
-    parser.add_argument("--json", type=Path, help="also write the rows here")
+    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; default: all")
+    parser.add_argument("--methods", metavar="PATTERN", help="measure only these; --table then keeps its other rows")
+    parser.add_argument("--flip", action="store_true", help="also measure FLIP, which takes most of the time")
+    results.add_option(parser)
     args = parser.parse_args()
-    sessions = [Session(find_model(0, name)) for name in args.model or shipped_models()]
-    rows = [row for scene in scenes.load(args.folder) for row in run_scene(scene, sessions, args.flip)]
-    print_tables(rows)
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        contracts = {s.contract.name: s.contract.provenance for s in sessions}
-        args.json.write_text(json.dumps({"machine": platform.machine(), "models": contracts, "rows": rows}, indent=1))
+    pattern = args.methods or "*"
+    sessions = load_models(args.model or list(shipped_models()), pattern)
+    rows = [
+        row for scene in scenes.load(args.folder) for row in measure(scene, sessions, flip=args.flip, pattern=pattern)
+    ]
+    if not rows:
+        parser.error(f"no method matches {args.methods}")
+    rows = with_means(rows)
+    print(layout(rows))
+    if args.table and args.methods:
+        results.merge(args.table, rows, KEYS)
+    elif args.table:
+        results.write(args.table, rows)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on real pairs: does it work, and does every other layer come out as it went in?
+"""Runs the command line on real pairs and checks that every other layer of the HRLS comes out unchanged.
 
     python -m benchmarks.real_pairs FOLDER... [--layout spec] [--model FILE]
 
-In each folder below FOLDER, hr.exr or hr_1spp.exr is fused with every lr*.exr beside it by the command line, and the
-result opened with OpenEXR's own reader and with OpenImageIO's: every layer of the HRLS but the fused beauty must be in
-it, bit for bit. With a ref.exr the scores are printed too.
+In each folder below FOLDER, `msspl-fuse` fuses hr.exr or hr_1spp.exr with every lr*.exr beside it. OpenEXR's reader and
+OpenImageIO's then read the result: it must hold every layer of the HRLS bit for bit, except the fused beauty. If there
+is a ref.exr, the scores are printed too. The exit code is 1 if a check fails.
 """
 
 from __future__ import annotations
@@ -17,11 +17,14 @@ import subprocess
 import sys
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
 import OpenImageIO as oiio
 
+from benchmarks import results
+from benchmarks.results import Row
 from oiio_msspl.aovs import resolve
 from oiio_msspl.assemble import fused_channels
 from oiio_msspl.comparison import compare_files
@@ -39,7 +42,7 @@ def find_pairs(folders: list[Path]) -> list[tuple[Path, Path]]:
 
 
 def _planes(path: Path, leave_out: set[tuple[int, str]]) -> dict[str, collections.Counter[tuple[str, bytes]]]:
-    """Reader -> how often each plane (pixel type and bytes) occurs, as OpenEXR and as OpenImageIO read it."""
+    """Reader -> how often each plane (pixel type, bytes) occurs in a file. ``leave_out`` has (part, channel name)."""
     planes: dict[str, collections.Counter[tuple[str, bytes]]] = {"OpenEXR": collections.Counter()}
     planes["OpenImageIO"] = collections.Counter()
     by_oiio = oiio.ImageInput.open(str(path))
@@ -57,7 +60,7 @@ def _planes(path: Path, leave_out: set[tuple[int, str]]) -> dict[str, collection
 
 
 def compare_passed_on(hr: Path, out: Path) -> tuple[int, list[str]]:
-    """Number of channels of the HRLS that should be passed on, and a line a reader that misses some, bit for bit."""
+    """How many channels of the HRLS the result must hold, and a message for each reader that misses some of them."""
     fused = {(c.part, c.name) for c in fused_channels(resolve(open_exr(hr)))}
     before, after = _planes(hr, fused), _planes(out, set())
     faults = [
@@ -68,7 +71,8 @@ def compare_passed_on(hr: Path, out: Path) -> tuple[int, list[str]]:
     return before["OpenEXR"].total(), faults
 
 
-def run_pair(lr: Path, hr: Path, out: Path, arguments: list[str]) -> dict:
+def run_pair(lr: Path, hr: Path, out: Path, arguments: list[str]) -> dict[str, Any]:
+    """Fuse one pair and check the result."""
     command = ["msspl-fuse", str(lr), str(hr), "-o", str(out), "--json", "--overwrite", "--no-preview", *arguments]
     done = subprocess.run(command, capture_output=True, text=True)
     if done.returncode:
@@ -76,15 +80,15 @@ def run_pair(lr: Path, hr: Path, out: Path, arguments: list[str]) -> dict:
     report = json.loads(done.stdout)
     count, faults = compare_passed_on(hr, out)
     beauty = resolve(open_exr(out)).load().layers["rgb"]
+    if not (np.isfinite(beauty).all() and (beauty >= 0).all()):
+        faults.append("the fused beauty has NaN, Inf or negative values")
     result = {
         "pair": f"{hr.parent.parent.name}/{hr.parent.name}/{lr.name}",
         "renderer": report["renderer"],
         "scale": report["scale"],
-        "spp": report["spp"],
         "aovs": {row["feature"]: row["status"] for row in report["aovs"]},
         "passed_on": count,
         "faults": faults,
-        "finite": bool(np.isfinite(beauty).all() and (beauty >= 0).all()),
         "warnings": report["warnings"],
     }
     reference = hr.with_name("ref.exr")
@@ -99,14 +103,14 @@ def main() -> int:
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--layout", default="spec")
     parser.add_argument("--model")
-    parser.add_argument("--json", type=Path, help="also write the results here")
+    results.add_option(parser)
     args = parser.parse_args()
     extra = ["--layout", args.layout, *(["--model", args.model] if args.model else [])]
-    results = []
+    found = []
     with tempfile.TemporaryDirectory() as folder:
         for lr, hr in find_pairs(args.folders):
             result = run_pair(lr, hr, Path(folder) / "out.exr", extra)
-            results.append(result)
+            found.append(result)
             if "error" in result:
                 print(f"{result['pair']}: {result['error']}")
                 continue
@@ -120,9 +124,17 @@ def main() -> int:
             )
             for line in [*result["faults"], *result["warnings"]]:
                 print(f"    {line}")
-    if args.json:
-        args.json.write_text(json.dumps(results, indent=1))
-    return int(any(r.get("faults") or "error" in r for r in results))
+    if args.table:
+        results.write(args.table, [summary(result) for result in found])
+    return int(any(result.get("faults") or "error" in result for result in found))
+
+
+def summary(result: dict[str, Any]) -> Row:
+    """A result as a row of the table."""
+    row: Row = {name: result[name] for name in ("pair", "renderer", "scale", "passed_on", "error") if name in result}
+    if "error" not in result:
+        row |= {"faults": len(result["faults"]), "warnings": len(result["warnings"])}
+    return row | result.get("scores", {}).get("fused", {})
 
 
 if __name__ == "__main__":

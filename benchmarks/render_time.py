@@ -1,18 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How long the scenes of `benchmarks.quality` take to render: the larger part of what a user waits for.
+"""Time to render the development scenes, which is most of what a user waits for.
 
-    python -m benchmarks.render_time ../shared/scenes --json results/render_time.json
+    python -m benchmarks.render_time SCENES --table benchmarks/results/render_time.csv
 
-Every ``NAME/*.xml`` is rendered with Mitsuba 3, albedo and normal, as its HRLS was: a 384 x 256 crop, here the middle,
-of a frame whose longer side is 1280 pixels. Printed: seconds for one sample a pixel of 1024 x 1024, the median of the
-repeats after one that compiles; and the same at a quarter of the resolution with 16 times the samples, which should
-take as long.
+Mitsuba 3 renders every ``NAME/*.xml`` with albedo and normal: a crop of 384 x 256 pixels, in the middle of a frame
+whose longer side has 1280 pixels. The result is the time for one sample in each of 1024 x 1024 pixels: the median of
+the repeats, after one that compiles. The LRHS, with a quarter of the resolution and 16 times the samples, should take
+as long as the HRLS.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import statistics
 import time
 from pathlib import Path
@@ -20,36 +19,34 @@ from typing import Any
 
 import numpy as np
 
-LONGER, CROP = 1280, (384, 256)
+from benchmarks import results
+from benchmarks.render.film import CROP, frame_size, set_crop
+
 SPP, SCALE = 4, 4
 MEGAPIXEL = 1024 * 1024
 
 
 def seconds_per_spp(path: Path, repeats: int) -> dict[str, float]:
-    """``hrls`` and ``lrhs``: seconds for one sample in each of 1024 x 1024 pixels."""
+    """``hrls_s`` and ``lrhs_s``: seconds for one sample in each of 1024 x 1024 pixels."""
     import mitsuba as mi
 
     scene = mi.load_file(str(path))
     integrator: Any = mi.load_dict(
         {"type": "aov", "aovs": "albedo:albedo,nn:sh_normal", "img": {"type": "path", "max_depth": 12}}
     )
-    film = mi.traverse(scene.sensors()[0])
-    original = np.array(scene.sensors()[0].film().size())
-    full = np.round(original * LONGER / original.max() / 8).astype(int) * 8
+    sensor = scene.sensors()[0]
+    parameters, full = mi.traverse(sensor), frame_size(sensor)
     result = {}
-    for name, scale in (("hrls", 1), ("lrhs", SCALE)):
+    for name, scale in (("hrls_s", 1), ("lrhs_s", SCALE)):
         size, crop = full // scale, np.array(CROP) // scale
-        film["film.size"] = mi.ScalarVector2u(*size)
-        film["film.crop_size"] = mi.ScalarVector2u(*crop)
-        film["film.crop_offset"] = mi.ScalarPoint2u(*((size - crop) // 2))
-        film.update()
+        set_crop(mi, parameters, size, crop, (size - crop) // 2)
         spp = SPP * scale**2
         times = []
         for seed in range(repeats + 1):
             start = time.perf_counter()
             mi.render(scene, integrator=integrator, spp=spp, seed=seed).numpy()
             times.append(time.perf_counter() - start)
-        result[name] = statistics.median(times[1:]) * MEGAPIXEL / (crop[0] * crop[1] * spp)
+        result[name] = statistics.median(times[1:]) * MEGAPIXEL / float(crop[0] * crop[1] * spp)
     return result
 
 
@@ -58,17 +55,17 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("--repeats", type=int, default=3)
     parser.add_argument("--variant", default="llvm_ad_rgb")
-    parser.add_argument("--json", type=Path)
+    results.add_option(parser)
     args = parser.parse_args()
     import mitsuba as mi
 
     mi.set_variant(args.variant)
-    rows = {path.parent.name: seconds_per_spp(path, args.repeats) for path in sorted(args.scenes.glob("*/*.xml"))}
-    print("| scene | HRLS, s | LRHS x4, s |\n|---|---|---|")
-    for name, row in rows.items():
-        print(f"| {name} | {row['hrls']:.2f} | {row['lrhs']:.2f} |")
-    if args.json:
-        args.json.write_text(json.dumps({"seconds_per_spp": rows}, indent=1) + "\n")
+    paths = sorted(args.scenes.glob("*/*.xml"))
+    rows = [{"scene": path.parent.name, **seconds_per_spp(path, args.repeats)} for path in paths]
+    body = [[row["scene"], f"{row['hrls_s']:.2f}", f"{row['lrhs_s']:.2f}"] for row in rows]
+    print(results.markdown(["scene", "HRLS, s", f"LRHS x{SCALE}, s"], body))
+    if args.table:
+        results.write(args.table, rows)
 
 
 if __name__ == "__main__":

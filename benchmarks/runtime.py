@@ -1,49 +1,55 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and peak memory for one 1024 x 1024 frame at x2, x4 and x8: the work of the paper's table of runtimes.
+"""Time and peak memory of each method for one frame of 1024 x 1024 pixels, as in the paper's table of runtimes.
 
-    python -m benchmarks.runtime --json results/runtime.json
+    python -m benchmarks.runtime --table benchmarks/results/runtime.csv
 
-Each measurement is a process of its own; the network's time is the median of the repeats after one that warms up, and
-OIDN's (if pyoidn is installed) is taken in turn with ours, so that a machine whose speed drifts does not favour one.
-Peak memory is the process's largest resident set, libraries and weights included. `--size 8192x4320` shows what an 8K
-frame takes from file to file.
+Each measurement runs in its own process. A first call warms up and is not counted. The methods take turns for several
+rounds, so that a machine whose speed drifts favours none of them. Peak memory is the largest resident set of the
+process, with its libraries and weights. :mod:`benchmarks.runtime_files` measures a whole job from file to file.
 """
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import json
+import os
 import platform
 import re
 import resource
 import statistics
 import subprocess
 import sys
-import tempfile
 import time
+from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-#: OIDN's qualities that are measured, by what the table calls them.
-OIDN = {"OIDN 2.5.1, quality high": "high", "OIDN 2.5.1, quality fast": "fast"}
-#: Seconds on a Titan Xp GPU and MB of its memory, from the paper's table 3 and text.
-PAPER = {2: (0.362, 1134), 4: (0.118, 749), 8: (0.052, 737)}
+from benchmarks import results
+from benchmarks.results import Row
+
+OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
+#: As :mod:`benchmarks.quality` calls them -> as they are called here, where it does not matter which render they get.
+SAME_WORK = {
+    "OIDN on the HRLS": OIDN,
+    "OIDN, same samples": OIDN,
+    "OIDN fast on the HRLS": OIDN_FAST,
+    "OIDN prefiltered on the HRLS": OIDN_PREFILTERED,
+    "OIDN prefiltered, same samples": OIDN_PREFILTERED,
+}
 
 
 def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
-    """Random layers: times do not depend on what is in the pixels."""
+    """Random layers (height, width, 3): the time does not depend on what the pixels show."""
     import numpy as np
 
     rng = np.random.default_rng(seed)
-    return {
-        "rgb": rng.random((height, width, 3), dtype=np.float32),
-        "albedo": rng.random((height, width, 3), dtype=np.float32),
-        "normal": rng.random((height, width, 3), dtype=np.float32),
-    }
+    return {name: rng.random((height, width, 3), dtype=np.float32) for name in ("rgb", "albedo", "normal")}
 
 
-def measure_model(name: str, height: int, width: int, repeats: int, threads: int) -> dict[str, Any]:
-    """Seconds of :func:`oiio_msspl.fuse` on arrays, and the process's peak memory (in this process)."""
+def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[[], Any]:
+    """A call of :func:`oiio_msspl.fuse` on arrays."""
     from oiio_msspl import Render, Session, find_model, fuse
     from oiio_msspl.transforms import box_downsample
 
@@ -53,78 +59,29 @@ def measure_model(name: str, height: int, width: int, repeats: int, threads: int
     high = Render.from_arrays("hr", **layers)
     aovs = {name: box_downsample(layers[name], scale) for name in ("albedo", "normal")}
     low = Render.from_arrays("lr", rgb=layers["rgb"][::scale, ::scale].copy(), **aovs)
-    fuse(low, high, session)
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        fuse(low, high, session)
-        times.append(time.perf_counter() - start)
-    return {"seconds": times, "peak_mb": peak_mb()}
+    return lambda: fuse(low, high, session)
 
 
-def measure_oidn(quality: str, height: int, width: int, repeats: int) -> dict[str, Any]:
-    import pyoidn
+def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
+    """A call of OIDN on arrays."""
+    from benchmarks import oidn
 
     layers = frame(height, width)
-    guides = {name: layers[name] for name in ("albedo", "normal")}
-    pyoidn.denoise(layers["rgb"], **guides, hdr=True, quality=quality)
-    times = []
+    images = {"color": layers["rgb"], "albedo": layers["albedo"], "normal": layers["normal"]}
+    if name == OIDN_PREFILTERED:
+        return lambda: oidn.denoise_prefiltered(**images)
+    return lambda: oidn.denoise(**images, quality="fast" if name == OIDN_FAST else "high")
+
+
+def measure(call: Callable[[], Any], repeats: int) -> dict[str, Any]:
+    """Seconds of each repeat, and the peak memory of this process."""
+    call()
+    seconds = []
     for _ in range(repeats):
         start = time.perf_counter()
-        pyoidn.denoise(layers["rgb"], **guides, hdr=True, quality=quality)
-        times.append(time.perf_counter() - start)
-    return {"seconds": times, "peak_mb": peak_mb()}
-
-
-def measure_files(scale: int, height: int, width: int, max_memory: int) -> dict[str, Any]:
-    """A whole job from file to file: half-float EXRs with the layers of a Cycles render."""
-    from oiio_msspl import fuse_files
-
-    with tempfile.TemporaryDirectory() as folder:
-        for name, h, w in (("lr", height // scale, width // scale), ("hr", height, width)):
-            # Written by a process of its own, so that its memory is not ours.
-            subprocess.run(
-                [sys.executable, "-m", "benchmarks.runtime", "--write", f"{folder}/{name}.exr", f"{w}x{h}"], check=True
-            )
-        start = time.perf_counter()
-        preview = Path(folder, "out.png")
-        files = [f"{folder}/{name}.exr" for name in ("lr", "hr", "out")]
-        report = fuse_files(*files, max_memory=max_memory, preview_path=preview)
-        return {
-            "seconds": [time.perf_counter() - start],
-            "peak_mb": peak_mb(),
-            "tiles": report.tiles,
-            "parts": report.seconds,
-        }
-
-
-def write_frame(path: str, width: int, height: int) -> None:
-    import numpy as np
-    import OpenEXR
-
-    layers = frame(height, width)
-    channels = {}
-    for name, suffixes in (
-        ("rgb", "RGB"),
-        ("albedo", "RGB"),
-        ("normal", "XYZ"),
-        ("diffuse", "RGB"),
-        ("specular", "RGB"),
-    ):
-        source = layers.get(name, layers["rgb"])
-        for i, suffix in enumerate(suffixes):
-            channel = suffix if name == "rgb" else f"{name}.{suffix}"
-            channels[channel] = np.ascontiguousarray(source[..., i].astype(np.float16))
-    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
-    with OpenEXR.File(header, channels) as file:
-        file.write(path)
-
-
-def processor() -> str:
-    """What this machine computes with; of Linux, Python says nothing."""
-    info = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", info.read_text()) if info.exists() else []
-    return names[0] if names else platform.processor()
+        call()
+        seconds.append(time.perf_counter() - start)
+    return {"seconds": seconds, "peak_mb": peak_mb()}
 
 
 def peak_mb() -> float:
@@ -133,92 +90,83 @@ def peak_mb() -> float:
     return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
+def processor() -> str:
+    """The processor's name. On Linux Python does not know it, so it comes from /proc/cpuinfo."""
+    info = Path("/proc/cpuinfo")
+    names = re.findall(r"model name\s*: (.*)", info.read_text()) if info.exists() else []
+    return names[0] if names else platform.processor()
+
+
 def in_process(module: str, *arguments: str) -> dict[str, Any]:
-    """What a module prints as JSON in a process of its own."""
+    """Run a module in its own process; what it prints, read as JSON."""
     done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
     if done.returncode:
         raise SystemExit(done.stderr)
-    return json.loads(done.stdout)
+    found: dict[str, Any] = json.loads(done.stdout)
+    return found
 
 
-def measured(kind: str, size: str, *extra: str) -> dict[str, Any]:
-    """``kind``: ``files``, one of ``OIDN`` or a model."""
-    return in_process("benchmarks.runtime", "--measure", kind, "--size", size, *extra)
+def compare(args: argparse.Namespace) -> list[Row]:
+    """A row for each method: median, fastest and slowest seconds, and peak memory."""
+    from oiio_msspl.session import shipped_models
+
+    cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED]
+    cases = [case for case in cases if fnmatch.fnmatchcase(case, args.methods or "*")]
+    measured: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
+    settings = "--size", args.size, "--repeats", str(args.repeats), "--threads", str(args.threads)
+    for _ in range(args.rounds):
+        for case, rounds in measured.items():
+            rounds.append(in_process("benchmarks.runtime", "--measure", case, *settings))
+    rows = []
+    for case, rounds in measured.items():
+        seconds = [value for done in rounds for value in done["seconds"]]
+        row: Row = {"method": case, "size": args.size, "machine": processor(), "cores": os.cpu_count()}
+        row |= {"seconds": statistics.median(seconds), "fastest": min(seconds), "slowest": max(seconds)}
+        row |= {"peak_mb": max(done["peak_mb"] for done in rounds)}
+        if case in SAME_WORK.values():
+            row["version"] = ".".join(version("pyoidn").split(".")[:3])
+        rows.append(row)
+    return rows
+
+
+def layout(rows: list[Row]) -> str:
+    """A line for each method, beside OIDN's time."""
+    found = results.index(rows, "method")
+    body = []
+    for name, row in found.items():
+        of_oidn = f"{row['seconds'] / found[OIDN]['seconds']:.2f}" if OIDN in found else ""
+        spread = f"{row['fastest']:.2f} to {row['slowest']:.2f}"
+        title = name.replace(OIDN, f"{OIDN} {row['version']}", 1) if "version" in row else f"`{name}`"
+        body.append([title, f"{row['seconds']:.2f}", spread, of_oidn, f"{row['peak_mb']:.0f}"])
+    head = f"{rows[0]['size'].replace('x', ' x ')}, {rows[0]['cores']} cores, {rows[0]['machine']}"
+    return results.markdown([head, "median s", "fastest to slowest", "of OIDN's time", "peak MB"], body)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="1024x1024")
-    parser.add_argument("--repeats", type=int, default=2)
-    parser.add_argument("--rounds", type=int, default=5, help="times that each is measured, in turn")
-    parser.add_argument("--threads", type=int, default=0)
-    parser.add_argument("--max-memory", type=int, default=3 << 30)
-    parser.add_argument(
-        "--files", type=int, metavar="SCALE", help="measure a whole job from file to file at this scale"
-    )
-    parser.add_argument("--json", type=Path)
-    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; all if none")
+    parser.add_argument("--repeats", type=int, default=2, help="calls that are timed in a process")
+    parser.add_argument("--rounds", type=int, default=5, help="processes for each method, in turn")
+    parser.add_argument("--threads", type=int, default=0, help="of ONNX Runtime; 0: one a core")
+    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; default: all")
+    parser.add_argument("--methods", metavar="PATTERN", help="measure only these; --table then keeps its other rows")
     parser.add_argument("--measure", help=argparse.SUPPRESS)
-    parser.add_argument("--write", nargs=2, help=argparse.SUPPRESS)
+    results.add_option(parser)
     args = parser.parse_args()
-    width, height = (int(v) for v in (args.write[1] if args.write else args.size).split("x"))
-    if args.write:
-        return write_frame(args.write[0], width, height)
     if args.measure:
-        if args.measure == "files":
-            result = measure_files(args.files, height, width, args.max_memory)
-        elif args.measure in OIDN:
-            result = measure_oidn(OIDN[args.measure], height, width, args.repeats)
+        width, height = (int(v) for v in args.size.split("x"))
+        if args.measure in SAME_WORK.values():
+            call = prepare_oidn(args.measure, height, width)
         else:
-            result = measure_model(args.measure, height, width, args.repeats, args.threads)
-        print(json.dumps(result))
-        return None
-    if args.files:
-        result = measured("files", args.size, "--files", str(args.files), "--max-memory", str(args.max_memory))
-        print(
-            f"{args.size} x{args.files}, file to file: {result['seconds'][0]:.1f} s, peak {result['peak_mb']:.0f} MB, "
-            f"{result['tiles']} tiles; {result['parts']}"
-        )
-        results: Any = {"files": result}
-    else:
-        results = compare(args)
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        args.json.write_text(json.dumps({"size": args.size, "machine": processor(), "results": results}, indent=1))
-    return None
-
-
-def compare(args: argparse.Namespace) -> dict[str, Any]:
-    """Each model and OIDN, in turn; prints the table."""
-    from oiio_msspl.contract import Contract
-    from oiio_msspl.session import find_model, shipped_models
-
-    scales = {name: Contract.of_file(find_model(0, name)).scale for name in args.model or shipped_models()}
-    cases = [*scales]
-    try:
-        import pyoidn  # noqa: F401
-
-        cases += OIDN
-    except ImportError:
-        pass
-    seconds: dict[str, list[float]] = {case: [] for case in cases}
-    peak: dict[str, float] = dict.fromkeys(cases, 0.0)
-    for _ in range(args.rounds):
-        for case in cases:
-            result = measured(case, args.size, "--repeats", str(args.repeats), "--threads", str(args.threads))
-            seconds[case] += result["seconds"]
-            peak[case] = max(peak[case], result["peak_mb"])
-    reference = statistics.median(seconds[next(iter(OIDN))]) if len(cases) > len(scales) else None
-    print(f"| {args.size} | median s | of OIDN's time | peak MB | the paper's network, Titan Xp |")
-    print("|---|---|---|---|---|")
-    table = {}
-    for case in cases:
-        median = statistics.median(seconds[case])
-        ratio = f"{median / reference:.2f}" if reference else "-"
-        paper = "{} s, {} MB".format(*PAPER[scales[case]]) if case in scales else "-"
-        print(f"| {case} | {median:.2f} | {ratio} | {peak[case]:.0f} | {paper} |")
-        table[case] = {"seconds": seconds[case], "peak_mb": peak[case], "scale": scales.get(case)}
-    return table
+            call = prepare_model(args.measure, height, width, args.threads)
+        print(json.dumps(measure(call, args.repeats)))
+        return
+    rows = compare(args)
+    print(layout(rows))
+    if args.table and args.methods:
+        results.merge(args.table, rows, ("method",))
+    elif args.table:
+        results.write(args.table, rows)
 
 
 if __name__ == "__main__":

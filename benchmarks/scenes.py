@@ -1,8 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What models are judged by: pairs of renders with a reference, of scenes that nothing was trained on.
+"""The development scenes: pairs of renders with a reference, of scenes that no network was trained on.
 
-Two kinds, by what a folder holds. **Renders**: a folder a scene, with ``ref.exr``, ``hr_<n>spp.exr`` and
-``lr_x<s>_<n>spp.exr``. **Views** of :mod:`training.views`: those of the split ``test`` whose reference is good enough.
+Models and defaults are chosen by them, so they are no blind test. A folder holds one of two kinds:
+
+- Renders: a folder for each scene, with ``ref.exr``, ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``.
+- Views of :mod:`training.views`: those of the split ``test`` whose reference is clean enough are used.
 """
 
 from __future__ import annotations
@@ -21,32 +23,32 @@ from oiio_msspl.pairing import Source
 from oiio_msspl.render import Array, Render
 from training import data
 
-#: The reference of this one is full of fireflies.
+#: The references of these scenes are full of fireflies. No mean includes them.
 NOISY_REFERENCE = {"veach-bidir"}
-#: PSNR [dB] that a view's reference must have, as far as its own noise goes.
+#: PSNR in dB that a view's reference must have against the noise-free picture.
 MIN_REFERENCE = 30.0
 
 
 @dataclass(frozen=True)
 class Scene:
-    """A frame. Sources of the same arguments are the same pixels; of different ones, independent samples."""
+    """A frame to measure. Renders with different arguments have independent noise."""
 
     name: str
-    """Of the scene; some have several views, and then several of these."""
+    """The scene's name. Views of the same scene share it."""
     reference: Array
-    """(H, W, 3), linear, exposed for display."""
+    """(h, w, 3), linear, exposed for display."""
     hrls: Callable[[int], Source]
-    """Of a number of spp."""
+    """The HRLS of a number of spp."""
     lrhs: Callable[[int, int], Source]
-    """Of a scale s and an average of n samples a pixel of the HRLS, which is ``s^2 n`` spp."""
+    """The LRHS of a scale s and n: it has n samples for every HRLS pixel, which is ``s^2 n`` spp."""
     nearest: Callable[[int, int], Source | None] = lambda scale, spp: None
-    """The same as the paper's data set has it: of every s x s pixels one, of ``s^2 n`` spp. None if there is none."""
+    """The same as in the paper's data set, which keeps one of s x s pixels; None if there is none."""
     has: Callable[[int], bool] = lambda spp: True
-    """Whether there is an HRLS of so many spp."""
+    """Whether there is an HRLS of a number of spp."""
 
 
 def load(folder: Path) -> list[Scene]:
-    """All scenes of a folder of either kind.
+    """All scenes of a folder.
 
     Raises:
         SystemExit: there are none.
@@ -60,7 +62,7 @@ def load(folder: Path) -> list[Scene]:
 
 
 def beauty(source: Source) -> Array:
-    """Repaired colour of all of a source."""
+    """The beauty (h, w, 3) of a whole render, without NaN, Inf and negative values."""
     return transforms.repair(source.read(source.data_window, ["rgb"])["rgb"])[0]
 
 
@@ -78,7 +80,7 @@ def _render(folder: Path) -> Scene:
 
 
 def of_view(view: data.View) -> Scene:
-    """A rendered view."""
+    """A rendered view as a scene."""
     reference = data.read(view.ref)
     exposure = np.float32(transforms.exposure_of(reference))
     whole = slice(None)
@@ -93,7 +95,7 @@ def of_view(view: data.View) -> Scene:
     def lrhs(scale: int, spp: int) -> Source:
         chosen = np.flatnonzero(view.lr_spp == spp)[:1]
         image = data.mean_lrhs(view, chosen, scale) * exposure
-        # The last passes, which no HRLS has at the same average
+        # The last passes: the HRLS of the same pair has the first ones, so the noise is independent
         features = data.split_features(
             data.read_hrls(view, list(range(len(view.hr)))[-spp:], whole, whole).mean(axis=0)
         )
@@ -104,7 +106,9 @@ def of_view(view: data.View) -> Scene:
         passes = range(len(view.lr_spp))
         subsets = itertools.chain.from_iterable(itertools.combinations(passes, n) for n in range(1, len(passes) + 1))
         chosen = next((list(c) for c in subsets if view.lr_spp[list(c)].sum() == scale**2 * spp), None)
-        if chosen is None or 1 not in view.lr:  # rendered at 1/s of the resolution, it has no single pixels
+        if (
+            chosen is None or 1 not in view.lr
+        ):  # an LRHS that was rendered at 1/s of the resolution has no single HRLS pixels
             return None
         image = data.mean_lrhs(view, chosen, scale, nearest=True) * exposure
         return Render.from_arrays(f"{view.path.name}, x{scale} nearest", rgb=image)

@@ -1,14 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot's wall time against the slowest of its three stages, and its memory early and late.
+"""Wall time of a shot against the slowest of its three stages, and its memory early and late.
 
-    python -m benchmarks.shot --json results/shot.json
-    python -m benchmarks.shot --frames 1000 --size 256x144 --json results/shot_1000.json
+    python -m benchmarks.shot --table benchmarks/results/shot.csv
+    python -m benchmarks.shot --frames 1000 --size 256x144
 
-Frames of random layers are made in a temporary folder: half-float EXRs with what a render has beside its beauty. Then,
-each in a process of its own and in turn, rounds of: the three stages one after the other (all frames read, fused and
-written, nothing at the same time), and `fuse_shot`, where they overlap. The ratio is the shot's wall time over the
-slowest stage's alone; 1 would be an overlap that costs nothing, and the sum of the stages over the slowest is what no
-overlap at all would give. Inference on the CPU uses every core by itself, so there the other stages cannot be free.
+Frames of random pixels are written to a temporary folder, as half-float EXRs with the layers of a Cycles render. Two
+jobs take turns, each in its own process: the three stages one after the other (read, fuse and write all frames), and
+`fuse_shot`, where the stages overlap. The ratio is the shot's wall time over the time of the slowest stage alone. A
+ratio of 1 means that the overlap costs nothing. Inference on the CPU uses every core, so there the other stages cannot
+be free.
 """
 
 from __future__ import annotations
@@ -23,21 +23,24 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from benchmarks.runtime import in_process, peak_mb, processor, write_frame
+from benchmarks import results
+from benchmarks.results import Row
+from benchmarks.runtime import in_process, peak_mb, processor
+from benchmarks.runtime_files import write_frame
 
 
 def make_shot(folder: Path, count: int, width: int, height: int, scale: int) -> None:
-    """One pair, and links to it: what differs between frames does not change what they cost."""
+    """Write one pair and link the other frames to it: every frame costs the same, whatever it shows."""
     for name, w, h in (("lr", width // scale, height // scale), ("hr", width, height)):
         (folder / name).mkdir()
         first = folder / name / f"{name}.0001.exr"
-        write_frame(str(first), w, h)
+        write_frame(first, w, h)
         for frame in range(2, count + 1):
             os.link(first, folder / name / f"{name}.{frame:04d}.exr")
 
 
 def measure_stages(folder: Path, device: str, threads: int) -> dict[str, Any]:
-    """Seconds of each stage alone, all frames together."""
+    """Seconds of each stage alone, over all frames."""
     from oiio_msspl.sequence import find_shot
     from oiio_msspl.shot import Stages
 
@@ -57,28 +60,20 @@ def measure_stages(folder: Path, device: str, threads: int) -> dict[str, Any]:
 
 
 def measure_shot(folder: Path, device: str, threads: int) -> dict[str, Any]:
-    """Wall seconds of the whole shot, and the process's peak and present memory after each frame."""
+    """Wall seconds of the whole shot, and the process's peak memory after each frame."""
     from oiio_msspl import fuse_shot
 
     peak: list[float] = []
-    present: list[float] = []
 
     def note(*_: Any) -> None:
         peak.append(peak_mb())
-        present.append(present_mb())
 
     report = fuse_shot(
         folder / "lr", folder / "hr", folder / "out", device=device, threads=threads, overwrite=True, progress=note
     )
     if report.exit_code:
         raise SystemExit(next(result.message for result in report.results.values() if result.message))
-    return {"seconds": report.seconds, "peak_mb": peak, "present_mb": present}
-
-
-def present_mb() -> float:
-    """Resident set at this moment, in MB; 0 where the system has no /proc."""
-    statm = Path("/proc/self/statm")
-    return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / (1 << 20) if statm.exists() else 0.0
+    return {"seconds": report.seconds, "peak_mb": peak}
 
 
 def measured(kind: str, folder: Path, args: argparse.Namespace) -> dict[str, Any]:
@@ -94,8 +89,8 @@ def main() -> None:
     parser.add_argument("--device", default="cpu")
     parser.add_argument("--threads", type=int, default=0)
     parser.add_argument("--rounds", type=int, default=2, help="times that both are measured, in turn")
-    parser.add_argument("--json", type=Path)
     parser.add_argument("--measure", nargs=2, help=argparse.SUPPRESS)
+    results.add_option(parser)
     args = parser.parse_args()
     if args.measure:
         measure = {"stages": measure_stages, "shot": measure_shot}[args.measure[0]]
@@ -111,28 +106,27 @@ def main() -> None:
         ]
     alone = {stage: statistics.median(r[0]["seconds"][stage] for r in rounds) for stage in ("read", "infer", "write")}
     wall = statistics.median(r[1]["seconds"] for r in rounds)
-    slowest = max(alone, key=lambda stage: alone[stage])
-    # Early: after the first tenth, when every stage has had its first frames.
+    # After the first tenth every stage has had its first frames.
     early = max(3, args.frames // 10) - 1
     memory = [(r[1]["peak_mb"][early], r[1]["peak_mb"][-1]) for r in rounds]
     peak_early, peak_late = max(memory, key=lambda pair: pair[1] / pair[0])
+    row: Row = {name: getattr(args, name) for name in ("frames", "size", "scale", "device", "threads")}
+    row |= {"machine": processor(), "cores": os.cpu_count(), **{f"{stage}_s": s for stage, s in alone.items()}}
+    row |= {"shot_s": wall, "peak_early_mb": peak_early, "peak_late_mb": peak_late}
+    print(layout(row))
+    if args.table:
+        results.write(args.table, [row])
 
-    print(f"| {args.frames} frames, {args.size} x{args.scale}, {args.device} | s | of the slowest stage |")
-    print("|---|---|---|")
-    for stage, seconds in alone.items():
-        print(f"| {stage} alone | {seconds:.2f} | {seconds / alone[slowest]:.2f} |")
-    print(f"| one after the other | {sum(alone.values()):.2f} | {sum(alone.values()) / alone[slowest]:.2f} |")
-    print(f"| **the shot** | {wall:.2f} | **{wall / alone[slowest]:.2f}** |")
-    print(
-        f"\npeak memory after frame {early + 1}: {peak_early:.0f} MB, after frame {args.frames}: {peak_late:.0f} MB "
-        f"(x{peak_late / peak_early:.3f})"
-    )
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        summary = {"ratio": wall / alone[slowest], "wall": wall, "alone": alone, "peak_mb": [peak_early, peak_late]}
-        settings = {k: getattr(args, k) for k in ("frames", "size", "scale", "device", "threads")}
-        machine = {"machine": processor(), "cores": os.cpu_count()}
-        args.json.write_text(json.dumps({**settings, **machine, **summary, "rounds": rounds}, indent=1))
+
+def layout(row: Row) -> str:
+    """A line for each stage, for their sum and for the shot."""
+    stages = {f"{stage} alone": row[f"{stage}_s"] for stage in ("read", "infer", "write")}
+    slowest = max(stages.values())
+    lines = stages | {"one after the other": sum(stages.values()), "the shot": row["shot_s"]}
+    head = [f"{row['frames']} frames, {row['size']} x{row['scale']}, {row['device']}", "s", "of the slowest stage"]
+    body = [[name, f"{seconds:.2f}", f"{seconds / slowest:.2f}"] for name, seconds in lines.items()]
+    memory = f"Peak memory early in the shot: {row['peak_early_mb']:.0f} MB, at its end: {row['peak_late_mb']:.0f} MB."
+    return f"{results.markdown(head, body)}\n{memory}\n"
 
 
 if __name__ == "__main__":

@@ -1,236 +1,249 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lay out what was measured: README.md, docs/results.md and docs/mix.md have the figures of
-`benchmarks/results/*.json`.
+"""Puts the tables of `benchmarks/results` into the pages.
 
     python -m benchmarks.tables
 
-What lies between ``<!-- begin: NAME -->`` and ``<!-- end -->`` is replaced; the sentences around it are not.
+In the pages of `TABLES`, everything between ``<!-- begin: NAME -->`` and ``<!-- end -->`` is replaced by what the
+function NAME returns. The text around it stays.
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
-import io
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks import confidence, quality
-from benchmarks.paper import Rows, result, table
+from benchmarks import confidence, quality, results, runtime_files
+from benchmarks import runtime as runtimes
+from benchmarks.flicker import report as flicker_report
+from benchmarks.results import MEAN, Row
+from benchmarks.runtime import OIDN, SAME_WORK
+from benchmarks.scenes import NOISY_REFERENCE
+from benchmarks.stability import report as stability_report
 from oiio_msspl.schema import SCALES
 
 ROOT = Path(__file__).parents[1]
 FAMILIES = ("paper", "pyramid", "mix", "joint")
-#: Those that gain most by an uneven division of the samples.
-DIVIDED = ("mix", "joint")
-#: What a user would do instead, by its name in the rows.
-PEERS = {
-    "OIDN fast on the HRLS": "OIDN 2.5.1 on the HRLS, quality fast",
-    "OIDN on the HRLS": "OIDN 2.5.1 on the HRLS",
-    "OIDN on both x2, together": "OIDN 2.5.1 on both together, x2 (no network of ours)",
-    "OIDN, same samples": "OIDN 2.5.1 on full resolution, same samples",
-}
-OIDN = "OIDN 2.5.1, quality high"
+#: Methods of :mod:`benchmarks.quality` that most tables compare the models with.
+PEERS = (
+    "OIDN on the HRLS",
+    "OIDN prefiltered on the HRLS",
+    "OIDN on both x2, together",
+    "OIDN, same samples",
+    "OIDN prefiltered, same samples",
+)
 BEST = "joint-x2"
-FORMS = {measure: form for measure, (_, form) in quality.MEASURES.items()}
+#: A method of README's table -> its title, and what it needs.
+WHEN_IT_PAYS = {
+    "HRLS": ("HRLS alone", "HRLS"),
+    "paper-x2": ("`paper-x2`", "LRHS and HRLS"),
+    "pyramid-x4": ("`pyramid-x4`", "LRHS and HRLS"),
+    "joint-x2": ("`joint-x2`", "LRHS and HRLS, pyoidn"),
+    "joint-x4": ("`joint-x4`", "LRHS and HRLS, pyoidn"),
+    "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
+    "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
+    "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
+}
+
+Found = Mapping[Hashable, Row]
 
 
-def rows_of(name: str) -> Rows:
-    rows: Rows = result(name)["rows"]
-    return rows
-
-
-def code(name: str) -> str:
+def title(method: str) -> str:
     """A method's name, as code if it is a model's."""
-    return f"`{name}`" if name.startswith(FAMILIES) else name
+    return f"`{method}`" if method.startswith(FAMILIES) else method
 
 
 def models(scales: Sequence[int] = SCALES, families: Sequence[str] = FAMILIES) -> list[str]:
+    """Names of the shipped models."""
     return [f"{family}-x{scale}" for family in families for scale in scales]
 
 
-def accuracy() -> str:
-    """README: PSNR and RelMSE of all models and peers at every average spp."""
-    rows = rows_of("quality")
-
-    def line(title: str, methods: Sequence[str]) -> list[str]:
-        cells = [title]
-        for spp in quality.AVERAGES:
-            if not any(row["method"] in methods and row["spp"] == spp for row in rows):
-                cells += ["", ""]  # that many samples can't be divided so
-                continue
-            psnr, relmse = ([quality.mean_of(rows, m, spp, k) for m in methods] for k in ("psnr", "relmse"))
-            cells += [FORMS["psnr"].format(max(psnr)), FORMS["relmse"].format(min(relmse))]
-        return cells
-
-    body = [
-        line("HRLS alone (1, 2 and 4 spp)", ["HRLS"]),
-        line("full resolution, same samples", ["full resolution"]),
-        line("LRHS bicubic, best scale for each number", [f"LRHS x{scale} bicubic" for scale in SCALES]),
-        *(line(code(name), [name]) for name in models()),
-        *(line(f"{code(BEST)}, HRLS {a}/{a + b} of the samples", [f"{BEST}, {a}:{b}"]) for a, b in quality.UNEVEN),
-        *(line(title, [method]) for method, title in PEERS.items()),
-    ]
-    return table(["", *(cell for spp in quality.AVERAGES for cell in (f"{spp} spp: PSNR", "RelMSE"))], body)
+def means_of(rows: Iterable[Row]) -> Found:
+    """The mean rows of :mod:`benchmarks.quality` by (spp, method)."""
+    return results.index((row for row in rows if row["scene"] == MEAN), "spp", "method")
 
 
-def runtime() -> str:
-    """README: time and memory."""
-    results = result("runtime")["results"]
-    base = np.median(results[OIDN]["seconds"])
+def when_it_pays() -> str:
+    """Accuracy at 2 and 8 spp on average, and time, of what a user can choose from."""
+    rows, times = results.read("quality"), results.index(results.read("runtime"), "method")
+    means = means_of(rows)
     body = []
-    for name in [*models(), OIDN, "OIDN 2.5.1, quality fast"]:
-        seconds = np.median(results[name]["seconds"])
-        body.append([code(name), f"{seconds:.2f}", f"{seconds / base:.2f}", f"{results[name]['peak_mb']:.0f}"])
-    machine = result("runtime")["machine"]
-    return table([f"1024 x 1024, two cores of an {machine}", "median s", "of OIDN's time", "peak MB"], body)
+    for method, (name, needs) in WHEN_IT_PAYS.items():
+        time = times.get(SAME_WORK.get(method, method))
+        relative = f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "not measured"
+        if method == "HRLS":
+            relative = "0"  # nothing is computed
+        cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
+        body.append([name, needs, *cells, relative])
+    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time of OIDN's"]
+    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
 
 def scenes() -> str:
-    """All measures of all methods, per scene."""
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        quality.print_tables(rows_of("quality"))
-    return printed.getvalue().strip() + "\n"
+    """All measures of all methods on the development scenes."""
+    return quality.layout(results.read("quality"))
 
 
-def _cells(rows: Rows, method: str, measures: Sequence[str]) -> list[str]:
-    """A cell an average spp; empty where the views have too few samples for a method."""
-    measured = {(row["method"], row["spp"]) for row in rows}
-    return [
-        " / ".join(FORMS[measure].format(quality.mean_of(rows, method, spp, measure)) for measure in measures)
-        if (method, spp) in measured
-        else ""
-        for spp in quality.AVERAGES
-    ]
+def runtime() -> str:
+    """Time and memory of a frame on arrays, and of one from file to file."""
+    return f"{runtimes.layout(results.read('runtime'))}\n{runtime_files.layout(results.read('runtime_files'))}"
 
 
 def filters() -> str:
-    """Either pixel filter, with all layers; then the best model against OIDN with the same samples, per scene."""
-    sets = {"box": rows_of("quality_box"), "Blackman-Harris": rows_of("quality_bh")}
-    methods = [*list(PEERS)[1:], *models(SCALES[:2], FAMILIES[1:])]
-    methods += [f"{name}, {more}:{less}" for name in models(SCALES[:2], DIVIDED) for more, less in quality.UNEVEN]
-    head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in sets for spp in quality.AVERAGES)]
-    body = [
-        [code(m), *(cell for rows in sets.values() for cell in _cells(rows, m, ("psnr", "relmse")))] for m in methods
-    ]
-    judged = [
-        name for name in dict.fromkeys(row["scene"] for row in sets["box"]) if name not in quality.NOISY_REFERENCE
-    ]
+    """Both pixel filters, with all layers, and the best model against OIDN with the same samples by scene."""
+    tables = {"box": results.read("quality_box"), "Blackman-Harris": results.read("quality_blackman_harris")}
+    means = {name: means_of(rows) for name, rows in tables.items()}
+    names = [*PEERS, *models(SCALES[:2], FAMILIES[1:])]
+    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("mix", "joint")) for a, b in quality.UNEVEN]
+    head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in tables for spp in quality.AVERAGES)]
+    cases = [(name, spp) for name in tables for spp in quality.AVERAGES]
+    body = _measured(
+        [title(method), *(quality.cell(means[name].get((spp, method)), "psnr", "relmse") for name, spp in cases)]
+        for method in names
+    )
+    clean = _clean_scenes(tables["box"])
     differences = []
-    for name, rows in sets.items():
-        psnr = {(row["method"], row["spp"], row["scene"]): row["psnr"] for row in rows}
+    for name, rows in tables.items():
+        found = results.index(rows, *quality.KEYS)
         for spp in quality.AVERAGES:
-            by_scene = (psnr[BEST, spp, s] - psnr["OIDN, same samples", spp, s] for s in judged)
-            differences.append([f"{name}, {spp}", *(f"{value:+.2f}" for value in by_scene)])
-    between = f"\nPSNR of `{BEST}` less that of OIDN on full resolution with the same samples, per scene:\n\n"
-    return table(head, body) + between + table(["filter, spp", *judged], differences)
-
-
-def division() -> str:
-    """What it is worth to give the HRLS more than half of the samples: box filter, all layers."""
-    rows = rows_of("quality_box")
-    measured = {(row["method"], row["spp"]) for row in rows}
-    ways = ["", *(f", {more}:{less}" for more, less in quality.UNEVEN)]
-    columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (BEST + way, spp) in measured]
-    body = [
-        [code(name)]
-        + [
-            FORMS["psnr"].format(quality.mean_of(rows, name + way, spp, "psnr"))
-            if (name + way, spp) in measured
-            else ""  # OIDN has one render
-            for spp, way in columns
-        ]
-        for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples")
-    ]
-    return table(["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)], body)
+            pairs = ((found[s, spp, BEST], found[s, spp, "OIDN, same samples"]) for s in clean)
+            differences.append([f"{name}, {spp}", *(f"{ours['psnr'] - oidn['psnr']:+.2f}" for ours, oidn in pairs)])
+    between = f"\nPSNR of `{BEST}` minus that of OIDN on full resolution with the same samples, by scene:\n\n"
+    return (
+        f"{results.markdown(head, body)}\n{quality.mean_note(tables['box'])}\n{between}"
+        f"{results.markdown(['filter, spp', *clean], differences)}"
+    )
 
 
 def cycles() -> str:
-    """Views by Cycles, with both footprints of the LRHS."""
-    rows = rows_of("quality_cycles")
-    methods = [*list(PEERS)[1:]]
-    for name in models():
-        methods += [m for m in (name, f"{name}, nearest") if any(row["method"] == m for row in rows)]
+    """Views by Cycles, with both kinds of LRHS."""
+    rows = results.read("quality_cycles")
+    means = means_of(rows)
+    names = [*PEERS, *(name for model in models() for name in (model, f"{model}, nearest"))]
+    body = _measured(
+        [title(name), *(quality.cell(means.get((spp, name)), "psnr", "relmse", "flip") for spp in quality.AVERAGES)]
+        for name in names
+    )
     head = ["PSNR / RelMSE / FLIP", *(f"{spp} spp" for spp in quality.AVERAGES)]
-    return table(head, [[code(m), *_cells(rows, m, ("psnr", "relmse", "flip"))] for m in methods])
+    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
 
-#: Seconds that a sample of a frame may take.
+def division() -> str:
+    """PSNR when the HRLS has more than half of the samples: box filter, all layers."""
+    rows = results.read("quality_box")
+    means = means_of(rows)
+    ways = ["", *(f", {more}:{less}" for more, less in quality.UNEVEN)]
+    columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, BEST + way) in means]
+    body = [
+        [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
+        for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples")
+    ]
+    head = ["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)]
+    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
+
+
+def _measured(body: Iterable[list[str]]) -> list[list[str]]:
+    """The lines that have more than a title."""
+    return [line for line in body if any(line[1:])]
+
+
+def _clean_scenes(rows: Iterable[Row]) -> list[str]:
+    names = dict.fromkeys(row["scene"] for row in rows)
+    return [name for name in names if name != MEAN and name not in NOISY_REFERENCE]
+
+
+#: Seconds for one sample in each pixel of a frame, as candidates for the break-even cost.
 _COSTS = tuple(np.geomspace(0.1, 100, 301))
 
 
 def total() -> str:
-    """What is gained on OIDN at the same time in all, render included, and how slow or fast a render must be to gain.
+    """PSNR gained over OIDN at the same total time, render included, and the render cost at which a method gains.
 
-    OIDN's PSNR at the samples that our time would have bought is interpolated over the logarithm of its own.
+    The faster method gets more samples for the time that it saves. OIDN's PSNR at those samples is interpolated over
+    the logarithm of its measured ones.
     """
-    rows, results, renders = rows_of("quality"), result("runtime")["results"], result("render_time")["seconds_per_spp"]
-    seconds = {name: float(np.median(entry["seconds"])) for name, entry in results.items()}
+    rows, times = results.read("quality"), results.index(results.read("runtime"), "method")
+    costs = {row["scene"]: row["hrls_s"] for row in results.read("render_time")}
     psnr = {(row["method"], row["spp"], row["scene"]): row["psnr"] for row in rows}
-    judged = [name for name in renders if name not in quality.NOISY_REFERENCE]
-    # On the HRLS of 1 spp, and on full resolution
-    known = [("OIDN on the HRLS", 2), *(("OIDN, same samples", spp) for spp in quality.AVERAGES)]
+    clean = [name for name in costs if name not in NOISY_REFERENCE]
+    # OIDN on the HRLS of 1 spp, then on full resolution
+    measured = [("OIDN on the HRLS", 2), *(("OIDN, same samples", spp) for spp in quality.AVERAGES)]
     octaves = np.log2([1, *quality.AVERAGES])
 
     def gain(name: str, spp: int, scene: str, more: float) -> float:
-        """On OIDN with so many more samples; beyond the most that were measured, it goes on as before."""
-        values = [psnr[method, n, scene] for method, n in known]
-        at = np.log2(max(spp + more, 1.0))  # with less it has no picture to show
+        """PSNR of a method minus that of OIDN with ``more`` samples. Beyond 8 spp OIDN's last slope goes on."""
+        values = [psnr[method, n, scene] for method, n in measured]
+        at = np.log2(max(spp + more, 1.0))  # OIDN needs at least one sample
         beyond = max(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 
     body = []
     for model in ("joint-x2", "joint-x4"):
-        slower = seconds[model] - seconds[OIDN]
+        slower = times[model]["seconds"] - times[OIDN]["seconds"]
         for spp in quality.AVERAGES:
             for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
-                if (name, spp, judged[0]) not in psnr:
+                if (name, spp, clean[0]) not in psnr:
                     continue
-                gains = [gain(name, spp, scene, slower / renders[scene]["hrls"]) for scene in judged]
-                pays = [
-                    cost for cost in _COSTS if np.mean([gain(name, spp, scene, slower / cost) for scene in judged]) >= 0
-                ]
+                gains = [gain(name, spp, scene, slower / costs[scene]) for scene in clean]
+                pays = [c for c in _COSTS if np.mean([gain(name, spp, scene, slower / c) for scene in clean]) >= 0]
                 cells = (f"{value:+.2f}" for value in (float(np.mean(gains)), *gains))
-                body.append([code(name), str(spp), _between(pays), *cells])
-    return table(["", "spp", "pays, a spp", "mean", *judged], body)
+                body.append([title(name), str(spp), _range_of(pays), *cells])
+    return results.markdown(["PSNR gained", "spp", "gains if a sample costs", MEAN, *clean], body)
 
 
-def _between(paying: list[float]) -> str:
-    """Which of ``_COSTS`` these are: a method slower than the other pays from some cost on, a faster one up to one."""
-    if len(paying) in (0, len(_COSTS)):
-        return "always" if paying else "never"
-    return f"up to {paying[-1]:.2g} s" if paying[0] == _COSTS[0] else f"from {paying[0]:.2g} s"
+def _range_of(costs: Sequence[float]) -> str:
+    """Some of `_COSTS` in words. A method slower than OIDN gains from some cost on, a faster one up to some cost."""
+    if len(costs) in (0, len(_COSTS)):
+        return "anything" if costs else "never"
+    return f"up to {costs[-1]:.2g} s" if costs[0] == _COSTS[0] else f"at least {costs[0]:.2g} s"
 
 
 def errors() -> str:
-    """Predicted errors against actual ones."""
-    with contextlib.redirect_stdout(io.StringIO()) as printed:
-        confidence.print_table(result("confidence"))
-    return printed.getvalue()
+    """Predicted errors beside actual ones."""
+    return confidence.layout(results.read("confidence"))
+
+
+def flicker() -> str:
+    """Flicker of sequences."""
+    return flicker_report.layout(results.read("flicker"))
+
+
+def stability() -> str:
+    """How often each method holds, suffers and fails."""
+    return stability_report.summary(results.read("stability"))
 
 
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
-    ROOT / "README.md": (accuracy, runtime),
-    ROOT / "docs/results.md": (scenes, total, filters, cycles, errors),
-    ROOT / "docs/mix.md": (division,),
+    ROOT / "README.md": (when_it_pays,),
+    ROOT / "docs/design/results.md": (
+        scenes,
+        runtime,
+        total,
+        filters,
+        cycles,
+        division,
+        errors,
+        flicker,
+        stability,
+    ),
 }
 
 
 def laid_out(text: str, tables: Sequence[Callable[[], str]]) -> str:
-    """A page with these tables anew.
+    """A page with its tables replaced.
 
     Raises:
-        SystemExit: there is no place for one.
+        SystemExit: the page has no place for one of them.
     """
     for make in tables:
         place = re.compile(rf"(<!-- begin: {make.__name__} -->\n).*?(<!-- end -->)", re.DOTALL)
         if not place.search(text):
             raise SystemExit(f"no <!-- begin: {make.__name__} --> ... <!-- end -->")
-        made = make()
-        text = place.sub(lambda found, made=made: f"{found[1]}\n{made}\n{found[2]}", text)  # type: ignore[misc]
+        made = make().strip("\n")
+        text = place.sub(lambda found, made=made: f"{found[1]}\n{made}\n\n{found[2]}", text)  # type: ignore[misc]
     return text
 
 

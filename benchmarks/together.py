@@ -1,34 +1,37 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What both renders are worth to Open Image Denoise at the LRHS's resolution: the figures behind `oiio_msspl.denoiser`.
+"""Ways to denoise both renders with Open Image Denoise at the LRHS's resolution, as `oiio_msspl.denoiser` does.
 
     python -m benchmarks.together VIEWS
 
-Of the views for validation (:mod:`training.views`), every third, the PSNR in sRGB of ways to denoise: at the LRHS's
-resolution, against the mean of the reference over s x s pixels; and "at full resolution" of the HRLS's own result when
-it is brought to the local brightness of each of them. Quality high.
+Every third validation view (:mod:`training.views`) is used. PSNR is of sRGB pictures, in two places: at the LRHS's
+resolution, against the mean of the reference over s x s pixels; and at full resolution, where the denoised HRLS gets
+the local means of that picture. OIDN has the quality "high".
 """
 
 from __future__ import annotations
 
 import argparse
-import statistics
 from pathlib import Path
 
 import numpy as np
-import pyoidn
 
-from benchmarks.quality import brought_to
+from benchmarks import results
+from benchmarks.peers import match_local_means
+from benchmarks.results import Row
 from oiio_msspl import metrics, schema, transforms
 from oiio_msspl.denoiser import lrhs_share
 from oiio_msspl.render import Array
 from oiio_msspl.schema import SCALES
 from training import data
 
+#: spp of the HRLS, and average spp of the LRHS.
 SPP = (1, 4)
 
 
 def denoise(color: Array, albedo: Array, normal: Array, *, clean: bool = False, albedo_first: bool = False) -> Array:
-    """Open Image Denoise on an HDR picture (h, w, 3)."""
+    """Open Image Denoise on an HDR picture (h, w, 3). ``albedo_first`` prefilters the albedo and implies ``clean``."""
+    import pyoidn
+
     albedo = np.ascontiguousarray(albedo.clip(0, 1))
     if albedo_first:
         albedo = pyoidn.denoise(albedo).clip(0, 1)
@@ -38,53 +41,79 @@ def denoise(color: Array, albedo: Array, normal: Array, *, clean: bool = False, 
     return np.maximum(image, 0)
 
 
-def results(lrhs: Array, color: Array, albedo: Array, normal: Array) -> dict[str, Array]:
-    """By the way it was made, of images (h, w, 3) at the LRHS's resolution."""
+def ways(lrhs: Array, color: Array, albedo: Array, normal: Array) -> dict[str, Array]:
+    """Results of every way to denoise, from images (h, w, 3) at the LRHS's resolution."""
     share = lrhs_share(transforms.compress(lrhs, 1.0), transforms.compress(color, 1.0))
-    together = share * lrhs + (1 - share) * color
+    weighted = share * lrhs + (1 - share) * color
     return {
-        "the LRHS": denoise(lrhs, albedo, normal),
-        "both, half of each": denoise((lrhs + color) / 2, albedo, normal),
-        "both, by their noise": denoise(together, albedo, normal),
-        "told that albedo and normal are clean": denoise(together, albedo, normal, clean=True),
-        "and the albedo denoised first": denoise(together, albedo, normal, albedo_first=True),
+        "the LRHS alone": denoise(lrhs, albedo, normal),
+        "mean of both": denoise((lrhs + color) / 2, albedo, normal),
+        "mean, weighted by noise": denoise(weighted, albedo, normal),
+        "weighted, cleanAux": denoise(weighted, albedo, normal, clean=True),
+        "weighted, cleanAux, albedo prefiltered": denoise(weighted, albedo, normal, albedo_first=True),
     }
+
+
+def measure(view: data.View) -> list[Row]:
+    """A row for each scale, spp of the HRLS, average spp of the LRHS and way."""
+    rows = []
+    whole = slice(None)
+    passes = data.read_hrls(view, list(range(max(SPP))), whole, whole)
+    for spp in SPP:
+        layers = data.split_features(passes[:spp].mean(axis=0))
+        for average in SPP:
+            chosen = np.flatnonzero(view.lr_spp == average)[:1]
+            exposure = np.float32(transforms.exposure_of(data.mean_lrhs(view, chosen, SCALES[0])))
+            color, albedo, normal = layers[schema.RGB] * exposure, layers[schema.ALBEDO], layers[schema.NORMAL]
+            reference = data.read(view.ref) * exposure
+            alone = denoise(color, albedo, normal)
+            for scale in SCALES:
+                small = [transforms.box_downsample(image, scale) for image in (color, albedo, normal)]
+                expected = transforms.box_downsample(reference, scale)
+                for way, image in ways(data.mean_lrhs(view, chosen, scale) * exposure, *small).items():
+                    full = match_local_means(alone, image)
+                    row: Row = {"scale": scale, "hrls_spp": spp, "lrhs_spp": average, "method": way}
+                    row |= {"psnr_low": metrics.psnr(image, expected), "psnr_full": metrics.psnr(full, reference)}
+                    rows.append(row)
+    return rows
+
+
+def means(rows: list[Row]) -> list[Row]:
+    """Mean PSNR over the views."""
+    groups: dict[tuple[int, int, int, str], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["hrls_spp"], row["lrhs_spp"], row["scale"], row["method"]), []).append(row)
+    columns = ("psnr_low", "psnr_full")
+    return [
+        members[0] | {c: float(np.mean([row[c] for row in members])) for c in columns} for members in groups.values()
+    ]
+
+
+def layout(rows: list[Row]) -> str:
+    """One table for each of the two places, a column for each way."""
+    names = list(dict.fromkeys(row["method"] for row in rows))
+    found = results.index(rows, "scale", "hrls_spp", "lrhs_spp", "method")
+    tables = []
+    for column, title in (("psnr_low", "at the LRHS's resolution"), ("psnr_full", "at full resolution")):
+        body = [
+            [f"x{scale}, HRLS {spp} spp, LRHS {average} on average"]
+            + [f"{found[scale, spp, average, name][column]:.2f}" for name in names]
+            for scale, spp, average in dict.fromkeys((row["scale"], row["hrls_spp"], row["lrhs_spp"]) for row in rows)
+        ]
+        tables.append(results.markdown([title, *names], body))
+    return "\n".join(tables)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path)
+    results.add_option(parser)
     args = parser.parse_args()
     views = data.Folder(args.views).split("validation")[::3]
-    whole = slice(None)
-    scores: dict[tuple[str, int, int, int], list[tuple[float, float]]] = {}
-    for view in views:
-        passes = data.read_hrls(view, list(range(max(SPP))), whole, whole)
-        for spp in SPP:
-            for average in SPP:
-                chosen = np.flatnonzero(view.lr_spp == average)[:1]
-                layers = data.split_features(passes[:spp].mean(axis=0))
-                color, albedo, normal = (layers[name] for name in (schema.RGB, schema.ALBEDO, schema.NORMAL))
-                exposure = np.float32(transforms.exposure_of(data.mean_lrhs(view, chosen, SCALES[0])))
-                reference = data.read(view.ref) * exposure
-                alone = denoise(color * exposure, albedo, normal)
-                for scale in SCALES:
-                    of_hrls = [transforms.box_downsample(image, scale) for image in (color * exposure, albedo, normal)]
-                    small = [data.mean_lrhs(view, chosen, scale) * exposure, *of_hrls]
-                    expected = transforms.box_downsample(reference, scale)
-                    for name, image in results(*small).items():
-                        scores.setdefault((name, scale, spp, average), []).append(
-                            (metrics.psnr(image, expected), metrics.psnr(brought_to(alone, image), reference))
-                        )
-    print(f"{len(views)} views\n")
-    ways = list(dict.fromkeys(key[0] for key in scores))
-    for part, title in enumerate(("at the LRHS's resolution", "at full resolution")):
-        print(f"| {title} | " + " | ".join(ways) + " |\n|---|" + "---|" * len(ways))
-        for scale, spp, average in sorted({key[1:] for key in scores}, key=lambda case: (case[1:], case[0])):
-            means = (statistics.fmean(pair[part] for pair in scores[way, scale, spp, average]) for way in ways)
-            row = " | ".join(f"{mean:.2f}" for mean in means)
-            print(f"| x{scale}, HRLS {spp} spp, LRHS {average} on average | {row} |")
-        print()
+    rows = means([row for view in views for row in measure(view)])
+    print(f"Means over {len(views)} views.\n\n{layout(rows)}")
+    if args.table:
+        results.write(args.table, rows)
 
 
 if __name__ == "__main__":

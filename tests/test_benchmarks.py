@@ -1,15 +1,23 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What models are judged by, and how the result is drawn."""
+"""Scenes, result tables, the pages and the chart that are made of them."""
+
+import re
+import shutil
+import subprocess
 
 import numpy as np
 import pytest
 
 pytest.importorskip("torch")
 
-from benchmarks import scenes
-from oiio_msspl import transforms
+from benchmarks import chart, paper, quality, results, scenes, tables
+from oiio_msspl import Render, transforms
 from tests.conftest import downsample, picture, rgb, write_exr
 from training import views
+
+BROWSER = next(
+    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
+)
 
 
 def test_views_for_testing_are_scenes(tmp_path):
@@ -21,10 +29,10 @@ def test_views_for_testing_are_scenes(tmp_path):
     )
     lr = np.stack([np.full((64, 64, 3), float(i + 1)) for i in range(len(views.LR_SPP))])
     for name in ("test", "train"):
-        for quality in (25, 35):
-            meta = {"split": name, "seed": f"cycles-{name}", "ref_psnr": quality}
+        for psnr in (25, 35):
+            meta = {"split": name, "seed": f"cycles-{name}", "ref_psnr": psnr}
             arrays = views.pack(hr, {1: lr}, clean, np.random.default_rng(1), meta)
-            views.save(tmp_path / f"{name}-{quality}.npz", arrays)
+            views.save(tmp_path / f"{name}-{psnr}.npz", arrays)
     (scene,) = scenes.load(tmp_path)  # the one that is held out and has a clean reference
     assert scene.name == "cycles-test"
     assert transforms.exposure_of(scene.reference) == pytest.approx(1, rel=1e-3)
@@ -63,34 +71,122 @@ def test_a_folder_without_scenes_is_refused(tmp_path):
         scenes.load(tmp_path)
 
 
-def test_the_page_has_a_chart_a_scene_with_and_without_the_render(tmp_path):
-    pytest.importorskip("matplotlib")
-    from benchmarks import chart
-
-    methods = [*chart.PEERS, "pyramid-x4"]
-    rows = [
-        {"scene": scene, "spp": spp, "method": method, "psnr": 30.0 + i, "relmse": 0.01 / (i + 1)}
-        for scene in ("lamp", "tire")
-        for spp in (2, 4)
-        for i, method in enumerate(methods)
-    ]
-    runs = {run for _, run in chart.PEERS.values()} | {"pyramid-x4"}
-    timings = chart.Timings(dict.fromkeys(runs, 0.5), {"lamp": 2.0, "tire": 4.0})
-    assert timings.of_a_sample(None) == 3.0
-    page = chart.page(rows, timings)
-    assert page.count("<svg") == page.count("</svg>") == 6
-    assert all(f"<h2>{name}</h2>" in page for name in ("Mean of the scenes", "lamp", "tire"))
+def test_a_table_keeps_four_digits_and_leaves_out_empty_cells(tmp_path):
+    path = tmp_path / "table.csv"
+    results.write(path, [{"method": "a, b", "psnr": 31.05678}, {"method": "2^-10", "relmse": 0.0012346, "count": 3}])
+    assert path.read_text() == 'method,psnr,relmse,count\n"a, b",31.06,,\n2^-10,,0.001235,3\n'
+    rows = [{"method": "a, b", "psnr": 31.06}, {"method": "2^-10", "relmse": 0.001235, "count": 3}]
+    assert results.read(path) == rows
+    results.merge(path, [{"method": "2^-10", "relmse": 1.0}, {"method": "c", "psnr": 1.0}], ("method",))
+    assert results.read(path) == [rows[0], {"method": "2^-10", "relmse": 1}, {"method": "c", "psnr": 1.0}]
 
 
-def test_pages_have_the_figures_that_were_measured():
-    """`python -m benchmarks.tables` brings README.md and docs/results.md up to date."""
-    from benchmarks import tables
+def test_means_leave_out_noisy_references_and_methods_that_were_not_measured_everywhere():
+    def row(scene, method, psnr):
+        return {"scene": scene, "spp": 2, "method": method, "psnr": psnr}
 
-    for path, of_page in tables.TABLES.items():
-        text = path.read_text()
-        assert tables.laid_out(text, of_page) == text, path.name
-        with pytest.raises(SystemExit, match="no <!-- begin: "):
-            tables.laid_out("", of_page)
+    noisy = next(iter(scenes.NOISY_REFERENCE))
+    rows = [row("a", "x", 10.0), row("a", "x", 20.0), row("b", "x", 25.0), row(noisy, "x", 99.0), row("a", "y", 1.0)]
+    mean, *of_scenes = quality.with_means(rows)
+    assert mean == row("mean", "x", 20.0)  # the two views of "a" count once
+    assert of_scenes == [row("a", "x", 15.0), *rows[2:]]
+    assert quality.mean_note(of_scenes) == f"Means are over 2 scenes: a, b. Not over {noisy}, whose reference is noisy."
+
+
+def test_quality_measures_only_the_methods_that_are_asked_for(tmp_path, bilinear_models):
+    """The HRLS is the reference here, so it scores an infinite PSNR; "LRHS x4 nearest" does not."""
+    clean = picture(32, 32)
+    source = Render.from_arrays("HRLS", rgb=clean)
+    low = {scale: Render.from_arrays("LRHS", rgb=downsample(clean, scale)) for scale in (2, 4, 8)}
+    scene = scenes.Scene("a", clean, lambda spp: source, lambda scale, spp: low[scale])
+    rows = quality.measure(scene, [], pattern="[HL]R[HL]S*")
+    assert {row["method"] for row in rows} == {"HRLS", *(f"LRHS x{s} {m}" for s in low for m in ("nearest", "bicubic"))}
+    assert {row["spp"] for row in rows} == set(quality.AVERAGES)
+    psnr = {row["method"]: row["psnr"] for row in rows}
+    assert psnr["HRLS"] > 60 > psnr["LRHS x2 bicubic"] > psnr["LRHS x8 bicubic"]
+    assert quality.load_models([str(bilinear_models[4])], "OIDN*") == []
+    (session,) = quality.load_models([str(bilinear_models[4])], "*, 3:1")
+    assert session.contract.scale == 4
+
+
+def test_prefiltering_helps_where_the_auxiliary_layers_are_noisy():
+    """OIDN with a prefiltered albedo is closer to the truth than its plain call."""
+    pytest.importorskip("pyoidn")
+    from benchmarks import oidn
+
+    rng = np.random.default_rng(0)
+    clean = picture(128, 128).clip(0, 1)
+    noisy = clean * rng.exponential(size=(128, 128, 1)).astype(np.float32)
+    albedo = (clean + rng.normal(0, 0.1, clean.shape)).clip(0, 1).astype(np.float32)
+    plain, prefiltered = oidn.denoise(noisy, albedo), oidn.denoise_prefiltered(noisy, albedo)
+    assert np.square(prefiltered - clean).mean() < 0.9 * np.square(plain - clean).mean()
+
+
+def test_every_table_can_be_laid_out():
+    """Each line has as many cells as its head, and what was measured is in it."""
+    functions = [make for of_page in tables.TABLES.values() for make in of_page]
+    for make in functions:
+        text = make()
+        blocks = [block.splitlines() for block in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)]
+        assert blocks, make.__name__
+        for head, rule, *body in blocks:
+            assert rule.replace(" ", "") == "|" + "---|" * (head.count("|") - 1)
+            assert body and {line.count("|") for line in body} == {head.count("|")}, make.__name__
+    body = tables.when_it_pays().split("\n\n")[0].splitlines()[2:]
+    assert len(body) == len(tables.WHEN_IT_PAYS) <= 8
+    assert all(re.fullmatch(r"\d+\.\d+", cell.strip()) for line in body for cell in line.split("|")[3:7])
+    assert "# The paper's tables" in paper.page()
+
+
+def test_a_page_has_its_tables_replaced():
+    def table():
+        return "| new |\n"
+
+    page = "a\n<!-- begin: table -->\nold\n<!-- end -->\nb\n"
+    made = "a\n<!-- begin: table -->\n\n| new |\n\n<!-- end -->\nb\n"
+    assert tables.laid_out(page, [table]) == made
+    assert tables.laid_out(made, [table]) == made
+    with pytest.raises(SystemExit, match="no <!-- begin: table"):
+        tables.laid_out("", [table])
+
+
+@pytest.mark.skipif(not all(path.exists() for path in tables.TABLES), reason="the pages are not there yet")
+@pytest.mark.parametrize("path", tables.TABLES, ids=lambda path: path.name)
+def test_pages_have_the_figures_that_were_measured(path):
+    """`python -m benchmarks.tables` brings the pages up to date."""
+    text = path.read_text()
+    assert tables.laid_out(text, tables.TABLES[path]) == text
+
+
+def test_the_chart_is_up_to_date():
+    """`python -m benchmarks.chart -o docs/chart.html` makes it."""
+    assert (tables.ROOT / "docs/chart.html").read_text() == chart.page(chart.data())
+
+
+@pytest.mark.skipif(not BROWSER, reason="needs Chromium")
+@pytest.mark.parametrize(
+    ("measure", "scene", "time"),
+    [("psnr", "mean", "method"), ("relmse", "lamp", "total"), ("flip", "veach-bidir", "method")],
+)
+def test_the_chart_draws_every_point(measure, scene, time):
+    """In the browser each point of the data stands in the page, with its time and its value."""
+    shown = chart.data()
+    address = f"{(tables.ROOT / 'docs/chart.html').as_uri()}#measure={measure}&scene={scene}&time={time}"
+    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", address]
+    dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    drawn = re.findall(r'class="point".*?data-method="(.*?)" data-spp="(\d)" data-x="(.*?)" data-y="(.*?)"', dom)
+    column = list(shown["measures"]).index(measure)
+    expected = []
+    for series in shown["series"]:
+        for point in series["points"]:
+            if scene in point["values"]:
+                seconds = point["seconds"] + (point["spp"] * shown["cost"][scene] if time == "total" else 0)
+                expected.append((point["method"], point["spp"], seconds, point["values"][scene][column]))
+    assert len(drawn) == len(expected) > 40
+    found = {(method, int(spp)): (float(x), float(y)) for method, spp, x, y in drawn}
+    for method, spp, seconds, value in expected:
+        assert found[method, spp] == (pytest.approx(seconds, rel=1e-3), value)
+    assert dom.count("<polyline") > 0
 
 
 def test_curves_of_a_log_go_on_from_run_to_run(tmp_path):

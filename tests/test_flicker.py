@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What `benchmarks.flicker` calls flicker, on sequences whose flicker is known."""
+"""`benchmarks.flicker` measures the right amount on sequences whose flicker is known."""
 
 import math
 
 import numpy as np
 import pytest
 
-from benchmarks.flicker import BLUR, blur, flicker, psnr
-from benchmarks.temporal import LENGTH, Motion, accumulate
+from benchmarks.flicker.measures import BLUR, blur, flicker, psnr
+from benchmarks.flicker.temporal import LENGTH, Motion, accumulate
 from tests.conftest import picture
 
 SIGMA = 0.02
@@ -43,16 +43,16 @@ def test_independent_noise_flickers_by_the_root_of_two_of_its_deviation():
     assert measured["rms"] == pytest.approx(math.sqrt(2) * SIGMA, rel=0.01)
     assert measured["mean_abs"] == pytest.approx(2 / math.sqrt(math.pi) * SIGMA, rel=0.01)
     # A Gaussian of deviation b leaves 1 / (2 sqrt(pi) b) of white noise, and somewhat more along the border.
-    assert measured["rms_low"] == pytest.approx(math.sqrt(2) * SIGMA / (2 * math.sqrt(math.pi) * BLUR), rel=0.35)
-    assert measured["rms_rest"] == pytest.approx(measured["rms"], rel=0.01)
+    assert measured["rms_blotches"] == pytest.approx(math.sqrt(2) * SIGMA / (2 * math.sqrt(math.pi) * BLUR), rel=0.35)
+    assert measured["rms_grain"] == pytest.approx(measured["rms"], rel=0.01)
 
 
 def test_a_frame_that_changes_as_a_whole_flickers_in_the_low_frequencies_alone():
     truth = still()
     brightness = np.array([0, 0.01] * 3, np.float32)[:, None, None, None]
     measured = flicker(truth + brightness, (truth, truth))
-    assert measured["rms_low"] == pytest.approx(0.01, rel=1e-3)
-    assert measured["rms_rest"] < 1e-5
+    assert measured["rms_blotches"] == pytest.approx(0.01, rel=1e-3)
+    assert measured["rms_grain"] < 1e-5
 
 
 def test_noise_of_the_reference_halves_cancels_out():

@@ -2,9 +2,11 @@
 import numpy as np
 import pytest
 
+from benchmarks import results
 from benchmarks.stability import analytic, cases, measures, report
-from benchmarks.stability.__main__ import document, enlarged, judged, ours, run
+from benchmarks.stability.__main__ import enlarged, ours, run
 from benchmarks.stability.bases import Analytic
+from benchmarks.stability.gallery import Gallery
 from oiio_msspl.session import Session
 from oiio_msspl.transforms import luminance
 from tests.conftest import downsample
@@ -51,21 +53,37 @@ def test_a_moved_scene_is_the_moved_picture():
 
 
 def test_every_case_runs_and_stays_finite(bilinear_models, tmp_path):
-    """All cases, measures, pictures and tables, with a model that takes nothing but the LRHS."""
+    """All cases, measures, pictures and tables, with a model that reads only the LRHS."""
     methods = {report.ENLARGED: enlarged, "bilinear": ours(Session(bilinear_models[4]))}
-    rows = judged(run(None, 4, methods, SIZE, report.Gallery(tmp_path)))
-    assert {row["group"] for row in rows} == {*cases.ANYWHERE, *cases.MADE}
-    for row in rows:
+    gallery = Gallery()
+    measured = run(None, 4, methods, SIZE, gallery)
+    assert {row["group"] for row in measured} == {*cases.ANYWHERE, *cases.MADE}
+    for row in measured:
         figures = [value for value in row.values() if isinstance(value, float)]
         assert np.isfinite(figures).all(), row
         assert row["finite"]
-    mine = [row for row in rows if row["method"] == "bilinear"]
+    mine = [row for row in measured if row["method"] == "bilinear"]
     assert max(row.get("deviation", 0) for row in mine) < 1e-3
-    assert max(row["excess"] for row in mine) < measures.EXCESS
-    text = document(rows, tmp_path, tmp_path)
-    assert all(row["case"] in text for row in rows)
-    assert (tmp_path / "x4-all.png").stat().st_size > 1000
-    assert len(list(tmp_path.glob("x4-*.png"))) == 1 + len(cases.ANYWHERE) + len(cases.MADE)
+    assert max(row["range"] for row in mine) < measures.EXCESS
+
+    rows = report.judged(measured)
+    assert len(rows) == len(measured)
+    results.write(tmp_path / "stability.csv", rows)
+    text = report.document(results.read(tmp_path / "stability.csv"))
+    assert all(row["case"] in text and row.get("sentence", "") in text for row in rows)
+    gallery.write_worst(tmp_path / "worst.png", rows)
+    gallery.write_groups(tmp_path / "groups")
+    assert (tmp_path / "worst.png").stat().st_size > 1000
+    assert len(list((tmp_path / "groups").glob("x4-*.png"))) == len(cases.ANYWHERE) + len(cases.MADE)
+
+
+def test_several_views_are_one_row():
+    """The range is the worst of all views, PSNR is their mean, and the verdict is on these."""
+    key = {"scale": 4, "scenes": "views", "group": "x", "case": "y", "method": "z"}
+    view = {"finite": True, "worst_pixel": 1.0, "relmse": 0.1, "relmse_trimmed": 0.1, "relmse_enlarged": 0.2}
+    view |= {"outside": 0.0, "warnings": []}
+    (row,) = report.judged([{**key, **view, "psnr": 20.0, "range": 1.0}, {**key, **view, "psnr": 30.0, "range": 2.0}])
+    assert (row["psnr"], row["range"], row["verdict"]) == (25.0, 2.0, "suffers")
 
 
 def test_the_verdict_names_what_is_wrong():

@@ -1,19 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Everything that goes wrong on a set, put through every method.
+"""Disturbs pairs in every way that goes wrong in production, and measures what each method makes of them.
 
-    python -m benchmarks.stability --markdown docs/stability.md --pictures docs/images/stability
-    python -m benchmarks.stability VIEWS --scale 4 --model paper-x4 --model my.onnx --json results/stability.json
+    python -m benchmarks.stability --table benchmarks/results/stability.csv --picture docs/images/stability.png
+    python -m benchmarks.stability VIEWS --scale 4 --model paper-x4 --model my.onnx
 
-Without arguments: analytic scenes, and all shipped models for x4. VIEWS adds the held-out views of a folder of rendered
-views (see training/data.py). See docs/stability.md for what is measured.
+Without arguments it uses analytic scenes and all shipped models for x4. VIEWS adds the held-out views of a folder of
+rendered views (see training/data.py). :mod:`benchmarks.stability.report` says what is measured.
 """
 
 from __future__ import annotations
 
 import argparse
-import json
-import os
-import platform
 import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -21,18 +18,19 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks import quality
+from benchmarks import peers, results
+from benchmarks.results import Row
 from benchmarks.stability import bases, cases, measures, report
+from benchmarks.stability.gallery import Gallery
 from oiio_msspl import fuse, schema
 from oiio_msspl.comparison import upsample_bicubic
-from oiio_msspl.output import replacing
 from oiio_msspl.render import Array
 from oiio_msspl.session import Session, find_model, shipped_models
 
 #: Side of the analytic frames.
 SIZE = 256
 
-#: A pair to the result and what the tool said.
+#: From a pair to the picture (h, w, 3) and the warnings.
 Method = Callable[[bases.Pair], tuple[Array, list[str]]]
 
 
@@ -42,9 +40,7 @@ def enlarged(pair: bases.Pair) -> tuple[Array, list[str]]:
 
 
 def oidn(pair: bases.Pair) -> tuple[Array, list[str]]:
-    image = quality.oidn(pair.hr)
-    assert image is not None
-    return image, []
+    return peers.oidn(pair.hr), []
 
 
 def ours(session: Session) -> Method:
@@ -56,17 +52,12 @@ def ours(session: Session) -> Method:
 
 
 def methods_for(scale: int, sessions: list[Session]) -> dict[str, Method]:
-    made: dict[str, Method] = {report.ENLARGED: enlarged}
-    made |= {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-    try:
-        import pyoidn  # noqa: F401
-    except ImportError:
-        return made
-    return made | {"OIDN on the HRLS": oidn}
+    models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
+    return {report.ENLARGED: enlarged, **models, "OIDN on the HRLS": oidn}
 
 
 def groups_of(base: bases.Base | None, scale: int, size: int) -> Iterator[tuple[str, Iterator[cases.Case]]]:
-    """(group, its cases) for a base; for the analytic ones if None."""
+    """Each group and its cases, for a rendered view, or for the analytic scenes if ``base`` is None."""
     for name, anywhere in cases.ANYWHERE.items():
         yield name, anywhere(base or cases.room(size), scale)
     if base is None:
@@ -75,59 +66,27 @@ def groups_of(base: bases.Base | None, scale: int, size: int) -> Iterator[tuple[
 
 
 def run(
-    base: bases.Base | None, scale: int, methods: dict[str, Method], size: int, gallery: report.Gallery | None = None
+    base: bases.Base | None, scale: int, methods: dict[str, Method], size: int, gallery: Gallery | None = None
 ) -> list[dict[str, Any]]:
-    """A row for each case and method: ``scale, base, group, case, method`` and what :func:`measures.measure` gives."""
+    """What :func:`measures.measure` finds for each case and method, and ``scale, scenes, group, case, method``."""
     rows = []
     for group, members in groups_of(base, scale, size):
         undisturbed: dict[tuple[str, bases.Pair], Array] = {}
         for case in members:
-            results: dict[str, Array] = {}
+            pictures: dict[str, Array] = {}
             for name, method in methods.items():
                 if case.clean is not None and (name, case.clean) not in undisturbed:
                     undisturbed[name, case.clean] = method(case.clean)[0]
-                results[name], warnings = method(case.pair)
+                pictures[name], warnings = method(case.pair)
                 clean = undisturbed[name, case.clean] if case.clean is not None else None
-                figures = measures.measure(case, results[name], clean, results[report.ENLARGED], warnings)
-                key = {"scale": scale, "base": base.name if base else "analytic", "group": group, "case": case.name}
-                rows.append({**key, "method": name, **figures})
+                figures = measures.measure(case, pictures[name], clean, pictures[report.ENLARGED], warnings)
+                scenes = "views" if base else "analytic"
+                key = {"scale": scale, "scenes": scenes, "group": group, "case": case.name, "method": name}
+                rows.append({**key, **figures})
             if gallery is not None:
-                truth, hr = case.pair.reference, case.pair.hr.layers[schema.RGB]
-                gallery.add(case.name, hr, truth, results, case.factor)
+                gallery.add(scale, group, case, pictures)
         print(f"x{scale} {base.name if base else 'analytic'}: {group}", file=sys.stderr)
-        if gallery is not None:
-            gallery.write_group(f"x{scale}-{report.slug(group)}")
-    if gallery is not None:
-        gallery.write_sheet(f"x{scale}-all")
     return rows
-
-
-def judged(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """The rows, each with its ``verdict`` and ``sentence``."""
-    for row in rows:
-        row["verdict"], row["sentence"] = measures.verdict(row)
-    return rows
-
-
-def document(rows: list[dict[str, Any]], pictures: Path | None, beside: Path) -> str:
-    """All tables as Markdown; pictures are linked from the folder ``beside``."""
-    lines = [report.INTRODUCTION]
-    for scale in dict.fromkeys(row["scale"] for row in rows):
-        for analytic in (True, False):
-            mine = [r for r in rows if r["scale"] == scale and (r["base"] == "analytic") == analytic]
-            if not mine:
-                continue
-            count = len({row["base"] for row in mine})
-            lines.append(f"\n## x{scale}, " + ("analytic scenes" if analytic else f"{count} rendered views") + "\n")
-            table = judged(report.pooled(mine))
-            lines += report.summary(table)
-            if analytic and pictures is not None:
-                link = Path(os.path.relpath(pictures, beside)).as_posix()
-                lines.append(f"\n![Error maps of all cases]({link}/x{scale}-all.png)\n")
-                names = ", ".join(dict.fromkeys(row["method"] for row in table))
-                lines.append(f"*log10 RelMSE from 1e-5 (black) to 1, in each case: {names}.*")
-            lines += report.tables(table)
-    return "\n".join(lines) + "\n"
 
 
 def main() -> None:
@@ -138,34 +97,31 @@ def main() -> None:
         "--scale", type=int, action="append", choices=schema.SCALES, help="default: those of --model, or 4"
     )
     parser.add_argument("--size", type=int, default=SIZE, help="side of the analytic frames (%(default)s)")
-    parser.add_argument("--threads", type=int, default=0, help="of onnxruntime; 0: one a core")
-    parser.add_argument("--json", type=Path, help="write all rows here")
-    parser.add_argument("--markdown", type=Path, help="write the tables here")
-    parser.add_argument("--pictures", type=Path, help="write error maps into this folder")
+    parser.add_argument("--threads", type=int, default=0, help="of ONNX Runtime; 0: one a core")
+    parser.add_argument("--picture", type=Path, help="draw the error maps of each group's worst analytic case as a PNG")
+    parser.add_argument(
+        "--pictures", type=Path, help="draw results and error maps of every analytic case, a PNG a group"
+    )
+    results.add_option(parser)
     args = parser.parse_args()
     files = [find_model(4, name) for name in args.model] or list(shipped_models().values())
     sessions = [Session(file, threads=args.threads) for file in files]
     scales = args.scale or (sorted({session.contract.scale for session in sessions}) if args.model else [4])
-    rows = []
+    measured = []
+    gallery = Gallery() if args.picture or args.pictures else None
     for scale in scales:
         methods = methods_for(scale, sessions)
-        gallery = report.Gallery(args.pictures) if args.pictures else None
-        rows += run(None, scale, methods, args.size, gallery)
+        measured += run(None, scale, methods, args.size, gallery)
         for view in bases.views(args.views) if args.views else []:
-            rows += run(view, scale, methods, args.size)
-    rows = judged(rows)
-    if args.json:
-        args.json.parent.mkdir(parents=True, exist_ok=True)
-        provenance = {s.contract.name: s.contract.provenance for s in sessions if s.contract.scale in scales}
-        record = {"machine": platform.machine(), "models": provenance, "rows": rows}
-        with replacing(args.json, overwrite=True) as temporary:
-            temporary.write_text(json.dumps(record, indent=1, default=float))
-    text = document(rows, args.pictures, args.markdown.parent if args.markdown else Path.cwd())
-    if args.markdown:
-        args.markdown.parent.mkdir(parents=True, exist_ok=True)
-        with replacing(args.markdown, overwrite=True) as temporary:
-            temporary.write_text(text)
-    print(text)
+            measured += run(view, scale, methods, args.size)
+    rows: list[Row] = report.judged(measured)
+    print(report.document(rows))
+    if args.table:
+        results.write(args.table, rows)
+    if gallery and args.picture:
+        gallery.write_worst(args.picture, rows)
+    if gallery and args.pictures:
+        gallery.write_groups(args.pictures)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pictures with exact references, and renders of them with the noise of one-sample Monte Carlo.
+"""Analytic scenes with exact references, and renders of them with the noise of one-sample Monte Carlo.
 
-A scene is known at ``SUB`` x ``SUB`` points a pixel. A sample picks one of the points under its pixel filter, then
-what it hits there (the front, with the probability of its coverage, or the back), whether the light is seen
-(Bernoulli), and how much ambient and glossy light arrives (exponential, the glossy one rare and strong). The reference
-is the expectation of that, computed and not sampled: the mean of renders converges to it exactly.
+A scene is defined at ``SUB`` x ``SUB`` points in each pixel. A sample picks one of the points under its pixel filter.
+Then it picks the front, with the probability of its coverage, or the back; whether it sees the light (Bernoulli); and
+how much ambient and glossy light arrives (exponential, the glossy light is rare and strong). The reference is the
+expectation of this, computed without sampling. The mean of many renders converges to it.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ CHANNELS = {"albedo": 3, "normal": 3, "direct": 1, "visible": 1, "ambient": 1, "
 
 
 def surface(shape: tuple[int, int], **features: NDArray | float | tuple[float, ...]) -> Array:
-    """Features at every point, (H * SUB, W * SUB, 15); what is not given is 0, the normal faces the camera.
+    """Features at every point, (h * SUB, w * SUB, 15). Missing ones are 0, and the normal faces the camera.
 
     Radiance is ``albedo * (direct * visible + ambient) + gloss + emission``; ``visible`` is a probability.
     """
@@ -44,37 +44,37 @@ def split(points: Array) -> dict[str, Array]:
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """What is seen at every point."""
+    """A front that partly covers a back, at every point."""
 
     back: Array
     """See :func:`surface`."""
     front: Array | None = None
-    """Likewise, seen where ``coverage`` says."""
+    """The same for what covers the back."""
     coverage: Array | None = None
-    """Probability that a sample at a point hits the front, (H * SUB, W * SUB, 1): blur of a lens or of motion."""
+    """Probability that a sample at a point hits the front, (h * SUB, w * SUB, 1), as with lens or motion blur."""
 
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """A pixel filter: points along one axis from a pixel's first one, and their probability."""
+    """A pixel filter along one axis: points, counted from the first one of the pixel, and their probabilities."""
 
     offsets: NDArray[np.int64]
     weights: NDArray[np.float64]
 
 
 def box(scale: int = 1) -> Footprint:
-    """The pixel's own area; of a pixel that is ``scale`` HRLS pixels wide."""
+    """The box filter of a pixel that is ``scale`` HRLS pixels wide."""
     count = SUB * scale
     return Footprint(np.arange(count), np.full(count, 1 / count))
 
 
 def point(scale: int) -> Footprint:
-    """One HRLS pixel out of those that an LRHS pixel spans: the nearest-neighbour LRHS of the paper."""
+    """Only one of the HRLS pixels that an LRHS pixel covers, as in the paper's nearest-neighbour LRHS."""
     return Footprint(scale // 2 * SUB + np.arange(SUB), np.full(SUB, 1 / SUB))
 
 
 def blackman_harris(scale: int = 1, width: float = 3.0) -> Footprint:
-    """The Blackman-Harris window over ``width`` pixels, which renderers with this filter sample by importance."""
+    """The Blackman-Harris window over ``width`` pixels, as renderers sample it by importance."""
     count = round(width * SUB * scale)
     phase = 2 * np.pi * (np.arange(count) + 0.5) / count
     window = 0.35875 - 0.48829 * np.cos(phase) + 0.14128 * np.cos(2 * phase) - 0.01168 * np.cos(3 * phase)
@@ -82,7 +82,7 @@ def blackman_harris(scale: int = 1, width: float = 3.0) -> Footprint:
 
 
 def reference(scene: Scene, footprint: Footprint | None = None, scale: int = 1) -> Array:
-    """Expected colour of every pixel, (H / scale, W / scale, 3), through the filter (the box if None)."""
+    """Expected colour of every pixel, (h / scale, w / scale, 3), with a pixel filter (the box if None)."""
     footprint = footprint or box(scale)
     image = _expected(scene.back)
     if scene.front is not None:
@@ -100,7 +100,7 @@ def reference(scene: Scene, footprint: Footprint | None = None, scale: int = 1) 
 def render(
     scene: Scene, spp: int, rng: np.random.Generator, *, footprint: Footprint | None = None, scale: int = 1
 ) -> Render:
-    """All layers of the schema, at 1 / ``scale`` of the scene's resolution; variance from 2 spp on."""
+    """All layers at 1 / ``scale`` of the scene's resolution. The variance needs at least 2 spp."""
     footprint = footprint or box(scale)
     height, width = (n // (SUB * scale) for n in scene.back.shape[:2])
     corners = np.mgrid[0:height, 0:width] * (SUB * scale)
@@ -126,7 +126,7 @@ def _sample(
     scene: Scene, footprint: Footprint, corners: NDArray[np.int64], rng: np.random.Generator
 ) -> dict[str, Array]:
     shape = corners.shape[1:]
-    steps = np.cumsum(footprint.weights)[:-1]  # the last bin is open, whatever the sum was rounded to
+    steps = np.cumsum(footprint.weights)[:-1]  # the last bin is open, so the rounding of the sum does not matter
     rows, columns = (
         np.clip(corner + footprint.offsets[np.searchsorted(steps, rng.random(shape))], 0, size - 1)
         for corner, size in zip(corners, scene.back.shape[:2], strict=True)
@@ -147,7 +147,7 @@ def _sample(
     }
 
 
-# Scenes. Lengths are shares of the frame, or pixels where the name says so: a hair is thin at any size.
+# Scenes. Lengths are shares of the frame. Those named ``pixels`` are in pixels: a hair is thin at any frame size.
 
 
 def grid(size: int) -> tuple[Array, Array]:
@@ -158,12 +158,12 @@ def grid(size: int) -> tuple[Array, Array]:
 
 
 def where(mask: NDArray[np.bool_], yes: Any, no: Any) -> Array:
-    """np.where in single precision: the points of a frame are many."""
+    """np.where in single precision, to save memory."""
     return np.where(mask, np.asarray(yes, np.float32), np.asarray(no, np.float32))
 
 
 def moved(scene: Scene, x: int, y: int) -> Scene:
-    """A scene shifted by whole pixels to the right and down; its edge goes on."""
+    """A scene shifted by whole pixels to the right and down. Its border values are repeated."""
     rows, columns = (
         np.clip(np.arange(size) - pixels * SUB, 0, size - 1)
         for size, pixels in zip(scene.back.shape, (y, x), strict=False)
@@ -175,7 +175,7 @@ def moved(scene: Scene, x: int, y: int) -> Scene:
 def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 1.0) -> Scene:
     """A checkered wall, a floor of thin tiles, a ball with its soft shadow, a glossy box, a few posts of all widths.
 
-    ``light``: brightness of the light that is sometimes hidden; the ambient light stays.
+    ``light`` scales the direct light. The ambient light stays.
     """
     x, y = grid(size)
     wall = where(((np.floor(x * 9) + np.floor(y * 9)) % 2) == 0, (0.7, 0.55, 0.4), (0.25, 0.3, 0.45))
@@ -213,7 +213,7 @@ def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 
 
 
 def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
-    """Emitters before a scene whose own light is dimmed; they have no albedo, as in renderers."""
+    """Emitters in front of a scene whose own light is dimmed. They have no albedo, as in renderers."""
     features = split(scene.back)
     lit = emission.max(axis=-1, keepdims=True) > 0
     features["emission"] = where(lit, emission, 0)
@@ -224,7 +224,7 @@ def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
 
 
 def small_lights(size: int, radiance: float) -> Scene:
-    """Lamps of 0.3 to 3 pixels' radius before a dim room, from ``radiance`` / 1000 to ``radiance``."""
+    """Lamps with a radius of 0.3 to 3 pixels in front of a dim room, from ``radiance`` / 1000 to ``radiance``."""
     x, y = grid(size)
     rng = np.random.default_rng(5)
     emission = np.zeros((*x.shape[:2], 3), np.float32)
@@ -247,15 +247,15 @@ def emitters(size: int) -> Scene:
 
 
 def near_black(size: int, traces: float = 0.0) -> Scene:
-    """A room in which one sample of 200 finds the light. ``traces``: share of the gloss that is left, and with it its
-    tails, down to what a float can just hold."""
+    """A room in which one sample of 200 finds the light. ``traces`` is the share of the glossy light that stays; its
+    tails reach down to the smallest floats."""
     features = split(room(size).back)
     features |= {"visible": features["visible"] * 0.005, "ambient": np.float32(0), "gloss": features["gloss"] * traces}
     return Scene(surface(features["albedo"].shape[:2], **features))
 
 
 def defocused(size: int) -> Scene:
-    """Out-of-focus discs before the room: every sample at their rims is all front or all back."""
+    """Out-of-focus discs in front of the room. At their rims each sample hits the front or the back."""
     x, y = grid(size)
     coverage = np.zeros_like(x)
     albedo = np.zeros((*x.shape[:2], 3), np.float32)
@@ -296,7 +296,7 @@ def moving(size: int) -> Scene:
 
 
 def hairy(size: int) -> Scene:
-    """Curved hairs of 0.1 to 0.8 pixels' width, lighter than what is behind them."""
+    """Curved hairs with a width of 0.1 to 0.8 pixels, lighter than their background."""
     x, y = grid(size)
     cell = 1 / SUB
     coverage = np.zeros_like(x)
@@ -315,7 +315,7 @@ def hairy(size: int) -> Scene:
 
 
 def glassy(size: int) -> Scene:
-    """A pane and a lens of albedo 1: what is seen through them stands in no layer but the specular one."""
+    """A pane and a lens of albedo 1. Only the specular layer shows what is behind them."""
     x, y = grid(size)
     features = split(room(size).back)
     pane = (np.abs(x - 0.68) < 0.22) & (np.abs(y - 0.5) < 0.35)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the suite starts from: pairs with their reference, of analytic scenes or of rendered views."""
+"""Undisturbed pairs with their reference, from analytic scenes or from rendered views."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from training import data
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """An LRHS, an HRLS and the truth, (H, W, 3)."""
+    """An LRHS, an HRLS and the reference (h, w, 3)."""
 
     lr: Render
     hr: Render
@@ -29,12 +29,12 @@ class Pair:
 
 
 def seeded(*key: object) -> np.random.Generator:
-    """Independent noise for every key, the same in every run."""
+    """A random generator that is different for every key and the same in every run."""
     return np.random.default_rng(zlib.crc32(repr(key).encode()))
 
 
 class Base:
-    """Something that can be rendered at any scale and spp."""
+    """A scene that gives pairs of any scale and spp."""
 
     name: str
 
@@ -42,11 +42,11 @@ class Base:
         self._made: dict[tuple[int, int, int | None, bool], Pair] = {}
 
     def pair(self, scale: int, hr_spp: int = 1, lr_spp: int | None = None, *, nearest: bool = False) -> Pair:
-        """The same question gets the same object.
+        """A pair; the same arguments return the same object.
 
         Args:
-            lr_spp: of the LRHS; by default as many as an LRHS pixel has HRLS pixels.
-            nearest: an LRHS pixel samples one of the HRLS pixels that it spans, instead of all.
+            lr_spp: spp of the LRHS; by default one for every HRLS pixel.
+            nearest: an LRHS pixel samples only one of the HRLS pixels that it covers.
 
         Raises:
             LookupError: this base has no such pair.
@@ -78,7 +78,7 @@ class Analytic(Base):
         hr_filter: analytic.Footprint | None = None,
         lr_scene: analytic.Scene | None = None,
     ) -> Pair:
-        """As :meth:`pair`; also with other pixel filters, or an LRHS that shows something else."""
+        """As :meth:`pair`, also with other pixel filters or with another scene in the LRHS."""
         low = analytic.render(
             lr_scene or self.scene,
             lr_spp or scale**2,

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What can go wrong with a pair, one small function a group."""
+"""The cases: what can go wrong with a pair. There is one function for each group."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from oiio_msspl import schema
 from oiio_msspl.render import Array, Render
 from oiio_msspl.transforms import MAX_RADIANCE
 
-#: What a pair's LRHS and HRLS may differ in by a mistake of the user, as opposed to by noise.
+#: The group in which both renders show different things, by a mistake of the user.
 DISAGREE = "LRHS and HRLS disagree"
 
 
@@ -24,18 +24,18 @@ class Case:
     name: str
     pair: Pair
     clean: Pair | None = None
-    """The pair that was disturbed, for what the disturbance costs; None for a scene that is hard by itself."""
+    """The pair before it was disturbed; None for a scene that is hard as it is."""
     factor: float = 1.0
-    """The result should be that of ``clean`` times this."""
+    """The result should be the one for ``clean``, times this."""
 
 
 def changed(render: Render, **layers: Array | None) -> Render:
-    """A render with other layers; None takes one away."""
+    """A render with other layers; None removes one."""
     return Render.from_arrays(render.name, **{k: v for k, v in {**render.layers, **layers}.items() if v is not None})
 
 
 def scaled(pair: Pair, factor: float) -> Pair:
-    """All light times a factor."""
+    """A pair with all light multiplied by a factor."""
     powers = dict.fromkeys((schema.RGB, schema.DIFFUSE, schema.SPECULAR), 1) | {schema.VARIANCE: 2}
     lr, hr = (
         changed(r, **{k: v * np.float32(factor ** powers[k]) for k, v in r.layers.items() if k in powers})
@@ -45,7 +45,7 @@ def scaled(pair: Pair, factor: float) -> Pair:
 
 
 def with_pixels(render: Render, value: float, share: float, layers: tuple[str, ...] = (schema.RGB,)) -> Render:
-    """A share of the pixels, at least one and none at the rim, set to a value in some layers."""
+    """A render in which a share of the pixels, at least one and none at the border, has a value in some layers."""
     height, width = render.layers[schema.RGB].shape[:2]
     rng = seeded("pixels", value, share, height)
     count = max(1, round(share * height * width))
@@ -62,7 +62,7 @@ def mean_light(pair: Pair) -> float:
     return float(pair.reference.mean())
 
 
-# Groups that any base can be put through
+# Groups for any base
 
 
 def fireflies(base: Base, scale: int) -> Iterator[Case]:
@@ -99,7 +99,7 @@ def exposure(base: Base, scale: int) -> Iterator[Case]:
 
 
 def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
-    """One bright pixel; ``clean`` has it one pixel to the left."""
+    """One bright pixel. In ``clean`` it is one pixel further left."""
     clean = base.pair(scale)
     value = 1e4 * mean_light(clean)
 
@@ -122,7 +122,7 @@ def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
 
 
 def layers(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale, 4)  # of 4 spp: at 1 there is no variance to take away
+    clean = base.pair(scale, 4)  # 4 spp: with 1 there is no variance to remove
     for name in schema.OPTIONAL_FEATURES:
         yield Case(f"no {name}", Pair(clean.lr, changed(clean.hr, **{name: None}), clean.reference), clean)
     bare = changed(clean.hr, **dict.fromkeys(schema.OPTIONAL_FEATURES))
@@ -181,7 +181,7 @@ def footprints(base: Base, scale: int) -> Iterator[Case]:
 
 
 def overflow(base: Base, scale: int) -> Iterator[Case]:
-    """Light beyond 65504, in files of half floats."""
+    """Light beyond 65504, the largest half float."""
     clean = base.pair(scale)
     bright = scaled(clean, 4 * MAX_RADIANCE / float(np.quantile(clean.reference, 0.999)))
     with np.errstate(over="ignore"):
@@ -189,7 +189,7 @@ def overflow(base: Base, scale: int) -> Iterator[Case]:
             changed(r, **{k: v.astype(np.float16).astype(np.float32) for k, v in r.layers.items()})
             for r in (bright.lr, bright.hr)
         )
-    truth = np.minimum(bright.reference, MAX_RADIANCE)  # what such a file can say
+    truth = np.minimum(bright.reference, MAX_RADIANCE)  # the largest value that such a file can hold
     yield Case("a frame that reaches 4 times the largest half", Pair(lr, hr, truth), Pair(bright.lr, bright.hr, truth))
 
 
@@ -207,12 +207,12 @@ ANYWHERE: dict[str, Callable[[Base, int], Iterator[Case]]] = {
 }
 
 
-# Groups that need a scene made for them
+# Groups with scenes of their own
 
 
 @cache
 def room(size: int) -> Analytic:
-    """The analytic base, for the groups above too."""
+    """The analytic base. The groups for any base use it, too."""
     return Analytic("room", analytic.room(size))
 
 
@@ -250,7 +250,7 @@ def filters(size: int, scale: int) -> Iterator[Case]:
 
 
 def disagreement(size: int, scale: int) -> Iterator[Case]:
-    """The HRLS is right; the LRHS shows something else."""
+    """The HRLS is right. The LRHS shows something else."""
     base = room(size)
     clean = base.pair(scale)
     other = analytic.hairy(size)

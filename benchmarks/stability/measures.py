@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is measured of a result, and the sentence that follows from it."""
+"""Measures a result, and words a verdict from the figures."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from oiio_msspl.render import Array
 
 #: Share of pixels that the trimmed RelMSE leaves out: the worst ones.
 TRIMMED = 1e-4
-#: Neighbourhoods whose range a result should not leave: pixels to each side. Our networks look at 10 x 10 HRLS pixels,
-#: four more to each side than the 2 x 2 that a pixel is one of.
+#: A result should stay in the range of the inputs within this many pixels to each side. Our networks average 10 x 10
+#: HRLS pixels.
 LRHS_REACH, HRLS_REACH = 1, 5
-#: Values are told apart from this share of mid-grey on: below, ratios say nothing.
+#: Values below this share of mid-grey are not compared: their ratios mean nothing.
 FLOOR = 0.01
 
 #: The verdict's thresholds.
 EXCESS = 1.02
-"""A result leaves its inputs' range where it is that many times beyond it; half floats and curves round."""
+"""Factor from which a value counts as outside the inputs' range. Half floats and the encoding round."""
 COST = 1.0
-"""dB that a disturbance may cost before the method is said to suffer."""
+"""dB that a disturbance may cost before a method counts as suffering."""
 DEVIATION = 0.01
-"""Share by which a scaled scene's result may differ from the scaled result."""
+"""Relative difference allowed between the result of a scaled scene and the scaled result."""
 AWAY = 0.02
-"""Share of a pixel's value by which it may change though nothing within ``NEAR`` LRHS pixels has."""
+"""Relative change allowed in a pixel if nothing within ``NEAR`` LRHS pixels has changed."""
 NEAR = 8
 
 
@@ -40,13 +40,13 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     """All figures of one result.
 
     Args:
-        image: the result, (H, W, 3).
+        image: the result (h, w, 3), linear.
         clean: the same method's result for ``case.clean``.
         enlarged: the case's LRHS enlarged, without any method.
     """
     pair = case.pair
     truth = pair.reference
-    grey = np.float32(transforms.exposure_of(truth))  # scores want a picture that is exposed, whatever its units
+    grey = np.float32(transforms.exposure_of(truth))  # the scores are made for exposed pictures
     floor = np.float32(FLOOR * transforms.KEY) / grey
     finite = bool(np.isfinite(image).all())
     low, high = input_range(pair)
@@ -55,14 +55,13 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     errors = relmse_map(image * grey, truth * grey).mean(axis=-1)
     row: dict[str, Any] = {
         "finite": finite,
-        "worst_ratio": float(((image + floor) / (brightest + floor)).max()),
-        "worst_error": float(np.abs(image - truth).max()),
+        "worst_pixel": float(((image + floor) / (brightest + floor)).max()),
         "relmse": float(errors.mean()),
         "relmse_trimmed": trimmed(errors),
         "relmse_enlarged": trimmed(relmse_map(enlarged * grey, truth * grey).mean(axis=-1)),
         "psnr": psnr(image * grey, truth * grey),
         "outside": float((beyond > EXCESS).mean()),
-        "excess": float(beyond.max()),
+        "range": float(beyond.max()),
         "warnings": warnings,
     }
     if clean is not None and case.clean is not None:
@@ -78,13 +77,13 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
 
 
 def verdict(row: dict[str, Any]) -> tuple[str, str]:
-    """(holds, suffers or fails; the sentence) of what :func:`measure` found, with the case's ``group``."""
+    """("holds", "suffers" or "fails", a sentence) from the figures of :func:`measure` and the case's ``group``."""
     if not row["finite"] or not math.isfinite(row["relmse"]):
         return "fails", "NaN or Inf comes out."
     faults = []
-    if row["excess"] > EXCESS:
+    if row["range"] > EXCESS:
         faults.append(
-            f"leaves the inputs' range by up to x{row['excess']:.3g} in {100 * row['outside']:.2g} % of values"
+            f"leaves the inputs' range by up to x{row['range']:.3g} in {100 * row['outside']:.2g} % of values"
         )
     if row.get("deviation", 0) > DEVIATION:
         faults.append(f"does not scale: off by up to {100 * row['deviation']:.2g} %")
@@ -105,7 +104,7 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def trimmed(errors: NDArray[np.float64]) -> float:
-    """Mean without the worst pixels."""
+    """Mean without the share `TRIMMED` of the largest values."""
     kept = errors.size - max(1, round(TRIMMED * errors.size))
     return float(np.partition(errors.ravel(), kept - 1)[:kept].mean())
 
@@ -115,7 +114,7 @@ def repaired(values: Array) -> Array:
 
 
 def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) -> Array:
-    """Largest or smallest value within ``reach`` pixels in x and y."""
+    """Largest or smallest value within ``reach`` pixels along x and y."""
     for axis in (0, 1):
         size = values.shape[axis]
         padded = np.pad(values, [(reach, reach) if i == axis else (0, 0) for i in range(values.ndim)], mode="edge")
@@ -126,7 +125,7 @@ def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) 
 
 
 def input_range(pair: Pair) -> tuple[Array, Array]:
-    """Smallest and largest value of both renders around every pixel, by channel."""
+    """Smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
     low, high = repaired(pair.lr.layers[schema.RGB]), repaired(pair.hr.layers[schema.RGB])
     s = pair.scale
     result = []
@@ -137,7 +136,7 @@ def input_range(pair: Pair) -> tuple[Array, Array]:
 
 
 def touched(before: Pair, after: Pair) -> NDArray[np.bool_]:
-    """Where a disturbance is near, (H, W)."""
+    """Where either render differs within ``NEAR`` LRHS pixels, (h, w)."""
     s = after.scale
     low = _differs(before.lr.layers[schema.RGB], after.lr.layers[schema.RGB])
     high = np.zeros((low.shape[0] * s, low.shape[1] * s), bool)

@@ -1,47 +1,48 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Short sequences of real scenes for `benchmarks.flicker`, rendered with Mitsuba 3.
+"""Renders short sequences of two scenes for `benchmarks.flicker`, with Mitsuba 3.
 
-A folder a scene and camera. ``static``: frames that differ by their noise alone, and one reference. ``moving``: a
-camera that pans and trucks, so that what is nearer moves faster. A frame is::
+    python -m benchmarks.render.sequences SEQUENCES --scenes SCENES
+
+Each scene gets two folders. In ``static`` the frames differ only by their noise, and there is one reference. In
+``moving`` the camera pans and trucks, so that near surfaces move faster. The files of a frame are::
 
     hr.####.exr     1 spp                    } albedo, normal, depth, motion
     full.####.exr   2 spp                    }
     lr.####.exr     16 spp at a quarter of the resolution
-    ref_a.####.exr, ref_b.####.exr           two halves of the reference, of independent noise
+    ref_a.####.exr, ref_b.####.exr           two halves of the reference, with independent noise
 
-``motion.X``, ``motion.Y`` say where a pixel's surface was in the frame before, in HRLS pixels from here, y downwards:
-the exact reprojection of the positions that were hit. Every file has a seed of its own that follows from its name;
-files that exist are kept.
+``motion.X`` and ``motion.Y`` say where the surface of a pixel was in the frame before, in HRLS pixels from here, y
+downwards. They are the exact reprojection of the positions that rays hit. The name of a file gives its seed. Files
+that exist are kept.
 """
 
 from __future__ import annotations
 
+import argparse
+import sys
 import time
 import zlib
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import OpenImageIO as oiio
 
+from benchmarks.render.film import set_crop, write_exr
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.output import replacing
-from oiio_msspl.render import Array
 from training import mitsuba_start
 
 SCALE = 4
 FRAMES = 10
 WIDTH, HEIGHT = 256, 192
-#: Long side of the frame that the sequences are a crop of.
-LONG_SIDE = 1024
-#: Mean motion in HRLS pixels a frame: of everything by the pan, of the median depth by the truck.
+#: Longer side of the whole frame, of which a crop is rendered.
+LONGER = 1024
+#: Motion in HRLS pixels a frame: the pan moves everything, the truck moves a surface at the median depth.
 PAN, TRUCK = 0.9, 0.8
 MAX_DEPTH = 8
 #: spp of each half of the reference.
 REFERENCE_HALF = 128
-#: Samples of one launch, so that memory stays small.
+#: Samples that are rendered at once; more need more memory.
 LAUNCH = 2_000_000
 
 CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.T", "motion.X", "motion.Y")
@@ -52,7 +53,7 @@ SCENES = {"staircase2": (0.53, 0.60), "lamp": (0.47, 0.40)}
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole at ``to_world`` (4 x 4); ``focal`` in pixels, ``centre`` where its axis meets the crop."""
+    """A pinhole at ``to_world`` (4 x 4). ``focal`` is in pixels; ``centre`` is where the axis meets the crop."""
 
     to_world: np.ndarray
     focal: float
@@ -66,7 +67,7 @@ class Camera:
 
 
 def render_sequences(folder: Path, scenes: Path, names: list[str]) -> None:
-    """Render what is missing of both sequences of each scene.
+    """Render the files of both sequences of each scene that do not exist yet.
 
     Raises:
         InputError: no such scene, or no Mitsuba.
@@ -95,7 +96,7 @@ class _Sequences:
         )
         self.sensor = mi.traverse(self.scene.sensors()[0])
         width, height = self.sensor["film.size"]
-        self.full = [round(v * LONG_SIDE / max(width, height) / SCALE) * SCALE for v in (width, height)]
+        self.full = [round(v * LONGER / max(width, height) / SCALE) * SCALE for v in (width, height)]
         self.offset = [
             min(max(int((share * size - crop / 2) // SCALE * SCALE), 0), size - crop)
             for share, size, crop in zip(SCENES[file.parent.name], self.full, (WIDTH, HEIGHT), strict=True)
@@ -138,16 +139,14 @@ class _Sequences:
         positions, image = image[..., 10:13], image[..., :10]
         if kind in ("hr", "full"):
             image = np.concatenate([image, before.project(positions) - camera.project(positions)], axis=-1)
-        write_exr(path, image[..., :3] if kind.startswith("ref") else image)
+        write_exr(path, image[..., :3] if kind.startswith("ref") else image, CHANNELS)
 
     def shoot(self, camera: Camera, spp: int, scale: int, seed: int) -> np.ndarray:
         """The crop at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS` to depth, then world positions."""
         mi, sensor = self.mi, self.sensor
         sensor["to_world"] = mi.Transform4f(mi.Matrix4f(camera.to_world))
-        sensor["film.size"] = mi.ScalarVector2u(*(v // scale for v in self.full))
-        sensor["film.crop_size"] = mi.ScalarVector2u(WIDTH // scale, HEIGHT // scale)
-        sensor["film.crop_offset"] = mi.ScalarPoint2u(*(v // scale for v in self.offset))
-        sensor.update()
+        full, offset = ([v // scale for v in values] for values in (self.full, self.offset))
+        set_crop(mi, sensor, full, (WIDTH // scale, HEIGHT // scale), offset)
         launch = max(1, LAUNCH // (WIDTH * HEIGHT // scale**2))
         total, done = 0.0, 0
         while done < spp:
@@ -159,16 +158,19 @@ class _Sequences:
         return np.asarray(total) / spp
 
 
-def write_exr(path: Path, image: Array, channels: Sequence[str] = CHANNELS) -> None:
-    """Half floats, the first of the channels."""
-    height, width, count = image.shape
-    spec = oiio.ImageSpec(width, height, count, "half")
-    spec.channelnames = tuple(channels[:count])
-    spec.attribute("compression", "zip")
-    spec.attribute("Software", "Mitsuba 3")
-    with replacing(path, overwrite=True) as temporary:
-        writer = oiio.ImageOutput.create(str(temporary))
-        ok = writer.open(str(temporary), spec)
-        ok = ok and writer.write_image(np.ascontiguousarray(np.clip(image, -65000, 65000), dtype=np.float32))
-        if not (writer.close() and ok):
-            raise MssplError(f"{path}: can't be written ({writer.geterror()})")
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--scenes", type=Path, required=True, help="a folder with a scene.xml for each scene")
+    parser.add_argument("--scene", action="append", default=[], help=f"{', '.join(SCENES)}; default: both")
+    args = parser.parse_args()
+    try:
+        render_sequences(args.folder, args.scenes, args.scene or list(SCENES))
+    except MssplError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

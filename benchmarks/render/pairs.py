@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Render scenes of other people for `benchmarks.quality`, with the pixel filter that is asked for.
+"""Renders pairs and references of scenes for `benchmarks.quality`, with either pixel filter and all layers.
 
-    python -m benchmarks.render_scenes SCENES OUT --filter blackman-harris
+    python -m benchmarks.render.pairs SCENES OUT --filter blackman-harris
 
-Of every ``NAME/scene.xml`` the middle 384 x 256 pixels of a frame whose longer side is 1280 pixels: a reference, HRLS
-of 1, 2, 4 and 8 spp and LRHS of as many samples for every one of their pixels, both with albedo, normal, diffuse and
-specular. Files that exist are kept.
+Of every ``NAME/scene.xml`` a crop of 384 x 256 pixels is rendered with Mitsuba 3, in the middle of a frame whose longer
+side has 1280 pixels: a reference, HRLS of 1 to 8 spp, and LRHS with 1, 2 and 4 samples for every HRLS pixel. HRLS and
+LRHS have albedo, normal, diffuse and specular. Files that exist are kept.
 """
 
 from __future__ import annotations
@@ -18,15 +18,14 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.flicker_render import write_exr
-from benchmarks.render_time import CROP, LONGER
+from benchmarks.render.film import CROP, frame_size, set_crop, write_exr
 from oiio_msspl.schema import SCALES
 from training import mitsuba_start, views
 
 HRLS = (1, 2, 3, 4, 6, 7, 8)
-#: Samples of the LRHS for every pixel of the frame.
+#: Samples of the LRHS for every HRLS pixel.
 LRHS = (1, 2, 4)
-#: Samples of one launch, so that memory stays small.
+#: Samples that are rendered at once; more need more memory.
 LAUNCH = 1_500_000
 LAYERS = ("", "albedo.", "nn.", "diffuse.", "specular.")
 CHANNELS = [layer + c for layer in LAYERS for c in ("XYZ" if layer == "nn." else "RGB")]
@@ -37,17 +36,12 @@ class SensorCamera:
 
     def __init__(self, mi: Any, sensor: Any) -> None:
         self.mi, self.sensor = mi, sensor
-        self.film = mi.traverse(sensor)
-        original = np.array(sensor.film().size())
-        self.full = np.round(original * LONGER / original.max() / 8).astype(int) * 8
+        self.parameters, self.full = mi.traverse(sensor), frame_size(sensor)
 
     def at(self, scale: int) -> tuple[int, int]:
-        """Take the crop at 1/scale of the resolution; its width and height."""
+        """Render the crop at 1/scale of the resolution from now on; its width and height."""
         size, crop = self.full // scale, np.array(CROP) // scale
-        self.film["film.size"] = self.mi.ScalarVector2u(*size)
-        self.film["film.crop_size"] = self.mi.ScalarVector2u(*crop)
-        self.film["film.crop_offset"] = self.mi.ScalarPoint2u(*((self.full - CROP) // 2 // 8 * 8 // scale))
-        self.film.update()
+        set_crop(self.mi, self.parameters, size, crop, (self.full - CROP) // 2 // 8 * 8 // scale)
         return int(crop[0]), int(crop[1])
 
     def rays(self, x: Any, y: Any, lens: Any) -> Any:
@@ -56,7 +50,7 @@ class SensorCamera:
 
 
 def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
-    """Render what is missing of a scene."""
+    """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
     import mitsuba as mi
 
     from training.mitsuba_views.trace import blackman_harris, box, render_passes

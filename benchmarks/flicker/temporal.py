@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A prototype, for `benchmarks.flicker` alone: accumulate frames along the motion of their surfaces.
+"""A prototype of temporal accumulation: averages frames along the motion of their surfaces.
 
-What is accumulated may be a method's outputs or its inputs. Motion is that of surfaces: reflections, refractions and
-shadows that move differently are averaged wrongly.
+It accumulates a method's outputs or its inputs. The motion is that of the surfaces: reflections, refractions and
+shadows that move otherwise are averaged wrongly.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ import numpy as np
 
 from oiio_msspl.render import Array
 
-#: Frames that count: the weight of the newest is 1/n while n of them are there, and never less than 1/LENGTH.
+#: The n-th frame of a surface has the weight 1/n, from this n on 1/LENGTH.
 LENGTH = 5
-#: A surface is another one if its depth is not within this share of the depths around where it was.
+#: A surface counts as another one if its depth differs by more than this share from the depths where it was before.
 DEPTH_TOLERANCE = 0.05
 
 Layers = dict[str, Array]
@@ -24,33 +24,33 @@ Layers = dict[str, Array]
 
 @dataclass(frozen=True)
 class Motion:
-    """Of a frame's surfaces."""
+    """Motion and depth of the surfaces in a frame."""
 
     vectors: Array
-    """(h, w, 2): where a pixel's surface was in the frame before, in pixels from here, x first, y downwards."""
+    """(h, w, 2): where the surface of a pixel was in the frame before, as (x, y) in pixels from here, y downwards."""
     depth: Array
     """(h, w)"""
 
     def reduced(self, scale: int) -> Motion:
-        """The same for a picture that is smaller by a whole factor."""
+        """The same for a picture that is `scale` times smaller, a whole factor."""
         return Motion(_means(self.vectors, scale) / scale, _means(self.depth[..., None], scale)[..., 0])
 
 
 def accumulate(frames: Sequence[Layers], motions: Sequence[Motion]) -> list[Layers]:
-    """Each frame's layers (h, w, c), averaged with those before it where the same surface was seen."""
+    """The layers (h, w, c) of each frame, averaged with those of earlier frames where these saw the same surface."""
     height, width = motions[0].depth.shape
     result = [frames[0]]
     ages = np.ones((height, width, 1), dtype=np.float32)
     for now, motion, before in zip(frames[1:], motions[1:], motions, strict=False):
         y, x = np.mgrid[0:height, 0:width] + np.moveaxis(motion.vectors, -1, 0)[::-1]
-        known = _was_there(motion.depth, before.depth, y, x)[..., None]
+        known = _same_surface(motion.depth, before.depth, y, x)[..., None]
         ages = np.where(known, np.minimum(_sample(ages, y, x) + 1, LENGTH), 1).astype(np.float32)
         result.append({k: v / ages + _sample(result[-1][k], y, x) * (1 - 1 / ages) for k, v in now.items()})
     return result
 
 
-def _was_there(depth: Array, before: Array, y: Array, x: Array) -> Array:
-    """Is the place inside the frame before, and the depth among those of the 3 x 3 pixels there?"""
+def _same_surface(depth: Array, before: Array, y: Array, x: Array) -> Array:
+    """(h, w): whether (y, x) lies in the frame before, and the depth within that of the 3 x 3 pixels there."""
     height, width = before.shape
     inside = (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
     row, column = (np.rint(v).astype(int) for v in (y, x))
@@ -64,7 +64,7 @@ def _was_there(depth: Array, before: Array, y: Array, x: Array) -> Array:
 
 
 def _sample(image: Array, y: Array, x: Array) -> Array:
-    """Bicubic (Catmull-Rom) at pixel positions, within the range of the four nearest pixels: sharp without ringing."""
+    """Bicubic (Catmull-Rom) at pixel positions, clipped to the range of the four nearest pixels against ringing."""
     height, width = image.shape[:2]
     top, left = np.floor(y).astype(int), np.floor(x).astype(int)
     total: Array = np.zeros(1, np.float32)
@@ -79,7 +79,7 @@ def _sample(image: Array, y: Array, x: Array) -> Array:
 
 
 def _weights(t: Array) -> tuple[Array, Array, Array, Array]:
-    """Catmull-Rom's, of the four pixels around a position that is ``t`` beyond the second."""
+    """Catmull-Rom weights of the four pixels around a position that lies ``t`` beyond the second one."""
     return (
         ((-t + 2) * t - 1) * t / 2,
         ((3 * t - 5) * t * t + 2) / 2,

@@ -1,0 +1,71 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open Image Denoise (OIDN) on arrays: its plain call, and the one that its documentation recommends.
+
+Images are (h, w, 3) and linear. Both functions need pyoidn: ``pip install '.[benchmark]'``.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float32]
+
+
+def denoise(color: Array, albedo: Array | None = None, normal: Array | None = None, quality: str = "high") -> Array:
+    """The plain call: one filter that gets the beauty and the noisy albedo and normal."""
+    import pyoidn
+
+    return np.asarray(pyoidn.denoise(color, albedo, normal, hdr=True, quality=quality))
+
+
+def denoise_prefiltered(color: Array, albedo: Array | None = None, normal: Array | None = None) -> Array:
+    """The recommended call: the albedo and the normal are first denoised, each by a filter of its own.
+
+    The filter of the beauty gets the results and is told by ``cleanAux`` that they have no noise. Every filter has the
+    quality "high". See https://github.com/RenderKit/oidn, "prefiltering".
+    """
+    auxiliary = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
+    clean = {name: _run({name: image}) for name, image in auxiliary.items()}
+    return _run({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
+
+
+def _run(images: dict[str, Array], **flags: bool) -> Array:
+    """The output of one OIDN filter. It denoises the color, or the only image that it gets."""
+    import pyoidn
+
+    images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
+    output = np.empty_like(next(iter(images.values())))
+    oidn_filter = _filter(tuple(images))
+    for name, image in {**images, pyoidn.OIDN_IMAGE_OUTPUT: output}.items():
+        oidn_filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
+    for flag, value in flags.items():
+        oidn_filter.set_bool(flag, value)
+    oidn_filter.commit()
+    oidn_filter.execute()
+    if error := _device().get_error():
+        raise RuntimeError(f"Open Image Denoise: {error}")
+    return output
+
+
+@functools.cache
+def _filter(inputs: tuple[str, ...]) -> Any:
+    """A filter for these inputs. It is used again for the next picture, as in pyoidn's plain call."""
+    import pyoidn
+
+    oidn_filter = pyoidn.Filter(_device(), pyoidn.OIDN_FILTER_TYPE_RT)
+    oidn_filter.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+    return oidn_filter
+
+
+@functools.cache
+def _device() -> Any:
+    """One device for all filters of the process."""
+    import pyoidn
+
+    device = pyoidn.Device()
+    device.commit()
+    return device

@@ -22,10 +22,12 @@ from numpy.typing import NDArray
 from benchmarks import results, scenes
 from benchmarks.quality import AVERAGES
 from benchmarks.results import Row
-from oiio_msspl import fuse, transforms
-from oiio_msspl.render import Array
-from oiio_msspl.schema import SCALES
-from oiio_msspl.session import Session, find_model
+from oiio_msspl import fuse
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.session import Session
 
 #: In the column `bin`: all pixels. Bins have the numbers 1 to `BINS`.
 ALL, BINS = 0, 20
@@ -37,11 +39,11 @@ def errors(scene: scenes.Scene, session: Session, spp: int) -> tuple[Array, Arra
     pair = scene.lrhs(session.contract.scale, spp // 2), scene.hrls(spp // 2)
     fused = fuse(*pair, session, error=True)
     assert fused.error is not None
-    values, truth = (transforms.compress(image, fused.exposure) for image in (fused.rgb, scene.reference))
+    values, truth = (encode_radiance(image, fused.exposure) for image in (fused.rgb, scene.reference))
     middle = values.mean(axis=-1, keepdims=True)
-    brighter = transforms.expand(middle, fused.exposure) + fused.error
+    brighter = decode_radiance(middle, fused.exposure) + fused.error
     actual = np.abs(values - truth).mean(axis=-1, keepdims=True)
-    return transforms.compress(brighter, fused.exposure) - middle, actual
+    return encode_radiance(brighter, fused.exposure) - middle, actual
 
 
 def measure(model: str, pairs: list[tuple[Array, Array]]) -> list[Row]:
@@ -49,10 +51,7 @@ def measure(model: str, pairs: list[tuple[Array, Array]]) -> list[Row]:
     predicted, actual = (np.concatenate([pair[i].ravel() for pair in pairs]) for i in range(2))
     order = np.argsort(predicted)
     worst = order[-len(order) // 10 :]
-    squares = [
-        np.concatenate([transforms.box_downsample(_cropped(pair[i]), SQUARE).ravel() for pair in pairs])
-        for i in range(2)
-    ]
+    squares = [np.concatenate([box_downsample(_cropped(pair[i]), SQUARE).ravel() for pair in pairs]) for i in range(2)]
     quality = {
         "worst_tenth": float(actual[worst].sum() / actual.sum()),
         "correlation": float(np.corrcoef(*np.log(np.maximum(squares, 1e-4)))[0, 1]),

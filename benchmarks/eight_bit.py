@@ -24,11 +24,16 @@ import torch
 from benchmarks import results, scenes
 from benchmarks.results import Row
 from benchmarks.runtime import frame
-from oiio_msspl import Render, Session, find_model, fuse, metrics, schema, tensors, transforms
-from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import NO_LAYERS, Denoiser, Layers, layers_of, merged
-from oiio_msspl.pairing import Source
-from oiio_msspl.render import Array
+from oiio_msspl import Render, Session, find_model, fuse
+from oiio_msspl.aovs.features import HRLS_FEATURES, LRHS_FEATURES, RGB
+from oiio_msspl.arrays import Array
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.fusion.tile_features import read_features
+from oiio_msspl.metrics import psnr
+from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.encoding import decode_radiance, encode_features, find_exposure
+from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.render_mean import NO_IMAGES, Images, denoiser_images, mean_of_renders
 from training import data, export
 from training.joint import JointFusion
 from training.train import to_tensor
@@ -50,20 +55,22 @@ def medians(ways: list[Callable[[], object]]) -> list[float]:
     return [statistics.median(taken) for taken in seconds]
 
 
-def accuracy(views: list[scenes.Scene], scale: int, ways: list[Callable[[Source, Source], Array]]) -> list[float]:
+def accuracy(
+    views: list[scenes.Scene], scale: int, ways: list[Callable[[ReadableRender, ReadableRender], Array]]
+) -> list[float]:
     """Mean PSNR of each way to use LRHS and HRLS: for each of `SPP`, all ways."""
     return [
-        statistics.fmean(metrics.psnr(way(view.lrhs(scale, spp), view.hrls(spp)), view.reference) for view in views)
+        statistics.fmean(psnr(way(view.lrhs(scale, spp), view.hrls(spp)), view.reference) for view in views)
         for spp in SPP
         for way in ways
     ]
 
 
-def denoised(denoiser: Denoiser, lr: Source, hr: Source) -> Array:
+def denoised(denoiser: OidnDenoiser, lr: ReadableRender, hr: ReadableRender) -> Array:
     """The denoised HRLS, with the exposure that fusion would choose."""
-    exposure = transforms.exposure_of(scenes.beauty(lr))
-    layers = tensors.pack(tensors.read(hr, hr.data_window, hr.data_window), schema.HRLS_FEATURES, exposure)
-    return transforms.expand(denoiser.hrls(layers_of(layers)), exposure)
+    exposure = find_exposure(scenes.beauty(lr))
+    layers = encode_features(read_features(hr, hr.data_window, hr.data_window), HRLS_FEATURES, exposure)
+    return decode_radiance(denoiser.hrls(denoiser_images(layers)), exposure)
 
 
 class InTorch(Session):
@@ -76,10 +83,12 @@ class InTorch(Session):
         self._network = network
 
     def run(
-        self, lrhs: Array, hrls: Array, *, low_aovs: Layers = NO_LAYERS, error: bool = False
+        self, lrhs: Array, hrls: Array, *, lrhs_aovs: Images = NO_IMAGES, error: bool = False
     ) -> tuple[Array, Array | None]:
         light = lrhs[..., :3]
-        together = self._network.together.denoised(merged(light, layers_of(hrls, complete=True), low_aovs))
+        together = self._network.together.denoised(
+            mean_of_renders(light, denoiser_images(hrls, complete=True), lrhs_aovs)
+        )
         images = np.concatenate([light, together], axis=-1), hrls
         with torch.inference_mode():
             fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
@@ -114,18 +123,18 @@ def layout(rows: list[Row]) -> str:
 def measure(views: list[scenes.Scene], models: list[str]) -> Iterator[Row]:
     """A row for each method."""
     layers = frame(SIZE, SIZE)
-    hrls = tensors.pack(layers, schema.HRLS_FEATURES, 1.0)
-    both = [Denoiser(exact=exact) for exact in (True, False)]
-    seconds = medians([partial(denoiser.hrls, layers_of(hrls)) for denoiser in both])
+    hrls = encode_features(layers, HRLS_FEATURES, 1.0)
+    both = [OidnDenoiser(exact=exact) for exact in (True, False)]
+    seconds = medians([partial(denoiser.hrls, denoiser_images(hrls)) for denoiser in both])
     yield row("OIDN on the HRLS", seconds, accuracy(views, 2, [partial(denoised, denoiser) for denoiser in both]))
-    for scale in schema.SCALES[:2]:
-        low = tensors.pack({schema.RGB: layers[schema.RGB][::scale, ::scale]}, schema.LRHS_FEATURES, 1.0)
-        yield row(f"OIDN on both, x{scale}", medians([partial(denoiser.together, low, hrls) for denoiser in both]))
+    for scale in SCALES[:2]:
+        low = encode_features({RGB: layers[RGB][::scale, ::scale]}, LRHS_FEATURES, 1.0)
+        yield row(f"OIDN on both, x{scale}", medians([partial(denoiser.denoise_mean, low, hrls) for denoiser in both]))
     hr = Render.from_arrays("hr", **layers)
     for name in models:
         sessions = [in_32_bits(name), Session(find_model(0, name))]
         scale = sessions[0].contract.scale
-        lr = Render.from_arrays("lr", rgb=layers[schema.RGB][::scale, ::scale].copy())
+        lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
         seconds = medians([partial(fuse, lr, hr, session) for session in sessions])
         ways = [lambda lr, hr, session=session: fuse(lr, hr, session).rgb for session in sessions]
         yield row(name, seconds, accuracy(views, scale, ways))
@@ -135,7 +144,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path)
     parser.add_argument(
-        "--models", nargs="+", default=[f"{family}-x{scale}" for family in ("mix", "joint") for scale in schema.SCALES]
+        "--models", nargs="+", default=[f"{family}-x{scale}" for family in ("mix", "joint") for scale in SCALES]
     )
     results.add_option(parser)
     args = parser.parse_args()

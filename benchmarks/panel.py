@@ -15,15 +15,16 @@ from pathlib import Path
 
 import numpy as np
 
-from oiio_msspl.aovs import resolve
-from oiio_msspl.exr import open_exr
-from oiio_msspl.preview import write_png
-from oiio_msspl.transforms import repair, srgb
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.arrays import repair
+from oiio_msspl.colour import srgb
+from oiio_msspl.exr.preview import write_png
+from oiio_msspl.exr.reader import open_exr
 
 
 def display(path: Path) -> np.ndarray:
     """The beauty of an EXR file in sRGB, (h, w, 3)."""
-    file = resolve(open_exr(path))
+    file = map_render(open_exr(path))
     return srgb(repair(file.read(file.data_window, ["rgb"])["rgb"])[0])
 
 

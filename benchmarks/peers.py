@@ -7,25 +7,27 @@ import numpy as np
 
 from benchmarks.oidn import denoise, denoise_prefiltered
 from benchmarks.scenes import beauty
-from oiio_msspl import schema, tensors, transforms
-from oiio_msspl.comparison import upsample_bicubic
-from oiio_msspl.denoiser import Denoiser, aovs_of_lrhs
-from oiio_msspl.pairing import Source
-from oiio_msspl.render import Array
-from oiio_msspl.transforms import box_downsample, repair
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.arrays import Array, box_downsample, repair
+from oiio_msspl.compare import upsample_bicubic
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.fusion.tile_features import read_features
+from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
+from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.render_mean import useful_lrhs_aovs
 
 
-def oidn(source: Source, quality: str = "high") -> Array:
+def oidn(source: ReadableRender, quality: str = "high") -> Array:
     """OIDN's plain call on a render, with its noisy albedo and normal if it has them."""
     return denoise(**_inputs(source), quality=quality)
 
 
-def oidn_prefiltered(source: Source) -> Array:
+def oidn_prefiltered(source: ReadableRender) -> Array:
     """OIDN as its documentation recommends it: the albedo and the normal are denoised first."""
     return denoise_prefiltered(**_inputs(source))
 
 
-def _inputs(source: Source) -> dict[str, Array]:
+def _inputs(source: ReadableRender) -> dict[str, Array]:
     """``color``, ``albedo`` and ``normal`` of a render, as far as it has them. OIDN takes no normal without albedo."""
     layers = source.read(source.data_window)
     layers = {name: np.ascontiguousarray(repair(v, signed=name == "normal")[0]) for name, v in layers.items()}
@@ -33,16 +35,16 @@ def _inputs(source: Source) -> dict[str, Array]:
     return {"color": layers["rgb"]} | {name: layers[name] for name in auxiliary if name in layers}
 
 
-def oidn_on_average(lrhs: Source, hrls: Source) -> Array:
+def oidn_on_average(lrhs: ReadableRender, hrls: ReadableRender) -> Array:
     """OIDN on the weighted mean of both renders at the LRHS's resolution, in 32 bits; linear (h / s, w / s, 3)."""
     low = beauty(lrhs)
-    exposure = transforms.exposure_of(low)
-    layers = tensors.read(hrls, hrls.data_window, hrls.data_window)
-    packed = tensors.pack(layers, schema.HRLS_FEATURES, exposure)
-    names = aovs_of_lrhs(packed.shape[0] // low.shape[0])
-    low_aovs = tensors.read(lrhs, lrhs.data_window, lrhs.data_window, features=names) if names else {}
-    denoised = Denoiser(exact=True).together(transforms.compress(low, exposure), packed, low_aovs)
-    return transforms.expand(denoised, exposure)
+    exposure = find_exposure(low)
+    layers = read_features(hrls, hrls.data_window, hrls.data_window)
+    packed = encode_features(layers, HRLS_FEATURES, exposure)
+    names = useful_lrhs_aovs(packed.shape[0] // low.shape[0])
+    lrhs_aovs = read_features(lrhs, lrhs.data_window, lrhs.data_window, features=names) if names else {}
+    denoised = OidnDenoiser(exact=True).denoise_mean(encode_radiance(low, exposure), packed, lrhs_aovs)
+    return decode_radiance(denoised, exposure)
 
 
 def match_local_means(image: Array, low: Array) -> Array:

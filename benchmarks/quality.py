@@ -33,13 +33,14 @@ from benchmarks import results, scenes
 from benchmarks.peers import match_local_means, oidn, oidn_on_average, oidn_prefiltered
 from benchmarks.results import MEAN, Row
 from benchmarks.scenes import NOISY_REFERENCE, beauty
-from oiio_msspl import fuse, schema
-from oiio_msspl.comparison import scores, upsample_bicubic
-from oiio_msspl.contract import Contract
-from oiio_msspl.pairing import Source
-from oiio_msspl.render import Array
-from oiio_msspl.session import Session, find_model, shipped_models
-from oiio_msspl.transforms import srgb
+from oiio_msspl import fuse
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import srgb
+from oiio_msspl.compare import scores, upsample_bicubic
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.model.catalogue import find_model, shipped_models
+from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.session import Session
 
 #: Average spp. The HRLS and the LRHS have half of it each, as in the paper's tables.
 AVERAGES = (2, 4, 8)
@@ -62,7 +63,7 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
     height, width = scene.reference.shape[:2]
     hr, full = scene.hrls(spp // 2), scene.hrls(spp)
 
-    def fused(session: Session, lr: Source, hr: Source) -> Array:
+    def fused(session: Session, lr: ReadableRender, hr: ReadableRender) -> Array:
         return fuse(lr, hr, session).rgb
 
     denoised = functools.cache(lambda: oidn(hr))
@@ -73,7 +74,7 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
     yield "full resolution", lambda: beauty(full)
     yield "OIDN, same samples", lambda: oidn(full)
     yield "OIDN prefiltered, same samples", lambda: oidn_prefiltered(full)
-    for scale in schema.SCALES:
+    for scale in SCALES:
         lr, nearest = scene.lrhs(scale, spp // 2), scene.nearest(scale, spp // 2)
         denoised_low = functools.cache(functools.partial(oidn, lr))
         yield f"LRHS x{scale} nearest", lambda lr=lr, s=scale: beauty(lr).repeat(s, 0).repeat(s, 1)

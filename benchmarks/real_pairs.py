@@ -25,10 +25,9 @@ import OpenImageIO as oiio
 
 from benchmarks import results
 from benchmarks.results import Row
-from oiio_msspl.aovs import resolve
-from oiio_msspl.assemble import fused_channels
-from oiio_msspl.comparison import compare_files
-from oiio_msspl.exr import open_exr
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.compare import compare_files
+from oiio_msspl.exr.reader import open_exr
 
 
 def find_pairs(folders: list[Path]) -> list[tuple[Path, Path]]:
@@ -61,7 +60,7 @@ def _planes(path: Path, leave_out: set[tuple[int, str]]) -> dict[str, collection
 
 def compare_passed_on(hr: Path, out: Path) -> tuple[int, list[str]]:
     """How many channels of the HRLS the result must hold, and a message for each reader that misses some of them."""
-    fused = {(c.part, c.name) for c in fused_channels(resolve(open_exr(hr)))}
+    fused = {(c.part, c.name) for c in map_render(open_exr(hr)).beauty_channels}
     before, after = _planes(hr, fused), _planes(out, set())
     faults = [
         f"{missing.total()} channels are not in the result ({reader})"
@@ -79,7 +78,7 @@ def run_pair(lr: Path, hr: Path, out: Path, arguments: list[str]) -> dict[str, A
         return {"pair": f"{hr.parent.name}/{lr.name}", "error": done.stderr.strip()}
     report = json.loads(done.stdout)
     count, faults = compare_passed_on(hr, out)
-    beauty = resolve(open_exr(out)).load().layers["rgb"]
+    beauty = map_render(open_exr(out)).load().layers["rgb"]
     if not (np.isfinite(beauty).all() and (beauty >= 0).all()):
         faults.append("the fused beauty has NaN, Inf or negative values")
     result = {

@@ -51,7 +51,7 @@ def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
 def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[[], Any]:
     """A call of :func:`oiio_msspl.fuse` on arrays."""
     from oiio_msspl import Render, Session, find_model, fuse
-    from oiio_msspl.transforms import box_downsample
+    from oiio_msspl.arrays import box_downsample
 
     session = Session(find_model(0, name), threads=threads)
     scale = session.contract.scale
@@ -108,7 +108,7 @@ def in_process(module: str, *arguments: str) -> dict[str, Any]:
 
 def compare(args: argparse.Namespace) -> list[Row]:
     """A row for each method: median, fastest and slowest seconds, and peak memory."""
-    from oiio_msspl.session import shipped_models
+    from oiio_msspl.model.catalogue import shipped_models
 
     cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED]
     cases = [case for case in cases if fnmatch.fnmatchcase(case, args.methods or "*")]

@@ -16,11 +16,12 @@ from pathlib import Path
 
 import numpy as np
 
-from oiio_msspl import schema, transforms
-from oiio_msspl.aovs import resolve
-from oiio_msspl.exr import open_exr
-from oiio_msspl.pairing import Source
-from oiio_msspl.render import Array, Render
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.arrays import Array, box_downsample, repair
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.render import ReadableRender, Render
+from oiio_msspl.model.encoding import find_exposure
 from training import data
 
 #: The references of these scenes are full of fireflies. No mean includes them.
@@ -37,11 +38,11 @@ class Scene:
     """The scene's name. Views of the same scene share it."""
     reference: Array
     """(h, w, 3), linear, exposed for display."""
-    hrls: Callable[[int], Source]
+    hrls: Callable[[int], ReadableRender]
     """The HRLS of a number of spp."""
-    lrhs: Callable[[int, int], Source]
+    lrhs: Callable[[int, int], ReadableRender]
     """The LRHS of a scale s and n: it has n samples for every HRLS pixel, which is ``s^2 n`` spp."""
-    nearest: Callable[[int, int], Source | None] = lambda scale, spp: None
+    nearest: Callable[[int, int], ReadableRender | None] = lambda scale, spp: None
     """The same as in the paper's data set, which keeps one of s x s pixels; None if there is none."""
     has: Callable[[int], bool] = lambda spp: True
     """Whether there is an HRLS of a number of spp."""
@@ -61,14 +62,14 @@ def load(folder: Path) -> list[Scene]:
     raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing with clean references")
 
 
-def beauty(source: Source) -> Array:
+def beauty(source: ReadableRender) -> Array:
     """The beauty (h, w, 3) of a whole render, without NaN, Inf and negative values."""
-    return transforms.repair(source.read(source.data_window, ["rgb"])["rgb"])[0]
+    return repair(source.read(source.data_window, ["rgb"])["rgb"])[0]
 
 
 def _render(folder: Path) -> Scene:
-    def file(name: str) -> Source:
-        return resolve(open_exr(folder / name))
+    def file(name: str) -> ReadableRender:
+        return map_render(open_exr(folder / name))
 
     return Scene(
         name=folder.name,
@@ -82,27 +83,27 @@ def _render(folder: Path) -> Scene:
 def of_view(view: data.View) -> Scene:
     """A rendered view as a scene."""
     reference = data.read(view.ref)
-    exposure = np.float32(transforms.exposure_of(reference))
+    exposure = np.float32(find_exposure(reference))
     whole = slice(None)
 
-    def hrls(spp: int) -> Source:
+    def hrls(spp: int) -> ReadableRender:
         passes = data.read_hrls(view, list(range(spp)), whole, whole).mean(axis=0)
         layers = data.split_features(passes)
-        for name in layers.keys() & set(schema.RADIANCE_FEATURES):
+        for name in layers.keys() & set(RADIANCE_FEATURES):
             layers[name] = layers[name] * exposure
         return Render.from_arrays(f"{view.path.name}, {spp} spp", **layers)
 
-    def lrhs(scale: int, spp: int) -> Source:
+    def lrhs(scale: int, spp: int) -> ReadableRender:
         chosen = np.flatnonzero(view.lr_spp == spp)[:1]
         image = data.mean_lrhs(view, chosen, scale) * exposure
         # The last passes: the HRLS of the same pair has the first ones, so the noise is independent
         features = data.split_features(
             data.read_hrls(view, list(range(len(view.hr)))[-spp:], whole, whole).mean(axis=0)
         )
-        layers = {name: transforms.box_downsample(features[name], scale) for name in (schema.ALBEDO, schema.NORMAL)}
+        layers = {name: box_downsample(features[name], scale) for name in (ALBEDO, NORMAL)}
         return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image, **layers)
 
-    def nearest(scale: int, spp: int) -> Source | None:
+    def nearest(scale: int, spp: int) -> ReadableRender | None:
         passes = range(len(view.lr_spp))
         subsets = itertools.chain.from_iterable(itertools.combinations(passes, n) for n in range(1, len(passes) + 1))
         chosen = next((list(c) for c in subsets if view.lr_spp[list(c)].sum() == scale**2 * spp), None)

@@ -15,8 +15,9 @@ import numpy as np
 
 from benchmarks import results, scenes
 from benchmarks.results import Row
-from oiio_msspl import fuse, metrics
-from oiio_msspl.session import Session, find_model
+from oiio_msspl import fuse
+from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.session import Session
 
 MODEL, SCALE = "paper-x4", 4
 LRHS_SPP, HRLS_SPP = (16, 32, 64), (1, 2, 4)
@@ -28,7 +29,7 @@ def measure(clean: list[scenes.Scene]) -> list[Row]:
 
     def psnr(scene: scenes.Scene, low: int, high: int) -> float:
         pair = scene.lrhs(SCALE, low // SCALE**2), scene.hrls(high)
-        return metrics.psnr(fuse(*pair, session).rgb, scene.reference)
+        return psnr(fuse(*pair, session).rgb, scene.reference)
 
     return [
         {"lrhs_spp": low, "hrls_spp": high, "psnr": float(np.mean([psnr(scene, low, high) for scene in clean]))}

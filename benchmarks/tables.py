@@ -23,7 +23,7 @@ from benchmarks.results import MEAN, Row
 from benchmarks.runtime import OIDN, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
-from oiio_msspl.schema import SCALES
+from oiio_msspl.model.contract import SCALES
 
 ROOT = Path(__file__).parents[1]
 FAMILIES = ("paper", "pyramid", "mix", "joint")

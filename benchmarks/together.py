@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Ways to denoise both renders with Open Image Denoise at the LRHS's resolution, as `oiio_msspl.denoiser` does.
+"""Ways to denoise both renders with Open Image Denoise at the LRHS's resolution, as `oiio_msspl.model.oidn` does.
 
     python -m benchmarks.together VIEWS
 
@@ -18,10 +18,12 @@ import numpy as np
 from benchmarks import results
 from benchmarks.peers import match_local_means
 from benchmarks.results import Row
-from oiio_msspl import metrics, schema, transforms
-from oiio_msspl.denoiser import lrhs_share
-from oiio_msspl.render import Array
-from oiio_msspl.schema import SCALES
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.metrics import psnr
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.encoding import encode_radiance, find_exposure
+from oiio_msspl.model.render_mean import lrhs_weight
 from training import data
 
 #: spp of the HRLS, and average spp of the LRHS.
@@ -43,7 +45,7 @@ def denoise(color: Array, albedo: Array, normal: Array, *, clean: bool = False, 
 
 def ways(lrhs: Array, color: Array, albedo: Array, normal: Array) -> dict[str, Array]:
     """Results of every way to denoise, from images (h, w, 3) at the LRHS's resolution."""
-    share = lrhs_share(transforms.compress(lrhs, 1.0), transforms.compress(color, 1.0))
+    share = lrhs_weight(encode_radiance(lrhs, 1.0), encode_radiance(color, 1.0))
     weighted = share * lrhs + (1 - share) * color
     return {
         "the LRHS alone": denoise(lrhs, albedo, normal),
@@ -63,17 +65,17 @@ def measure(view: data.View) -> list[Row]:
         layers = data.split_features(passes[:spp].mean(axis=0))
         for average in SPP:
             chosen = np.flatnonzero(view.lr_spp == average)[:1]
-            exposure = np.float32(transforms.exposure_of(data.mean_lrhs(view, chosen, SCALES[0])))
-            color, albedo, normal = layers[schema.RGB] * exposure, layers[schema.ALBEDO], layers[schema.NORMAL]
+            exposure = np.float32(find_exposure(data.mean_lrhs(view, chosen, SCALES[0])))
+            color, albedo, normal = layers[RGB] * exposure, layers[ALBEDO], layers[NORMAL]
             reference = data.read(view.ref) * exposure
             alone = denoise(color, albedo, normal)
             for scale in SCALES:
-                small = [transforms.box_downsample(image, scale) for image in (color, albedo, normal)]
-                expected = transforms.box_downsample(reference, scale)
+                small = [box_downsample(image, scale) for image in (color, albedo, normal)]
+                expected = box_downsample(reference, scale)
                 for way, image in ways(data.mean_lrhs(view, chosen, scale) * exposure, *small).items():
                     full = match_local_means(alone, image)
                     row: Row = {"scale": scale, "hrls_spp": spp, "lrhs_spp": average, "method": way}
-                    row |= {"psnr_low": metrics.psnr(image, expected), "psnr_full": metrics.psnr(full, reference)}
+                    row |= {"psnr_low": psnr(image, expected), "psnr_full": psnr(full, reference)}
                     rows.append(row)
     return rows
 

@@ -9,11 +9,9 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl.model import oidn, oidn_weights
-from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.oidn import quantised_networks_work
 from oiio_msspl.model.oidn_weights import find_weights
-from oiio_msspl.model.contract import Contract, METADATA_KEY
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"

@@ -7,9 +7,9 @@ from unittest.mock import Mock
 
 import numpy as np
 import pytest
+from oiio_msspl.denoiser import Denoiser
 
 from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, runtime, transforms
-from oiio_msspl.denoiser import Denoiser
 from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
 

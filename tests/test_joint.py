@@ -7,14 +7,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from oiio_msspl.contract import Contract
+from oiio_msspl.denoiser import Denoiser, Together, layers_of
+from oiio_msspl.files import Inputs
 
 from oiio_msspl import Render, Session, denoiser, eight_bit, find_model, fuse, fuse_files, schema, session, transforms
 from oiio_msspl.aovs import resolve
-from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser, Together, layers_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr import open_exr
-from oiio_msspl.files import Inputs
 from tests.conftest import noisy, picture, rgb, write_exr
 
 JOINT = [f"joint-x{scale}" for scale in schema.SCALES]

@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 torch = pytest.importorskip("torch")
+from oiio_msspl.contract import Contract  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
 
 from oiio_msspl import schema  # noqa: E402
-from oiio_msspl.contract import Contract  # noqa: E402
 from training import train  # noqa: E402
 from training.mix import MixFusion, disagreement, mixed  # noqa: E402
 from training.pyramid import logarithmic  # noqa: E402

@@ -14,8 +14,9 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
-from oiio_msspl import metrics, schema, tensors, transforms  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
+
+from oiio_msspl import metrics, schema, tensors, transforms  # noqa: E402
 from training import batches, data, losses, train  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
 from training.pyramid import (  # noqa: E402

@@ -5,8 +5,8 @@ import json
 
 import numpy as np
 import pytest
-
 from oiio_msspl.transforms import luminance
+
 from training import data, shards, views
 
 

@@ -27,10 +27,10 @@ from benchmarks.peers import oidn
 from benchmarks.render.sequences import SCALE
 from benchmarks.results import Row
 from oiio_msspl import Render, Session, find_model, fuse, shipped_models
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.output import check_target
-from oiio_msspl.render import Array
-from oiio_msspl.transforms import srgb
+from oiio_msspl.exr.atomic import check_target
 
 CAMERAS = ("static", "moving")
 

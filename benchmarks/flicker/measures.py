@@ -16,7 +16,7 @@ import math
 
 import numpy as np
 
-from oiio_msspl.render import Array
+from oiio_msspl.arrays import Array
 
 #: Standard deviation of the Gaussian that divides blotches from grain, in pixels.
 BLUR = 8.0

@@ -13,8 +13,8 @@ from benchmarks import results
 from benchmarks.flicker.sequence import Sequence
 from benchmarks.flicker.temporal import LENGTH
 from benchmarks.results import Row
-from oiio_msspl.output import replacing
-from oiio_msspl.render import Array
+from oiio_msspl.arrays import Array
+from oiio_msspl.exr.atomic import replacing
 
 OIDN_FULL = "OIDN, same samples"
 #: In the column `accumulated`: nothing, the method's outputs, or its inputs.

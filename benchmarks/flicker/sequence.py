@@ -11,10 +11,10 @@ import OpenImageIO as oiio
 
 from benchmarks.flicker.temporal import Layers, Motion
 from benchmarks.scenes import beauty
-from oiio_msspl import open_exr, resolve
+from oiio_msspl import map_render, open_exr
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError
-from oiio_msspl.render import Array
-from oiio_msspl.transforms import srgb
 
 
 @dataclass(frozen=True)
@@ -44,9 +44,11 @@ def load(folder: Path) -> Sequence:
         raise InputError(f"{folder}: the sequence is not complete; render again to make what is missing")
 
     def layers(kind: str) -> list[Layers]:
-        return [resolve(open_exr(path)).load().layers for path in paths[kind]]
+        return [map_render(open_exr(path)).load().layers for path in paths[kind]]
 
-    first, second = (srgb(np.stack([beauty(resolve(open_exr(p))) for p in paths[kind]])) for kind in ("ref_a", "ref_b"))
+    first, second = (
+        srgb(np.stack([beauty(map_render(open_exr(p))) for p in paths[kind]])) for kind in ("ref_a", "ref_b")
+    )
     shape = (count, *first.shape[1:])
     return Sequence(
         folder.parent.name,

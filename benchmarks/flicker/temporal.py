@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oiio_msspl.render import Array
+from oiio_msspl.arrays import Array
 
 #: The n-th frame of a surface has the weight 1/n, from this n on 1/LENGTH.
 LENGTH = 5

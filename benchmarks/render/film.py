@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 import OpenImageIO as oiio
 
+from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
-from oiio_msspl.output import replacing
-from oiio_msspl.render import Array
+from oiio_msspl.exr.atomic import replacing
 
 #: Longer side of the whole frame, and width and height of the crop that is rendered, in pixels.
 LONGER, CROP = 1280, (384, 256)

@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.render.film import CROP, frame_size, set_crop, write_exr
-from oiio_msspl.schema import SCALES
+from oiio_msspl.model.contract import SCALES
 from training import mitsuba_start, views
 
 HRLS = (1, 2, 3, 4, 6, 7, 8)

@@ -22,10 +22,13 @@ from benchmarks import peers, results
 from benchmarks.results import Row
 from benchmarks.stability import bases, cases, measures, report
 from benchmarks.stability.gallery import Gallery
-from oiio_msspl import fuse, schema
-from oiio_msspl.comparison import upsample_bicubic
-from oiio_msspl.render import Array
-from oiio_msspl.session import Session, find_model, shipped_models
+from oiio_msspl import fuse
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.arrays import Array
+from oiio_msspl.compare import upsample_bicubic
+from oiio_msspl.model.catalogue import find_model, shipped_models
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.session import Session
 
 #: Side of the analytic frames.
 SIZE = 256
@@ -35,7 +38,7 @@ Method = Callable[[bases.Pair], tuple[Array, list[str]]]
 
 
 def enlarged(pair: bases.Pair) -> tuple[Array, list[str]]:
-    low = measures.repaired(pair.lr.layers[schema.RGB])
+    low = measures.repaired(pair.lr.layers[RGB])
     return upsample_bicubic(low, pair.hr.data_window.width, pair.hr.data_window.height), []
 
 
@@ -93,9 +96,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, nargs="?", metavar="VIEWS", help="folder of rendered views")
     parser.add_argument("--model", action="append", default=[], help="ONNX file or shipped name; repeat it for more")
-    parser.add_argument(
-        "--scale", type=int, action="append", choices=schema.SCALES, help="default: those of --model, or 4"
-    )
+    parser.add_argument("--scale", type=int, action="append", choices=SCALES, help="default: those of --model, or 4")
     parser.add_argument("--size", type=int, default=SIZE, help="side of the analytic frames (%(default)s)")
     parser.add_argument("--threads", type=int, default=0, help="of ONNX Runtime; 0: one a core")
     parser.add_argument("--picture", type=Path, help="draw the error maps of each group's worst analytic case as a PNG")

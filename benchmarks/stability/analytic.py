@@ -15,8 +15,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.render import Array, Render
-from oiio_msspl.transforms import luminance
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import luminance
+from oiio_msspl.exr.render import Render
 
 #: Points a pixel along each axis.
 SUB = 4

@@ -10,8 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.stability import analytic
-from oiio_msspl import schema, transforms
-from oiio_msspl.render import Array, Render
+from oiio_msspl.aovs.features import RGB, VARIANCE
+from oiio_msspl.arrays import Array
+from oiio_msspl.colour import luminance
+from oiio_msspl.exr.render import Render
 from training import data
 
 
@@ -108,8 +110,8 @@ class View(Base):
         features = data.split_features(samples)
         layers = {name: values.mean(axis=0) for name, values in features.items()}
         if hr_spp > 1:
-            grey = transforms.luminance(features[schema.RGB])
-            layers[schema.VARIANCE] = grey.var(axis=0, ddof=1)[..., None] / hr_spp
+            grey = luminance(features[RGB])
+            layers[VARIANCE] = grey.var(axis=0, ddof=1)[..., None] / hr_spp
         high = Render.from_arrays("HRLS", **layers)
         return Pair(Render.from_arrays("LRHS", rgb=low), high, data.read(self.view.ref[:height, :width]))
 

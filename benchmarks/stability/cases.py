@@ -11,9 +11,10 @@ import numpy as np
 
 from benchmarks.stability import analytic
 from benchmarks.stability.bases import Analytic, Base, Pair, seeded
-from oiio_msspl import schema
-from oiio_msspl.render import Array, Render
-from oiio_msspl.transforms import MAX_RADIANCE
+from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, NORMAL, OPTIONAL_FEATURES, RGB, SPECULAR, VARIANCE
+from oiio_msspl.arrays import Array
+from oiio_msspl.exr.render import Render
+from oiio_msspl.model.encoding import MAX_RADIANCE
 
 #: The group in which both renders show different things, by a mistake of the user.
 DISAGREE = "LRHS and HRLS disagree"
@@ -36,7 +37,7 @@ def changed(render: Render, **layers: Array | None) -> Render:
 
 def scaled(pair: Pair, factor: float) -> Pair:
     """A pair with all light multiplied by a factor."""
-    powers = dict.fromkeys((schema.RGB, schema.DIFFUSE, schema.SPECULAR), 1) | {schema.VARIANCE: 2}
+    powers = dict.fromkeys((RGB, DIFFUSE, SPECULAR), 1) | {VARIANCE: 2}
     lr, hr = (
         changed(r, **{k: v * np.float32(factor ** powers[k]) for k, v in r.layers.items() if k in powers})
         for r in (pair.lr, pair.hr)
@@ -44,9 +45,9 @@ def scaled(pair: Pair, factor: float) -> Pair:
     return Pair(lr, hr, pair.reference * np.float32(factor))
 
 
-def with_pixels(render: Render, value: float, share: float, layers: tuple[str, ...] = (schema.RGB,)) -> Render:
+def with_pixels(render: Render, value: float, share: float, layers: tuple[str, ...] = (RGB,)) -> Render:
     """A render in which a share of the pixels, at least one and none at the border, has a value in some layers."""
-    height, width = render.layers[schema.RGB].shape[:2]
+    height, width = render.layers[RGB].shape[:2]
     rng = seeded("pixels", value, share, height)
     count = max(1, round(share * height * width))
     rows, columns = rng.integers(2, height - 2, count), rng.integers(2, width - 2, count)
@@ -69,7 +70,7 @@ def fireflies(base: Base, scale: int) -> Iterator[Case]:
     clean = base.pair(scale)
     for value in (1e3, 1e6):
         hot = value * mean_light(clean)
-        lobes = (schema.RGB, schema.SPECULAR)
+        lobes = (RGB, SPECULAR)
         hr, lr = with_pixels(clean.hr, hot, 1e-3, lobes), with_pixels(clean.lr, hot, 1e-3)
         size = f"{value:.0e}".replace("e+0", "e")
         yield Case(f"0.1 % of the HRLS, {size} times the mean", Pair(clean.lr, hr, clean.reference), clean)
@@ -78,7 +79,7 @@ def fireflies(base: Base, scale: int) -> Iterator[Case]:
 
 def broken_values(base: Base, scale: int) -> Iterator[Case]:
     clean = base.pair(scale)
-    every = (schema.RGB, *schema.OPTIONAL_FEATURES)
+    every = (RGB, *OPTIONAL_FEATURES)
     for name, value in (("NaN", np.nan), ("Inf", np.inf), ("-Inf", -np.inf), ("-1", -1.0)):
         hr = with_pixels(clean.hr, value, 1e-3, every)
         yield Case(f"{name} in 0.1 % of the HRLS, all layers", Pair(clean.lr, hr, clean.reference), clean)
@@ -104,7 +105,7 @@ def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
     value = 1e4 * mean_light(clean)
 
     def at(render: Render, column: int) -> Render:
-        rgb = render.layers[schema.RGB].copy()
+        rgb = render.layers[RGB].copy()
         rgb[rgb.shape[0] // 3, column] = value
         return changed(render, rgb=rgb)
 
@@ -123,9 +124,9 @@ def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
 
 def layers(base: Base, scale: int) -> Iterator[Case]:
     clean = base.pair(scale, 4)  # 4 spp: with 1 there is no variance to remove
-    for name in schema.OPTIONAL_FEATURES:
+    for name in OPTIONAL_FEATURES:
         yield Case(f"no {name}", Pair(clean.lr, changed(clean.hr, **{name: None}), clean.reference), clean)
-    bare = changed(clean.hr, **dict.fromkeys(schema.OPTIONAL_FEATURES))
+    bare = changed(clean.hr, **dict.fromkeys(OPTIONAL_FEATURES))
     yield Case("none at all", Pair(clean.lr, bare, clean.reference), clean)
 
 
@@ -133,24 +134,24 @@ def garbage(base: Base, scale: int) -> Iterator[Case]:
     clean = base.pair(scale, 4)
     have = clean.hr.layers
     rng = seeded("garbage")
-    noise = rng.random(have[schema.RGB].shape, dtype=np.float32)
-    turned = {k: np.ascontiguousarray(have[k][::-1, ::-1]) for k in (schema.ALBEDO, schema.NORMAL)}
+    noise = rng.random(have[RGB].shape, dtype=np.float32)
+    turned = {k: np.ascontiguousarray(have[k][::-1, ::-1]) for k in (ALBEDO, NORMAL)}
     for name, layers in {
-        "albedo of noise": {schema.ALBEDO: noise},
-        "normal of noise": {schema.NORMAL: 2 * noise - 1},
-        "albedo and normal exchanged": {schema.ALBEDO: have[schema.NORMAL], schema.NORMAL: have[schema.ALBEDO]},
+        "albedo of noise": {ALBEDO: noise},
+        "normal of noise": {NORMAL: 2 * noise - 1},
+        "albedo and normal exchanged": {ALBEDO: have[NORMAL], NORMAL: have[ALBEDO]},
         "albedo and normal of another frame": turned,
         "albedo and normal 0": {k: np.zeros_like(noise) for k in turned},
-        "albedo 1000 times too large": {schema.ALBEDO: have[schema.ALBEDO] * 1000},
-        "diffuse and specular of noise": {schema.DIFFUSE: noise, schema.SPECULAR: noise[::-1]},
-        "every layer of noise": {k: rng.random(have[k].shape, dtype=np.float32) for k in schema.OPTIONAL_FEATURES},
+        "albedo 1000 times too large": {ALBEDO: have[ALBEDO] * 1000},
+        "diffuse and specular of noise": {DIFFUSE: noise, SPECULAR: noise[::-1]},
+        "every layer of noise": {k: rng.random(have[k].shape, dtype=np.float32) for k in OPTIONAL_FEATURES},
     }.items():
         yield Case(name, Pair(clean.lr, changed(clean.hr, **layers), clean.reference), clean)
 
 
 def variance(base: Base, scale: int) -> Iterator[Case]:
     clean = base.pair(scale, 4)
-    true = clean.hr.layers[schema.VARIANCE]
+    true = clean.hr.layers[VARIANCE]
     for name, values in {
         "constant": np.full_like(true, true.mean()),
         "0 everywhere": np.zeros_like(true),
@@ -259,7 +260,7 @@ def disagreement(size: int, scale: int) -> Iterator[Case]:
     ball = analytic.room(size, ball=(0.41, 0.5))
     yield Case("another frame: the ball 6 % further", base.make(scale, lr_scene=ball), clean)
     for factor in (0.25, 0.67, 1.5, 4.0):
-        lr = changed(clean.lr, rgb=clean.lr.layers[schema.RGB] * np.float32(factor))
+        lr = changed(clean.lr, rgb=clean.lr.layers[RGB] * np.float32(factor))
         yield Case(f"LRHS {factor:g} times as bright", Pair(lr, clean.hr, clean.reference), clean)
     for pixels in sorted({1, 2, 3, scale, 2 * scale, 3 * scale}):
         moved = analytic.moved(base.scene, pixels, pixels)

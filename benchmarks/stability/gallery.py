@@ -12,10 +12,12 @@ import OpenImageIO as oiio
 from benchmarks.results import Row
 from benchmarks.stability.cases import Case
 from benchmarks.stability.report import ENLARGED
-from oiio_msspl import schema, transforms
-from oiio_msspl.comparison import error_map
-from oiio_msspl.preview import write_png
-from oiio_msspl.render import Array
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.colour import srgb
+from oiio_msspl.compare import error_map
+from oiio_msspl.exr.preview import write_png
+from oiio_msspl.model.encoding import find_exposure
 
 #: Colours of the picture that is committed: error maps have few, and a palette needs a quarter of the bytes.
 COLOURS = 48
@@ -31,8 +33,8 @@ class Gallery:
     def add(self, scale: int, group: str, case: Case, pictures: dict[str, Array]) -> None:
         """Add a case's results, linear (h, w, 3) by method."""
         truth = case.pair.reference
-        shown = case.factor * transforms.exposure_of(truth)
-        hr = case.pair.hr.layers[schema.RGB]
+        shown = case.factor * find_exposure(truth)
+        hr = case.pair.hr.layers[RGB]
         views = [np.concatenate([_display(hr, shown), _display(truth, shown)], axis=1)]
         errors = []
         for image in pictures.values():
@@ -84,12 +86,12 @@ def labelled(picture: Array, text: str) -> Array:
 def _display(image: Array, exposure: float) -> Array:
     """sRGB at mid-grey; NaN and Inf are magenta."""
     bad = ~np.isfinite(image).all(axis=-1, keepdims=True)
-    values = transforms.srgb(np.nan_to_num(image, posinf=0, neginf=0) * np.float32(exposure))
+    values = srgb(np.nan_to_num(image, posinf=0, neginf=0) * np.float32(exposure))
     return np.where(bad, np.asarray((1, 0, 1), np.float32), values)
 
 
 def _halved(image: Array) -> Array:
-    return transforms.box_downsample(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2], 2)
+    return box_downsample(image[: image.shape[0] // 2 * 2, : image.shape[1] // 2 * 2], 2)
 
 
 def _rows_of(blocks: Sequence[Array], columns: int) -> Array:

@@ -12,9 +12,10 @@ from numpy.typing import NDArray
 
 from benchmarks.stability.bases import Pair
 from benchmarks.stability.cases import DISAGREE, Case
-from oiio_msspl import schema, transforms
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.arrays import Array, repair
 from oiio_msspl.metrics import psnr, relmse_map
-from oiio_msspl.render import Array
+from oiio_msspl.model.encoding import KEY, find_exposure
 
 #: Share of pixels that the trimmed RelMSE leaves out: the worst ones.
 TRIMMED = 1e-4
@@ -46,8 +47,8 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     """
     pair = case.pair
     truth = pair.reference
-    grey = np.float32(transforms.exposure_of(truth))  # the scores are made for exposed pictures
-    floor = np.float32(FLOOR * transforms.KEY) / grey
+    grey = np.float32(find_exposure(truth))  # the scores are made for exposed pictures
+    floor = np.float32(FLOOR * KEY) / grey
     finite = bool(np.isfinite(image).all())
     low, high = input_range(pair)
     beyond = np.maximum((image + floor) / (high + floor), (low + floor) / (np.maximum(image, 0) + floor))
@@ -65,7 +66,7 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
         "warnings": warnings,
     }
     if clean is not None and case.clean is not None:
-        grey = np.float32(transforms.exposure_of(case.clean.reference))
+        grey = np.float32(find_exposure(case.clean.reference))
         row["cost"] = psnr(clean * grey, case.clean.reference * grey) - row["psnr"]
         change = np.abs(image / case.factor - clean) / (clean + floor / case.factor)
         if case.factor != 1:
@@ -110,7 +111,7 @@ def trimmed(errors: NDArray[np.float64]) -> float:
 
 
 def repaired(values: Array) -> Array:
-    return transforms.repair(values)[0]
+    return repair(values)[0]
 
 
 def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) -> Array:
@@ -126,7 +127,7 @@ def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) 
 
 def input_range(pair: Pair) -> tuple[Array, Array]:
     """Smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
-    low, high = repaired(pair.lr.layers[schema.RGB]), repaired(pair.hr.layers[schema.RGB])
+    low, high = repaired(pair.lr.layers[RGB]), repaired(pair.hr.layers[RGB])
     s = pair.scale
     result = []
     for extreme in (np.minimum, np.maximum):
@@ -138,7 +139,7 @@ def input_range(pair: Pair) -> tuple[Array, Array]:
 def touched(before: Pair, after: Pair) -> NDArray[np.bool_]:
     """Where either render differs within ``NEAR`` LRHS pixels, (h, w)."""
     s = after.scale
-    low = _differs(before.lr.layers[schema.RGB], after.lr.layers[schema.RGB])
+    low = _differs(before.lr.layers[RGB], after.lr.layers[RGB])
     high = np.zeros((low.shape[0] * s, low.shape[1] * s), bool)
     for name in {*before.hr.layers, *after.hr.layers}:
         if name not in before.hr.layers or name not in after.hr.layers:

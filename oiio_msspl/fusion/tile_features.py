@@ -96,7 +96,7 @@ def read_features(
     render: ReadableRender,
     window: Window,
     data_window: Window,
-    features: Iterable[str],
+    features: Iterable[str] | None = None,
     *,
     counts: dict[str, int] | None = None,
     counted: Window | None = None,
@@ -105,6 +105,7 @@ def read_features(
 
     Args:
         window, data_window: both relative to the top left of the display window.
+        features: names of features; all if None. Those that the render lacks are left out.
         counts: numbers of repaired values by feature; those inside ``counted`` are added, because overlaps are read
             twice.
     """

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.fusion.alignment import align
 from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.fusion.alignment import align
 
 
 def render(name, width, height, data=None, origin=(0, 0), aspect=1.0):

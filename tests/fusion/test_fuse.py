@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from oiio_msspl import find_model, fuse
-from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture
 

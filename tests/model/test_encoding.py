@@ -12,9 +12,7 @@ from tests.conftest import picture
 def test_compress_and_expand_are_inverse_over_the_whole_range():
     """Radiance -> network values -> radiance is a no-op from half's smallest step to its largest value."""
     radiance = np.concatenate([[0], np.logspace(-6, np.log10(65504), 200)]).astype(np.float32)
-    np.testing.assert_allclose(
-        decode_radiance(encode_radiance(radiance, 1.0), 1.0), radiance, rtol=2e-4, atol=1e-7
-    )
+    np.testing.assert_allclose(decode_radiance(encode_radiance(radiance, 1.0), 1.0), radiance, rtol=2e-4, atol=1e-7)
 
 
 @pytest.mark.parametrize("factor", [2.0**-10, 1.0, 2.0**10])

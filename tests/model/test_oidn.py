@@ -6,11 +6,11 @@ import pytest
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import box_downsample
+from oiio_msspl.errors import InputError
 from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
 from oiio_msspl.model.oidn import OidnDenoiser
 from oiio_msspl.model.render_mean import NOISE_GAIN, lrhs_weight, mean_of_renders
-from oiio_msspl.errors import InputError
 from tests.conftest import noisy, picture
 
 

@@ -4,10 +4,9 @@ import json
 import numpy as np
 import pytest
 
-from oiio_msspl.model.contract import SCALES
-from oiio_msspl.model.contract import Contract, METADATA_KEY
 from oiio_msspl.errors import InputError
 from oiio_msspl.model.catalogue import find_model, shipped_models
+from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.session import PROVIDERS, Session, usable_devices
 
 

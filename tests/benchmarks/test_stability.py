@@ -7,8 +7,8 @@ from benchmarks.stability import analytic, cases, measures, report
 from benchmarks.stability.__main__ import enlarged, ours, run
 from benchmarks.stability.bases import Analytic
 from benchmarks.stability.gallery import Gallery
-from oiio_msspl.session import Session
-from oiio_msspl.transforms import luminance
+from oiio_msspl.colour import luminance
+from oiio_msspl.model.session import Session
 from tests.conftest import downsample
 
 SIZE = 32

@@ -58,7 +58,6 @@ class SensorCamera:
 def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
     """Render what is missing of a scene."""
     import mitsuba as mi
-
     from training.mitsuba_views.trace import blackman_harris, box, render_passes
 
     scene = mi.load_file(str(file))

@@ -24,9 +24,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
 from oiio_msspl import metrics, schema, tensors, transforms
 from oiio_msspl.comparison import upsample_bicubic
-from training import data, losses
+from training import losses
 from training.paper import HRLS_CHANNELS, MultiResolutionFusion
 from training.pyramid import linear
 from training.train import to_tensor
@@ -90,21 +91,21 @@ class Pair:
     exposure: float
 
 
-def pair_of(view: data.View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
+def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
     """A crop whose HRLS is the pass ``chosen``."""
     rows, columns = slice(top, top + patch), slice(left, left + patch)
-    colour = data.mean_lrhs(view, list(range(len(view.lr_spp))), scale)
+    colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
     exposure = transforms.exposure_of(colour)
     low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
 
     def packed(passes: np.ndarray) -> np.ndarray:
-        return tensors.pack(data.split_features(passes), schema.HRLS_FEATURES, exposure)
+        return tensors.pack(split_features(passes), schema.HRLS_FEATURES, exposure)
 
     others = [p for p in range(len(view.hr)) if p != chosen]
-    low = transforms.box_downsample(data.read_hrls(view, others, rows, columns).mean(axis=0), scale)
+    low = transforms.box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
     low[..., :3] = colour[low_rows, low_columns]
-    high = data.read_hrls(view, [chosen], rows, columns)[0]
-    return Pair(packed(low), packed(high), data.read(view.ref[rows, columns]), exposure)
+    high = read_hrls(view, [chosen], rows, columns)[0]
+    return Pair(packed(low), packed(high), as_float32(view.ref[rows, columns]), exposure)
 
 
 def channels_of(name: str) -> Tensor:
@@ -115,7 +116,7 @@ def channels_of(name: str) -> Tensor:
 
 
 @functools.lru_cache(maxsize=1)  # some GB; variants come scale by scale
-def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Batches of ``lrhs``, ``hrls`` and target, in network values."""
     rng = np.random.default_rng(0)
     batches = []
@@ -134,7 +135,7 @@ def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor,
     return batches
 
 
-def train(variant: Variant, views: tuple[data.View, ...], steps: int) -> MultiResolutionFusion:
+def train(variant: Variant, views: tuple[View, ...], steps: int) -> MultiResolutionFusion:
     """A network after so many steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
@@ -156,7 +157,7 @@ def train(variant: Variant, views: tuple[data.View, ...], steps: int) -> MultiRe
 
 
 @torch.inference_mode()
-def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[data.View, ...]) -> dict[str, float]:
+def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
     """Mean PSNR and RelMSE, and those of bicubic upsampling."""
     found = []
     for view in views:
@@ -179,7 +180,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(1)
     result: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {"rows": []}
-    folder = data.Folder(args.views)
+    folder = Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
     result |= {"steps": args.steps, "network": REDUCED, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in result["rows"]}

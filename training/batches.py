@@ -19,8 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from datagen.views import PASS_FEATURES, Folder, View
 from oiio_msspl import schema, transforms
-from training.data import PASS_FEATURES, Folder, Prepare, Sampling, View, random_orthogonal
+from training.data import Prepare, Sampling, random_orthogonal
 from training.pyramid import logarithmic
 
 #: What a batch is made of, by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w); all
@@ -48,7 +49,7 @@ class Pixels:
         return cls(on_device(view.hr), lr, on_device(view.ref), view.lr_spp)
 
     def lrhs(self, passes: np.ndarray, scale: int, clip: float, *, nearest: bool) -> Tensor:
-        """As :func:`training.data.mean_lrhs`, clipped before pixels are joined: (H/s, W/s, 3)."""
+        """As :func:`datagen.views.mean_lrhs`, clipped before pixels are joined: (H/s, W/s, 3)."""
         stored = self.lr[scale if scale in self.lr else 1]
         weights = torch.from_numpy((self.lr_spp[passes] / self.lr_spp[passes].sum()).astype(np.float32))
         mean = torch.einsum(

@@ -26,6 +26,7 @@ import torch.nn.functional as F
 from onnx import TensorProto, helper, numpy_helper
 from torch import Tensor
 
+from datagen.views import Folder
 from oiio_msspl import eight_bit, transforms
 from oiio_msspl.denoiser import Denoiser, Layers, installed_weights, layers_of, merged
 from oiio_msspl.schema import SCALES
@@ -484,7 +485,7 @@ def pictures(views: Path, split: str, name: str, count: int) -> Iterator[Layers]
     """What a network reads of views, drawn as training draws them."""
     denoiser = Denoiser(exact=True)
     rng = np.random.default_rng(0)
-    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(views).split(split)]
+    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in Folder(views).split(split)]
     left_out = 0
     while count:
         with torch.no_grad():

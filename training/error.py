@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from datagen.views import Folder
 from training import batches, data, export, losses
 from training.joint import JointFusion
 from training.networks import preparation, run
@@ -65,7 +66,7 @@ def main() -> None:
     network, state = export.load(args.checkpoint)
     if not isinstance(network, Trunk | JointFusion):
         raise SystemExit(f"{args.checkpoint}: the paper's network does not predict its error")
-    views = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
+    views = [batches.Pixels.of(view, torch.device("cpu")) for view in Folder(args.data).split("train")]
     scales = [int(scale) for scale in state["training_spp"]]
     network.reset_error()
     loss = fit(network, views, scales, preparation(state["architecture"], args.threads), args.steps)

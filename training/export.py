@@ -29,6 +29,7 @@ from onnxscript import opset18
 from torch import nn
 from torch.utils._pytree import tree_map
 
+from datagen.views import Folder, View
 from oiio_msspl import runtime, schema
 from oiio_msspl.contract import METADATA_KEY, Contract
 from oiio_msspl.denoiser import installed_weights
@@ -242,7 +243,7 @@ def parity(network: Network, scale: int, path: Path) -> float:
 
 
 @torch.inference_mode()
-def measure_overlap(network: Network, scale: int, views: list[data.View], tile: int = 16) -> dict[int, float]:
+def measure_overlap(network: Network, scale: int, views: list[View], tile: int = 16) -> dict[int, float]:
     """How far the middle of a tile is from the same pixels of the whole image, for some overlaps in LRHS pixels.
 
     The theoretical receptive field, over 60 LRHS pixels each way, is far larger than what trained weights use. Returns
@@ -330,7 +331,7 @@ def main() -> None:
     if scale is None:
         raise SystemExit("--scale: this network serves several; say which one to export")
     if args.measure_overlap:
-        views = data.Folder(args.measure_overlap).split("validation")[:8]
+        views = Folder(args.measure_overlap).split("validation")[:8]
         for overlap, difference in measure_overlap(network, scale, views).items():
             print(f"overlap {overlap}: {difference:.2g}")
     if args.output:

@@ -17,6 +17,7 @@ from onnx import TensorProto, compose, helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from datagen.views import Folder
 from oiio_msspl import eight_bit
 from oiio_msspl.contract import Contract
 from oiio_msspl.denoiser import for_model
@@ -89,7 +90,7 @@ def pictures(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Values]
 def drawn(views: Path, contract: Contract, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
     """Pairs as training draws them."""
     denoiser, rng = for_model(contract.denoiser, 0), np.random.default_rng(0)
-    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(views).split("train")]
+    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in Folder(views).split("train")]
     with torch.no_grad():
         each = (batches.draw(folder, contract.scale, PATCH, 1, rng, data.Sampling(), denoiser) for _ in range(count))
         return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in each]

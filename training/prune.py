@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from datagen.views import Folder
 from training import batches, data, export
 from training.joint import BEFORE, DECODED, JointFusion, with_mean
 from training.train import save
@@ -80,7 +81,7 @@ def main() -> None:
     network, state = export.load(args.checkpoint)
     if not isinstance(network, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
-    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
+    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in Folder(args.data).split("train")]
     rng = np.random.default_rng(0)
     with torch.no_grad():
         pairs = [batches.draw(folder, 2, PATCH, 1, rng, data.Sampling(), with_mean) for _ in range(PAIRS)]

@@ -18,6 +18,7 @@ import torch
 from onnx import helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
+from datagen.views import Folder
 from oiio_msspl.contract import Contract
 from oiio_msspl.denoiser import for_model
 from training import batches, data
@@ -84,13 +85,13 @@ def _with_inputs_of_their_own(model: onnx.ModelProto) -> onnx.ModelProto:
 
 class _Samples(CalibrationDataReader):
     def __init__(self, contract: Contract, views: Path) -> None:
-        self._feeds = self._draw(contract, data.Folder(views))
+        self._feeds = self._draw(contract, Folder(views))
 
     def get_next(self) -> dict[str, np.ndarray] | None:
         return next(self._feeds, None)
 
     @staticmethod
-    def _draw(contract: Contract, folder: data.Folder) -> Iterator[dict[str, np.ndarray]]:
+    def _draw(contract: Contract, folder: Folder) -> Iterator[dict[str, np.ndarray]]:
         denoiser = for_model(contract.denoiser, 0)
         rng = np.random.default_rng(0)
         cpu = torch.device("cpu")

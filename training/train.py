@@ -31,6 +31,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from datagen.views import Array, Folder
 from oiio_msspl import metrics, transforms
 from training import batches, data, losses
 from training.joint import JointFusion
@@ -136,7 +137,7 @@ def evaluate(network: Network, pairs: Iterable[data.Evaluation], device: torch.d
 # State
 
 
-def to_tensor(image: data.Array, device: torch.device) -> Tensor:
+def to_tensor(image: Array, device: torch.device) -> Tensor:
     """(N, H, W, C) to (N, C, H, W) in channels-last memory, without copying on the CPU."""
     return torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).to(device, non_blocking=True)
 
@@ -241,7 +242,7 @@ def train(args: argparse.Namespace) -> None:
     args.out.mkdir(parents=True, exist_ok=True)
 
     # Data
-    folder = data.Folder(args.data)
+    folder = Folder(args.data)
     if not folder.split("train"):
         raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
     validation: dict[tuple[Path, int], data.Evaluation] = {}

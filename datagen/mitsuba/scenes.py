@@ -14,11 +14,12 @@ from collections.abc import Callable
 import mitsuba as mi
 import numpy as np
 
+from datagen import meshes as geo
+from datagen import textures as tex
+from datagen.meshes import Mesh
+
 from . import materials as mat
-from . import meshes as geo
-from . import textures as tex
 from .assets import Assets, read_gltf, read_image, read_obj
-from .meshes import Mesh
 from .trace import Camera
 
 VERSION = 3  # of the generator: raise it when a seed would give another scene

@@ -12,14 +12,15 @@ import bpy
 import numpy as np
 import OpenImageIO as oiio
 
-from .. import views
+from datagen import quality, views
+
 from . import scenes
 from .assets import Assets
 
-_ATTEMPTS, _RENDERS = 12, 2  # cameras tried, and how many of them are rendered at most, per view
-# Samples are added until a reference's own noise is this good [dB], up to some times `ref_spp`; one that is then still
-# worse than the second figure is not used. Noise in what a network learns from has no mean and many scenes teach more
-# than clean ones; what it is judged by must be clean.
+_ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
+# By split: samples are added until a reference reaches the first PSNR [dB], up to the third figure times `ref_spp`. A
+# reference below the second PSNR is not used. Training references may be noisy: their noise has zero mean, and many
+# scenes help more than clean ones. Validation and test references must be clean.
 _REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
 _LIGHT_PASSES = (
     "diffuse_direct",
@@ -33,7 +34,7 @@ _FILTERS = {"BOX": "box", "BLACKMAN_HARRIS": "blackman-harris"}
 
 
 class Renderer:
-    """Cycles on the scene that is open, always at frame 1 and through one scratch file."""
+    """Cycles on the open scene, at frame 1. It renders into one scratch file."""
 
     def __init__(self, scratch: Path, stage: scenes.Stage, threads: int) -> None:
         self._file = scratch / "render.exr"
@@ -46,7 +47,7 @@ class Renderer:
         c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
         c.caustics_reflective = c.caustics_refractive = stage.caustics
         c.blur_glossy = 0.0 if rng.random() < 0.5 else 1.0  # "Filter Glossy": 1 is Blender's default
-        # Blue noise is what Blender's own default comes to in final renders.
+        # Blender's default amounts to blue noise in final renders.
         c.sampling_pattern = str(rng.choice(["BLUE_NOISE", "TABULATED_SOBOL"]))
         c.max_bounces = int(rng.integers(8, 13))
         limit = c.max_bounces if rng.random() < 0.5 else 4
@@ -69,14 +70,14 @@ class Renderer:
         }  # fmt: skip
 
     def layers(self, on: bool) -> None:
-        """Write every layer that :meth:`render` can return, or the colour alone."""
+        """Switch all AOVs on, or all but the colour off."""
         layer = self._scene.view_layers[0]
         for name in _LIGHT_PASSES:
             setattr(layer, f"use_pass_{name}", on)
         layer.cycles.denoising_store_passes = on
 
     def render(self, size: int, spp: int, seed: int, pixel_filter: str = "BOX") -> dict[str, np.ndarray]:
-        """Layers (size, size, C) as Blender names them, scene linear and finite."""
+        """Render; return AOVs (size, size, C) by Blender's names, scene-linear and finite."""
         c = self._scene.cycles
         c.samples, c.seed = spp, seed
         c.pixel_filter_type, c.filter_width = pixel_filter, 1.5
@@ -93,7 +94,7 @@ class Renderer:
 
 
 def features(layers: dict[str, np.ndarray]) -> np.ndarray:
-    """Colour, albedo, normal, diffuse, specular, (H, W, 15), as `oiio_msspl/aovs.toml` composes them."""
+    """Colour, albedo, normal, diffuse, specular, (H, W, 15), composed as the package composes a Cycles file."""
     diffuse = (layers["Diffuse Direct"] + layers["Diffuse Indirect"]) * layers["Diffuse Color"]
     specular = (layers["Glossy Direct"] + layers["Glossy Indirect"]) * layers["Glossy Color"]
     parts = [layers["Combined"][..., :3], layers["Denoising Albedo"], layers["Denoising Normal"], diffuse, specular]
@@ -105,7 +106,7 @@ def _color(layers: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def find_cameras(renderer: Renderer, stage: scenes.Stage, seed: int, view: int) -> Iterator[dict[str, object]]:
-    """Aim at a few random targets; yield the cameras that are not inside something, facing a wall, or in the dark."""
+    """Yield random cameras that are not inside an object, in front of a bare wall or in the dark."""
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, view, attempt, scenes.VERSION])
         camera = scenes.aim(stage, rng)
@@ -113,14 +114,18 @@ def find_cameras(renderer: Renderer, stage: scenes.Stage, seed: int, view: int) 
         probe = renderer.render(32, 16, int(rng.integers(2**31)))
         depth = probe["Denoising Depth"]
         near = np.percentile(np.where(depth > 0, depth, 1e3), 10)  # metres; 0: background
-        if (near > 0.15 or stage.hazy) and views.shows_something(features(probe)):
+        if (near > 0.15 or stage.hazy) and quality.shows_something(features(probe)):
             yield camera
 
 
 def _reference(
     renderer: Renderer, rng: np.random.Generator, spp: int, pixel_filter: str, good: float, worst: float, steps: int
 ) -> tuple[np.ndarray, int, float] | None:
-    """The mean of `spp` samples a pixel, up to `steps` times until it is `good`; how many; its own PSNR."""
+    """Render a reference: `spp` samples a pixel at a time, at most `steps` times, until its PSNR is `good`.
+
+    Returns:
+        The image (H, W, 3), its spp and its estimated sRGB PSNR; None if that is below `worst`.
+    """
     halves, done = np.zeros((2, views.SIZE, views.SIZE, 3)), 0
     while True:
         for half in range(2):
@@ -128,39 +133,39 @@ def _reference(
                 spp / 2 * _color(renderer.render(views.SIZE, spp // 2, int(rng.integers(2**31)), pixel_filter))
             )
         done += spp
-        quality = views.psnr_of_mean(*halves * (2 / done))
-        if quality > good or done >= steps * spp:
-            return (halves.sum(0) / done, done, quality) if quality > worst else None
+        psnr = quality.psnr_of_mean(*halves * (2 / done))
+        if psnr > good or done >= steps * spp:
+            return (halves.sum(0) / done, done, psnr) if psnr > worst else None
 
 
 def render_view(
     renderer: Renderer, stage: scenes.Stage, camera: dict[str, object], seed: int, view: int, ref_spp: int
 ) -> dict[str, np.ndarray] | None:
-    """All arrays of one training file; None if it will not converge."""
+    """Render all arrays of one view, see :mod:`datagen.views`; None if the reference stays too noisy."""
     rng = np.random.default_rng([seed, view, 7])
     pixel_filter = "BLACKMAN_HARRIS" if seed % 4 == 3 else "BOX"
 
-    good, worst, steps = _REFERENCE[views.split(seed)]
+    good, worst, steps = _REFERENCE[views.split_of(seed)]
 
     def some_seed() -> int:
         return int(rng.integers(2**31))
 
     renderer.layers(False)
     lr = np.stack([_color(renderer.render(views.SIZE, spp, some_seed())) for spp in views.LR_SPP])
-    # The samples of the LR passes tell whether a reference is within reach.
+    # The noise of the LR passes tells whether the reference can become clean enough.
     first = np.average(lr[:-1], axis=0, weights=views.LR_SPP[:-1])
-    if views.psnr_of_mean(first, lr[-1]) + 10 * np.log10(steps * ref_spp / sum(views.LR_SPP)) < worst:
+    if quality.psnr_of_mean(first, lr[-1]) + 10 * np.log10(steps * ref_spp / sum(views.LR_SPP)) < worst:
         return None
     found = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
     if found is None:
         return None
-    ref, spent, quality = found
+    ref, spent, psnr = found
     renderer.layers(True)
     hr = np.stack([features(renderer.render(views.SIZE, 1, some_seed(), pixel_filter)) for _ in range(views.HR_PASSES)])
     meta = {
         "seed": f"cycles-{seed}",
         "view": view,
-        "split": views.split(seed),
+        "split": views.split_of(seed),
         "generator": scenes.VERSION,
         "kind": stage.kind,
         "renderer": f"Blender {bpy.app.version_string} Cycles",
@@ -168,7 +173,7 @@ def render_view(
         "filter": _FILTERS[pixel_filter],
         "lr_filter": "box",
         "ref_spp": spent,
-        "ref_psnr": quality,
+        "ref_psnr": psnr,
         "assets": sorted(stage.sources),
         "camera": camera,
     }
@@ -176,13 +181,13 @@ def render_view(
 
 
 def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int, threads: int) -> tuple[int, str]:
-    """Write the missing ones of a scene's first views; return how many were written and the kind of the scene."""
+    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene."""
     missing = [v for v in range(count) if not views.path_of(out, "cycles", seed, v).exists()]
     if not missing:
         return 0, "done before"
     stage = scenes.build(seed, assets)
     written = 0
-    shared = Path("/dev/shm")  # where there is a RAM disk
+    shared = Path("/dev/shm")  # a RAM disk, on Linux
     with tempfile.TemporaryDirectory(prefix="cycles-views-", dir=shared if shared.is_dir() else None) as scratch:
         renderer = Renderer(Path(scratch), stage, threads)
         for view in missing:

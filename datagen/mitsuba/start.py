@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mitsuba 3, ready to render on the CPU."""
+"""Import Mitsuba 3, ready to render on the CPU."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ VARIANT = "llvm_ad_rgb"
 
 
 def start(threads: int = 1, variant: str = VARIANT) -> Any:
-    """Import Mitsuba and set its variant and number of threads; return the module.
+    """Import Mitsuba, set its variant and number of threads, and return the module.
 
-    LLVM is that of `DRJIT_LIBLLVM_PATH`, else Debian's LLVM 19 if it is there, else what Dr.Jit finds by itself.
+    Dr.Jit uses the LLVM of `DRJIT_LIBLLVM_PATH`, else Debian's LLVM 19 if it is installed, else the one that it finds.
 
     Raises:
         ImportError: Mitsuba is not installed.

@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Rendered views in files that travel.
+"""Pack rendered views into ZIP files for transport, and unpack them.
 
-    python -m training.shards pack VIEWS SHARDS      # views-000.zip, views-001.zip ... and manifest.json
-    python -m training.shards unpack SHARDS VIEWS
+    python -m datagen.shards pack VIEWS SHARDS      # views-000.zip, views-001.zip ... and manifest.json
+    python -m datagen.shards unpack SHARDS VIEWS
 
-A shard is a ZIP archive of whole views of one split, at most ``LIMIT`` bytes. ``manifest.json`` tells of every view
-where it is and what rendered it: scene, seed, split, renderer and version, spp, size, and the assets with their
-licences. Denoised references are left out: :mod:`training.references` makes them again.
+A shard is a ZIP archive with whole views of one split, at most ``LIMIT`` bytes. ``manifest.json`` lists every view with
+its shard, scene, split, renderer and version, spp, size, and the assets with their licences. Denoised references are
+left out, because :mod:`datagen.references` can make them again.
 """
 
 from __future__ import annotations
@@ -18,16 +18,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from datagen.views import SPLITS, Folder, View
 from oiio_msspl.output import replacing
-from training import data
-from training.views import SPLITS
 
 LIMIT = 60_000_000
 MANIFEST = "manifest.json"
 
 
-def describe(view: data.View) -> dict[str, Any]:
-    """An entry of the manifest, but for the shard."""
+def describe(view: View) -> dict[str, Any]:
+    """The manifest's entry for a view, without the shard."""
     passes, height, width, _ = view.hr.shape
     return {
         "file": view.path.name,
@@ -48,30 +47,30 @@ def describe(view: data.View) -> dict[str, Any]:
     }
 
 
-def grouped(views: list[data.View], limit: int) -> Iterator[list[data.View]]:
-    """Neighbouring views that, uncompressed, fill a shard.
+def grouped(views: list[View], limit: int) -> Iterator[list[View]]:
+    """Group consecutive views whose files together have at most ``limit`` bytes.
 
     Raises:
-        SystemExit: one alone does not fit.
+        SystemExit: a single view is larger than that.
     """
-    group: list[data.View] = []
+    group: list[View] = []
     size = 0
     for view in views:
-        bytes_ = view.path.stat().st_size
-        if bytes_ > limit:
-            raise SystemExit(f"{view.path}: has {bytes_} bytes, a shard holds {limit}")
-        if group and size + bytes_ > limit:
+        size_of_view = view.path.stat().st_size
+        if size_of_view > limit:
+            raise SystemExit(f"{view.path}: has {size_of_view} bytes, a shard holds {limit}")
+        if group and size + size_of_view > limit:
             yield group
             group, size = [], 0
         group.append(view)
-        size += bytes_
+        size += size_of_view
     if group:
         yield group
 
 
 def pack(views: Path, shards: Path, limit: int = LIMIT) -> None:
-    """Write all views of a folder as shards, and the manifest last; shards of an earlier pack are replaced."""
-    folder = data.Folder(views)
+    """Write all views of a folder as shards, then the manifest. Shards of an earlier pack are replaced."""
+    folder = Folder(views)
     shards.mkdir(parents=True, exist_ok=True)
     entries = []
     groups = [group for split in SPLITS for group in grouped(folder.split(split), limit)]
@@ -93,7 +92,7 @@ def pack(views: Path, shards: Path, limit: int = LIMIT) -> None:
 
 
 def unpack(shards: Path, views: Path) -> None:
-    """Write the views that are not there yet.
+    """Unpack the views that are not in the folder yet.
 
     Raises:
         SystemExit: there is no manifest, or a shard that it names is missing.
@@ -118,8 +117,8 @@ def unpack(shards: Path, views: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("action", choices=("pack", "unpack"))
-    parser.add_argument("source", type=Path)
-    parser.add_argument("target", type=Path)
+    parser.add_argument("source", type=Path, help="folder of views to pack, or of shards to unpack")
+    parser.add_argument("target", type=Path, help="folder to write to")
     args = parser.parse_args()
     {"pack": pack, "unpack": unpack}[args.action](args.source, args.target)
 

@@ -7,7 +7,7 @@ import bmesh
 import bpy
 import numpy as np
 
-from ..mitsuba_views.meshes import Mesh
+from datagen.meshes import Mesh
 
 
 def blender_mesh(mesh: Mesh) -> bpy.types.Mesh:

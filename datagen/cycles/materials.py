@@ -9,7 +9,7 @@ from collections.abc import Callable
 import bpy
 import numpy as np
 
-from ..mitsuba_views import textures as tex
+from datagen import textures as tex
 
 Rng = np.random.Generator
 Material = bpy.types.Material

@@ -2,8 +2,9 @@
 """Render a low-resolution-high-spp / high-resolution-low-spp pair of one frame with Cycles.
 
 The scene is built in code from a seed.  Writes hr.exr, lr.exr and (with --ref-spp) ref.exr as
-multilayer EXR into --out.  Works with bpy 4.5 and bpy 5.0; see README.md for the commands.
+multilayer EXR into --out.  Works with bpy 4.5 and bpy 5.0; see datagen/README.md for the commands.
 """
+
 from __future__ import annotations
 
 import argparse
@@ -64,9 +65,17 @@ def mix_colors(nt, factor, a, b, blend="MIX"):
 
 def wood_floor():
     mat, nt, bsdf = new_material("Wood Floor", Roughness=0.32)
-    planks = node(nt, "ShaderNodeTexBrick", Color1=rgb(.46, .25, .11), Color2=rgb(.27, .13, .055),
-                  Mortar=rgb(.03, .015, .008), Scale=1.0, Mortar_Size=0.005, Brick_Width=1.3,
-                  Row_Height=0.17)
+    planks = node(
+        nt,
+        "ShaderNodeTexBrick",
+        Color1=rgb(0.46, 0.25, 0.11),
+        Color2=rgb(0.27, 0.13, 0.055),
+        Mortar=rgb(0.03, 0.015, 0.008),
+        Scale=1.0,
+        Mortar_Size=0.005,
+        Brick_Width=1.3,
+        Row_Height=0.17,
+    )
     nt.links.new(object_coords(nt, rotation=(0, 0, math.radians(90))), planks.inputs["Vector"])
     grain = node(nt, "ShaderNodeTexNoise", Scale=3.0, Detail=8.0, Roughness=0.65)
     nt.links.new(object_coords(nt, scale=(22, 1.6, 1)), grain.inputs["Vector"])
@@ -82,8 +91,8 @@ def wallpaper():
     nt.links.new(object_coords(nt), wave.inputs["Vector"])
     ramp = nt.nodes.new("ShaderNodeValToRGB")
     ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.47, 0.53
-    ramp.color_ramp.elements[0].color = rgb(.33, .45, .42)
-    ramp.color_ramp.elements[1].color = rgb(.42, .54, .49)
+    ramp.color_ramp.elements[0].color = rgb(0.33, 0.45, 0.42)
+    ramp.color_ramp.elements[1].color = rgb(0.42, 0.54, 0.49)
     nt.links.new(wave.outputs["Fac" if "Fac" in wave.outputs else 1], ramp.inputs[0])
     nt.links.new(ramp.outputs["Color"], bsdf.inputs["Base Color"])
     return mat
@@ -103,15 +112,15 @@ def checker(name, a, b, scale, **inputs):
 def tablecloth():
     """A matte plaid from two crossed wave textures."""
     mat, nt, bsdf = new_material("Cloth", Roughness=0.9, Sheen_Weight=0.4)
-    color, flat = rgb(.76, .71, .62), nt.nodes.new("ShaderNodeTexCoord").outputs["UV"]
-    for direction, tint in (("X", rgb(.55, .06, .05)), ("Y", rgb(.10, .14, .34))):
+    color, flat = rgb(0.76, 0.71, 0.62), nt.nodes.new("ShaderNodeTexCoord").outputs["UV"]
+    for direction, tint in (("X", rgb(0.55, 0.06, 0.05)), ("Y", rgb(0.10, 0.14, 0.34))):
         wave = node(nt, "ShaderNodeTexWave", Scale=3.4, Distortion=0.0)
         wave.bands_direction = direction
         nt.links.new(flat, wave.inputs["Vector"])
         ramp = nt.nodes.new("ShaderNodeValToRGB")
         ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.62, 0.70
         ramp.color_ramp.elements[0].color = rgb(0, 0, 0)
-        ramp.color_ramp.elements[1].color = rgb(.8, .8, .8)
+        ramp.color_ramp.elements[1].color = rgb(0.8, 0.8, 0.8)
         nt.links.new(wave.outputs["Fac" if "Fac" in wave.outputs else 1], ramp.inputs[0])
         color = mix_colors(nt, ramp.outputs["Color"], color, tint)
     nt.links.new(color, bsdf.inputs["Base Color"])
@@ -122,7 +131,7 @@ def painting():
     mat, nt, bsdf = new_material("Painting", Roughness=0.5)
     tex = node(nt, "ShaderNodeTexVoronoi", Scale=13.0)
     nt.links.new(object_coords(nt), tex.inputs["Vector"])
-    warm = mix_colors(nt, 0.55, tex.outputs["Color"], rgb(.95, .45, .12), "OVERLAY")
+    warm = mix_colors(nt, 0.55, tex.outputs["Color"], rgb(0.95, 0.45, 0.12), "OVERLAY")
     nt.links.new(warm, bsdf.inputs["Base Color"])
     return mat
 
@@ -134,12 +143,12 @@ def glass(caustics):
     nt = mat.node_tree
     nt.nodes.clear()
     out = nt.nodes.new("ShaderNodeOutputMaterial")
-    bsdf = node(nt, "ShaderNodeBsdfGlass", Color=rgb(.95, .985, .97), Roughness=0.0, IOR=1.45)
+    bsdf = node(nt, "ShaderNodeBsdfGlass", Color=rgb(0.95, 0.985, 0.97), Roughness=0.0, IOR=1.45)
     if caustics:
         nt.links.new(bsdf.outputs[0], out.inputs["Surface"])
         return mat
     path = nt.nodes.new("ShaderNodeLightPath")
-    clear = node(nt, "ShaderNodeBsdfTransparent", Color=rgb(.86, .90, .88))
+    clear = node(nt, "ShaderNodeBsdfTransparent", Color=rgb(0.86, 0.90, 0.88))
     mix = nt.nodes.new("ShaderNodeMixShader")
     nt.links.new(path.outputs["Is Shadow Ray"], mix.inputs[0])
     nt.links.new(bsdf.outputs[0], mix.inputs[1])
@@ -206,7 +215,7 @@ def cloth(name, mat, at, radius=0.56, drop=0.50):
             hang = max(0.0, s - radius)
             fold = (0.6 * math.sin(11 * a) + 0.4 * math.sin(17 * a + 1.3)) * 0.085
             r = min(s, radius) + (0.05 + fold) * (hang / drop) ** 0.8
-            z = -hang * (1 - 0.03 * math.sin(5 * a)) - 0.012 * math.exp(-((s - radius) / 0.03) ** 2)
+            z = -hang * (1 - 0.03 * math.sin(5 * a)) - 0.012 * math.exp(-(((s - radius) / 0.03) ** 2))
             verts.append((r * math.cos(a), r * math.sin(a), z))
             flat.append((s * math.cos(a), s * math.sin(a)))
     faces += [(0, 1 + j, 1 + (j + 1) % n) for j in range(n)]
@@ -232,24 +241,21 @@ def grass(name, rng, mat, at, radius=0.13, count=260, height=0.52):
         first = len(verts)
         for k in range(7):
             t = k / 6
-            p = base + Vector((0, 0, h * (t - 0.25 * t ** 3))) + lean * h * t * t
+            p = base + Vector((0, 0, h * (t - 0.25 * t**3))) + lean * h * t * t
             verts += [tuple(p - side * (1 - t)), tuple(p + side * (1 - t))]
-        faces += [(first + 2 * k, first + 2 * k + 1, first + 2 * k + 3, first + 2 * k + 2)
-                  for k in range(6)]
+        faces += [(first + 2 * k, first + 2 * k + 1, first + 2 * k + 3, first + 2 * k + 2) for k in range(6)]
     return mesh_object(name, verts, faces, mat, at=at)
 
 
 def sphere(name, radius, mat, at, segments=64):
-    bpy.ops.mesh.primitive_uv_sphere_add(segments=segments, ring_count=segments // 2, radius=radius,
-                                         location=at)
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=segments, ring_count=segments // 2, radius=radius, location=at)
     ob = bpy.context.object
     ob.name = name
     return finish(ob, mat, smooth=True)
 
 
 def cone(name, r1, r2, depth, mat, at, cap="NGON"):
-    bpy.ops.mesh.primitive_cone_add(vertices=64, radius1=r1, radius2=r2, depth=depth, location=at,
-                                    end_fill_type=cap)
+    bpy.ops.mesh.primitive_cone_add(vertices=64, radius1=r1, radius2=r2, depth=depth, location=at, end_fill_type=cap)
     ob = bpy.context.object
     ob.name = name
     return finish(ob, mat)
@@ -270,10 +276,10 @@ def build_scene(seed, transparent=False, caustics=False):
     _index[0] = 0
     rng = random.Random(seed)
     scene = bpy.context.scene
-    white = new_material("Paint", Base_Color=rgb(.80, .79, .76), Roughness=0.45)[0]
-    dark = new_material("Dark Metal", Base_Color=rgb(.05, .05, .055), Metallic=1.0, Roughness=0.35)[0]
-    plaster = new_material("Plaster", Base_Color=rgb(.47, .55, .51), Roughness=0.8)[0]
-    oak = new_material("Oak", Base_Color=rgb(.34, .19, .09), Roughness=0.4)[0]
+    white = new_material("Paint", Base_Color=rgb(0.80, 0.79, 0.76), Roughness=0.45)[0]
+    dark = new_material("Dark Metal", Base_Color=rgb(0.05, 0.05, 0.055), Metallic=1.0, Roughness=0.35)[0]
+    plaster = new_material("Plaster", Base_Color=rgb(0.47, 0.55, 0.51), Roughness=0.8)[0]
+    oak = new_material("Oak", Base_Color=rgb(0.34, 0.19, 0.09), Roughness=0.4)[0]
 
     # shell: floor, back wall, a left wall with a barred window
     box("Floor", (-4, -5, -0.1), (4, 2.2, 0), wood_floor())
@@ -282,24 +288,38 @@ def build_scene(seed, transparent=False, caustics=False):
         box("Back Wall", (-2.1, 2.2, 0), (4, 2.3, 3.4), wall)
         box("Skirting", (-4, 2.17, 0), (4, 2.2, 0.13), white)
     x0, x1, ya, yb, za, zb = -2.1, -2.0, 0.15, 1.75, 0.85, 2.35
-    for k, (lo, hi) in enumerate([((x0, -5, 0), (x1, ya, 3.4)), ((x0, yb, 0), (x1, 2.2, 3.4)),
-                                  ((x0, ya, 0), (x1, yb, za)), ((x0, ya, zb), (x1, yb, 3.4))]):
+    for k, (lo, hi) in enumerate(
+        [
+            ((x0, -5, 0), (x1, ya, 3.4)),
+            ((x0, yb, 0), (x1, 2.2, 3.4)),
+            ((x0, ya, 0), (x1, yb, za)),
+            ((x0, ya, zb), (x1, yb, 3.4)),
+        ]
+    ):
         if not (transparent and k == 0):
             box(f"Left Wall {k}", lo, hi, plaster)
     for k in range(1, 4):
         y = ya + (yb - ya) * k / 4
-        box(f"Bar V{k}", (x0 + .03, y - .014, za), (x1 - .03, y + .014, zb), white)
+        box(f"Bar V{k}", (x0 + 0.03, y - 0.014, za), (x1 - 0.03, y + 0.014, zb), white)
     for k in range(1, 3):
         z = za + (zb - za) * k / 3
-        box(f"Bar H{k}", (x0 + .03, ya, z - .014), (x1 - .03, yb, z + .014), white)
-    box("Sill", (x0, ya - .05, za - .04), (x1 + .14, yb + .05, za), white)
+        box(f"Bar H{k}", (x0 + 0.03, ya, z - 0.014), (x1 - 0.03, yb, z + 0.014), white)
+    box("Sill", (x0, ya - 0.05, za - 0.04), (x1 + 0.14, yb + 0.05, za), white)
 
     # rug, pedestal with the head, table with cloth and glass ball
-    box("Rug", (-1.45, -0.95, 0), (0.55, 0.30, 0.012),
-        checker("Rug", rgb(.60, .52, .40), rgb(.13, .035, .04), 11.0, Roughness=0.95))
-    box("Pedestal", (-1.02, 0.62, 0), (-0.28, 1.30, 0.62),
-        checker("Marquetry", rgb(.36, .20, .09), rgb(.13, .06, .03), 9.0, Roughness=0.25))
-    gold = new_material("Gold", Base_Color=rgb(.95, .56, .20), Metallic=1.0, Roughness=0.16)[0]
+    box(
+        "Rug",
+        (-1.45, -0.95, 0),
+        (0.55, 0.30, 0.012),
+        checker("Rug", rgb(0.60, 0.52, 0.40), rgb(0.13, 0.035, 0.04), 11.0, Roughness=0.95),
+    )
+    box(
+        "Pedestal",
+        (-1.02, 0.62, 0),
+        (-0.28, 1.30, 0.62),
+        checker("Marquetry", rgb(0.36, 0.20, 0.09), rgb(0.13, 0.06, 0.03), 9.0, Roughness=0.25),
+    )
+    gold = new_material("Gold", Base_Color=rgb(0.95, 0.56, 0.20), Metallic=1.0, Roughness=0.16)[0]
     bpy.ops.mesh.primitive_monkey_add(size=0.92, location=(-0.65, 0.93, 1.03))
     head = bpy.context.object
     head.name = "Suzanne"
@@ -310,38 +330,46 @@ def build_scene(seed, transparent=False, caustics=False):
     table = (0.74, 0.62, 0.74)
     cone("Table Leg", 0.20, 0.05, 0.72, oak, (table[0], table[1], 0.36))
     cloth("Tablecloth", tablecloth(), table)
-    sphere("Glass Ball", 0.22, glass(caustics), (table[0] - .12, table[1] - .14, table[2] + .22))
-    china = new_material("China", Base_Color=rgb(.80, .82, .86), Roughness=0.08)[0]
-    sphere("Pearl", 0.085, china, (table[0] + .26, table[1] - .20, table[2] + .085))
-    red = new_material("Red Lacquer", Base_Color=rgb(.62, .03, .03), Roughness=0.12, Coat_Weight=1.0)[0]
-    sphere("Cherry", 0.055, red, (table[0] + .10, table[1] - .37, table[2] + .055))
+    sphere("Glass Ball", 0.22, glass(caustics), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
+    china = new_material("China", Base_Color=rgb(0.80, 0.82, 0.86), Roughness=0.08)[0]
+    sphere("Pearl", 0.085, china, (table[0] + 0.26, table[1] - 0.20, table[2] + 0.085))
+    red = new_material("Red Lacquer", Base_Color=rgb(0.62, 0.03, 0.03), Roughness=0.12, Coat_Weight=1.0)[0]
+    sphere("Cherry", 0.055, red, (table[0] + 0.10, table[1] - 0.37, table[2] + 0.055))
 
     # pot with grass, wire globe
-    pot = new_material("Terracotta", Base_Color=rgb(.52, .19, .09), Roughness=0.8)[0]
+    pot = new_material("Terracotta", Base_Color=rgb(0.52, 0.19, 0.09), Roughness=0.8)[0]
     cone("Pot", 0.13, 0.19, 0.30, pot, (1.62, 0.16, 0.15))
-    blade, nt, bsdf = new_material("Grass", Base_Color=rgb(.13, .36, .05), Roughness=0.5)
+    blade, nt, bsdf = new_material("Grass", Base_Color=rgb(0.13, 0.36, 0.05), Roughness=0.5)
     tone = node(nt, "ShaderNodeTexNoise", Scale=9.0, Detail=2.0)
-    nt.links.new(mix_colors(nt, tone.outputs[0], rgb(.05, .20, .03), rgb(.42, .50, .10)),
-                 bsdf.inputs["Base Color"])
+    nt.links.new(
+        mix_colors(nt, tone.outputs[0], rgb(0.05, 0.20, 0.03), rgb(0.42, 0.50, 0.10)), bsdf.inputs["Base Color"]
+    )
     grass("Grass", rng, blade, (1.62, 0.16, 0.29), radius=0.16, height=0.60)
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3, radius=0.23, location=(-0.98, -0.30, 0.24))
     globe = bpy.context.object
     globe.name = "Wire Globe"
     wires = globe.modifiers.new("Wireframe", "WIREFRAME")
     wires.thickness = 0.010
-    finish(globe, new_material("Steel", Base_Color=rgb(.75, .77, .80), Metallic=1.0, Roughness=0.2)[0])
+    finish(globe, new_material("Steel", Base_Color=rgb(0.75, 0.77, 0.80), Metallic=1.0, Roughness=0.2)[0])
 
     # pendant lamp: cable, shade, visible bulb, three stay wires
     lamp = Vector((0.10, 0.80, 1.98))
-    tube("Cable", [(lamp.x, lamp.y, 3.4), (lamp.x, lamp.y, lamp.z + .16)], 0.006, dark)
-    cone("Shade", 0.26, 0.07, 0.20, new_material("Shade", Base_Color=rgb(.04, .20, .22), Roughness=0.3)[0],
-         lamp + Vector((0, 0, .06)), cap="NOTHING")
-    bulb, nt, bsdf = new_material("Bulb", Emission_Color=rgb(1.0, .72, .40), Emission_Strength=38.0)
+    tube("Cable", [(lamp.x, lamp.y, 3.4), (lamp.x, lamp.y, lamp.z + 0.16)], 0.006, dark)
+    cone(
+        "Shade",
+        0.26,
+        0.07,
+        0.20,
+        new_material("Shade", Base_Color=rgb(0.04, 0.20, 0.22), Roughness=0.3)[0],
+        lamp + Vector((0, 0, 0.06)),
+        cap="NOTHING",
+    )
+    bulb, nt, bsdf = new_material("Bulb", Emission_Color=rgb(1.0, 0.72, 0.40), Emission_Strength=38.0)
     sphere("Bulb", 0.062, bulb, lamp - Vector((0, 0, 0.02)), segments=24)
     for k in range(3):
         a = 2 * math.pi * k / 3 + 0.4
         edge = lamp + Vector((0.26 * math.cos(a), 0.26 * math.sin(a), -0.04))
-        tube(f"Stay {k}", [tuple(lamp + Vector((0, 0, .62))), tuple(edge)], 0.0035, dark)
+        tube(f"Stay {k}", [tuple(lamp + Vector((0, 0, 0.62))), tuple(edge)], 0.0035, dark)
 
     # picture and shelf on the back wall
     if not transparent:
@@ -352,16 +380,24 @@ def build_scene(seed, transparent=False, caustics=False):
         box("Shelf", (0.48, 1.96, 1.38), (1.98, 2.2, 1.42), oak)
         x = 0.55
         while x < 1.86:
-            w, h = rng.uniform(.025, .065), rng.uniform(.24, .40)
-            hue = rng.choice([(.45, .08, .06), (.08, .16, .34), (.60, .47, .24), (.10, .25, .14),
-                              (.50, .50, .47), (.62, .28, .06)])
-            mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(.25, .7))[0]
-            book = box("Book", (x, 1.99 + rng.uniform(0, .03), 1.42), (x + w, 2.17, 1.42 + h), mat)
-            bands = new_material("Band", Base_Color=rgb(.75, .60, .25), Metallic=1.0, Roughness=.3)[0]
+            w, h = rng.uniform(0.025, 0.065), rng.uniform(0.24, 0.40)
+            hue = rng.choice(
+                [
+                    (0.45, 0.08, 0.06),
+                    (0.08, 0.16, 0.34),
+                    (0.60, 0.47, 0.24),
+                    (0.10, 0.25, 0.14),
+                    (0.50, 0.50, 0.47),
+                    (0.62, 0.28, 0.06),
+                ]
+            )
+            mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(0.25, 0.7))[0]
+            book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), mat)
+            bands = new_material("Band", Base_Color=rgb(0.75, 0.60, 0.25), Metallic=1.0, Roughness=0.3)[0]
             y = book.location.y - 0.001 - (2.17 - book.location.y)
             for f in (0.18, 0.80):
-                box("Band", (x + .002, y, 1.42 + f * h), (x + w - .002, y + .002, 1.42 + f * h + .013), bands)
-            x += w + rng.uniform(.002, .006)
+                box("Band", (x + 0.002, y, 1.42 + f * h), (x + w - 0.002, y + 0.002, 1.42 + f * h + 0.013), bands)
+            x += w + rng.uniform(0.002, 0.006)
 
     # light: a window-sized area light and the sun outside, a soft fill in front, the sky
     def light(name, kind, energy, color, at, to, **attrs):
@@ -376,11 +412,21 @@ def build_scene(seed, transparent=False, caustics=False):
         ob.visible_camera = False
         return ob
 
-    light("Window", "AREA", 85, (.82, .91, 1.0), (-2.35, 0.95, 1.65), (1, 0.2, 0.9), shape="RECTANGLE",
-          size=1.5, size_y=1.7)
-    light("Sun", "SUN", 11.0, (1.0, .84, .62), (-4, 1.85, 3.2), (0.2, -0.1, 0), angle=math.radians(0.8))
-    light("Fill", "AREA", 30, (1.0, .95, .88), (1.9, -3.4, 3.0), (0, 0.8, 0.7), shape="RECTANGLE",
-          size=1.6, size_y=1.2)
+    light(
+        "Window",
+        "AREA",
+        85,
+        (0.82, 0.91, 1.0),
+        (-2.35, 0.95, 1.65),
+        (1, 0.2, 0.9),
+        shape="RECTANGLE",
+        size=1.5,
+        size_y=1.7,
+    )
+    light("Sun", "SUN", 11.0, (1.0, 0.84, 0.62), (-4, 1.85, 3.2), (0.2, -0.1, 0), angle=math.radians(0.8))
+    light(
+        "Fill", "AREA", 30, (1.0, 0.95, 0.88), (1.9, -3.4, 3.0), (0, 0.8, 0.7), shape="RECTANGLE", size=1.6, size_y=1.2
+    )
 
     world = bpy.data.worlds.new("Sky")
     scene.world = world
@@ -390,8 +436,8 @@ def build_scene(seed, transparent=False, caustics=False):
     coords = nt.nodes.new("ShaderNodeTexCoord")
     split = nt.nodes.new("ShaderNodeSeparateXYZ")
     ramp = nt.nodes.new("ShaderNodeValToRGB")
-    ramp.color_ramp.elements[0].color = rgb(.90, .93, .95)
-    ramp.color_ramp.elements[1].color = rgb(.30, .50, .95)
+    ramp.color_ramp.elements[0].color = rgb(0.90, 0.93, 0.95)
+    ramp.color_ramp.elements[1].color = rgb(0.30, 0.50, 0.95)
     nt.links.new(coords.outputs["Generated"], split.inputs[0])
     nt.links.new(split.outputs["Z"], ramp.inputs[0])
     nt.links.new(ramp.outputs["Color"], back.inputs["Color"])
@@ -418,11 +464,30 @@ def build_scene(seed, transparent=False, caustics=False):
 
 # ------------------------------------------------------------------- render
 PASSES_LEAN = [
-    "z", "normal", "cryptomatte_object", "diffuse_direct", "diffuse_indirect", "diffuse_color",
-    "glossy_direct", "glossy_indirect", "glossy_color"]
+    "z",
+    "normal",
+    "cryptomatte_object",
+    "diffuse_direct",
+    "diffuse_indirect",
+    "diffuse_color",
+    "glossy_direct",
+    "glossy_indirect",
+    "glossy_color",
+]
 PASSES_ALL = [
-    *PASSES_LEAN, "mist", "vector", "uv", "position", "object_index", "material_index",
-    "transmission_direct", "transmission_indirect", "transmission_color", "emit", "environment"]
+    *PASSES_LEAN,
+    "mist",
+    "vector",
+    "uv",
+    "position",
+    "object_index",
+    "material_index",
+    "transmission_direct",
+    "transmission_indirect",
+    "transmission_color",
+    "emit",
+    "environment",
+]
 
 
 def configure(scene, args):
@@ -524,8 +589,15 @@ def main(argv):
     jobs = [("hr", (w, h), args.hr_spp, 1), ("lr", low, args.lr_spp, 2), ("ref", (w, h), args.ref_spp, 3)]
     for name, size, spp, offset in jobs:
         if name in wanted and spp > 0:
-            render(scene, args.out.resolve() / f"{name}{args.suffix}.exr", size, spp,
-                   1000 * args.seed + offset, args.border, args.crop)
+            render(
+                scene,
+                args.out.resolve() / f"{name}{args.suffix}.exr",
+                size,
+                spp,
+                1000 * args.seed + offset,
+                args.border,
+                args.crop,
+            )
 
 
 if __name__ == "__main__":

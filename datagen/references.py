@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Take the noise out of training references.
+"""Denoise the references of training views.
 
-    python -m training.references VIEWS
+    python -m datagen.references VIEWS
 
-A reference of some hundred spp is noisy where the light is hard to find, and there its noise is larger than what a
-network has left to learn. Open Image Denoise, with the albedo and normal of all passes, leaves hardly any of it. The
-result lies beside each view for training and validation as ``NAME.ref.npy``, which :class:`training.data.View` prefers.
-Views for testing keep the reference that was rendered: against its own results no denoiser can be judged.
+A reference of some hundred spp is still noisy where light is hard to sample, and there its noise exceeds the error that
+a network could still remove. Open Image Denoise, guided by the albedo and normal of all passes, removes nearly all of
+it. The result is stored beside each training and validation view as ``NAME.ref.npy``, which
+:class:`datagen.views.View` reads instead of ``ref``. Test views keep the rendered reference, because a denoiser must
+not be scored against its own results.
 """
 
 from __future__ import annotations
@@ -17,19 +18,19 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen import views
 from oiio_msspl import schema
 from oiio_msspl.transforms import MAX_RADIANCE
-from training import data
 
 
-def denoised(view: data.View) -> data.Array:
-    """The rendered reference (H, W, 3) without its noise."""
+def denoised(view: views.View) -> views.Array:
+    """The denoised reference of a view, (H, W, 3), scene-linear."""
     import pyoidn
 
     whole = slice(None)
-    guides = data.split_features(np.mean(data.read_hrls(view, list(range(len(view.hr))), whole, whole), axis=0))
+    guides = views.split_features(np.mean(views.read_hrls(view, list(range(len(view.hr))), whole, whole), axis=0))
     return pyoidn.denoise(
-        data.read(view.ref),
+        views.as_float32(view.ref),
         albedo=np.ascontiguousarray(guides[schema.ALBEDO].clip(0, 1)),
         normal=np.ascontiguousarray(guides[schema.NORMAL]),
         hdr=True,
@@ -39,12 +40,12 @@ def denoised(view: data.View) -> data.Array:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("views", type=Path)
+    parser.add_argument("views", type=Path, help="folder of views")
     args = parser.parse_args()
     made = 0
-    folder = data.Folder(args.views)
+    folder = views.Folder(args.views)
     for view in folder.split("train") + folder.split("validation"):
-        path = data.clean_reference(view.path)
+        path = views.denoised_reference(view.path)
         if path.exists():
             continue
         partial = path.with_name(f".{path.name}")

@@ -6,8 +6,8 @@ import json
 import numpy as np
 import pytest
 
+from datagen import command_line, quality, shards, views
 from oiio_msspl.transforms import luminance
-from training import data, shards, views
 
 
 def _write(folder, seed=20, brightness=1.0):
@@ -16,7 +16,7 @@ def _write(folder, seed=20, brightness=1.0):
     hr = rng.random((views.HR_PASSES, n, n, 15), np.float32) * brightness
     lr = rng.random((len(views.LR_SPP), n, n, 3), np.float32) * brightness
     ref = rng.random((n, n, 3), np.float32) * brightness
-    meta = {"seed": f"cycles-{seed}", "split": views.split(seed)}
+    meta = {"seed": f"cycles-{seed}", "split": views.split_of(seed)}
     views.save(views.path_of(folder, "cycles", seed, 0), views.pack(hr, {1: lr}, ref, rng, meta))
     return hr, lr, ref
 
@@ -25,7 +25,7 @@ def _write(folder, seed=20, brightness=1.0):
 def test_training_reads_what_a_renderer_saves(tmp_path, brightness):
     hr, lr, ref = _write(tmp_path, brightness=brightness)
     assert [p.name for p in tmp_path.iterdir()] == ["cycles-000020-0.npz"]
-    (view,) = data.Folder(tmp_path).split("validation")
+    (view,) = views.Folder(tmp_path).split("validation")
     assert view.scene == "cycles-20" and tuple(view.lr_spp) == views.LR_SPP
     # Exposed so that half floats hold it, all radiance alike; albedo and normal are no radiance.
     scale = luminance(view.ref.astype(np.float32)).mean() / luminance(ref).mean()
@@ -41,7 +41,7 @@ def test_training_reads_what_a_renderer_saves(tmp_path, brightness):
 
 
 def test_whole_scenes_are_held_out():
-    splits = [views.split(seed) for seed in range(40)]
+    splits = [views.split_of(seed) for seed in range(40)]
     assert splits.count("validation") == 2 and splits.count("test") == 2 and splits[20] == "validation"
 
 
@@ -51,7 +51,7 @@ def test_psnr_of_mean_is_the_error_of_the_mean():
     a, b = (clean + rng.normal(0, 0.02, clean.shape) for _ in range(2))
     slope = 0.46 / 0.18 / 2.4 * 1.1  # of the sRGB curve at mid-grey, about
     expected = -20 * np.log10(0.02 / np.sqrt(2) * slope)
-    assert views.psnr_of_mean(a, b) == pytest.approx(expected, abs=0.5)
+    assert quality.psnr_of_mean(a, b) == pytest.approx(expected, abs=0.5)
 
 
 def test_bare_and_black_views_show_nothing():
@@ -61,8 +61,8 @@ def test_bare_and_black_views_show_nothing():
     bare[..., 3:9] = 0.5
     black[: 32 // 2, :, :3] = 0
     sky[:24, :, 6:9] = 0
-    assert views.shows_something(busy)
-    assert not any(views.shows_something(probe) for probe in (bare, black, sky))
+    assert quality.shows_something(busy)
+    assert not any(quality.shows_something(probe) for probe in (bare, black, sky))
 
 
 def test_shards_bring_every_view_back(tmp_path):
@@ -105,6 +105,6 @@ def test_shards_that_cannot_be_made_or_read_are_named(tmp_path):
 
 
 def test_seeds_are_ranges():
-    parser = views.parser("x", ref_spp=1)
+    parser = command_line.parser("x", "", ref_spp=1)
     for text, seeds in (("7", [7]), ("3:5", [3, 4]), ("1:50:20", [1, 21, 41])):
         assert list(parser.parse_args(["--out", "o", "--seeds", text]).seeds) == seeds

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The command line: `python -m training.cycles_views --out DIR --seeds 0:400`."""
+"""The command line: ``python -m datagen.cycles --out VIEWS --seeds 0:400``."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import logging
 import os
 import sys
 
-from .. import views
+from datagen import command_line
 
 
 def main() -> int:
-    args = views.parser("training.cycles_views", ref_spp=32).parse_args()
+    args = command_line.parser(
+        "datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32
+    ).parse_args()
     from .assets import Assets
     from .render import render_scene
 
-    # Blender reports every file it saves, its importers every step; only our own lines are worth reading.
+    # Blender prints a line for every file that it saves or imports. Python keeps the terminal, Blender gets /dev/null.
     logging.disable(logging.INFO)
     sys.stdout = os.fdopen(os.dup(1), "w")
     with open(os.devnull, "w") as nowhere:
         os.dup2(nowhere.fileno(), 1)
 
     assets = Assets(args.assets)
-    return views.render_all(
+    return command_line.render_all(
         args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.threads)
     )
 

@@ -1,7 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How hard a set of views is: `python -m training.mitsuba_views.stats DIR [--validation RENDERS]`.
+"""Print how difficult a set of views is: noise, dynamic range, edges.
 
-Every image is exposed to a log-mean luminance of 0.18 first, the reference's, as a viewer would see it.
+    python -m datagen.stats VIEWS [--validation RENDERS]
+
+Every view is first exposed so that its reference has a log-mean luminance of 0.18, as a photograph would.
 """
 
 from __future__ import annotations
@@ -13,11 +15,10 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.quality import log_mean
 from oiio_msspl import metrics
 from oiio_msspl.transforms import KEY
 from oiio_msspl.transforms import luminance as luminance_of
-
-from ..views import log_mean
 
 _MEASURES = {
     "psnr": "1-spp PSNR in sRGB [dB]",
@@ -31,7 +32,7 @@ _MEASURES = {
 
 
 def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dict[str, float]:
-    """Numbers of one view from its 1-spp colour, its reference and a clean-ish albedo, each (H, W, 3)."""
+    """Measure one view from its 1-spp colour, its reference and an albedo with little noise, each (H, W, 3)."""
     luminance = np.maximum(luminance_of(reference), 0)
     mean = log_mean(reference)
     exposure = KEY / mean
@@ -49,7 +50,7 @@ def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dic
 
 
 def training_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
-    """(kind, numbers) of each training file."""
+    """(kind of scene, measures) of each view."""
     for path in sorted(folder.glob("[!.]*.npz")):
         with np.load(path) as view:
             hr, meta = view["hr"].astype(np.float32), json.loads(str(view["meta"]))
@@ -58,7 +59,7 @@ def training_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
 
 
 def validation_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
-    """(scene, numbers) of each folder that holds `hr_1spp.exr` and `ref.exr`."""
+    """(scene, measures) of each folder that holds ``hr_1spp.exr`` and ``ref.exr``."""
     import OpenImageIO as oiio
 
     def read(path: Path, names: list[str]) -> np.ndarray:
@@ -67,7 +68,7 @@ def validation_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
         return buffer.get_pixels(oiio.FLOAT)[..., [have.index(n) for n in names]]
 
     for path in sorted(folder.glob("*/hr_1spp.exr")):
-        # The albedo of most samples: edges of a 1-spp albedo would count its aliasing.
+        # The albedo of the highest spp: the edges of a 1-spp albedo include its aliasing.
         best = max(path.parent.glob("hr_*spp.exr"), key=lambda p: int(p.stem[3:-3]))
         rgb = list("RGB")
         albedo = read(best, ["albedo.R", "albedo.G", "albedo.B"])
@@ -83,9 +84,9 @@ def _row(name: str, views: list[dict[str, float]], key: str) -> str:
 
 
 def main() -> None:
-    p = argparse.ArgumentParser(prog="python -m training.mitsuba_views.stats", description=__doc__.split("\n")[0])
+    p = argparse.ArgumentParser(prog="python -m datagen.stats", description=__doc__.split("\n")[0])
     p.add_argument("folder", type=Path, help="folder of .npz views")
-    p.add_argument("--validation", type=Path, help="folder of <scene>/hr_1spp.exr and ref.exr to set beside it")
+    p.add_argument("--validation", type=Path, help="folder with <scene>/hr_1spp.exr and ref.exr to compare with")
     args = p.parse_args()
 
     sets: dict[str, list[dict[str, float]]] = {"training": []}

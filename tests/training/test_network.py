@@ -14,6 +14,7 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from datagen.views import Folder, mean_lrhs, read_hrls  # noqa: E402
 from oiio_msspl import metrics, schema, tensors, transforms  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
 from training import batches, data, losses, train  # noqa: E402
@@ -155,15 +156,15 @@ def test_relative_loss_counts_light_in_the_dark() -> None:
 
 
 def test_hrls_is_the_mean_of_passes(views: Path) -> None:
-    (view,) = data.Folder(views).split("train")
+    (view,) = Folder(views).split("train")
     everything = slice(0, SIZE)
-    passes = data.read_hrls(view, [2, 5], everything, everything)
+    passes = read_hrls(view, [2, 5], everything, everything)
     expected = (view.hr[2, ..., :3].astype(np.float32) + view.hr[5, ..., :3]) / 2
     np.testing.assert_array_equal(passes.mean(0)[..., :3], expected)
 
 
 def drawn(views: Path, scale: int, patch: int, count: int, sampling: data.Sampling, seed: int = 0) -> batches.Batch:
-    pixels = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(views).split("train")]
+    pixels = [batches.Pixels.of(view, torch.device("cpu")) for view in Folder(views).split("train")]
     return batches.draw(pixels, scale, patch, count, np.random.default_rng(seed), sampling)
 
 
@@ -202,9 +203,9 @@ def test_an_lrhs_with_a_filter_of_its_own_is_read_as_it_was_rendered(views: Path
     wide.mkdir()
     np.savez(wide / "one.npz", **others, lr_x2=rendered[2])
     np.savez(wide / "all.npz", **others, **{f"lr_x{s}": passes for s, passes in rendered.items()})
-    (view,) = data.Folder(wide).split("train")
+    (view,) = Folder(wide).split("train")
     for nearest in (False, True):
-        np.testing.assert_array_equal(data.mean_lrhs(view, [0, 3], scale, nearest=nearest), rendered[scale][0])
+        np.testing.assert_array_equal(mean_lrhs(view, [0, 3], scale, nearest=nearest), rendered[scale][0])
         sampling = data.Sampling(nearest=float(nearest), exposure_stops=0, gain_stops=0, grey=0)
         lrhs = drawn(wide, scale, 32, 2, sampling)["lrhs"]
         # A flat picture is exposed to the key
@@ -265,7 +266,7 @@ def test_normals_keep_their_lengths_and_angles(views: Path) -> None:
 
 
 def test_new_views_are_found_and_broken_ones_wait(views: Path) -> None:
-    folder = data.Folder(views)
+    folder = Folder(views)
     (views / "late.npz").write_bytes((views / "train.npz").read_bytes()[:1000])
     folder.scan()
     assert len(folder.split("train")) == 1
@@ -285,7 +286,7 @@ def tiny_network() -> MultiResolutionFusion:
 
 def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
     """SIGTERM leaves a checkpoint, and the same command goes on from it."""
-    root = Path(__file__).parents[1]
+    root = Path(__file__).parents[2]
     command = [
         sys.executable, "-m", "training.train", "--scale", "2", "--data", str(views), "--out", str(tmp_path / "run"),
         "--minutes", "5", "--batch", "1", "--patch", "16", "--val-patch", "16", "--checkpoint-seconds", "0.5",
@@ -304,7 +305,7 @@ def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
 
 
 def test_the_thread_that_draws_ahead_ends(views: Path) -> None:
-    source = batches.Batches(data.Folder(views), (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
+    source = batches.Batches(Folder(views), (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
     assert source.next()["lrhs"].shape == (1, 3, 8, 8)
     source.close()
     assert not source._worker.is_alive()
@@ -342,7 +343,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     assert export.parity(tiny_network, 4, path) < (5e-3 if half else 1e-5)
     kinds = {node.op_type for node in onnx.load(path).graph.node}
     assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
-    assert str(Path(__file__).parents[1]).encode() not in path.read_bytes()
+    assert str(Path(__file__).parents[2]).encode() not in path.read_bytes()
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
     metadata = session.get_modelmeta().custom_metadata_map
     assert Contract.from_json(metadata[METADATA_KEY], str(path)) == contract

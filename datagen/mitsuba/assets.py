@@ -13,7 +13,7 @@ from pathlib import Path
 import mitsuba as mi
 import numpy as np
 
-from .meshes import Mesh, merge
+from datagen.meshes import Mesh, merge
 
 _TO_Z_UP = np.array([[1, 0, 0], [0, 0, -1], [0, 1, 0]], float)
 _DTYPES = {5121: np.uint8, 5123: np.uint16, 5125: np.uint32, 5126: np.float32}

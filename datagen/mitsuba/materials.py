@@ -10,7 +10,7 @@ from __future__ import annotations
 import mitsuba as mi
 import numpy as np
 
-from . import textures
+from datagen import textures
 
 Rng = np.random.Generator
 Bsdf = dict

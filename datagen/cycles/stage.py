@@ -12,9 +12,10 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..mitsuba_views import meshes as geo
-from ..mitsuba_views import textures as tex
-from ..mitsuba_views.meshes import Mesh
+from datagen import meshes as geo
+from datagen import textures as tex
+from datagen.meshes import Mesh
+
 from . import materials as mat
 from .assets import Assets, licence_of, load_model
 from .geometry import blender_mesh, from_bmesh, strands

@@ -15,8 +15,9 @@ import bpy
 import numpy as np
 from mathutils import Matrix, Vector
 
-from ..mitsuba_views import meshes as geo
-from ..mitsuba_views import textures as tex
+from datagen import meshes as geo
+from datagen import textures as tex
+
 from . import materials as mat
 from .assets import Assets
 from .geometry import blender_mesh

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The network that mixes what Open Image Denoise makes of both renders. Needs PyTorch, but no OIDN."""
+"""The mix network. Needs PyTorch, but no OIDN."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from torch.nn import functional as F  # noqa: E402
 from oiio_msspl import schema  # noqa: E402
 from oiio_msspl.contract import Contract  # noqa: E402
 from training import train  # noqa: E402
-from training.mix import MixFusion, disagreement, mixed  # noqa: E402
-from training.pyramid import logarithmic  # noqa: E402
+from training.encoding import log_encode  # noqa: E402
+from training.mix import MixFusion, distillation_loss, mixed  # noqa: E402
 
 HEIGHT, WIDTH = 64, 96
-#: By their place in FINER and in COARSEST.
-BROUGHT, DENOISED, LIGHT, SAMPLES = range(4)
-TOGETHER, DENOISED_MEAN, MEAN, LOW = range(4, 8)
+#: Indices of the candidates in FINER and in COARSEST.
+RESCALED, DENOISED, LIGHT, HRLS = range(4)
+DENOISED_MEAN, DENOISED_HRLS, HRLS_MEAN, LRHS = range(4, 8)
 
 
 @pytest.fixture
@@ -36,8 +36,8 @@ def pair(scale: int) -> tuple[torch.Tensor, torch.Tensor]:
     )
 
 
-def prefer(network: MixFusion, finer: int, coarsest: int = TOGETHER) -> None:
-    """The same choice everywhere: light is all that the albedo colours."""
+def prefer(network: MixFusion, finer: int, coarsest: int = DENOISED_MEAN) -> None:
+    """Set the logits so that every pixel takes one candidate, and the albedo colours all light."""
     for level, head in enumerate(network.heads):
         head.weight.data.zero_()
         choice = torch.full((8,), -40.0)
@@ -54,7 +54,7 @@ def test_one_network_serves_every_scale(network: MixFusion, scale: int) -> None:
 
 
 @torch.inference_mode()
-def test_shares_are_those_of_a_softmax() -> None:
+def test_weights_are_those_of_a_softmax() -> None:
     logits = 30 * torch.randn(2, 3, 4, 5)
     images = [torch.rand(2, 3, 4, 5) for _ in range(3)]
     expected = (torch.softmax(logits, 1).unsqueeze(2) * torch.stack(images, 1)).sum(1)
@@ -63,19 +63,19 @@ def test_shares_are_those_of_a_softmax() -> None:
 
 @torch.inference_mode()
 @pytest.mark.parametrize("scale", schema.SCALES)
-def test_it_can_believe_any_of_them(network: MixFusion, scale: int) -> None:
-    """Noise around an even picture, a denoised HRLS that is 1.5 times too dark, an albedo of stripes."""
+def test_every_fine_candidate_can_be_chosen(network: MixFusion, scale: int) -> None:
+    """With noisy renders of even light, a denoised HRLS that is 1.5 times too dark, and a striped albedo."""
     lrhs, hrls = pair(scale)
     stripes = 0.4 + 0.2 * (torch.arange(WIDTH) % 2).expand(1, 3, HEIGHT, WIDTH)
     light = 0.5 * torch.ones(1, 3, HEIGHT, WIDTH)
     hrls[:, 3:6] = stripes
-    hrls[:, 16:] = logarithmic(stripes * light / 1.5)
-    lrhs[:, 3:] = logarithmic(F.avg_pool2d(stripes * light, scale))
+    hrls[:, 16:] = log_encode(stripes * light / 1.5)
+    lrhs[:, 3:] = log_encode(F.avg_pool2d(stripes * light, scale))
     expected = {
-        BROUGHT: logarithmic(stripes * light),
+        RESCALED: log_encode(stripes * light),
         DENOISED: hrls[:, 16:],
-        LIGHT: logarithmic(stripes * light),
-        SAMPLES: hrls[:, :3],
+        LIGHT: log_encode(stripes * light),
+        HRLS: hrls[:, :3],
     }
     for choice, image in expected.items():
         prefer(network, choice)
@@ -84,18 +84,18 @@ def test_it_can_believe_any_of_them(network: MixFusion, scale: int) -> None:
 
 @torch.inference_mode()
 @pytest.mark.parametrize("scale", schema.SCALES)
-def test_the_coarsest_level_too(network: MixFusion, scale: int) -> None:
-    """What it believes there is the brightness of the result, if that follows the coarser levels."""
+def test_every_coarse_candidate_can_be_chosen(network: MixFusion, scale: int) -> None:
+    """The coarsest candidate sets the brightness of the result, if finer levels follow it."""
     lrhs, hrls = pair(scale)
     hrls[:, :3], hrls[:, 16:], lrhs[:, :3], lrhs[:, 3:] = 0.2, 0.3, 0.4, 0.35
-    for choice, value in {TOGETHER: 0.35, DENOISED_MEAN: 0.3, MEAN: 0.2, LOW: 0.4}.items():
-        prefer(network, BROUGHT, choice)
+    for choice, value in {DENOISED_MEAN: 0.35, DENOISED_HRLS: 0.3, HRLS_MEAN: 0.2, LRHS: 0.4}.items():
+        prefer(network, RESCALED, choice)
         torch.testing.assert_close(network(lrhs, hrls)[0], torch.full((1, 3, HEIGHT, WIDTH), value), atol=0.01, rtol=0)
 
 
 @torch.inference_mode()
 def test_it_never_leaves_the_range_of_its_inputs(network: MixFusion) -> None:
-    """Even with wild weights, and whatever was denoised: what is bright or dark in the renders stays where it was."""
+    """Even with random weights and a wrong denoised HRLS, the result stays in the range of the renders around it."""
     for parameter in network.parameters():
         parameter.copy_(3 * torch.randn_like(parameter))
     lrhs, hrls = pair(4)
@@ -106,20 +106,19 @@ def test_it_never_leaves_the_range_of_its_inputs(network: MixFusion) -> None:
     assert fused.max() <= 1.0
 
 
-def test_a_teacher_is_agreed_with(network: MixFusion) -> None:
-    """Deciding as it does costs nothing, otherwise more; what a scale does not use does not count, and it learns
-    nothing itself."""
+def test_distillation_loss_is_least_for_the_teachers_logits(network: MixFusion) -> None:
+    """It is 0 for equal logits, ignores logits that a scale does not use, and has no gradient into the teacher."""
     lrhs, hrls = pair(4)
-    logits, _ = network.decide(lrhs, hrls)
-    assert disagreement(logits, logits, first=2).item() == pytest.approx(0, abs=1e-6)
+    logits, _ = network.predict_logits(lrhs, hrls)
+    assert distillation_loss(logits, logits, coarsest=2).item() == pytest.approx(0, abs=1e-6)
     others = [logits[0] + 1, logits[1] + torch.randn(8, 1, 1), *logits[2:]]
-    output, loss = train.fused_and_taught(network, network, lrhs, hrls)
+    output, loss = train.fuse_and_distil(network, network, lrhs, hrls)
     torch.testing.assert_close(output, network(lrhs, hrls)[0])
     assert loss.item() == pytest.approx(0, abs=1e-6)
-    assert disagreement(logits, others, first=2) > 0.01
+    assert distillation_loss(logits, others, coarsest=2) > 0.01
     unused = [*logits[:3], torch.randn_like(logits[3])]
-    assert disagreement(logits, unused, first=2).item() == pytest.approx(0, abs=1e-6)
-    disagreement(logits, [each.detach() for each in others], first=2).backward()
+    assert distillation_loss(logits, unused, coarsest=2).item() == pytest.approx(0, abs=1e-6)
+    distillation_loss(logits, [each.detach() for each in others], coarsest=2).backward()
     assert network.heads[1].weight.grad.abs().max() > 0
     assert network.heads[3].weight.grad is None or not network.heads[3].weight.grad.any()
 

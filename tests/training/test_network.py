@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -17,15 +18,11 @@ torch = pytest.importorskip("torch")
 from datagen.views import Folder, mean_lrhs, read_hrls  # noqa: E402
 from oiio_msspl import metrics, schema, tensors, transforms  # noqa: E402
 from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
-from training import batches, data, losses, train  # noqa: E402
+from training import checkpoints, data, encoding, losses, train  # noqa: E402
+from training.encoding import log_decode  # noqa: E402
+from training.ops import from_phases, to_phases, weighted_sum  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
-from training.pyramid import (  # noqa: E402
-    PyramidFusion,
-    from_phases,
-    linear,
-    to_phases,
-    weighted_sum,
-)
+from training.pyramid import PyramidFusion  # noqa: E402
 
 TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
 SIZE = 64
@@ -151,7 +148,7 @@ def test_relative_loss_counts_light_in_the_dark() -> None:
     dark = torch.full((1, 3, 8, 8), 0.02)
     for step, at_most in ((0.02, None), (3.0, 4.0)):
         extra = (losses.relative(dark + step, dark) - losses.display(dark + step, dark)).item()
-        relmse = metrics.relmse(*(linear(x)[0].permute(1, 2, 0).numpy() for x in (dark + step, dark)))
+        relmse = metrics.relmse(*(log_decode(x)[0].permute(1, 2, 0).numpy() for x in (dark + step, dark)))
         assert extra == pytest.approx(at_most or relmse, rel=0.05)
 
 
@@ -163,9 +160,9 @@ def test_hrls_is_the_mean_of_passes(views: Path) -> None:
     np.testing.assert_array_equal(passes.mean(0)[..., :3], expected)
 
 
-def drawn(views: Path, scale: int, patch: int, count: int, sampling: data.Sampling, seed: int = 0) -> batches.Batch:
-    pixels = [batches.Pixels.of(view, torch.device("cpu")) for view in Folder(views).split("train")]
-    return batches.draw(pixels, scale, patch, count, np.random.default_rng(seed), sampling)
+def drawn(views: Path, scale: int, patch: int, count: int, sampling: data.Sampling, seed: int = 0) -> data.Batch:
+    tensors = data.view_tensors(Folder(views), "train", torch.device("cpu"))
+    return data.draw(tensors, scale, patch, count, np.random.default_rng(seed), sampling)
 
 
 def test_variance_is_that_of_the_mean_and_unbiased(views: Path) -> None:
@@ -227,12 +224,12 @@ def test_training_transforms_as_inference_does() -> None:
     layers[schema.NORMAL] -= 1
     low = rng.exponential(1.0, (7, 9, 3)).astype(np.float32)
     low[2:4] = 0
-    exposure = batches.exposure_of(torch.from_numpy(low)[None])
+    exposure = encoding.exposure_of(torch.from_numpy(low)[None])
     assert exposure.item() == pytest.approx(transforms.exposure_of(low), rel=1e-3)
-    packed = batches.pack({name: torch.from_numpy(values)[None] for name, values in layers.items()}, exposure)
+    packed = encoding.pack({name: torch.from_numpy(values)[None] for name, values in layers.items()}, exposure)
     expected = tensors.pack(layers, schema.HRLS_FEATURES, exposure.item())
     np.testing.assert_allclose(packed[0].numpy(), expected, atol=1e-5)
-    assert batches.exposure_of(torch.zeros(1, 4, 4, 3)).item() == transforms.exposure_of(
+    assert encoding.exposure_of(torch.zeros(1, 4, 4, 3)).item() == transforms.exposure_of(
         np.zeros((4, 4, 3), np.float32)
     )
 
@@ -243,7 +240,7 @@ def test_exposure_of_training_is_that_of_inference() -> None:
     frames = rng.gamma(1.0, 0.3, (4, 12, 16, 3)).astype(np.float32)
     frames[1, :4], frames[2, 4:], frames[3] = 0, 1e-20, 0
     expected = [transforms.exposure_of(frame) for frame in frames]
-    np.testing.assert_allclose(batches.exposure_of(torch.from_numpy(frames)), expected, rtol=1e-4)
+    np.testing.assert_allclose(encoding.exposure_of(torch.from_numpy(frames)), expected, rtol=1e-4)
 
 
 @pytest.mark.parametrize("determinant", [1, -1])
@@ -304,20 +301,51 @@ def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
     assert state["step"] > 0 and state["training_spp"] == {"2": {"hrls": [1, 8], "lrhs": [4, 64]}}
 
 
-def test_the_thread_that_draws_ahead_ends(views: Path) -> None:
-    source = batches.Batches(Folder(views), (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
-    assert source.next()["lrhs"].shape == (1, 3, 8, 8)
-    source.close()
-    assert not source._worker.is_alive()
+def test_the_loader_draws_what_the_data_set_does(views: Path) -> None:
+    """In its own process, from the same seed; and that process ends with the iterator."""
+    pairs = data.Batches(views, (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
+    loaded = iter(pairs.loader())
+    for _, expected, batch in zip(range(6), pairs, loaded, strict=False):
+        assert batch["lrhs"].shape == (1, 3, 8, 8)
+        for name, values in expected.items():
+            torch.testing.assert_close(batch[name], values, rtol=0, atol=0)
+    (worker,) = loaded._workers
+    del loaded
+    worker.join(timeout=30)
+    assert not worker.is_alive()
+
+
+def test_the_schedule_follows_the_clock() -> None:
+    """Warm-up from 0, the peak, the end of the cosine; a group's share scales it."""
+    run = Mock(spec_set=["optimizer", "peak_lr", "args", "recipe", "elapsed"], peak_lr=1e-3, elapsed=0.0)
+    run.args.minutes, run.recipe = 1, train.RECIPES["ours"]
+    run.optimizer = torch.optim.SGD([{"params": [torch.zeros(1)], "share": 0.5}], lr=1.0)
+    schedule = train.Run.new_schedule(run)
+    for elapsed, share in ((0.0, 1e-3), (0.9, 0.5), (1.8, 1.0), (60.0, train.FINAL)):
+        run.elapsed = elapsed
+        run.optimizer.step()
+        schedule.step()
+        assert run.optimizer.param_groups[0]["lr"] == pytest.approx(share * 0.5e-3)
+
+
+def test_the_moving_average_starts_with_a_short_memory() -> None:
+    """It follows the weights quickly at first; the decay then grows to EMA_DECAY."""
+    network = PyramidFusion(channels=(8,) * 5, own_size=(3,) * 5)
+    average = train.averaged(network)
+    expected = network.error.bias.detach().clone()
+    for step in range(1, 4):
+        network.error.bias.data += 1
+        average.update_parameters(network)
+        decay = (1 + step) / (10 + step)
+        expected = decay * expected + (1 - decay) * network.error.bias.detach()
+        torch.testing.assert_close(average.module.error.bias, expected)
 
 
 def test_larger_scale_starts_as_the_smaller_one(tiny_network: MultiResolutionFusion, tmp_path: Path) -> None:
     """Warm-started with a x4 network, a x8 one answers alike to images without detail (away from the border)."""
-    from training.train import warm_start
-
     torch.save({"ema": tiny_network.state_dict()}, tmp_path / "x4.pt")
     larger = MultiResolutionFusion(8, **TINY)
-    warm_start(larger, tmp_path / "x4.pt")
+    checkpoints.warm_start(larger, tmp_path / "x4.pt")
     colour, layers = torch.rand(1, 3, 1, 1), torch.rand(1, 16, 1, 1)
     middles = [
         network(colour.expand(1, 3, 40, 40), layers.expand(1, 16, 40 * network.scale, 40 * network.scale))[
@@ -421,11 +449,11 @@ def test_a_predicted_error_is_that_of_the_output_in_the_mean() -> None:
     """The loss of the prediction is least at the mean error; the output learns nothing from it."""
     output, reference = torch.rand(1, 3, 8, 8), torch.rand(1, 3, 8, 8)
     mean = (output - reference).abs().mean().log().expand(1, 1, 8, 8)
-    least = losses.of_error(mean, output, reference)
-    assert least < min(losses.of_error(mean + change, output, reference) for change in (-0.1, 0.1))
+    least = losses.error_likelihood(mean, output, reference)
+    assert least < min(losses.error_likelihood(mean + change, output, reference) for change in (-0.1, 0.1))
     network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5)
     fused, log_error = network(torch.rand(1, 3, 16, 16), torch.rand(1, 16, 64, 64))
-    losses.of_error(log_error, fused.detach(), torch.rand(1, 3, 64, 64)).backward()
+    losses.error_likelihood(log_error, fused.detach(), torch.rand(1, 3, 64, 64)).backward()
     assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}
 
 
@@ -433,17 +461,17 @@ def test_a_pyramid_begins_with_the_middle_of_larger_kernels(tmp_path: Path) -> N
     channels = (8, 8, 8, 8, 8)
     wide, narrow = (PyramidFusion(channels=channels, own_size=(size, 5, 5, 5, 5)) for size in (5, 3))
     torch.save({"ema": wide.state_dict(), "config": wide.config}, tmp_path / "wide.pt")
-    train.warm_start(narrow, tmp_path / "wide.pt")
+    checkpoints.warm_start(narrow, tmp_path / "wide.pt")
     ours, theirs = (network.heads[0].weight.unflatten(0, (-1, 4)) for network in (narrow, wide))
     assert torch.equal(ours[4], theirs[12])  # the middle ones
     assert torch.equal(ours[0], theirs[6])  # above and left of it
     assert torch.equal(ours[9:], theirs[25:])
     torch.save({"ema": narrow.state_dict(), "config": narrow.config}, tmp_path / "narrow.pt")
-    with pytest.raises(SystemExit, match="has 3x3 taps, and no more can be added"):
-        train.warm_start(wide, tmp_path / "narrow.pt")
+    with pytest.raises(SystemExit, match="has 3x3 kernels, which cannot grow"):
+        checkpoints.warm_start(wide, tmp_path / "narrow.pt")
     torch.save({"ema": {}, "config": {"scale": 4}}, tmp_path / "paper.pt")
-    with pytest.raises(SystemExit, match="no pyramid network"):
-        train.warm_start(wide, tmp_path / "paper.pt")
+    with pytest.raises(SystemExit, match="not a pyramid network"):
+        checkpoints.warm_start(wide, tmp_path / "paper.pt")
 
 
 @torch.inference_mode()
@@ -460,7 +488,8 @@ def test_onnx_file_of_a_pyramid_agrees_with_it(
     """In float32 to rounding. With 8-bit convolutions a smaller file says nearly the same, and no colour is rounded."""
     pytest.importorskip("onnxscript")
     onnx = pytest.importorskip("onnx")
-    from training import export, quantize
+    from training import export
+    from training.quantise import static
 
     path = tmp_path / "tiny.onnx"
     contract = Contract(name="tiny", scale=4, alignment=tiny_pyramid.multiple // 4, overlap=32)
@@ -468,8 +497,8 @@ def test_onnx_file_of_a_pyramid_agrees_with_it(
     onnx.save(plain, path)
     assert export.parity(tiny_pyramid, 4, path) < 1e-4
 
-    monkeypatch.setattr(quantize, "PATCH", SIZE)
-    quantised = quantize.quantise(plain, contract, views)
+    monkeypatch.setattr(static, "PATCH", SIZE)
+    quantised = static.quantise(plain, contract, views)
     assert quantised.ByteSize() < plain.ByteSize()
     assert {entry.key: entry.value for entry in quantised.metadata_props} == {METADATA_KEY: contract.to_json()}
     onnx.save(quantised, path)

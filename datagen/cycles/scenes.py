@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # ruff: noqa: RUF005 -- adding a tuple to an array is a sum, not a concatenation
-"""Random scenes for Cycles. A scene is a function of its seed and of the assets at hand, nothing else.
+"""Random scenes for Cycles. A seed and the asset files determine a scene.
 
-What makes a path tracer noisy is built in on purpose: sun and sky through small openings, lamps in shades, round
-corners and behind partitions, dozens of small lights, caustics, fur, wires, fog. About one scene in six is easy.
+Most scenes are hard for a path tracer: sun and sky through small openings, lamps in shades, round corners and behind
+partitions, dozens of small lights, caustics, fur, wires, fog. About one scene in six is easy.
 """
 
 from __future__ import annotations
@@ -230,7 +230,7 @@ def street(s: Stage) -> None:
 
 
 def studio(s: Stage) -> None:
-    """The easy kind: things on a ground under softboxes or an open environment."""
+    """An easy scene: objects on a ground under softboxes or an open environment."""
     rng = s.rng
     x, t = np.meshgrid(np.linspace(-8, 8, 20), np.linspace(0, 1, 60), indexing="ij")
     profile_y, profile_z = (
@@ -319,7 +319,7 @@ def build(seed: int, assets: Assets) -> Stage:
 
 
 def _set_moving(stage: Stage) -> None:
-    """Let some objects move through frame 1, the one that is rendered, while the shutter is open."""
+    """Animate some objects, so that they move during the exposure of frame 1, which is rendered."""
     rng = stage.rng
     stage.scene.render.use_motion_blur = True
     stage.scene.render.motion_blur_shutter = rng.uniform(0.3, 1.0)
@@ -336,7 +336,7 @@ def _set_moving(stage: Stage) -> None:
 
 
 def aim(stage: Stage, rng: Rng) -> dict[str, object]:
-    """Turn the scene's camera somewhere; whether it sees anything is for the caller to find out."""
+    """Aim the scene's camera at a random target. The caller checks that it shows something."""
     scene = stage.scene
     if scene.camera is None:
         scene.camera = stage.place(bpy.data.cameras.new("camera"))

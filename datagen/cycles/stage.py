@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 # ruff: noqa: RUF005 -- adding a tuple to an array is a sum, not a concatenation
-"""What scenes are made of: things, furniture, rooms, lamps and skies, all random. Metres; z is up."""
+"""Building blocks of random scenes: objects, furniture, rooms, lamps, skies. Lengths are in metres; z is up."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 # ruff: noqa: RUF005 -- adding a tuple to an array is a sum, not a concatenation
-"""Random scenes. A scene is a function of its seed and of the assets at hand, nothing else.
+"""Random scenes. A seed and the asset files determine a scene.
 
-What makes a path tracer noisy is built in on purpose: rooms lit through small openings, lamps in shades or
-facing walls, many lights of which each sample sees one, glass between light and floor, thin geometry. About
-one scene in four is easy (large lights, open sky), so that a network learns to leave a good image alone too.
+Most scenes are hard for a path tracer: rooms lit through small openings, lamps in shades or facing walls, many lights
+of which each sample picks one, glass between light and floor, thin geometry. About one scene in four is easy (large
+lights, open sky), so that a network also learns to keep a good image.
 """
 
 from __future__ import annotations
@@ -568,7 +568,7 @@ def outdoors(s: Scene) -> None:
 
 
 def studio(s: Scene) -> None:
-    """The easy kind: things on a ground under large lights or an open environment."""
+    """An easy scene: objects on a ground under large lights or an open environment."""
     rng = s.rng
     s.add(geo.rectangle(20, 20).tiled(rng.uniform(0.3, 2)), mat.structure(rng))
     if rng.random() < 0.5:
@@ -613,7 +613,7 @@ def build(seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
 
 
 def camera(plan: Scene, rng: Rng) -> Camera:
-    """A random camera; whether it sees anything is for the caller to find out."""
+    """A random camera. The caller checks that it shows something."""
     target = plan.focus[rng.integers(len(plan.focus))] + rng.normal(size=3) * 0.15
     if plan.room is not None:
         w, d, h = plan.room

@@ -18,16 +18,16 @@ MAX_DEPTH = 10
 RR_DEPTH = 4
 
 PixelFilter = Callable[[mi.Float], mi.Float]
-"""Makes of a uniform number where in a pixel a sample lies, from 0 (left or top edge) to 1 or beyond."""
+"""Maps a uniform random number to a sample's position in its pixel: 0 is the left or top edge, 1 the other one."""
 
 
 def box(uniform: mi.Float) -> mi.Float:
-    """A sample anywhere in its pixel."""
+    """Box filter of one pixel: samples are uniform in their pixel."""
     return uniform
 
 
 def blackman_harris(width: float = 1.5, size: int = 1024) -> PixelFilter:
-    """A Blackman-Harris filter `width` pixels wide, Blender's default of 1.5, by the inverse of its integral.
+    """Blackman-Harris filter, importance-sampled by the inverse of its integral.
 
     It is sampled, as Cycles does, so that pixels share no noise.
     """

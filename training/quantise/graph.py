@@ -2,7 +2,8 @@
 """The ONNX graph of a quantised U-Net.
 
 The file holds the differences from Open Image Denoise's weights, in 8-bit steps. The weights themselves are external
-tensors, which whoever loads the graph reads from the installed Open Image Denoise.
+tensors, which whoever loads the graph reads from the installed Open Image Denoise. Tensor names are those of the files
+that ship; ``.in_codes.more`` are the differences.
 """
 
 from __future__ import annotations

@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
 import hashlib
-import itertools
 import struct
 from pathlib import Path
 from unittest.mock import Mock
@@ -122,84 +121,6 @@ def test_a_session_may_ask_for_open_image_denoise_itself(both_ways):
     model = find_model(2, "mix")
     quick, exact = (fuse(lr, hr, Session(model, threads=1, exact=exact)).rgb for exact in (False, True))
     assert 0 < np.abs(quick - exact).mean() < 0.02 * clean.mean()
-
-
-# Making them
-
-
-def test_chosen_steps_beat_the_nearest():
-    torch = pytest.importorskip("torch")
-    from training.eight_bit import nearest_steps
-
-    random = torch.Generator().manual_seed(0)
-    mixing = torch.randn(24, 24, generator=random)
-    inputs = (torch.randn(4000, 24, generator=random) @ mixing).relu()
-    weights = torch.randn(5, 25, generator=random)
-    outputs = inputs @ weights[:, :24].T + weights[:, 24]
-
-    def error(chosen, step, bias):
-        return float((inputs @ (chosen * step[:, None]).T + bias - outputs).square().mean())
-
-    chosen, step, bias = nearest_steps(inputs, outputs, weights, weights[:, :24])
-    assert chosen.abs().max() <= 127
-    torch.testing.assert_close(chosen, chosen.round())
-    step_of_weights = weights[:, :24].abs().amax(1) / 127
-    nearest = (weights[:, :24] / step_of_weights[:, None]).round()
-    assert error(chosen, step, bias) < 0.6 * error(nearest, step_of_weights, weights[:, 24])
-
-
-def test_slices_are_those_with_the_least_noise():
-    torch = pytest.importorskip("torch")
-    from training.eight_bit import least_noise
-
-    noise = torch.tensor([9.0, 4.0, 1.5, 0.0])
-    slices = least_noise(noise, 6)
-    ways = [torch.tensor(way) for way in itertools.product(range(1, 8), repeat=4) if sum(way) == 10]
-    assert int(slices.sum()) == 10
-    assert slices[-1] == 1
-    assert float((noise / slices**2).sum()) == pytest.approx(min(float((noise / way**2).sum()) for way in ways))
-
-
-def test_the_graph_computes_what_was_fitted(tmp_path):
-    """A network of few channels: from original weights and what is added to them, ONNX Runtime makes the same codes."""
-    torch = pytest.importorskip("torch")
-    from training import eight_bit as made
-
-    shape, random = made.SHAPES["usual"], torch.Generator().manual_seed(0)
-    weights: dict[str, torch.Tensor] = {}
-
-    def conv(name, channels):
-        out = 3 if name == shape.last else 8
-        scale = (2 / (9 * channels)) ** 0.5
-        weights[f"{name}.weight"] = (torch.randn(out, channels, 3, 3, generator=random) * scale).half().float()
-        weights[f"{name}.bias"] = (0.1 * torch.rand(out, generator=random)).half().float()
-        return out
-
-    def same(channels):
-        return channels
-
-    made.walk(shape, [9], conv, same, same, lambda one, other: one + other)
-    drawn = [layers(64, 48, seed) for seed in range(2)]
-    pictures = [made.picture(picture) for picture in drawn]
-    fit = made.quantise("usual", weights, weights, drawn)
-    made.onnx.save(made.Graph(fit).model(), tmp_path / "usual.onnx")
-    halves = {name: values.half().numpy() for name, values in weights.items()}
-    session = runtime.load(tmp_path / "usual.onnx", 1, initializers=halves)
-    codes = pictures[0][1]
-    found = session.run(["codes"], {"layers": codes[0].permute(1, 2, 0).numpy().astype(np.uint8)[None]})[0][0]
-
-    expected = made.walk(
-        shape,
-        [codes],
-        lambda name, x: fit.layers[name](x),
-        lambda x: made.F.max_pool2d(x, 2),
-        lambda x: made.F.interpolate(x, scale_factor=2),
-        lambda one, other: torch.cat([one, other], dim=1),
-    )
-    slices = expected[0, : 3 * eight_bit.SLICES_OUT].unflatten(0, (-1, 3)).sum(dim=0).permute(1, 2, 0).numpy()
-    assert np.ptp(slices) > 100
-    # Codes that lie between two are rounded to the even one or up, and that goes on through the layers
-    assert np.abs(found - slices).mean() < 1
 
 
 def test_the_package_has_no_weights_of_open_image_denoise():

@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's ablations: what each branch reads, the loss, and super-resolution without an HRLS.
+"""The paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
 
     python -m training.ablations VIEWS --json benchmarks/results/ablations.json
 
-As in the paper: an HRLS of 1 spp, an LRHS of far more (all 16 samples a pixel of a view's ``lr`` passes, 256 spp at
-x4), and the branch that is not examined reads colour alone. A reduced network of the paper's shape is trained anew for
-every row, for the same few steps, on the same batches, and scored on the held-out views; so rows can be compared with
-each other, not with what ships. An LRHS with layers has those of the ``hr`` passes that are not in the HRLS. Rows that
-the JSON file has already are kept.
+As in the paper, the HRLS has 1 spp, the LRHS has far more (all ``lr`` passes of a view, 256 spp at x4), and the branch
+that is not varied reads colour only. For every row a reduced network of the paper's architecture is trained from
+scratch, for the same few steps on the same batches, and scored on the validation views. Rows can be compared with each
+other, not with the shipped models. The LRHS's AOVs come from the ``hr`` passes that are not in the HRLS. Rows that the
+JSON file already has are kept.
 """
 
 from __future__ import annotations
@@ -23,19 +23,21 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
 
+from datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
 from oiio_msspl import metrics, schema, tensors, transforms
 from oiio_msspl.comparison import upsample_bicubic
-from training import data, losses
+from training import losses
+from training.data import to_tensor
+from training.encoding import log_decode
 from training.paper import HRLS_CHANNELS, MultiResolutionFusion
-from training.pyramid import linear
-from training.train import to_tensor
 
 REDUCED = {"channels": 32, "growth": 16, "groups": 2, "blocks": 3}
 BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
-#: Batches drawn for a scale, which every row then goes through again and again.
+#: Batches that are drawn per scale. Every row trains on them repeatedly.
 POOL = 400
-#: Layers by what the tables call them; each has those before it, too.
+#: Features by the tables' names; each entry includes those before it.
 LAYERS = {
     "RGB": [schema.RGB],
     "and albedo": [schema.ALBEDO],
@@ -43,13 +45,13 @@ LAYERS = {
     "and diffuse, specular": [schema.DIFFUSE, schema.SPECULAR],
 }
 NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
-#: The paper clips radiance here.
+#: The paper's upper bound of radiance.
 CLIP = 100.0
 
 
 @dataclass(frozen=True)
 class Variant:
-    """One row."""
+    """One row of the tables."""
 
     name: str
     scale: int = 4
@@ -59,7 +61,7 @@ class Variant:
 
 
 def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
-    return lambda output, reference: loss(*(linear(values).clamp(0.0, CLIP) for values in (output, reference)))
+    return lambda output, reference: loss(*(log_decode(values).clamp(0.0, CLIP) for values in (output, reference)))
 
 
 def _robust(beta: float) -> Callable[[Tensor, Tensor], Tensor]:
@@ -79,7 +81,7 @@ VARIANTS = [
 
 @dataclass(frozen=True)
 class Pair:
-    """One crop of one view, transformed; layers as :data:`oiio_msspl.schema.HRLS_FEATURES` has them."""
+    """One crop of one view, encoded; channels in the order of :data:`oiio_msspl.schema.HRLS_FEATURES`."""
 
     lrhs: np.ndarray
     """(h, w, 16)"""
@@ -90,33 +92,33 @@ class Pair:
     exposure: float
 
 
-def pair_of(view: data.View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
-    """A crop whose HRLS is the pass ``chosen``."""
+def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
+    """A crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
     rows, columns = slice(top, top + patch), slice(left, left + patch)
-    colour = data.mean_lrhs(view, list(range(len(view.lr_spp))), scale)
+    colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
     exposure = transforms.exposure_of(colour)
     low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
 
     def packed(passes: np.ndarray) -> np.ndarray:
-        return tensors.pack(data.split_features(passes), schema.HRLS_FEATURES, exposure)
+        return tensors.pack(split_features(passes), schema.HRLS_FEATURES, exposure)
 
     others = [p for p in range(len(view.hr)) if p != chosen]
-    low = transforms.box_downsample(data.read_hrls(view, others, rows, columns).mean(axis=0), scale)
+    low = transforms.box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
     low[..., :3] = colour[low_rows, low_columns]
-    high = data.read_hrls(view, [chosen], rows, columns)[0]
-    return Pair(packed(low), packed(high), data.read(view.ref[rows, columns]), exposure)
+    high = read_hrls(view, [chosen], rows, columns)[0]
+    return Pair(packed(low), packed(high), as_float32(view.ref[rows, columns]), exposure)
 
 
 def channels_of(name: str) -> Tensor:
-    """1 for the channels that a branch reads, 0 for the others: (1, 16, 1, 1)."""
+    """Mask (1, 16, 1, 1) of the channels that a branch reads."""
     names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
     read = {feature for layers in names for feature in LAYERS[layers]}
     return torch.cat([torch.full((n,), float(f in read)) for f, n in schema.HRLS_FEATURES.items()])[None, :, None, None]
 
 
-@functools.lru_cache(maxsize=1)  # some GB; variants come scale by scale
-def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Batches of ``lrhs``, ``hrls`` and target, in network values."""
+@functools.lru_cache(maxsize=1)  # some GB; VARIANTS are sorted by scale
+def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Batches of LRHS, HRLS and target, encoded."""
     rng = np.random.default_rng(0)
     batches = []
     for _ in range(POOL):
@@ -134,17 +136,16 @@ def pool(views: tuple[data.View, ...], scale: int) -> list[tuple[Tensor, Tensor,
     return batches
 
 
-def train(variant: Variant, views: tuple[data.View, ...], steps: int) -> MultiResolutionFusion:
-    """A network after so many steps."""
+def train(variant: Variant, views: tuple[View, ...], steps: int) -> MultiResolutionFusion:
+    """A network after ``steps`` training steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
     batches = pool(views, variant.scale)
+    schedule = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / steps)))  # constant, then linear to zero
     for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * min(1.0, 2 * (1 - step / steps))  # constant, then to zero
         lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
         with torch.autocast("cpu", torch.bfloat16):
             output = network(lrhs * low_mask, hrls * high_mask)
@@ -152,12 +153,13 @@ def train(variant: Variant, views: tuple[data.View, ...], steps: int) -> MultiRe
         variant.loss(output.float(), target).backward()
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimizer.step()
+        schedule.step()
     return network
 
 
 @torch.inference_mode()
-def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[data.View, ...]) -> dict[str, float]:
-    """Mean PSNR and RelMSE, and those of bicubic upsampling."""
+def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
+    """Mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
     found = []
     for view in views:
         height, width = view.ref.shape[:2]
@@ -173,13 +175,13 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[data
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("views", type=Path)
-    parser.add_argument("--json", type=Path, required=True)
-    parser.add_argument("--steps", type=int, default=1500, help="for each row")
+    parser.add_argument("views", type=Path, help="folder of views")
+    parser.add_argument("--json", type=Path, required=True, help="table to write or complete")
+    parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(1)
     result: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {"rows": []}
-    folder = data.Folder(args.views)
+    folder = Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
     result |= {"steps": args.steps, "network": REDUCED, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in result["rows"]}

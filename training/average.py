@@ -1,85 +1,88 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The mean of networks that went on from one another, as a checkpoint to export or to train on from.
+"""Average the weights of several checkpoints of one network; the result can be exported or trained further.
 
     python -m training.average training/checkpoints/NEW.pt training/checkpoints/OLD.pt RUN/checkpoint.pt
     python -m training.average training/checkpoints/NEW.pt RUN/checkpoint.pt --kernels 1 3 3 3 3
+    python -m training.average training/checkpoints/joint.pt RUN/checkpoint.pt --initial 0.25 0.75
 
-    python -m training.average training/checkpoints/joint.pt RUN/checkpoint.pt --beginning 0.25 0.75
-
-A pyramid's kernels are cut to ``--kernels``, or to those of the last one. Of a joint network, a share of the mean may
-be what it begins as: Open Image Denoise, and the same choice everywhere of what to believe.
-
-Between a network and what more training made of it lie others that have most of what either is better at (Wortsman et
-al. 2022). The result is stored in half precision, and says of itself what the last one does.
+The mean of a network and of its continuation by further training often keeps the strengths of both (Wortsman et al.
+2022). A pyramid network's kernels are cropped to ``--kernels``, or to the sizes of the last checkpoint. The mean of a
+joint network may include its initial state, which is Open Image Denoise with constant logits. The result is stored in
+half precision, with the provenance of the last checkpoint.
 """
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
-from typing import Any
 
 import torch
+from torch.optim.swa_utils import AveragedModel
 
+from training import checkpoints
+from training.checkpoints import State
 from training.joint import JointFusion
+from training.networks import NETWORKS
 from training.pyramid import LEVELS
-from training.train import cut_kernels, save
 
-#: What only the run itself needs.
-OF_THE_RUN = ("network", "optimizer", "best_gain")
+#: Parts of a checkpoint that only a continued run needs.
+RUN_STATE = ("network", "optimizer", "best_gain")
 
 
-def mean(
-    states: list[dict[str, Any]], kernels: list[int] | None = None, beginning: tuple[float, float] = (0, 0)
-) -> dict[str, Any]:
+def mean(states: list[State], kernels: list[int] | None = None, initial: tuple[float, float] = (0, 0)) -> State:
     """A checkpoint with the mean of the averaged weights of several.
 
     Args:
-        kernels: of a pyramid, by level; the last one's if None.
-        beginning: of a joint network, shares of the mean that its beginning has: of itself, and of what denoises both
-            renders together.
+        kernels: kernel sizes of a pyramid network by level; the last checkpoint's if None.
+        initial: shares of a joint network's initial state: of the network, and of its denoiser of both renders' mean.
 
     Raises:
-        SystemExit: they are of different networks.
+        SystemExit: the checkpoints are of different networks.
     """
     last = states[-1]
     kernels = kernels or last["config"].get("own_size")
     for state in states:
         if kernels and "own_size" in state["config"]:
-            cut_kernels(state["ema"], state["config"]["own_size"], kernels)
+            checkpoints.crop_kernels(state["ema"], state["config"]["own_size"], kernels)
             state["config"]["own_size"] = kernels
     if any((state["config"], state["denoiser"]) != (last["config"], last["denoiser"]) for state in states):
         raise SystemExit("these checkpoints are of different networks")
-    weights = {name: torch.stack([state["ema"][name].float() for state in states]).mean(dim=0) for name in last["ema"]}
-    if any(beginning):
-        if last["architecture"] != "joint":
-            raise SystemExit("--beginning: only a joint network begins as something that is of use")
-        for name, start in JointFusion(**last["config"]).beginning().items():
-            weights[name] = torch.lerp(weights[name], start, beginning[name.startswith("together.")])
-    kept = {name: value for name, value in last.items() if name not in OF_THE_RUN}
+    if any(initial) and last["architecture"] != "joint":
+        raise SystemExit("--initial: only a joint network has an initial state worth averaging with")
+    network = NETWORKS[last["architecture"]](**last["config"])
+    average = AveragedModel(network)
+    for state in states:
+        network.load_state_dict(state["ema"])
+        average.update_parameters(network)
+    weights = average.module.state_dict()
+    if any(initial):
+        for name, start in JointFusion(**last["config"]).initial_state().items():
+            weights[name] = torch.lerp(weights[name], start, initial[name.startswith("mean_denoiser.")])
+    result = {name: value for name, value in last.items() if name not in RUN_STATE}
     if len(states) > 1:
-        kept["provenance"] = last["provenance"] | {"mean_of": [state["provenance"] for state in states]}
-    if any(beginning):
-        kept["provenance"] = kept["provenance"] | {"share_of_beginning": list(beginning)}
-    return kept | {"ema": {name: value.half() for name, value in weights.items()}}
+        result["provenance"] = last["provenance"] | {"mean_of": [state["provenance"] for state in states]}
+    if any(initial):
+        result["provenance"] = result["provenance"] | {"share_of_initial_state": list(initial)}
+    return result | {"ema": {name: value.half() for name, value in weights.items()}}
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("out", type=Path)
-    parser.add_argument("checkpoints", type=Path, nargs="+")
-    parser.add_argument("--kernels", type=int, nargs=LEVELS, metavar="TAPS", help="as of training.train")
+    parser.add_argument("out", type=Path, help="checkpoint to write")
+    parser.add_argument("checkpoints", type=Path, nargs="+", help="checkpoints to average")
+    parser.add_argument("--kernels", type=int, nargs=LEVELS, metavar="SIZE", help="as for training.train")
     parser.add_argument(
+        "--initial",
         "--beginning",
         type=float,
         nargs=2,
         default=(0, 0),
         metavar="SHARE",
-        help="of a joint network: of itself, and of what denoises both renders together",
+        help="joint: shares of the initial state in the network and in its denoiser of both renders' mean",
     )
     args = parser.parse_args()
-    states = [torch.load(path, map_location="cpu", weights_only=True) for path in args.checkpoints]
-    save(mean(states, args.kernels, tuple(args.beginning)), args.out)
+    states = [checkpoints.read(path) for path in args.checkpoints]
+    checkpoints.save(mean(states, args.kernels, tuple(args.initial)), args.out)
 
 
 if __name__ == "__main__":

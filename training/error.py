@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Teach a trained network, of any family but the paper's, to predict its own error.
+"""Train the prediction of a network's own error, for every network but the paper's.
 
     python -m training.error RUN/best.pt --data VIEWS
 
-Of finished weights, because they need nothing of it: only the last convolution learns, for some hundred batches as
-training draws them, and the checkpoint is written again with it.
+Only the convolution that predicts the error is trained, for some hundred batches; the rest of the network is final. The
+checkpoint is overwritten.
 """
 
 from __future__ import annotations
@@ -14,41 +14,36 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from torch.optim.lr_scheduler import LambdaLR
 
-from training import batches, data, export, losses
+from training import checkpoints, data, losses
 from training.joint import JointFusion
 from training.networks import preparation, run
-from training.pyramid import Trunk
-from training.train import lr_factor, save
+from training.train import lr_factor
+from training.trunk import Trunk
 
 PATCH, BATCH, LEARNING_RATE = 192, 4, 2e-3
 
 
 def fit(
-    network: Trunk | JointFusion,
-    views: list[batches.Pixels],
-    scales: list[int],
-    prepare: data.Prepare | None,
-    steps: int,
+    network: Trunk | JointFusion, views: Path, scales: list[int], prepare: data.Prepare | None, steps: int
 ) -> float:
-    """Train the prediction in place; return the mean of its loss over the last tenth of the steps."""
+    """Train the prediction in place; return the mean loss of the last tenth of the steps."""
     network.requires_grad_(False)
     network.error.requires_grad_(True)
-    optimizer = torch.optim.Adam(network.error.parameters())
-    rng = np.random.default_rng(0)
+    optimizer = torch.optim.Adam(network.error.parameters(), lr=LEARNING_RATE)
+    schedule = LambdaLR(optimizer, lambda step: lr_factor(step / steps))
+    batches = data.fixed_batches(views, "train", scales, PATCH, BATCH, prepare)
     last = []
-    for step in range(steps):
-        for group in optimizer.param_groups:
-            group["lr"] = LEARNING_RATE * lr_factor(step / steps)
-        with torch.no_grad():
-            pair = batches.draw(views, int(rng.choice(scales)), PATCH, BATCH, rng, data.Sampling(), prepare)
+    for step, pair in zip(range(steps), batches, strict=False):
         with torch.autocast("cpu", torch.bfloat16):
             output, log_error = run(network, pair["lrhs"], pair["hrls"])
         assert log_error is not None
-        loss = losses.of_error(log_error, output.float(), pair["target"])
+        loss = losses.error_likelihood(log_error, output.float(), pair["target"])
         optimizer.zero_grad()
         loss.backward()
         optimizer.step()
+        schedule.step()
         if step >= 0.9 * steps:
             last.append(float(loss.detach()))
     return float(np.mean(last))
@@ -58,20 +53,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--data", type=Path, required=True, help="folder of views")
-    parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--steps", type=int, default=400, help="(default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    network, state = export.load(args.checkpoint)
+    network, state = checkpoints.load(args.checkpoint)
     if not isinstance(network, Trunk | JointFusion):
         raise SystemExit(f"{args.checkpoint}: the paper's network does not predict its error")
-    views = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
-    scales = [int(scale) for scale in state["training_spp"]]
     network.reset_error()
-    loss = fit(network, views, scales, preparation(state["architecture"], args.threads), args.steps)
+    scales = [int(scale) for scale in state["training_spp"]]
+    loss = fit(network, args.data, scales, preparation(state["architecture"], args.threads), args.steps)
     state["ema"] = network.state_dict()
     state["provenance"]["error_steps"] = args.steps
-    save(state, args.checkpoint)
+    checkpoints.save(state, args.checkpoint)
     print(f"{args.steps} steps, loss {loss:.3f}")
 
 

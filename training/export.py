@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write a training checkpoint's averaged weights as an ONNX file with its contract.
+"""Export a checkpoint's averaged weights as an ONNX file with its contract.
 
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
     python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --int8 VIEWS --overlap 64
 
-With ``--half`` the weights are stored as half floats and cast to float32 when the file is loaded: half the size, while
-the computation stays in float32. With ``--int8`` convolutions are computed in 8 bits (:mod:`training.quantize`).
+``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
+computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`).
 """
 
 from __future__ import annotations
@@ -29,43 +29,38 @@ from onnxscript import opset18
 from torch import nn
 from torch.utils._pytree import tree_map
 
+from datagen.views import Folder, View
 from oiio_msspl import runtime, schema
 from oiio_msspl.contract import METADATA_KEY, Contract
 from oiio_msspl.denoiser import installed_weights
-from training import data, joint_graph
+from training.checkpoints import load
 from training.joint import JointFusion
-from training.networks import NETWORKS, Network, run
+from training.networks import Network, run
+from training.oidn import BASE_HDR
 from training.paper import MultiResolutionFusion
-from training.quantize import quantise
+from training.quantise import joint, static
+from training.validation import ValidationPair
 
 #: Operators and file format that ONNX Runtime 1.14 and newer understand.
 OPSET, IR_VERSION = 18, 8
 
-#: Bytes that a tile takes for each of its HRLS pixels, measured with ``benchmarks.runtime`` and rounded up; and what it
-#: takes together with Open Image Denoise, which keeps its buffers.
+#: Memory of a tile in bytes per HRLS pixel, measured with ``benchmarks.runtime`` and rounded up: of the network, and of
+#: the network with Open Image Denoise, which keeps its buffers.
 MEMORY, MEMORY_WITH_DENOISER = 1000, 1900
 
-#: Smallest tensor that is worth a half float: biases are small, and precise at no cost.
+#: Smaller tensors, such as biases, stay float32.
 HALF_ELEMENTS = 256
 
 
-def load(checkpoint: Path) -> tuple[Network, dict[str, Any]]:
-    """The network with its averaged weights, and everything that the checkpoint holds."""
-    state = torch.load(checkpoint, map_location="cpu", weights_only=True)
-    network = NETWORKS[state["architecture"]](**state["config"])
-    network.load_state_dict(state["ema"])
-    return network.eval(), state
-
-
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
-    """Contract of a checkpoint's network for one of its scales."""
+    """The contract of a checkpoint's network for one of its scales."""
     denoiser = state.get("denoiser") or ""
     lrhs, hrls = schema.inputs(denoiser)
     return Contract(
         lrhs=schema.channel_names(lrhs),
         hrls=schema.channel_names(hrls),
         denoiser=denoiser,
-        weights="usual" if isinstance(network, JointFusion) else "",
+        weights=BASE_HDR if isinstance(network, JointFusion) else "",
         bytes_per_pixel=MEMORY_WITH_DENOISER if denoiser else MEMORY,
         name=name,
         scale=scale,
@@ -78,7 +73,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
 
 
 def example(network: Network, scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Random ``lrhs`` and ``hrls`` for an LRHS of some size."""
+    """Random inputs ``lrhs`` and ``hrls`` for an LRHS of height x width."""
     generator = torch.Generator().manual_seed(seed)
     return (
         torch.rand(1, network.lrhs_channels, height, width, generator=generator),
@@ -91,8 +86,11 @@ def example(network: Network, scale: int, height: int, width: int, seed: int = 0
 
 @torch.inference_mode()
 def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
-    """Graph with inputs ``lrhs`` and ``hrls``, output ``fused`` (a pyramid's ``log_error`` too), batch of 1, any height
-    and width that are multiples of the contract's alignment, and that contract."""
+    """Export a network with its contract.
+
+    Inputs are ``lrhs`` and ``hrls``, outputs ``fused`` and, except for the paper's network, ``log_error``. The batch
+    size is 1; height and width are any multiples of the contract's alignment.
+    """
     scale, alignment = contract.scale, contract.alignment
     inputs = example(network, scale, 4 * alignment, 6 * alignment)
     aten = torch.ops.aten
@@ -120,8 +118,10 @@ def _traced(
     alignment: int,
     translations: dict[Any, Any] | None = None,
 ) -> onnx.ModelProto:
-    """Graph of a module for images of any size: of the first, multiples of ``alignment``, of the others as much larger
-    as they are here."""
+    """Export a module for images of any size.
+
+    Sides of the first input are multiples of ``alignment``; the other inputs keep their size relative to the first.
+    """
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
 
     def dynamic(image: torch.Tensor) -> dict[int, Any]:
@@ -148,46 +148,47 @@ def _traced(
 def joint_to_onnx(
     network: JointFusion, contract: Contract, pairs: list[tuple[torch.Tensor, torch.Tensor]]
 ) -> onnx.ModelProto:
-    """Graph with the same inputs and outputs, whose convolutions are fitted to pairs in 8 bits, and which leaves Open
-    Image Denoise's weights open."""
+    """Export a joint network with 8-bit convolutions, calibrated on pairs."""
     scale, alignment = contract.scale, contract.alignment
     lrhs, hrls = example(network, scale, 4 * alignment, 6 * alignment)
     levels = range(scale.bit_length())
     sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
     inputs = (lrhs, hrls, hrls[:, :3], [torch.rand(1, *size) for size in sizes])
     names = ["lrhs", "hrls", "denoised", *(f"logits{level}" for level in levels)]
-    mixing = _traced(joint_graph.Blend().eval(), inputs, names, ["fused"], alignment)
-    model = joint_graph.to_onnx(network, scale, pairs, mixing)
+    mixing = _traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
+    model = joint.to_onnx(network, scale, pairs, mixing)
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return model
 
 
 def _space_to_depth(x, downscale_factor: int):
-    """Pixel unshuffle as one operator; the exporter's own translation takes a dozen."""
+    """Pixel unshuffle as one operator instead of the exporter's dozen."""
     return opset18.SpaceToDepth(x, blocksize=downscale_factor)
 
 
 def _unshuffle(x, downscale_factor: int):
-    """Pixel unshuffle as a convolution of each plane with kernels of one tap, in PyTorch's order of channels: on two
-    cores 6 ms for 6 planes of 1024 x 1024 instead of the 28 ms of the exporter's Transpose, which one core does."""
+    """Pixel unshuffle as a grouped convolution with kernels of a single tap, in PyTorch's channel order.
+
+    It runs on all cores. The exporter's own translation has a Transpose, which takes four times as long.
+    """
     weight = _taps(x.shape[1], downscale_factor)
     return opset18.Conv(x, weight, group=x.shape[1], strides=[downscale_factor] * 2)
 
 
 def _shuffle(x, upscale_factor: int):
-    """Pixel shuffle, likewise: 2 ms for 3 planes of 1024 x 1024 instead of 14 ms."""
+    """Pixel shuffle as a grouped transposed convolution, likewise."""
     planes = x.shape[1] // upscale_factor**2
     return opset18.ConvTranspose(x, _taps(planes, upscale_factor), group=planes, strides=[upscale_factor] * 2)
 
 
 def _taps(planes: int, size: int):
-    """(planes * size**2, 1, size, size): for each plane, kernels of each one of the taps."""
+    """Kernels (planes * size**2, 1, size, size), each with a single tap."""
     taps = np.tile(np.eye(size**2, dtype=np.float32), (planes, 1)).reshape(-1, 1, size, size)
     return opset18.Constant(value=numpy_helper.from_array(taps))
 
 
 def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:
-    """A copy whose deshuffle convolutions read (row, column, channel) as SpaceToDepth writes, not PyTorch's order."""
+    """Return a copy whose deshuffle convolutions read SpaceToDepth's channel order instead of PyTorch's."""
     network = copy.deepcopy(network)
     with torch.no_grad():
         for stage in network.deshuffle:
@@ -199,7 +200,7 @@ def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionF
 
 
 def _strip_traces(model: onnx.ModelProto) -> None:
-    """Remove the exporter's notes: stack traces with paths of the machine that exported."""
+    """Remove the exporter's metadata: stack traces with paths of this machine."""
     graph = model.graph
     for item in (model, graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
         item.doc_string = ""
@@ -208,7 +209,7 @@ def _strip_traces(model: onnx.ModelProto) -> None:
 
 
 def _store_as_half(graph: onnx.GraphProto) -> None:
-    """Replace float32 weights by half floats and a Cast, which ONNX Runtime evaluates once, when it loads the file."""
+    """Replace float32 weights by half floats and a Cast, which ONNX Runtime folds when it loads the file."""
     casts = []
     for tensor in graph.initializer:
         if tensor.data_type == onnx.TensorProto.FLOAT and np.prod(tensor.dims) >= HALF_ELEMENTS:
@@ -225,16 +226,16 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
 
 
 def parity(network: Network, scale: int, path: Path) -> float:
-    """Largest difference of an exported file from the network it was made of, in network values."""
+    """Largest difference of an exported file's output from the network's, log-encoded."""
     session = _loaded(path)
     block = network.multiple // scale
-    block *= -(-6 // block)  # a few pixels, where the network would take any number
+    block *= -(-6 // block)  # at least six pixels
     worst = 0.0
     for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
         lrhs, hrls = example(network, scale, height, width, seed=height)
         (found,) = session.run(["fused"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
         with torch.inference_mode():
-            # Of a joint network, what denoises both together is a file of its own
+            # A joint network's denoiser of both renders' mean is a file of its own
             fused = network.fuse if isinstance(network, JointFusion) else partial(run, network)
             expected = fused(lrhs, hrls)[0].numpy()
         worst = max(worst, float(np.abs(found - expected).max()))
@@ -242,18 +243,18 @@ def parity(network: Network, scale: int, path: Path) -> float:
 
 
 @torch.inference_mode()
-def measure_overlap(network: Network, scale: int, views: list[data.View], tile: int = 16) -> dict[int, float]:
-    """How far the middle of a tile is from the same pixels of the whole image, for some overlaps in LRHS pixels.
+def measure_overlap(network: Network, scale: int, views: list[View], tile: int = 16) -> dict[int, float]:
+    """Largest difference between a tile and the same pixels of the whole image, by overlap in LRHS pixels.
 
-    The theoretical receptive field, over 60 LRHS pixels each way, is far larger than what trained weights use. Returns
-    the largest difference, in network values, of all views together, by overlap.
+    Trained weights use much less than the theoretical receptive field of over 60 LRHS pixels. Differences are
+    log-encoded, and the maximum of all views.
     """
     alignment = network.multiple // scale
     differences: dict[int, list[np.ndarray]] = collections.defaultdict(list)
     for view in views:
-        pair = data.Evaluation.centre(view, scale, view.ref.shape[0])
+        pair = ValidationPair.centre(view, scale, view.ref.shape[0])
         lrhs = pair.lrhs
-        # Mirrored on all sides, even a small view has room for the largest overlap
+        # Mirrored at its sides, a small view has room for the largest overlap
         margin = 64
         lrhs, hrls = (
             torch.from_numpy(np.pad(image, ((m, m), (m, m), (0, 0)), "symmetric")).permute(2, 0, 1)[None]
@@ -270,7 +271,7 @@ def measure_overlap(network: Network, scale: int, views: list[data.View], tile: 
 
 
 def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int = 1) -> torch.Tensor:
-    """Square crop with a border; everything in LRHS pixels of an image ``scale`` times as large."""
+    """A square crop with a border, all in LRHS pixels of an image that is ``scale`` times as large."""
     part = slice((start - border) * scale, (start + size + border) * scale)
     return image[..., part, part]
 
@@ -281,7 +282,7 @@ def _loaded(path: Path) -> onnxruntime.InferenceSession:
 
 
 def _check_casts(path: Path) -> None:
-    """Refuse a file that ONNX Runtime would cast the weights of at every run."""
+    """Refuse a file whose weights ONNX Runtime would cast in every run."""
     options = onnxruntime.SessionOptions()
     optimised = path.with_suffix(".optimised")
     options.optimized_model_filepath = str(optimised)
@@ -297,7 +298,7 @@ def _check_casts(path: Path) -> None:
 
 
 def describe(network: Network, scale: int, path: Path) -> None:
-    """Print what the file contains, what ONNX Runtime makes of it and how long it takes."""
+    """Print the operators of a file, and how long ONNX Runtime takes."""
     model = onnx.load(path, load_external_data=False)
     counts = collections.Counter(node.op_type for node in model.graph.node)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
@@ -312,37 +313,39 @@ def describe(network: Network, scale: int, path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--scale", type=int, help="which one, of a network that was trained for several")
+    parser.add_argument("--scale", type=int, help="scale to export, of a network for several")
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
     parser.add_argument(
-        "--int8", type=Path, metavar="VIEWS", help="run convolutions in 8 bits, with ranges learnt from some views"
+        "--int8", type=Path, metavar="VIEWS", help="compute convolutions in 8 bits, calibrated on these views"
     )
-    parser.add_argument("--overlap", type=int, default=24, help="LRHS pixels that tiles share on each side")
     parser.add_argument(
-        "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on some views"
+        "--overlap", type=int, default=24, help="LRHS pixels that tiles share on each side (%(default)s)"
+    )
+    parser.add_argument(
+        "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on these views"
     )
     args = parser.parse_args()
 
     network, state = load(args.checkpoint)
     scale = args.scale or getattr(network, "scale", None)
     if scale is None:
-        raise SystemExit("--scale: this network serves several; say which one to export")
+        raise SystemExit("this network serves several scales; choose one with --scale")
     if args.measure_overlap:
-        views = data.Folder(args.measure_overlap).split("validation")[:8]
+        views = Folder(args.measure_overlap).split("validation")[:8]
         for overlap, difference in measure_overlap(network, scale, views).items():
             print(f"overlap {overlap}: {difference:.2g}")
     if args.output:
         contract = contract_of(network, scale, args.name, args.overlap, state)
         if isinstance(network, JointFusion):
             if not args.int8:
-                raise SystemExit("--int8: a network that is made of Open Image Denoise's is exported in 8 bits")
-            model = joint_to_onnx(network, contract, joint_graph.drawn(args.int8, contract))
+                raise SystemExit("a joint network can only be exported with --int8")
+            model = joint_to_onnx(network, contract, joint.calibration_pairs(args.int8, contract))
         else:
             model = to_onnx(network, contract, half=args.half and not args.int8)
             if args.int8:
-                model = quantise(model, contract, args.int8)
+                model = static.quantise(model, contract, args.int8)
         onnx.save(model, args.output)
         describe(network, scale, args.output)
         print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")

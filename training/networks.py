@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The networks by name, as ``--network`` and checkpoints name them, and one way to run any of them."""
+"""All networks by the name that ``--network`` and checkpoints use, and one way to run any of them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from torch import Tensor
 
 from oiio_msspl.denoiser import Denoiser
 from training.data import Prepare
-from training.joint import JointFusion, with_mean
+from training.joint import DENOISER, JointFusion, with_mean
 from training.mix import MixFusion
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
@@ -20,18 +20,18 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[Mix
     "joint": JointFusion,
 }
 
-#: What is done for them when they run, see :func:`oiio_msspl.denoiser.for_model`.
-DENOISERS = {"mix": "high", "joint": "together"}
+#: The denoising that precedes a network, see :func:`oiio_msspl.denoiser.for_model`.
+DENOISERS = {"mix": "high", "joint": DENOISER}
 
 
 def preparation(architecture: str, threads: int) -> Prepare | None:
-    """How pairs are prepared for a network by this name, on so many threads; None: they are read as they are."""
+    """The function that adds a network's further input channels to a pair; None if it has none."""
     if architecture == "joint":
         return with_mean
     return Denoiser(threads) if architecture == "mix" else None
 
 
 def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:
-    """The fused image and, from a network that predicts it, the logarithm of its error: what ``forward`` returns."""
+    """Run a network; return the fused image and the logarithm of its expected error, None if it predicts none."""
     result = network(lrhs, hrls)
     return result if isinstance(result, tuple) else (result, None)

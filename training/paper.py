@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 """The network of Hou et al. 2021, "Fast Monte Carlo Rendering via Multi-Resolution Sampling", section 4.
 
-Two encoders and one decoder. The HRLS is folded down to the size of the LRHS by deshuffle layers, fused with it, and
-nearly all work happens there, at low resolution; shuffle layers then unfold the result.
+Two encoders and one decoder. Deshuffle layers fold the HRLS down to the size of the LRHS. The two are fused, nearly all
+work happens at that resolution, and shuffle layers unfold the result.
 
-Where the paper is silent or contradicts itself, this file takes these decisions, and nowhere else takes others:
+Decisions where the paper is silent or contradicts itself; they are taken in this file alone:
 
 * *Kernels*: 3x3 everywhere, 1x1 for the fusion, as "Implement details" says; so an RDB's last convolution is 3x3, where
   the RDN it builds on has 1x1. Convolutions pad with zeros.
@@ -31,18 +31,14 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl import schema
+from training.ops import conv3x3
 
 LRHS_CHANNELS = sum(schema.LRHS_FEATURES.values())
 HRLS_CHANNELS = sum(schema.HRLS_FEATURES.values())
 
 
-def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
-    """3x3 convolution that keeps the image's size."""
-    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
-
-
 class Deshuffle(nn.Module):
-    """``DSF``: (N, C, 2h, 2w) -> (N, C, h, w) without losing a sample before the convolution has seen it."""
+    """``DSF``: (N, C, 2h, 2w) -> (N, C, h, w). The convolution reads all four pixels of each 2x2 square."""
 
     def __init__(self, channels: int) -> None:
         super().__init__()
@@ -53,7 +49,7 @@ class Deshuffle(nn.Module):
 
     @torch.no_grad()
     def reset_to_average(self) -> None:
-        """Make every channel the mean of 2x2 pixels of the same channel."""
+        """Set the weights so that every channel is the mean of 2x2 pixels of the same channel."""
         nn.init.zeros_(self.conv.weight)
         nn.init.zeros_(self.conv.bias)
         for channel in range(self.conv.out_channels):
@@ -72,7 +68,7 @@ class Shuffle(nn.Module):
 
     @torch.no_grad()
     def reset_to_bilinear(self, channels: int) -> None:
-        """Make the first few channels the bilinear upsampling of the same channels (which are >= 0)."""
+        """Set the weights so that the first ``channels`` outputs upsample the same inputs (>= 0) bilinearly."""
         # Weights of the previous, same and next pixel for the first and the second half of a pixel
         taps = torch.tensor([[0.25, 0.75, 0.0], [0.0, 0.75, 0.25]])
         for channel in range(channels):
@@ -83,7 +79,7 @@ class Shuffle(nn.Module):
 
 
 class RDB(nn.Module):
-    """Residual dense block: every convolution reads all that came before it in the block."""
+    """Residual dense block: every convolution reads the outputs of all convolutions before it."""
 
     def __init__(self, channels: int, growth: int, dense: int) -> None:
         super().__init__()
@@ -91,10 +87,10 @@ class RDB(nn.Module):
         self.last = conv3x3(channels + dense * growth, channels)
 
     def forward(self, x: Tensor) -> Tensor:
-        seen = x
+        features = x
         for conv in self.dense:
-            seen = torch.cat([seen, F.relu(conv(seen))], dim=1)
-        return x + self.last(seen)
+            features = torch.cat([features, F.relu(conv(features))], dim=1)
+        return x + self.last(features)
 
 
 class RDG(nn.Module):
@@ -109,7 +105,7 @@ class RDG(nn.Module):
 
 
 class MultiResolutionFusion(nn.Module):
-    """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, all in the network values of :mod:`oiio_msspl.transforms`."""
+    """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, both encoded as in :mod:`oiio_msspl.transforms`."""
 
     def __init__(
         self,
@@ -119,7 +115,7 @@ class MultiResolutionFusion(nn.Module):
         groups: int = 3,  #   G: RDGs
         blocks: int = 5,  #   B: RDBs in an RDG
         dense: int = 3,  #    dense convolutions in an RDB, before its last one: 4 convolutional layers
-        lrhs_channels: int = LRHS_CHANNELS,  # beyond the colour: layers of an LRHS, for ablations
+        lrhs_channels: int = LRHS_CHANNELS,  # more than 3 if the LRHS has AOVs, for ablations
     ) -> None:
         super().__init__()
         if scale not in schema.SCALES:
@@ -136,7 +132,7 @@ class MultiResolutionFusion(nn.Module):
         self.lrhs_channels, self.hrls_channels = lrhs_channels, HRLS_CHANNELS
         self.scale = scale
         self.multiple = scale
-        """Height and width of the HRLS are multiples of this."""
+        """Height and width of the HRLS must be multiples of this."""
         stages = int(math.log2(scale))
         self.h_lrhs = conv3x3(lrhs_channels, channels)
         self.h_hrls = conv3x3(HRLS_CHANNELS, channels)
@@ -164,12 +160,11 @@ class MultiResolutionFusion(nn.Module):
         return self.h_rec(self.upscale(f_df))
 
     def reset_parameters(self) -> None:
-        """Start as a bilinear upsampling of the LRHS with small random corrections, so that step 0 is already sane.
+        """Start as a bilinear upsampling of the LRHS with small random corrections.
 
-        The LRHS is non-negative, so its three channels can travel through every ReLU unharmed: ``h_lrhs`` copies them,
-        ``F_LRHS`` is added back behind the groups, each upscale stage interpolates them, ``h_rec`` reads them out.
-        All other weights are He-initialised; the convolutions that end a residual branch are scaled down, since
-        G*B of them are summed up.
+        The LRHS is non-negative, so every ReLU passes its three channels unchanged: ``h_lrhs`` copies them, ``F_LRHS``
+        is added behind the groups, each upscale stage interpolates them, ``h_rec`` returns them. All other weights are
+        He-initialised. The last convolution of each residual branch is scaled down, because G*B of them are summed.
         """
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
@@ -179,7 +174,7 @@ class MultiResolutionFusion(nn.Module):
             for module in self.modules():
                 if isinstance(module, RDB):
                     module.last.weight *= 0.1
-            self.fuse.weight *= 0.1  # F_0 joins F_LRHS along the residual path: keep the copied channels recognisable
+            self.fuse.weight *= 0.1  # F_0 is added to F_LRHS, and must not drown the copied channels
             self.h_rec.weight *= 0.1
             for stage in self.upscale:
                 stage.reset_to_bilinear(LRHS_CHANNELS)

@@ -1,71 +1,75 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Leave out outputs of a joint network's convolutions that the next one hardly needs.
+"""Prune output channels of a joint network's convolutions that matter least to the next convolution.
 
     python -m training.prune RUN/checkpoint.pt PRUNED.pt --data VIEWS --keep dec_conv1a=48 dec_conv2b=48
 
-What is left out counts as its mean from then on. Training from PRUNED.pt makes good for the rest.
+A pruned channel is replaced by its mean, which goes into the next bias. Training on from PRUNED.pt recovers the rest.
 """
 
 from __future__ import annotations
 
 import argparse
+import itertools
 from pathlib import Path
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 
-from training import batches, data, export
-from training.joint import BEFORE, DECODED, JointFusion, with_mean
-from training.train import save
-from training.unet import Retrained
+from training import checkpoints, data
+from training.joint import DECODED, PREDECESSOR, JointFusion, with_mean
+from training.oidn import FineTunedConv
 
 PAIRS, PATCH = 24, 256
 
 
-def statistics(network: JointFusion, name: str, pairs: list[batches.Batch]) -> tuple[Tensor, Tensor]:
-    """Mean and variance of a convolution's outputs."""
-    seen: list[Tensor] = []
+def statistics(network: JointFusion, name: str, pairs: list[data.Batch]) -> tuple[Tensor, Tensor]:
+    """Mean and variance of each output channel of a convolution, (C,) each."""
+    outputs: list[Tensor] = []
     hook = network.convs[name].register_forward_hook(
-        lambda _, __, out: seen.append(out.relu().transpose(0, 1).flatten(1))
+        lambda _, __, out: outputs.append(out.relu().transpose(0, 1).flatten(1))
     )
     with torch.inference_mode():
         for pair in pairs:
             network(pair["lrhs"], pair["hrls"])
     hook.remove()
-    values = torch.cat(seen, dim=1)
+    values = torch.cat(outputs, dim=1)
     return values.mean(dim=1).clone(), values.var(dim=1).clone()
 
 
 @torch.no_grad()
-def without(network: JointFusion, name: str, count: int, pairs: list[batches.Batch]) -> JointFusion:
-    """The same with so many of a convolution's outputs."""
-    if name not in BEFORE.values():
-        raise SystemExit(f"--keep {name}: only convolutions on the way up, {', '.join(BEFORE.values())}")
-    readers: list[Retrained | nn.Conv2d] = [network.convs[next(n for n, before in BEFORE.items() if before == name)]]
+def pruned(network: JointFusion, name: str, count: int, pairs: list[data.Batch]) -> JointFusion:
+    """Return a copy that keeps the ``count`` most important output channels of a convolution.
+
+    The importance of a channel is its variance times the power of the weights that read it.
+    """
+    if name not in PREDECESSOR.values():
+        prunable = ", ".join(PREDECESSOR.values())
+        raise SystemExit(f"--keep {name}: only convolutions on the way up can be pruned: {prunable}")
+    reader = next(n for n, before in PREDECESSOR.items() if before == name)
+    readers: list[FineTunedConv | nn.Conv2d] = [network.convs[reader]]
     readers += [
         head
         for head, source in zip((*network.heads, network.error), (*DECODED, DECODED[1]), strict=True)
         if source == name
     ]
     mean, variance = statistics(network, name, pairs)
-    weight, _ = readers[0].parameters_in_all()
+    weight, _ = readers[0].total()
     importance = variance * weight[:, : len(variance)].square().sum(dim=(0, 2, 3))
-    stay = importance.argsort(descending=True)[:count].sort().values
-    go = torch.tensor(sorted(set(range(len(mean))) - set(stay.tolist())))
-    rows, _ = network.given_channels(name)
-    result = JointFusion(network.kept | {name: [rows[i] for i in stay]})
+    kept = importance.argsort(descending=True)[:count].sort().values
+    removed = torch.tensor(sorted(set(range(len(mean))) - set(kept.tolist())))
+    rows, _ = network.pretrained_channels(name)
+    result = JointFusion(network.kept | {name: [rows[i] for i in kept]})
     weights = network.state_dict()
     prefixes = {id(module): prefix for prefix, module in network.named_modules()}
-    for kind in ("weight", "bias", "more"):
+    for kind in ("weight", "bias", "extra"):
         if (key := f"convs.{name}.{kind}") in weights:
-            weights[key] = weights[key][stay]
+            weights[key] = weights[key][kept]
     for reader in readers:
         prefix = prefixes[id(reader)]
-        whole = reader.parameters_in_all()[0] if isinstance(reader, Retrained) else reader.weight
-        weights[f"{prefix}.bias"] = weights[f"{prefix}.bias"] + whole[:, go].sum(dim=(2, 3)) @ mean[go]
+        whole = reader.total()[0] if isinstance(reader, FineTunedConv) else reader.weight
+        weights[f"{prefix}.bias"] = weights[f"{prefix}.bias"] + whole[:, removed].sum(dim=(2, 3)) @ mean[removed]
         rest = range(len(mean), weights[f"{prefix}.weight"].shape[1])
-        weights[f"{prefix}.weight"] = weights[f"{prefix}.weight"][:, [*stay, *rest]]
+        weights[f"{prefix}.weight"] = weights[f"{prefix}.weight"][:, [*kept, *rest]]
     result.load_state_dict(weights)
     return result
 
@@ -73,22 +77,19 @@ def without(network: JointFusion, name: str, count: int, pairs: list[batches.Bat
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("output", type=Path)
+    parser.add_argument("output", type=Path, help="checkpoint to write")
     parser.add_argument("--data", type=Path, required=True, help="folder of views")
-    parser.add_argument("--keep", nargs="+", required=True, metavar="NAME=COUNT", help="multiples of 16 pay")
+    parser.add_argument("--keep", nargs="+", required=True, metavar="NAME=COUNT", help="best multiples of 16")
     args = parser.parse_args()
-    network, state = export.load(args.checkpoint)
+    network, state = checkpoints.load(args.checkpoint)
     if not isinstance(network, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
-    folder = [batches.Pixels.of(view, torch.device("cpu")) for view in data.Folder(args.data).split("train")]
-    rng = np.random.default_rng(0)
-    with torch.no_grad():
-        pairs = [batches.draw(folder, 2, PATCH, 1, rng, data.Sampling(), with_mean) for _ in range(PAIRS)]
+    pairs = list(itertools.islice(data.fixed_batches(args.data, "train", [2], PATCH, 1, with_mean), PAIRS))
     for name, _, count in (part.partition("=") for part in args.keep):
-        network = without(network, name, int(count), pairs)
+        network = pruned(network, name, int(count), pairs)
     state["ema"] = network.state_dict()
     state["config"] = network.config
-    save({key: value for key, value in state.items() if key not in ("network", "optimizer")}, args.output)
+    checkpoints.save({key: value for key, value in state.items() if key not in ("network", "optimizer")}, args.output)
 
 
 if __name__ == "__main__":

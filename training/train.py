@@ -1,62 +1,62 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train the network for a given number of minutes.
+"""Train a network for a given number of minutes.
 
     python -m training.train --scale 4 --data VIEWS --out RUN --minutes 60
     python -m training.train --scale 2 --data VIEWS --out RUN2 --minutes 20 --init RUN/checkpoint.pt
 
-The learning rate follows the share of the minutes that has passed, not the number of steps: a run ends when it was
-meant to, on any machine. The same command continues an interrupted run from its last checkpoint. RUN holds
-``checkpoint.pt``, written every few minutes and on SIGTERM, ``best.pt``, the one that was best on the validation views
-(as the paper selects its model), and ``log.csv``, a line for each.
+The learning rate depends on the share of the minutes that has passed, not on the number of steps, so a run ends in time
+on any machine. The same command continues an interrupted run from its last checkpoint. RUN holds ``checkpoint.pt``,
+written every few minutes and on SIGTERM; ``best.pt``, the best one on the validation views, by which the paper selects
+its model, too; and ``log.csv``, with a line for each checkpoint.
 """
 
 from __future__ import annotations
 
 import argparse
-import collections
-import copy
 import csv
+import functools
 import logging
 import math
-import os
 import signal
 import time
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
-from torch.nn import functional as F
+from torch.optim.lr_scheduler import LambdaLR
+from torch.optim.swa_utils import AveragedModel
 
-from oiio_msspl import metrics, transforms
-from training import batches, data, losses
+from datagen.views import Folder
+from training import checkpoints, losses
+from training.data import PAPER_PATCH, PAPER_SAMPLING, Batches, Sampling, spp_range
 from training.joint import JointFusion
-from training.mix import MIX_CHANNELS, MixFusion, blend, disagreement
+from training.mix import MIX_CHANNELS, MixFusion, blend, distillation_loss
 from training.networks import DENOISERS, NETWORKS, Network, preparation, run
+from training.ops import log2_scale
 from training.paper import HRLS_CHANNELS, MultiResolutionFusion
-from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion, level_of
+from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion
+from training.validation import ValidationPair, evaluate
 
 log = logging.getLogger(__name__)
 
-#: A step whose gradient is so many times longer than usual is left out: at these learning rates one bad batch can undo
-#: a run, though its length is clipped, because Adam divides it by the small gradients before it.
+#: A step is skipped if its gradient is this many times longer than usual. One bad batch could undo a run in spite of
+#: clipping, because Adam divides it by the small gradients before it.
 SPIKE = 4.0
-#: A run that falls so many dB behind its own best goes back to it, at half the learning rate.
+#: A run that falls this many dB behind its best checkpoint returns to it, with half the learning rate.
 COLLAPSE = 2.0
-
-#: Weight of the disagreement with a teacher: about as much as the loss itself where training begins.
-TAUGHT = 0.1
-
+#: Weight of the distillation loss, about that of the loss itself at the start of training.
+DISTILLATION = 0.1
 #: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
 WARM_UP, FINAL = 0.03, 0.01
+#: Largest decay of the averaged weights.
+EMA_DECAY = 0.999
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """How to optimise."""
+    """How a network is trained, see ``--preset``."""
 
     optimizer: type[torch.optim.Optimizer]
     options: dict[str, Any]
@@ -64,20 +64,20 @@ class Recipe:
     loss: str
     batch: int
     patch: dict[int, int]
-    """HR pixels of the training patches, by scale."""
+    """Width of the training patches in HRLS pixels, by scale."""
     schedule: bool
     """Warm-up and cosine decay; otherwise the learning rate is constant."""
     clip_gradient: float
-    """Largest norm of the gradient."""
-    sampling: data.Sampling
+    """Upper bound of the gradient's norm."""
+    sampling: Sampling
 
 
 RECIPES = {
-    # For a CPU and an hour: there, more and smaller steps beat fewer and larger ones.
+    # For a CPU and an hour, where many small steps beat few large ones.
     "ours": Recipe(
         optimizer=torch.optim.AdamW,
-        # Larger than the default: where a softmax is decided and hardly any gradient is left, Adam would still take
-        # steps of full length, all in one direction, until the features explode.
+        # Larger than the default: where a softmax saturates the gradient is tiny, yet Adam would take full steps, all
+        # in one direction, until the features explode.
         options={"eps": 1e-6},
         lr=4e-4,
         loss="l1",
@@ -85,336 +85,307 @@ RECIPES = {
         patch={2: 64, 4: 96, 8: 128},
         schedule=True,
         clip_gradient=1.0,
-        sampling=data.Sampling(),
+        sampling=Sampling(),
     ),
-    # As in the paper, whose 500 epochs took a week on a GPU; the input transform alone is ours.
+    # As in the paper, apart from the log encoding. Its 500 epochs took a week on a GPU.
     "paper": Recipe(
         optimizer=torch.optim.SGD,
         options={},
         lr=1e-4,
         loss="robust",
         batch=16,
-        patch=data.PAPER_PATCH,
+        patch=PAPER_PATCH,
         schedule=False,
         clip_gradient=math.inf,
-        sampling=data.PAPER_SAMPLING,
+        sampling=PAPER_SAMPLING,
     ),
 }
 
 
-# Evaluation
-
-
-def bicubic(lrhs: Tensor, scale: int) -> Tensor:
-    """Baseline: bicubic upsampling of the linear LRHS (N, 3, h, w)."""
-    return F.interpolate(lrhs, scale_factor=scale, mode="bicubic", align_corners=False).clamp(min=0)
-
-
-@torch.inference_mode()
-def evaluate(network: Network, pairs: Iterable[data.Evaluation], device: torch.device) -> dict[str, float]:
-    """Mean PSNR and RelMSE of the network and of bicubic upsampling over some pairs.
-
-    Views come at any brightness; they are scored at the exposure at which the network sees them, about that of a photo.
-    """
-    scores: dict[str, list[float]] = collections.defaultdict(list)
-    for pair in pairs:
-        fused, _ = run(network, to_tensor(pair.lrhs[None], device), to_tensor(pair.hrls[None], device))
-        output = transforms.expand(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
-        scale = pair.hrls.shape[0] // pair.lrhs.shape[0]
-        lrhs = transforms.expand(pair.lrhs[None, ..., :3], pair.exposure)
-        upsampled = bicubic(to_tensor(lrhs, torch.device("cpu")), scale)[0].permute(1, 2, 0).numpy()
-        reference = pair.reference * pair.exposure
-        for prefix, image in (("", output), ("bicubic_", upsampled)):
-            psnr = metrics.psnr(image * pair.exposure, reference)
-            scores[prefix + "psnr"].append(psnr)
-            if not prefix:
-                scores[f"psnr_x{scale}"].append(psnr)
-            scores[prefix + "relmse"].append(metrics.relmse(image * pair.exposure, reference))
-    return {name: float(np.mean(values)) for name, values in scores.items()}
-
-
-# State
-
-
-def to_tensor(image: data.Array, device: torch.device) -> Tensor:
-    """(N, H, W, C) to (N, C, H, W) in channels-last memory, without copying on the CPU."""
-    return torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).to(device, non_blocking=True)
-
-
-def save(state: dict[str, Any], path: Path) -> None:
-    """Write whole or not at all: a run may be killed at any time."""
-    partial = path.with_suffix(".partial")
-    torch.save(state, partial)
-    os.replace(partial, path)
-
-
-def warm_start(network: Network, path: Path) -> None:
-    """Copy what fits from another run's averaged weights: all scales share the trunk, and their stages by position.
-
-    Stages that the other network lacks begin as plain resampling of their features, so a network of a larger scale
-    begins as the other one followed by bilinear upsampling.
-    """
-    if isinstance(network, MultiResolutionFusion):
-        for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
-            deshuffle.reset_to_average()
-            shuffle.reset_to_bilinear(network.config["channels"])
-    state = torch.load(path, map_location="cpu", weights_only=True)
-    theirs, ours = state["ema"], network.state_dict()
-    if isinstance(network, PyramidFusion):
-        if "own_size" not in state["config"]:
-            raise SystemExit(f"--init {path}: that is no pyramid network, and nothing of it fits one")
-        cut_kernels(theirs, state["config"]["own_size"], network.own_size)
-    fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
-    network.load_state_dict(ours | fitting)
-    log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
-
-
-def cut_kernels(weights: dict[str, Tensor], sizes: Sequence[int], wanted: Sequence[int]) -> None:
-    """Change a pyramid's weights, whose kernels are so many taps across by level, to those of one with fewer."""
-    for level, (size, fewer) in enumerate(zip(sizes, wanted, strict=True)):
-        for name in (f"heads.{level}.weight", f"heads.{level}.bias"):
-            weights[name] = middle_taps(weights[name], size, fewer, 1 if level else 4)
-
-
-def middle_taps(parameter: Tensor, size: int, wanted: int, phases: int) -> Tensor:
-    """A parameter of a pyramid's head, whose first outputs are size x size taps for each phase, with fewer of them."""
-    if size < wanted:
-        raise SystemExit(f"--kernels: the network to start from has {size}x{size} taps, and no more can be added")
-    outputs = parameter.unflatten(0, (-1, phases))
-    margin = (size - wanted) // 2
-    middle = slice(margin, margin + wanted)
-    taps = outputs[: size**2].unflatten(0, (size, size))[middle, middle].flatten(0, 1)
-    return torch.cat([taps, outputs[size**2 :]]).flatten(0, 1)
-
-
-def fused_and_taught(
-    network: Network, teacher: MixFusion | None, lrhs: Tensor, hrls: Tensor
-) -> tuple[Tensor, Tensor | float]:
-    """The fused image, and what is to be lost by deciding otherwise than the teacher, if there is one."""
-    if teacher is None:
-        return run(network, lrhs, hrls)[0], 0.0
-    assert isinstance(network, MixFusion)
-    logits, _ = network.decide(lrhs, hrls)
-    with torch.no_grad():
-        wanted, _ = teacher.decide(lrhs, hrls)
-    return blend(lrhs, hrls, hrls[:, HRLS_CHANNELS:], logits), TAUGHT * disagreement(
-        logits, wanted, level_of(lrhs, hrls)
-    )
-
-
-class Average:
-    """Exponential moving average of a network's weights, in which a short memory grows to a long one."""
-
-    def __init__(self, network: Network, decay: float = 0.999) -> None:
-        self.network = copy.deepcopy(network).requires_grad_(False)
-        self.decay = decay
-
-    @torch.no_grad()
-    def update(self, network: Network, step: int) -> None:
-        weight = 1 - min(self.decay, (1 + step) / (10 + step))
-        torch._foreach_lerp_(list(self.network.parameters()), list(network.parameters()), weight)
+# What a step needs
 
 
 def lr_factor(progress: float) -> float:
-    """Linear warm-up, then half a cosine, for a share of the run in [0, 1]."""
+    """Learning rate as a share of its peak after a share of the run in [0, 1]: linear warm-up, then half a cosine."""
     if progress < WARM_UP:
         return max(progress / WARM_UP, 1e-3)
     done = min((progress - WARM_UP) / (1 - WARM_UP), 1.0)
     return FINAL + (1 - FINAL) * 0.5 * (1 + math.cos(math.pi * done))
 
 
+@torch.no_grad()
+def warming_ema(averages: Any, weights: Any, count: Tensor | int) -> None:
+    """Update an exponential moving average in place; its decay grows with the number of averaged weights."""
+    torch._foreach_lerp_(averages, weights, 1 - min(EMA_DECAY, (1 + int(count)) / (10 + int(count))))
+
+
+def averaged(network: Network) -> AveragedModel:
+    """The moving average of a network's weights, which counts the initial weights as the first."""
+    average = AveragedModel(network, multi_avg_fn=warming_ema).requires_grad_(False)
+    average.n_averaged.fill_(1)
+    return average
+
+
+def fuse_and_distil(
+    network: Network, teacher: MixFusion | None, lrhs: Tensor, hrls: Tensor
+) -> tuple[Tensor, Tensor | float]:
+    """The fused image, and the weighted distillation loss, 0 without a teacher."""
+    if teacher is None:
+        return run(network, lrhs, hrls)[0], 0.0
+    assert isinstance(network, MixFusion)
+    logits, _ = network.predict_logits(lrhs, hrls)
+    with torch.no_grad():
+        wanted, _ = teacher.predict_logits(lrhs, hrls)
+    fused = blend(lrhs, hrls, hrls[:, HRLS_CHANNELS:], logits)
+    return fused, DISTILLATION * distillation_loss(logits, wanted, log2_scale(lrhs, hrls))
+
+
 # The run
 
 
-def train(args: argparse.Namespace) -> None:
-    """Train until the minutes are over or a signal comes; see :func:`parse` for the arguments."""
-    recipe = RECIPES[args.preset]
-    batch = args.batch or recipe.batch
-    scales = tuple(args.scale)
-    patch = args.patch or max(recipe.patch[scale] for scale in scales)
-    peak_lr = args.lr or recipe.lr
-    loss_name = args.loss or recipe.loss
-    loss_function = losses.LOSSES[loss_name]
-    device = torch.device(args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu")
-    torch.set_num_threads(args.threads)
-    torch.manual_seed(args.seed)
-    args.out.mkdir(parents=True, exist_ok=True)
-
-    # Data
-    folder = data.Folder(args.data)
-    if not folder.split("train"):
-        raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
-    validation: dict[tuple[Path, int], data.Evaluation] = {}
-
-    # Network, from the last checkpoint, from another run, or new
-    network: Network
-    prepare = preparation(args.network, args.threads)
+def new_network(args: argparse.Namespace) -> Network:
+    """An untrained network, as the command line describes it."""
     if args.network == "pyramid":
-        network = PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels)
-    elif args.network == "mix":
-        network = MixFusion(args.channels or MIX_CHANNELS, args.stem)
-    elif args.network == "joint":
-        begun = args.out / "checkpoint.pt"
-        earlier = begun if begun.exists() else args.init
-        kept = torch.load(earlier, map_location="cpu", weights_only=True)["config"].get("kept") if earlier else None
-        network = JointFusion(kept)
-    elif len(scales) == 1:
-        network = MultiResolutionFusion(scales[0])
-    else:
-        raise SystemExit("--network paper: a network is for one --scale")
-    teacher = None
-    if args.teacher:
-        taught = torch.load(args.teacher, map_location="cpu", weights_only=True)
-        if args.network != "mix" or taught["architecture"] != "mix":
-            raise SystemExit("--teacher: for networks that mix, and one of them")
-        teacher = MixFusion(**taught["config"])
-        teacher.load_state_dict(taught["ema"])
-        teacher.to(device, memory_format=torch.channels_last).requires_grad_(False)
-    checkpoint_path, best_path = args.out / "checkpoint.pt", args.out / "best.pt"
-    state = torch.load(checkpoint_path, map_location="cpu", weights_only=True) if checkpoint_path.exists() else None
-    if state is None and args.init:
-        warm_start(network, args.init)
-    network.to(device, memory_format=torch.channels_last)
-    average = Average(network)
+        return PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels)
+    if args.network == "mix":
+        return MixFusion(args.channels or MIX_CHANNELS, args.stem)
+    if args.network == "joint":
+        started = args.out / "checkpoint.pt"
+        earlier = started if started.exists() else args.init
+        return JointFusion(checkpoints.read(earlier)["config"].get("kept") if earlier else None)
+    if len(args.scale) > 1:
+        raise SystemExit("--network paper: a network has one --scale")
+    return MultiResolutionFusion(args.scale[0])
+
+
+def load_teacher(args: argparse.Namespace, device: torch.device) -> MixFusion | None:
+    """The network of ``--teacher``."""
+    if not args.teacher:
+        return None
+    teacher, _ = checkpoints.load(args.teacher)
+    if args.network != "mix" or not isinstance(teacher, MixFusion):
+        raise SystemExit("--teacher: works only if both networks are mix networks")
+    return teacher.to(device, memory_format=torch.channels_last).requires_grad_(False)
+
+
+def parameter_groups(network: Network, args: argparse.Namespace, peak_lr: float) -> list[dict[str, Any]]:
+    """The parameters to train. Differences from pretrained weights have a smaller learning rate."""
     for name, parameter in network.named_parameters():
         parameter.requires_grad_(name.startswith(args.only))
     learning = [parameter for parameter in network.parameters() if parameter.requires_grad]
     if not learning:
         raise SystemExit(f"--only {args.only}: the network has no such part")
-    # Given weights, which took weeks to learn, go in smaller steps than new ones
-    retrained = {id(p) for p in network.retrained()} if isinstance(network, JointFusion) else set()
-    groups = [
-        {"params": params, "share": share}
-        for params, share in (
-            ([p for p in learning if id(p) not in retrained], 1.0),
-            ([p for p in learning if id(p) in retrained], args.retrain),
+    differences = {id(p) for p in network.differences()} if isinstance(network, JointFusion) else set()
+    groups = (
+        ([p for p in learning if id(p) not in differences], 1.0),
+        ([p for p in learning if id(p) in differences], args.fine_tune),
+    )
+    return [{"params": params, "lr": peak_lr * share, "share": share} for params, share in groups if params]
+
+
+class Run:
+    """A training run: its networks, optimiser and checkpoints. See :func:`parse` for ``args``."""
+
+    def __init__(self, args: argparse.Namespace) -> None:
+        self.args, self.recipe = args, RECIPES[args.preset]
+        self.scales = tuple(args.scale)
+        self.batch = args.batch or self.recipe.batch
+        self.patch = args.patch or max(self.recipe.patch[scale] for scale in self.scales)
+        self.peak_lr = args.lr or self.recipe.lr
+        self.loss_name = args.loss or self.recipe.loss
+        self.device = torch.device(
+            args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
         )
-        if params
-    ]
-    optimizer = recipe.optimizer(groups, lr=peak_lr, **recipe.options)
-    step, elapsed, best_gain = 0, 0.0, -math.inf
+        self.checkpoint_path, self.best_path = args.out / "checkpoint.pt", args.out / "best.pt"
+        self.step, self.elapsed, self.best_gain = 0, 0.0, -math.inf
 
-    def restore(state: dict[str, Any]) -> None:
-        network.load_state_dict(state["network"])
-        average.network.load_state_dict(state["ema"])
-        optimizer.load_state_dict(state["optimizer"])
+        # Data
+        self.folder = Folder(args.data)
+        if not self.folder.split("train"):
+            raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
+        self.validation: dict[tuple[Path, int], ValidationPair] = {}
 
-    if state is not None:
-        restore(state)
-        step, elapsed, best_gain = state["step"], state["seconds"], state.get("best_gain", -math.inf)
-        log.info("continues at step %d, minute %.1f", step, elapsed / 60)
-    source = batches.Batches(folder, scales, patch, batch, recipe.sampling, args.seed + step, device, prepare)
+        # Network: from the last checkpoint, from another run, or new
+        self.network = new_network(args)
+        self.teacher = load_teacher(args, self.device)
+        state = checkpoints.read(self.checkpoint_path) if self.checkpoint_path.exists() else None
+        if state is None and args.init:
+            checkpoints.warm_start(self.network, args.init)
+        self.network.to(self.device, memory_format=torch.channels_last)
+        self.average = averaged(self.network)
+        self.optimizer = self.recipe.optimizer(
+            parameter_groups(self.network, args, self.peak_lr), lr=self.peak_lr, **self.recipe.options
+        )
+        if state is not None:
+            self.restore(state)
+            self.step, self.elapsed = state["step"], state["seconds"]
+            self.best_gain = state.get("best_gain", -math.inf)
+            log.info("continues at step %d, minute %.1f", self.step, self.elapsed / 60)
+        self.schedule = self.new_schedule()
+        self.pairs = Batches(
+            args.data, self.scales, self.patch, self.batch, self.recipe.sampling, args.seed + self.step, self.device,
+            functools.partial(preparation, args.network, args.threads),
+        )  # fmt: skip
+        self.reset_statistics()
 
-    stop = False
+    def new_schedule(self) -> LambdaLR:
+        """Set the learning rate by the clock, at every ``step()`` of the schedule."""
+        for group in self.optimizer.param_groups:
+            group["initial_lr"] = self.peak_lr * group["share"]
+        budget = max(self.args.minutes * 60, 1e-9)
+        return LambdaLR(self.optimizer, lambda _: lr_factor(self.elapsed / budget) if self.recipe.schedule else 1.0)
 
-    def on_signal(*_: object) -> None:
-        nonlocal stop
-        stop = True
+    def restore(self, state: checkpoints.State) -> None:
+        """Return to the weights and the optimiser of a checkpoint."""
+        self.network.load_state_dict(state["network"])
+        self.average.module.load_state_dict(state["ema"])
+        self.average.n_averaged.fill_(1 + state["step"])
+        self.optimizer.load_state_dict(state["optimizer"])
 
-    signal.signal(signal.SIGTERM, on_signal)
-    signal.signal(signal.SIGINT, on_signal)
+    def reset_statistics(self) -> None:
+        """Start to count anew, for the next line of the log."""
+        self.since = {"time": time.monotonic(), "steps": 0, "skipped": 0, "loss": 0.0, "waited": 0.0}
 
-    budget = args.minutes * 60
-    started = time.monotonic() - elapsed
-    since = {"time": time.monotonic(), "steps": 0, "skipped": 0, "loss": 0.0, "waited": 0.0}
+    def train(self) -> None:
+        """Train until the minutes are over or a signal comes."""
+        stop = False
 
-    def checkpoint() -> None:
-        """Evaluate, log a line and write the state; step back if training has collapsed."""
-        nonlocal best_gain, peak_lr
-        interval = max(time.monotonic() - since["time"], 1e-9)
-        if not validation:  # a set that grew would make scores of different times incomparable
-            for view in folder.split("validation")[: args.val_views]:
-                for scale in scales:
-                    validation[view.path, scale] = data.Evaluation.centre(view, scale, args.val_patch, prepare)
-        scores = evaluate(average.network, validation.values(), device)
+        def on_signal(*_: object) -> None:
+            nonlocal stop
+            stop = True
+
+        signal.signal(signal.SIGTERM, on_signal)
+        signal.signal(signal.SIGINT, on_signal)
+
+        budget, started = self.args.minutes * 60, time.monotonic() - self.elapsed
+        self.checkpoint()
+        next_checkpoint = self.elapsed + self.args.checkpoint_seconds
+        if stop or self.elapsed >= budget:
+            return
+        batches, usual = iter(self.pairs.loader()), math.inf
+        while not stop and self.elapsed < budget:
+            self.step += 1
+            usual = self.take_step(batches, usual)
+            self.elapsed = time.monotonic() - started
+            if stop or self.elapsed >= min(budget, next_checkpoint):
+                self.checkpoint()
+                next_checkpoint = self.elapsed + self.args.checkpoint_seconds
+            self.schedule.step()
+
+    def take_step(self, batches: Any, usual: float) -> float:
+        """Train on a batch, unless its gradient is a spike; return the usual length of a gradient."""
+        before = time.monotonic()
+        pair = next(batches)
+        self.since["waited"] += time.monotonic() - before
+        with torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.precision == "bf16"):
+            output, loss = fuse_and_distil(self.network, self.teacher, pair["lrhs"], pair["hrls"])
+        loss = loss + losses.LOSSES[self.loss_name](output.float(), pair["target"])
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        learning = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
+        length = float(torch.nn.utils.clip_grad_norm_(learning, self.recipe.clip_gradient))
+        if math.isfinite(length) and length < SPIKE * usual:
+            self.optimizer.step()
+            self.average.update_parameters(self.network)
+        else:
+            self.since["skipped"] += 1
+        self.since["steps"] += 1
+        self.since["loss"] += float(loss.detach())
+        if not math.isfinite(length):
+            return usual
+        return length if math.isinf(usual) else 0.98 * usual + 0.02 * min(length, SPIKE * usual)
+
+    def checkpoint(self) -> None:
+        """Evaluate, log a line and write the state; return to the best checkpoint if training has collapsed."""
+        scores = self.evaluate()
+        self.log_row(scores)
+        gain = scores["psnr"] - scores["bicubic_psnr"] if scores else math.nan
+        if gain < self.best_gain - COLLAPSE:
+            self.peak_lr /= 2
+            self.restore(checkpoints.read(self.best_path))
+            self.schedule = self.new_schedule()
+            message = "collapsed to %+.1f dB, back to %+.1f dB, peak learning rate %.2g"
+            log.warning(message, gain, self.best_gain, self.peak_lr)
+        else:
+            better = not gain <= self.best_gain  # without validation views the newest is the best
+            if better:
+                self.best_gain = gain
+            state = self.state(scores)
+            if better:
+                checkpoints.save(state, self.best_path)
+            checkpoints.save(state, self.checkpoint_path)
+        self.reset_statistics()
+
+    def evaluate(self) -> dict[str, float]:
+        """Scores of the averaged weights on the validation views of the run's start."""
+        if not self.validation:  # views that are added later would make scores incomparable
+            prepare = preparation(self.args.network, self.args.threads)
+            for view in self.folder.split("validation")[: self.args.val_views]:
+                for scale in self.scales:
+                    pair = ValidationPair.centre(view, scale, self.args.val_patch, prepare)
+                    self.validation[view.path, scale] = pair
+        return evaluate(self.average.module, self.validation.values(), self.device)
+
+    def log_row(self, scores: dict[str, float]) -> None:
+        """Append a line to ``log.csv``."""
+        self.folder.scan()
+        since, interval = self.since, max(time.monotonic() - self.since["time"], 1e-9)
         row = {
-            "step": step,
-            "minutes": elapsed / 60,
+            "step": self.step,
+            "minutes": self.elapsed / 60,
             "loss": since["loss"] / max(since["steps"], 1),
-            "lr": optimizer.param_groups[0]["lr"],
+            "lr": self.optimizer.param_groups[0]["lr"],
             "skipped_steps": since["skipped"],
-            "samples_per_s": since["steps"] * batch / interval,
-            "wait_share": (source.waited - since["waited"]) / interval,
-            "train_views": len(folder.split("train")),
-            "val_pairs": len(validation),
+            "samples_per_s": since["steps"] * self.batch / interval,
+            "wait_share": since["waited"] / interval,
+            "train_views": len(self.folder.split("train")),
+            "val_pairs": len(self.validation),
             **scores,
         }
-        write_row(args.out / "log.csv", row)
         log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
-        views = folder.split("train")
-        gain = scores["psnr"] - scores["bicubic_psnr"] if scores else math.nan
-        state = {
-            "network": network.state_dict(),
-            "ema": average.network.state_dict(),
-            "optimizer": optimizer.state_dict(),
-            "architecture": args.network,
-            "config": network.config,
-            "denoiser": DENOISERS.get(args.network, ""),
-            "step": step,
-            "seconds": elapsed,
-            "best_gain": best_gain,
-            "training_spp": {str(scale): data.spp_range(views[0], recipe.sampling, scale) for scale in scales},
+        write_row(self.args.out / "log.csv", row)
+
+    def state(self, scores: dict[str, float]) -> checkpoints.State:
+        """The checkpoint, see :mod:`training.checkpoints`."""
+        views = self.folder.split("train")
+        return {
+            "network": self.network.state_dict(),
+            "ema": self.average.module.state_dict(),
+            "optimizer": self.optimizer.state_dict(),
+            "architecture": self.args.network,
+            "config": self.network.config,
+            "denoiser": DENOISERS.get(self.args.network, ""),
+            "step": self.step,
+            "seconds": self.elapsed,
+            "best_gain": self.best_gain,
+            "training_spp": {str(scale): spp_range(views[0], self.recipe.sampling, scale) for scale in self.scales},
             "provenance": {
-                "steps": step,
-                "minutes": round(elapsed / 60, 1),
-                "batch": batch,
-                "patch": patch,
-                "loss": loss_name,
-                "preset": args.preset,
-                "seed": args.seed,
+                "steps": self.step,
+                "minutes": round(self.elapsed / 60, 1),
+                "batch": self.batch,
+                "patch": self.patch,
+                "loss": self.loss_name,
+                "preset": self.args.preset,
+                "seed": self.args.seed,
                 "views": len(views),
                 "scenes": len({view.scene for view in views}),
                 "sources": sorted({view.source for view in views}),
                 "torch": str(torch.__version__),
-                "validation": {"pairs": len(validation), "hrls_spp": 1} | scores,
+                "validation": {"pairs": len(self.validation), "hrls_spp": 1} | scores,
             },
         }
-        if gain < best_gain - COLLAPSE:
-            peak_lr /= 2
-            restore(torch.load(best_path, map_location="cpu", weights_only=True))
-            log.warning("collapsed to %+.1f dB, back to %+.1f dB, peak learning rate %.2g", gain, best_gain, peak_lr)
-        else:
-            if not gain <= best_gain:  # without validation views the newest is the best
-                best_gain = state["best_gain"] = gain
-                save(state, best_path)
-            save(state, checkpoint_path)
-        since.update(time=time.monotonic(), steps=0, skipped=0, loss=0.0, waited=source.waited)
 
-    checkpoint()
-    next_checkpoint = elapsed + args.checkpoint_seconds
-    usual = math.inf
-    while not stop and elapsed < budget:
-        # One step
-        step += 1
-        for group in optimizer.param_groups:
-            group["lr"] = peak_lr * group["share"] * (lr_factor(elapsed / budget) if recipe.schedule else 1.0)
-        pair = source.next()
-        with torch.autocast(device.type, torch.bfloat16, enabled=args.precision == "bf16"):
-            output, loss = fused_and_taught(network, teacher, pair["lrhs"], pair["hrls"])
-        loss = loss + loss_function(output.float(), pair["target"])
-        optimizer.zero_grad(set_to_none=True)
-        loss.backward()
-        length = float(torch.nn.utils.clip_grad_norm_(learning, recipe.clip_gradient))
-        if math.isfinite(length) and length < SPIKE * usual:
-            optimizer.step()
-            average.update(network, step)
-        else:
-            since["skipped"] += 1
-        if math.isfinite(length):
-            usual = length if math.isinf(usual) else 0.98 * usual + 0.02 * min(length, SPIKE * usual)
 
-        # The clock decides what is next
-        since["steps"] += 1
-        since["loss"] += float(loss.detach())
-        elapsed = time.monotonic() - started
-        if stop or elapsed >= min(budget, next_checkpoint):
-            checkpoint()
-            next_checkpoint = elapsed + args.checkpoint_seconds
-    source.close()
+def train(args: argparse.Namespace) -> None:
+    """Train a network; see :func:`parse` for the arguments."""
+    torch.set_num_threads(args.threads)
+    torch.manual_seed(args.seed)
+    args.out.mkdir(parents=True, exist_ok=True)
+    Run(args).train()
 
 
 def write_row(path: Path, row: dict[str, float]) -> None:
-    """Append a line to a CSV file, with a header when it is new."""
+    """Append a line to a CSV file; a new file gets a header first."""
     new = not path.exists()
     with path.open("a", newline="") as file:
         writer = csv.writer(file)
@@ -426,50 +397,60 @@ def write_row(path: Path, row: dict[str, float]) -> None:
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument(
-        "--scale", type=int, choices=(2, 4, 8), required=True, nargs="+", help="several for a pyramid network"
+        "--scale",
+        type=int,
+        choices=(2, 4, 8),
+        required=True,
+        nargs="+",
+        help="upsampling factors; the paper's network has one",
     )
     parser.add_argument("--data", type=Path, required=True, help="folder of views (.npz)")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
-    parser.add_argument("--network", choices=NETWORKS, default="paper", help="the paper's, or another of docs/")
+    parser.add_argument("--network", choices=NETWORKS, default="paper", help="(default: %(default)s)")
     parser.add_argument(
         "--channels",
         type=int,
         nargs="+",
-        help="of the levels H/2, H/4, ...; default: what the shipped networks have",
+        help="channels at H/2, H/4, ... (default: those of the shipped network)",
     )
-    parser.add_argument(
-        "--stem", type=int, default=2, help="HRLS pixels across that a mixing network's features are first made of"
-    )
+    parser.add_argument("--stem", type=int, default=2, help="mix: kernel size of the first convolution over the HRLS")
     parser.add_argument(
         "--kernels",
         type=int,
         nargs=LEVELS,
         default=(5,) * LEVELS,
-        metavar="TAPS",
-        help="taps across of a pyramid network's kernels at H, H/2, ...",
+        metavar="SIZE",
+        help="pyramid: kernel sizes at H, H/2, ...",
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
+    parser.add_argument("--teacher", type=Path, help="mix: checkpoint of a larger mix network to distil")
+    parser.add_argument("--only", default="", help="train only the part of the network with this name, such as heads")
+    parser.add_argument("--batch", type=int, help="(default: the preset's)")
+    parser.add_argument("--patch", type=int, help="width in HRLS pixels (default: the preset's)")
+    parser.add_argument("--lr", type=float, help="peak learning rate (default: the preset's)")
     parser.add_argument(
-        "--teacher", type=Path, help="checkpoint of a larger mixing network, whose choices are learnt too"
+        "--fine-tune",
+        "--retrain",
+        type=float,
+        default=0.06,
+        help="joint: share of the learning rate for pretrained weights",
     )
-    parser.add_argument("--only", default="", help="train the part of the network with this name, such as heads")
-    parser.add_argument("--batch", type=int, help="default: the preset's")
-    parser.add_argument("--patch", type=int, help="HR pixels; default: the preset's")
-    parser.add_argument("--lr", type=float, help="peak learning rate; default: the preset's")
+    parser.add_argument("--loss", choices=losses.LOSSES, help="(default: the preset's)")
     parser.add_argument(
-        "--retrain", type=float, default=0.06, help="share of the learning rate for a joint network's given weights"
+        "--precision",
+        choices=("bf16", "fp32"),
+        default="bf16",
+        help="of convolutions; weights stay fp32 (default: %(default)s)",
     )
-    parser.add_argument("--loss", choices=losses.LOSSES, help="default: the preset's")
     parser.add_argument(
-        "--precision", choices=("bf16", "fp32"), default="bf16", help="of convolutions; weights stay fp32"
+        "--threads", type=int, default=1, help="CPU threads; no more than idle cores (default: %(default)s)"
     )
-    parser.add_argument("--threads", type=int, default=1, help="CPU threads; more than idle cores is slower")
     parser.add_argument("--device", default="auto")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--val-views", type=int, default=24, help="validation views, at most")
-    parser.add_argument("--val-patch", type=int, default=128, help="HR pixels of the validation crops")
+    parser.add_argument("--val-patch", type=int, default=128, help="width of the validation crops in HRLS pixels")
     parser.add_argument("--checkpoint-seconds", type=float, default=120)
     return parser.parse_args(arguments)
 

@@ -52,7 +52,6 @@ class SensorCamera:
 def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
     """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
     import mitsuba as mi
-
     from training.mitsuba_views.trace import blackman_harris, box, render_passes
 
     scene = mi.load_file(str(file))

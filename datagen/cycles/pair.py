@@ -1,0 +1,604 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Render a low-resolution-high-spp / high-resolution-low-spp pair of one frame with Cycles.
+
+The scene is built in code from a seed.  Writes hr.exr, lr.exr and (with --ref-spp) ref.exr as
+multilayer EXR into --out.  Works with bpy 4.5 and bpy 5.0; see datagen/README.md for the commands.
+"""
+
+from __future__ import annotations
+
+import argparse
+import math
+import random
+import sys
+import time
+from pathlib import Path
+
+import bpy
+from mathutils import Vector
+
+V5 = bpy.app.version >= (5, 0, 0)
+
+
+# ---------------------------------------------------------------- materials
+def new_material(name, **inputs):
+    """A Principled material; keyword `Base_Color` sets the input `Base Color`."""
+    mat = bpy.data.materials.new(name)
+    mat.use_nodes = True
+    bsdf = next(n for n in mat.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
+    for key, value in inputs.items():
+        bsdf.inputs[key.replace("_", " ")].default_value = value
+    return mat, mat.node_tree, bsdf
+
+
+def rgb(r, g, b):
+    return (r, g, b, 1.0)
+
+
+def node(nt, kind, **inputs):
+    n = nt.nodes.new(kind)
+    for key, value in inputs.items():
+        n.inputs[key.replace("_", " ")].default_value = value
+    return n
+
+
+def object_coords(nt, scale=(1, 1, 1), rotation=(0, 0, 0)):
+    coords = nt.nodes.new("ShaderNodeTexCoord")
+    mapping = node(nt, "ShaderNodeMapping", Scale=scale, Rotation=rotation)
+    nt.links.new(coords.outputs["Object"], mapping.inputs["Vector"])
+    return mapping.outputs["Vector"]
+
+
+def mix_colors(nt, factor, a, b, blend="MIX"):
+    """Mix two colours; each argument is a socket or a constant."""
+    n = nt.nodes.new("ShaderNodeMix")
+    n.data_type, n.blend_type = "RGBA", blend
+    sockets = [s for s in n.inputs if s.type == "RGBA"]
+    fac = next(s for s in n.inputs if s.identifier == "Factor_Float")
+    for socket, value in ((fac, factor), (sockets[0], a), (sockets[1], b)):
+        if isinstance(value, bpy.types.NodeSocket):
+            nt.links.new(value, socket)
+        else:
+            socket.default_value = value
+    return next(s for s in n.outputs if s.type == "RGBA")
+
+
+def wood_floor():
+    mat, nt, bsdf = new_material("Wood Floor", Roughness=0.32)
+    planks = node(
+        nt,
+        "ShaderNodeTexBrick",
+        Color1=rgb(0.46, 0.25, 0.11),
+        Color2=rgb(0.27, 0.13, 0.055),
+        Mortar=rgb(0.03, 0.015, 0.008),
+        Scale=1.0,
+        Mortar_Size=0.005,
+        Brick_Width=1.3,
+        Row_Height=0.17,
+    )
+    nt.links.new(object_coords(nt, rotation=(0, 0, math.radians(90))), planks.inputs["Vector"])
+    grain = node(nt, "ShaderNodeTexNoise", Scale=3.0, Detail=8.0, Roughness=0.65)
+    nt.links.new(object_coords(nt, scale=(22, 1.6, 1)), grain.inputs["Vector"])
+    out = mix_colors(nt, 0.55, planks.outputs["Color"], grain.outputs[0], "OVERLAY")
+    nt.links.new(out, bsdf.inputs["Base Color"])
+    return mat
+
+
+def wallpaper():
+    mat, nt, bsdf = new_material("Wallpaper", Roughness=0.8)
+    wave = node(nt, "ShaderNodeTexWave", Scale=2.1, Distortion=0.0)
+    wave.bands_direction = "X"
+    nt.links.new(object_coords(nt), wave.inputs["Vector"])
+    ramp = nt.nodes.new("ShaderNodeValToRGB")
+    ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.47, 0.53
+    ramp.color_ramp.elements[0].color = rgb(0.33, 0.45, 0.42)
+    ramp.color_ramp.elements[1].color = rgb(0.42, 0.54, 0.49)
+    nt.links.new(wave.outputs["Fac" if "Fac" in wave.outputs else 1], ramp.inputs[0])
+    nt.links.new(ramp.outputs["Color"], bsdf.inputs["Base Color"])
+    return mat
+
+
+def checker(name, a, b, scale, **inputs):
+    mat, nt, bsdf = new_material(name, **inputs)
+    tex = node(nt, "ShaderNodeTexChecker", Scale=scale, Color1=a, Color2=b)
+    # a turn and an offset keep faces away from the boundaries of the 3-D pattern
+    vector = object_coords(nt, rotation=(0, 0, math.radians(3)))
+    vector.node.inputs["Location"].default_value = (0.013, 0.017, 0.021)
+    nt.links.new(vector, tex.inputs["Vector"])
+    nt.links.new(tex.outputs["Color"], bsdf.inputs["Base Color"])
+    return mat
+
+
+def tablecloth():
+    """A matte plaid from two crossed wave textures."""
+    mat, nt, bsdf = new_material("Cloth", Roughness=0.9, Sheen_Weight=0.4)
+    color, flat = rgb(0.76, 0.71, 0.62), nt.nodes.new("ShaderNodeTexCoord").outputs["UV"]
+    for direction, tint in (("X", rgb(0.55, 0.06, 0.05)), ("Y", rgb(0.10, 0.14, 0.34))):
+        wave = node(nt, "ShaderNodeTexWave", Scale=3.4, Distortion=0.0)
+        wave.bands_direction = direction
+        nt.links.new(flat, wave.inputs["Vector"])
+        ramp = nt.nodes.new("ShaderNodeValToRGB")
+        ramp.color_ramp.elements[0].position, ramp.color_ramp.elements[1].position = 0.62, 0.70
+        ramp.color_ramp.elements[0].color = rgb(0, 0, 0)
+        ramp.color_ramp.elements[1].color = rgb(0.8, 0.8, 0.8)
+        nt.links.new(wave.outputs["Fac" if "Fac" in wave.outputs else 1], ramp.inputs[0])
+        color = mix_colors(nt, ramp.outputs["Color"], color, tint)
+    nt.links.new(color, bsdf.inputs["Base Color"])
+    return mat
+
+
+def painting():
+    mat, nt, bsdf = new_material("Painting", Roughness=0.5)
+    tex = node(nt, "ShaderNodeTexVoronoi", Scale=13.0)
+    nt.links.new(object_coords(nt), tex.inputs["Vector"])
+    warm = mix_colors(nt, 0.55, tex.outputs["Color"], rgb(0.95, 0.45, 0.12), "OVERLAY")
+    nt.links.new(warm, bsdf.inputs["Base Color"])
+    return mat
+
+
+def glass(caustics):
+    """Plain glass, or glass whose shadow is clear so that path tracing it stays quiet."""
+    mat = bpy.data.materials.new("Glass")
+    mat.use_nodes = True
+    nt = mat.node_tree
+    nt.nodes.clear()
+    out = nt.nodes.new("ShaderNodeOutputMaterial")
+    bsdf = node(nt, "ShaderNodeBsdfGlass", Color=rgb(0.95, 0.985, 0.97), Roughness=0.0, IOR=1.45)
+    if caustics:
+        nt.links.new(bsdf.outputs[0], out.inputs["Surface"])
+        return mat
+    path = nt.nodes.new("ShaderNodeLightPath")
+    clear = node(nt, "ShaderNodeBsdfTransparent", Color=rgb(0.86, 0.90, 0.88))
+    mix = nt.nodes.new("ShaderNodeMixShader")
+    nt.links.new(path.outputs["Is Shadow Ray"], mix.inputs[0])
+    nt.links.new(bsdf.outputs[0], mix.inputs[1])
+    nt.links.new(clear.outputs[0], mix.inputs[2])
+    nt.links.new(mix.outputs[0], out.inputs["Surface"])
+    return mat
+
+
+# ----------------------------------------------------------------- geometry
+_index = [0]
+
+
+def finish(ob, mat=None, smooth=False):
+    """Give an object its material, smoothness and a pass index of its own."""
+    if mat is not None:
+        ob.data.materials.append(mat)
+    if smooth:
+        ob.data.polygons.foreach_set("use_smooth", [True] * len(ob.data.polygons))
+    _index[0] += 1
+    ob.pass_index = _index[0]
+    return ob
+
+
+def mesh_object(name, verts, faces, mat, smooth=False, at=(0, 0, 0)):
+    mesh = bpy.data.meshes.new(name)
+    mesh.from_pydata(verts, [], faces)
+    mesh.validate()
+    ob = bpy.data.objects.new(name, mesh)
+    ob.location = at
+    bpy.context.scene.collection.objects.link(ob)
+    return finish(ob, mat, smooth)
+
+
+def box(name, lo, hi, mat):
+    c = [(lo[i] + hi[i]) / 2 for i in range(3)]
+    h = [(hi[i] - lo[i]) / 2 for i in range(3)]
+    verts = [(x * h[0], y * h[1], z * h[2]) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
+    faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+    return mesh_object(name, verts, faces, mat, at=c)
+
+
+def tube(name, points, radius, mat):
+    """A thin round wire through points."""
+    curve = bpy.data.curves.new(name, "CURVE")
+    curve.dimensions, curve.bevel_depth, curve.bevel_resolution = "3D", radius, 2
+    spline = curve.splines.new("POLY")
+    spline.points.add(len(points) - 1)
+    for p, q in zip(spline.points, points, strict=True):
+        p.co = (*q, 1)
+    ob = bpy.data.objects.new(name, curve)
+    bpy.context.scene.collection.objects.link(ob)
+    return finish(ob, mat)
+
+
+def cloth(name, mat, at, radius=0.56, drop=0.50):
+    """A round tablecloth: a flat top, a rounded edge and folds that grow towards the hem."""
+    n, rings = 220, 44
+    total = radius + drop
+    verts, faces, flat = [(0, 0, 0)], [], [(0, 0)]  # flat: where the point lay before it was draped
+    for k in range(1, rings + 1):
+        s = total * k / rings
+        for j in range(n):
+            a = 2 * math.pi * j / n
+            hang = max(0.0, s - radius)
+            fold = (0.6 * math.sin(11 * a) + 0.4 * math.sin(17 * a + 1.3)) * 0.085
+            r = min(s, radius) + (0.05 + fold) * (hang / drop) ** 0.8
+            z = -hang * (1 - 0.03 * math.sin(5 * a)) - 0.012 * math.exp(-(((s - radius) / 0.03) ** 2))
+            verts.append((r * math.cos(a), r * math.sin(a), z))
+            flat.append((s * math.cos(a), s * math.sin(a)))
+    faces += [(0, 1 + j, 1 + (j + 1) % n) for j in range(n)]
+    for k in range(rings - 1):
+        for j in range(n):
+            a, b = 1 + k * n + j, 1 + k * n + (j + 1) % n
+            faces.append((a, a + n, b + n, b))
+    ob = mesh_object(name, verts, faces, mat, smooth=True, at=at)
+    uv = ob.data.uv_layers.new(name="Flat")
+    for loop in ob.data.loops:
+        uv.data[loop.index].uv = flat[loop.vertex_index]
+    return ob
+
+
+def grass(name, rng, mat, at, radius=0.13, count=260, height=0.52):
+    verts, faces = [], []
+    for _ in range(count):
+        a, r = rng.uniform(0, 2 * math.pi), radius * math.sqrt(rng.random())
+        base = Vector((r * math.cos(a), r * math.sin(a), 0))
+        lean = Vector((math.cos(a), math.sin(a), 0)) * rng.uniform(0.05, 0.75) * (0.3 + r / radius)
+        h, w, turn = height * rng.uniform(0.55, 1.0), rng.uniform(0.004, 0.009), rng.uniform(0, math.pi)
+        side = Vector((math.cos(turn), math.sin(turn), 0)) * w
+        first = len(verts)
+        for k in range(7):
+            t = k / 6
+            p = base + Vector((0, 0, h * (t - 0.25 * t**3))) + lean * h * t * t
+            verts += [tuple(p - side * (1 - t)), tuple(p + side * (1 - t))]
+        faces += [(first + 2 * k, first + 2 * k + 1, first + 2 * k + 3, first + 2 * k + 2) for k in range(6)]
+    return mesh_object(name, verts, faces, mat, at=at)
+
+
+def sphere(name, radius, mat, at, segments=64):
+    bpy.ops.mesh.primitive_uv_sphere_add(segments=segments, ring_count=segments // 2, radius=radius, location=at)
+    ob = bpy.context.object
+    ob.name = name
+    return finish(ob, mat, smooth=True)
+
+
+def cone(name, r1, r2, depth, mat, at, cap="NGON"):
+    bpy.ops.mesh.primitive_cone_add(vertices=64, radius1=r1, radius2=r2, depth=depth, location=at, end_fill_type=cap)
+    ob = bpy.context.object
+    ob.name = name
+    return finish(ob, mat)
+
+
+def label(text, size, mat, at, rotation=(90, 0, 0)):
+    curve = bpy.data.curves.new("Text", "FONT")
+    curve.body, curve.size, curve.align_x = text, size, "CENTER"
+    ob = bpy.data.objects.new(f"Text {text}", curve)
+    ob.location, ob.rotation_euler = at, [math.radians(d) for d in rotation]
+    bpy.context.scene.collection.objects.link(ob)
+    return finish(ob, mat)
+
+
+# -------------------------------------------------------------------- scene
+def build_scene(seed, transparent=False, caustics=False):
+    bpy.ops.wm.read_factory_settings(use_empty=True)
+    _index[0] = 0
+    rng = random.Random(seed)
+    scene = bpy.context.scene
+    white = new_material("Paint", Base_Color=rgb(0.80, 0.79, 0.76), Roughness=0.45)[0]
+    dark = new_material("Dark Metal", Base_Color=rgb(0.05, 0.05, 0.055), Metallic=1.0, Roughness=0.35)[0]
+    plaster = new_material("Plaster", Base_Color=rgb(0.47, 0.55, 0.51), Roughness=0.8)[0]
+    oak = new_material("Oak", Base_Color=rgb(0.34, 0.19, 0.09), Roughness=0.4)[0]
+
+    # shell: floor, back wall, a left wall with a barred window
+    box("Floor", (-4, -5, -0.1), (4, 2.2, 0), wood_floor())
+    if not transparent:
+        wall = wallpaper()
+        box("Back Wall", (-2.1, 2.2, 0), (4, 2.3, 3.4), wall)
+        box("Skirting", (-4, 2.17, 0), (4, 2.2, 0.13), white)
+    x0, x1, ya, yb, za, zb = -2.1, -2.0, 0.15, 1.75, 0.85, 2.35
+    for k, (lo, hi) in enumerate(
+        [
+            ((x0, -5, 0), (x1, ya, 3.4)),
+            ((x0, yb, 0), (x1, 2.2, 3.4)),
+            ((x0, ya, 0), (x1, yb, za)),
+            ((x0, ya, zb), (x1, yb, 3.4)),
+        ]
+    ):
+        if not (transparent and k == 0):
+            box(f"Left Wall {k}", lo, hi, plaster)
+    for k in range(1, 4):
+        y = ya + (yb - ya) * k / 4
+        box(f"Bar V{k}", (x0 + 0.03, y - 0.014, za), (x1 - 0.03, y + 0.014, zb), white)
+    for k in range(1, 3):
+        z = za + (zb - za) * k / 3
+        box(f"Bar H{k}", (x0 + 0.03, ya, z - 0.014), (x1 - 0.03, yb, z + 0.014), white)
+    box("Sill", (x0, ya - 0.05, za - 0.04), (x1 + 0.14, yb + 0.05, za), white)
+
+    # rug, pedestal with the head, table with cloth and glass ball
+    box(
+        "Rug",
+        (-1.45, -0.95, 0),
+        (0.55, 0.30, 0.012),
+        checker("Rug", rgb(0.60, 0.52, 0.40), rgb(0.13, 0.035, 0.04), 11.0, Roughness=0.95),
+    )
+    box(
+        "Pedestal",
+        (-1.02, 0.62, 0),
+        (-0.28, 1.30, 0.62),
+        checker("Marquetry", rgb(0.36, 0.20, 0.09), rgb(0.13, 0.06, 0.03), 9.0, Roughness=0.25),
+    )
+    gold = new_material("Gold", Base_Color=rgb(0.95, 0.56, 0.20), Metallic=1.0, Roughness=0.16)[0]
+    bpy.ops.mesh.primitive_monkey_add(size=0.92, location=(-0.65, 0.93, 1.03))
+    head = bpy.context.object
+    head.name = "Suzanne"
+    head.rotation_euler = (math.radians(-14), 0, math.radians(16))
+    head.modifiers.new("Subdivision", "SUBSURF").render_levels = 2
+    finish(head, gold, smooth=True)
+
+    table = (0.74, 0.62, 0.74)
+    cone("Table Leg", 0.20, 0.05, 0.72, oak, (table[0], table[1], 0.36))
+    cloth("Tablecloth", tablecloth(), table)
+    sphere("Glass Ball", 0.22, glass(caustics), (table[0] - 0.12, table[1] - 0.14, table[2] + 0.22))
+    china = new_material("China", Base_Color=rgb(0.80, 0.82, 0.86), Roughness=0.08)[0]
+    sphere("Pearl", 0.085, china, (table[0] + 0.26, table[1] - 0.20, table[2] + 0.085))
+    red = new_material("Red Lacquer", Base_Color=rgb(0.62, 0.03, 0.03), Roughness=0.12, Coat_Weight=1.0)[0]
+    sphere("Cherry", 0.055, red, (table[0] + 0.10, table[1] - 0.37, table[2] + 0.055))
+
+    # pot with grass, wire globe
+    pot = new_material("Terracotta", Base_Color=rgb(0.52, 0.19, 0.09), Roughness=0.8)[0]
+    cone("Pot", 0.13, 0.19, 0.30, pot, (1.62, 0.16, 0.15))
+    blade, nt, bsdf = new_material("Grass", Base_Color=rgb(0.13, 0.36, 0.05), Roughness=0.5)
+    tone = node(nt, "ShaderNodeTexNoise", Scale=9.0, Detail=2.0)
+    nt.links.new(
+        mix_colors(nt, tone.outputs[0], rgb(0.05, 0.20, 0.03), rgb(0.42, 0.50, 0.10)), bsdf.inputs["Base Color"]
+    )
+    grass("Grass", rng, blade, (1.62, 0.16, 0.29), radius=0.16, height=0.60)
+    bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3, radius=0.23, location=(-0.98, -0.30, 0.24))
+    globe = bpy.context.object
+    globe.name = "Wire Globe"
+    wires = globe.modifiers.new("Wireframe", "WIREFRAME")
+    wires.thickness = 0.010
+    finish(globe, new_material("Steel", Base_Color=rgb(0.75, 0.77, 0.80), Metallic=1.0, Roughness=0.2)[0])
+
+    # pendant lamp: cable, shade, visible bulb, three stay wires
+    lamp = Vector((0.10, 0.80, 1.98))
+    tube("Cable", [(lamp.x, lamp.y, 3.4), (lamp.x, lamp.y, lamp.z + 0.16)], 0.006, dark)
+    cone(
+        "Shade",
+        0.26,
+        0.07,
+        0.20,
+        new_material("Shade", Base_Color=rgb(0.04, 0.20, 0.22), Roughness=0.3)[0],
+        lamp + Vector((0, 0, 0.06)),
+        cap="NOTHING",
+    )
+    bulb, nt, bsdf = new_material("Bulb", Emission_Color=rgb(1.0, 0.72, 0.40), Emission_Strength=38.0)
+    sphere("Bulb", 0.062, bulb, lamp - Vector((0, 0, 0.02)), segments=24)
+    for k in range(3):
+        a = 2 * math.pi * k / 3 + 0.4
+        edge = lamp + Vector((0.26 * math.cos(a), 0.26 * math.sin(a), -0.04))
+        tube(f"Stay {k}", [tuple(lamp + Vector((0, 0, 0.62))), tuple(edge)], 0.0035, dark)
+
+    # picture and shelf on the back wall
+    if not transparent:
+        box("Frame", (-1.55, 2.12, 1.42), (-0.95, 2.2, 2.22), dark)
+        box("Mat", (-1.51, 2.115, 1.46), (-0.99, 2.12, 2.18), white)
+        box("Painting", (-1.44, 2.11, 1.66), (-1.06, 2.115, 2.11), painting())
+        label("LRHS + HRLS", 0.068, dark, (-1.25, 2.112, 1.535))
+        box("Shelf", (0.48, 1.96, 1.38), (1.98, 2.2, 1.42), oak)
+        x = 0.55
+        while x < 1.86:
+            w, h = rng.uniform(0.025, 0.065), rng.uniform(0.24, 0.40)
+            hue = rng.choice(
+                [
+                    (0.45, 0.08, 0.06),
+                    (0.08, 0.16, 0.34),
+                    (0.60, 0.47, 0.24),
+                    (0.10, 0.25, 0.14),
+                    (0.50, 0.50, 0.47),
+                    (0.62, 0.28, 0.06),
+                ]
+            )
+            mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(0.25, 0.7))[0]
+            book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), mat)
+            bands = new_material("Band", Base_Color=rgb(0.75, 0.60, 0.25), Metallic=1.0, Roughness=0.3)[0]
+            y = book.location.y - 0.001 - (2.17 - book.location.y)
+            for f in (0.18, 0.80):
+                box("Band", (x + 0.002, y, 1.42 + f * h), (x + w - 0.002, y + 0.002, 1.42 + f * h + 0.013), bands)
+            x += w + rng.uniform(0.002, 0.006)
+
+    # light: a window-sized area light and the sun outside, a soft fill in front, the sky
+    def light(name, kind, energy, color, at, to, **attrs):
+        data = bpy.data.lights.new(name, kind)
+        data.energy, data.color = energy, color
+        for key, value in attrs.items():
+            setattr(data, key, value)
+        ob = bpy.data.objects.new(name, data)
+        ob.location = at
+        ob.rotation_euler = (Vector(to) - Vector(at)).to_track_quat("-Z", "Y").to_euler()
+        scene.collection.objects.link(ob)
+        ob.visible_camera = False
+        return ob
+
+    light(
+        "Window",
+        "AREA",
+        85,
+        (0.82, 0.91, 1.0),
+        (-2.35, 0.95, 1.65),
+        (1, 0.2, 0.9),
+        shape="RECTANGLE",
+        size=1.5,
+        size_y=1.7,
+    )
+    light("Sun", "SUN", 11.0, (1.0, 0.84, 0.62), (-4, 1.85, 3.2), (0.2, -0.1, 0), angle=math.radians(0.8))
+    light(
+        "Fill", "AREA", 30, (1.0, 0.95, 0.88), (1.9, -3.4, 3.0), (0, 0.8, 0.7), shape="RECTANGLE", size=1.6, size_y=1.2
+    )
+
+    world = bpy.data.worlds.new("Sky")
+    scene.world = world
+    world.use_nodes = True
+    nt = world.node_tree
+    back = next(n for n in nt.nodes if n.type == "BACKGROUND")
+    coords = nt.nodes.new("ShaderNodeTexCoord")
+    split = nt.nodes.new("ShaderNodeSeparateXYZ")
+    ramp = nt.nodes.new("ShaderNodeValToRGB")
+    ramp.color_ramp.elements[0].color = rgb(0.90, 0.93, 0.95)
+    ramp.color_ramp.elements[1].color = rgb(0.30, 0.50, 0.95)
+    nt.links.new(coords.outputs["Generated"], split.inputs[0])
+    nt.links.new(split.outputs["Z"], ramp.inputs[0])
+    nt.links.new(ramp.outputs["Color"], back.inputs["Color"])
+    back.inputs["Strength"].default_value = 0.62
+    world.cycles.sampling_method = "MANUAL"
+    world.cycles.sample_map_resolution = 512
+    world.mist_settings.start, world.mist_settings.depth = 2.0, 8.0
+
+    # something moves, so that the Vector pass is not all zero
+    globe.rotation_euler = (0, 0, 0)
+    globe.keyframe_insert("rotation_euler", frame=0)
+    globe.rotation_euler = (0.1, 0.0, 0.5)
+    globe.keyframe_insert("rotation_euler", frame=2)
+
+    data = bpy.data.cameras.new("Camera")
+    data.lens = 40
+    camera = bpy.data.objects.new("Camera", data)
+    camera.location = (0.30, -4.35, 1.42)
+    camera.rotation_euler = (Vector((-0.02, 0.8, 0.97)) - camera.location).to_track_quat("-Z", "Y").to_euler()
+    scene.collection.objects.link(camera)
+    scene.camera = camera
+    return scene
+
+
+# ------------------------------------------------------------------- render
+PASSES_LEAN = [
+    "z",
+    "normal",
+    "cryptomatte_object",
+    "diffuse_direct",
+    "diffuse_indirect",
+    "diffuse_color",
+    "glossy_direct",
+    "glossy_indirect",
+    "glossy_color",
+]
+PASSES_ALL = [
+    *PASSES_LEAN,
+    "mist",
+    "vector",
+    "uv",
+    "position",
+    "object_index",
+    "material_index",
+    "transmission_direct",
+    "transmission_indirect",
+    "transmission_color",
+    "emit",
+    "environment",
+]
+
+
+def configure(scene, args):
+    scene.render.engine = "CYCLES"
+    c = scene.cycles
+    c.device = "CPU"
+    c.use_denoising = False
+    c.use_adaptive_sampling = False
+    c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
+    c.sampling_pattern = "TABULATED_SOBOL"
+    c.use_animated_seed = False
+    c.pixel_filter_type, c.filter_width = args.filter, 1.5
+    c.caustics_reflective = c.caustics_refractive = args.caustics
+    c.max_bounces, c.diffuse_bounces, c.glossy_bounces, c.transmission_bounces = 8, 4, 4, 8
+    r = scene.render
+    r.threads_mode, r.threads = "FIXED", args.threads
+    r.use_persistent_data = True
+    r.use_motion_blur = False
+    r.film_transparent = args.transparent
+    r.resolution_percentage = 100
+    r.dither_intensity = 0.0
+    r.use_compositing = r.use_sequencer = False
+    image = r.image_settings
+    if V5:
+        image.media_type = "MULTI_LAYER_IMAGE"
+    image.file_format = "OPEN_EXR_MULTILAYER"
+    image.color_depth = "16" if args.half else "32"
+    image.exr_codec = args.codec
+    if V5:
+        image.use_exr_interleave = args.interleave
+    layer = scene.view_layers[0]
+    if args.view_layer:
+        layer.name = args.view_layer
+    for flag in PASSES_LEAN if args.lean else PASSES_ALL:
+        setattr(layer, f"use_pass_{flag}", True)
+    layer.cycles.denoising_store_passes = True
+    layer.cycles.pass_debug_sample_count = not args.lean
+    layer.pass_cryptomatte_depth = 2 if args.lean else 4
+
+
+def render(scene, path, size, spp, seed, border=None, crop=False):
+    r = scene.render
+    r.resolution_x, r.resolution_y = size
+    r.use_border, r.use_crop_to_border = border is not None, crop
+    if border is not None:
+        r.border_min_x, r.border_min_y, r.border_max_x, r.border_max_y = border
+    scene.cycles.samples, scene.cycles.seed = spp, seed
+    r.filepath = str(path)
+    start = time.time()
+    bpy.ops.render.render(write_still=True)
+    took = time.time() - start
+    print(f"{path.name}: {size[0]}x{size[1]}, {spp} spp, seed {seed}, {took:.1f} s", flush=True)
+
+
+def parse(argv):
+    def size(text):
+        return tuple(int(v) for v in text.lower().split("x"))
+
+    def border(text):
+        return tuple(float(v) for v in text.split(","))
+
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("--out", type=Path, required=True, metavar="DIR")
+    p.add_argument("--size", type=size, default=(512, 384), metavar="WxH", help="size of the HRLS render")
+    p.add_argument("--scale", type=int, default=4, help="LRHS is rendered at 1/scale of the size")
+    p.add_argument("--lr-size", type=size, metavar="WxH", help="size of the LRHS render, over --scale")
+    p.add_argument("--hr-spp", type=int, default=1)
+    p.add_argument("--lr-spp", type=int, default=16)
+    p.add_argument("--ref-spp", type=int, default=0, help="0: no reference")
+    p.add_argument("--only", default="hr,lr,ref", help="which of the renders to make")
+    p.add_argument("--suffix", default="", help="appended to the file names")
+    p.add_argument("--filter", choices=("BOX", "BLACKMAN_HARRIS"), default="BOX")
+    p.add_argument("--transparent", action="store_true", help="transparent film, no back wall")
+    depth = p.add_mutually_exclusive_group()
+    depth.add_argument("--half", dest="half", action="store_true", default=True)
+    depth.add_argument("--float", dest="half", action="store_false")
+    p.add_argument("--codec", default="ZIP")
+    p.add_argument("--interleave", action="store_true", help="Blender 5: one part with every pass")
+    p.add_argument("--border", type=border, metavar="X0,Y0,X1,Y1", help="region in fractions, y upwards")
+    p.add_argument("--crop", action="store_true", help="crop the file to the region")
+    p.add_argument("--lean", action="store_true", help="few passes")
+    p.add_argument("--caustics", action="store_true")
+    p.add_argument("--view-layer", help="name of the view layer")
+    p.add_argument("--seed", type=int, default=1)
+    p.add_argument("--threads", type=int, default=1)
+    return p.parse_args(argv)
+
+
+def main(argv):
+    args = parse(argv)
+    args.out.mkdir(parents=True, exist_ok=True)
+    scene = build_scene(args.seed, args.transparent, args.caustics)
+    configure(scene, args)
+    wanted = args.only.split(",")
+    w, h = args.size
+    # rounded up: an LRHS render covers all of the frame
+    low = args.lr_size or (-(-w // args.scale), -(-h // args.scale))
+    # every render has a seed of its own, else the samples of one would be nested in another's
+    jobs = [("hr", (w, h), args.hr_spp, 1), ("lr", low, args.lr_spp, 2), ("ref", (w, h), args.ref_spp, 3)]
+    for name, size, spp, offset in jobs:
+        if name in wanted and spp > 0:
+            render(
+                scene,
+                args.out.resolve() / f"{name}{args.suffix}.exr",
+                size,
+                spp,
+                1000 * args.seed + offset,
+                args.border,
+                args.crop,
+            )
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The joint network and its denoiser of both renders' mean: Open Image Denoise's networks, fine-tuned."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oiio_msspl import denoiser, transforms
+from oiio_msspl.contract import Contract
+from oiio_msspl.denoiser import Denoiser, Together, layers_of
+from tests.conftest import noisy, picture
+
+pytest.importorskip("pyoidn")
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+
+from tests.training.test_quantise import needs_exact_eight_bits  # noqa: E402
+from training import average, checkpoints, export, prune  # noqa: E402
+from training.joint import JointFusion, with_mean  # noqa: E402
+from training.mean_denoiser import FROZEN, MeanDenoiser  # noqa: E402
+from training.oidn import BASE, BASE_HDR  # noqa: E402
+from training.quantise.__main__ import CHECKPOINT  # noqa: E402
+
+
+def pairs(scale, prepare, count=2, size=64):
+    """Noisy input pairs of a network."""
+    result = []
+    for seed in range(count):
+        clean = picture(size, size)
+        values = [transforms.compress(noisy(clean, 4, seed + i), 1.0) for i in range(2)]
+        normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+        hrls = np.concatenate([values[0], clean.clip(0, 1), normal], axis=-1)
+        images = prepare(transforms.box_downsample(values[1], scale), hrls)
+        result.append(tuple(torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[None])) for i in images))
+    return result
+
+
+def test_a_new_network_is_open_image_denoise():
+    network = JointFusion().eval()
+    for head in network.heads:  # blend with the U-Net's result only
+        head.weight.data.zero_()
+        head.bias.data[1] = 60.0
+    ((lrhs, hrls),) = pairs(2, Together(threads=1), count=1)
+    with torch.inference_mode():
+        fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
+    expected = Denoiser(threads=1, exact=True).hrls(layers_of(hrls[0].permute(1, 2, 0).numpy()))
+    assert np.abs(fused - expected).mean() < 1e-3
+    assert not any(parameter.any() for parameter in network.differences())
+
+
+@pytest.mark.parametrize("scale", [2, 8])
+def test_the_graph_computes_what_the_network_does(scale, tmp_path):
+    """With random differences and pruned channels. The contract names the external weights."""
+    torch.manual_seed(0)
+    ups = [name for level in BASE.up for name in level]
+    network = JointFusion(kept={name: list(range(i, 16 + i)) for i, name in enumerate(ups)}).eval()
+    for name, parameter in network.named_parameters():
+        parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
+    state = {"denoiser": "together", "architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
+    contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
+    drawn = pairs(scale, Together(threads=1))
+    path = tmp_path / "joint.onnx"
+    onnx.save(export.joint_to_onnx(network, contract, drawn), path)
+    assert Contract.of_file(path).weights == BASE_HDR
+    model = export._loaded(path)
+    for lrhs, hrls in drawn:
+        fused, log_error = model.run(["fused", "log_error"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
+        with torch.inference_mode():
+            expected = [values.numpy() for values in network.fuse(lrhs, hrls)]
+        assert np.abs(fused - expected[0]).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - expected[0]).mean()
+        assert np.abs(log_error - expected[1]).mean() < 0.1
+
+
+def test_pruning_channels_that_nothing_reads_changes_nothing():
+    torch.manual_seed(0)
+    network = JointFusion().eval()
+    idle = torch.tensor([3, 20, 40])
+    reader = network.convs["dec_conv1a"]
+    reader.weight.data[:, idle] = -reader.pretrained_weight[:, idle]
+    head = network.heads[1]
+    head.weight.data[:, idle] = 0
+    drawn = pairs(2, with_mean, count=1)
+    pruned = prune.pruned(network, "dec_conv2b", 61, [{"lrhs": lrhs, "hrls": hrls} for lrhs, hrls in drawn]).eval()
+    assert len(pruned.kept["dec_conv2b"]) == 61
+    assert pruned.convs["dec_conv2b"].weight.shape[0] == pruned.heads[1].in_channels == 61
+    with torch.inference_mode():
+        for before, after in zip(network(*drawn[0]), pruned(*drawn[0]), strict=True):
+            torch.testing.assert_close(before, after, atol=1e-4, rtol=0)
+    with pytest.raises(SystemExit, match="only convolutions on the way up"):
+        prune.pruned(network, "enc_conv1", 16, [])
+
+
+def test_the_mean_may_include_the_initial_state():
+    network = JointFusion()
+    bias = network.heads[0].bias.detach().clone()
+    for parameter in network.parameters():
+        parameter.data += 0.5
+    state = {"architecture": "joint", "config": network.config, "ema": network.state_dict(), "denoiser": "together"}
+    mean = average.mean([state | {"provenance": {}}], initial=(0.25, 0.75))
+    assert mean["provenance"] == {"share_of_initial_state": [0.25, 0.75]}
+    assert (mean["ema"]["convs.enc_conv0.weight"] == 0.375).all()
+    assert (mean["ema"]["mean_denoiser.convs.enc_conv1a.extra"] == 0.125).all()
+    torch.testing.assert_close(mean["ema"]["heads.0.bias"].float(), bias + 0.375)
+    torch.testing.assert_close(mean["ema"]["error.bias"], network.error.bias.half())
+    with pytest.raises(SystemExit, match="only a joint network"):
+        average.mean([state | {"architecture": "mix", "config": {}, "provenance": {}}], initial=(0.25, 0))
+
+
+def test_a_new_mean_denoiser_is_open_image_denoise():
+    """The weights of the estimated noise start at zero."""
+    ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=96)
+    low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
+    layers = denoiser.merged(low, layers_of(high, complete=True))
+    found = MeanDenoiser().eval().denoise(layers)
+    del layers["noise"]
+    expected = Denoiser(threads=1, exact=True).both(layers)
+    assert np.abs(found - expected).mean() < 1e-3
+
+
+@needs_exact_eight_bits
+def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint():
+    """To a tenth of the noise, also for sides that are no multiple of 16."""
+    ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
+    low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
+    layers = denoiser.merged(low, layers_of(high, complete=True))
+    expected = checkpoints.load_mean_denoiser(CHECKPOINT).denoise(layers)
+    found = Together(threads=1)(low, high)[0][..., 3:]
+    assert np.abs(found - expected).mean() < 0.1 * np.abs(layers["colour"] - expected).mean()
+
+
+def test_a_run_starts_from_a_pruned_checkpoint_with_older_names(tmp_path: Path):
+    network = JointFusion(kept={"dec_conv1a": list(range(48))})
+    network.convs["enc_conv2"].extra.data.fill_(0.5)
+    older = {name.replace(".extra", ".more"): value for name, value in network.state_dict().items()}
+    torch.save({"ema": older, "config": network.config}, tmp_path / "earlier.pt")
+    other = JointFusion(kept=network.kept)
+    checkpoints.warm_start(other, tmp_path / "earlier.pt")
+    assert (other.convs["enc_conv2"].extra == 0.5).all()
+    differences, everything = len(list(other.differences())), len(list(other.parameters()))
+    assert differences == 2 * (16 + 19 - len(FROZEN))
+    assert everything == differences + 2 + 2 + 2 * 5

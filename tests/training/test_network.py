@@ -1,0 +1,532 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Network, losses, training data and export. Needs PyTorch, which the runtime library does not."""
+
+from __future__ import annotations
+
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from unittest.mock import Mock
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from datagen.views import Folder, mean_lrhs, read_hrls  # noqa: E402
+from oiio_msspl import metrics, schema, tensors, transforms  # noqa: E402
+from oiio_msspl.contract import METADATA_KEY, Contract  # noqa: E402
+from training import checkpoints, data, encoding, losses, train  # noqa: E402
+from training.encoding import log_decode  # noqa: E402
+from training.ops import from_phases, to_phases, weighted_sum  # noqa: E402
+from training.paper import RDB, MultiResolutionFusion  # noqa: E402
+from training.pyramid import PyramidFusion  # noqa: E402
+
+TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
+SIZE = 64
+
+
+def pair(scale: int, height: int = 10, width: int = 14) -> tuple[torch.Tensor, torch.Tensor]:
+    generator = torch.Generator().manual_seed(1)
+    return (
+        torch.rand(2, 3, height, width, generator=generator),
+        torch.rand(2, 16, scale * height, scale * width, generator=generator),
+    )
+
+
+def features_of(stack: np.ndarray) -> dict[str, np.ndarray]:
+    """Named layers of an HRLS stack (H, W, 16)."""
+    ends = np.cumsum(list(schema.HRLS_FEATURES.values()))[:-1]
+    return dict(zip(schema.HRLS_FEATURES, np.split(stack, ends, axis=-1), strict=True))
+
+
+@pytest.fixture
+def views(tmp_path: Path) -> Path:
+    """Two views: a gradient with known noise, one unit normal that turns over the image."""
+    rng = np.random.default_rng(0)
+    x = np.linspace(0.2, 1.0, SIZE)
+    colour = np.broadcast_to(x[:, None, None], (SIZE, SIZE, 3))
+    angle = np.pi * x
+    normal = np.broadcast_to(np.stack([np.cos(angle), np.sin(angle), 0 * angle], -1)[None], (SIZE, SIZE, 3))
+    clean = np.concatenate([colour, 0.5 * colour, normal, 0.7 * colour, 0.3 * colour], axis=-1)
+    for name in ("train", "validation"):
+        noise = np.zeros((8, SIZE, SIZE, 15))
+        noise[..., :3] = 0.02 * rng.standard_normal((8, SIZE, SIZE, 1))
+        np.savez(
+            tmp_path / f"{name}.npz",
+            hr=(clean + noise).astype(np.float16),
+            lr=np.repeat(colour[None], 5, axis=0).astype(np.float16),
+            lr_spp=np.array([1, 1, 2, 4, 8]),
+            ref=colour.astype(np.float16),
+            meta=json.dumps({"split": name, "seed": 1}),
+        )
+    return tmp_path
+
+
+# Network
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_output_has_the_size_of_the_hrls(scale: int) -> None:
+    lrhs, hrls = pair(scale)
+    assert MultiResolutionFusion(scale, **TINY)(lrhs, hrls).shape == (2, 3, 10 * scale, 14 * scale)
+
+
+def test_default_network_is_the_papers() -> None:
+    """G = 3 groups of B = 5 blocks of 4 convolutions; D = log2(s) deshuffle and shuffle layers; 64 channels."""
+    network = MultiResolutionFusion(8)
+    convolutions = [m for m in network.modules() if isinstance(m, torch.nn.Conv2d)]
+    assert sum(isinstance(m, RDB) for m in network.modules()) == 15
+    assert len(convolutions) == 15 * 4 + 2 + 3 + 1 + 3 + 1
+    assert network.fuse.in_channels == 128 and network.fuse.kernel_size == (1, 1)
+    assert all(c.kernel_size == (3, 3) for c in convolutions if c is not network.fuse)
+
+
+def test_rdb_adds_to_its_input() -> None:
+    """With its last convolution at zero, an RDB is the identity."""
+    block = RDB(channels=16, growth=8, dense=3)
+    torch.nn.init.zeros_(block.last.weight)
+    torch.nn.init.zeros_(block.last.bias)
+    x = torch.randn(1, 16, 5, 5)
+    assert torch.equal(block(x), x)
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_new_network_upsamples_the_lrhs(scale: int) -> None:
+    """Without its random part, a new network is bilinear upsampling (away from the zero-padded border)."""
+    network = MultiResolutionFusion(scale, **TINY)
+    with torch.no_grad():
+        network.h_rec.weight[:, 3:] = 0  # all but the channels that carry the LRHS
+        network.fuse.weight[:] = 0
+        for block in network.modules():
+            if isinstance(block, RDB):
+                block.last.weight[:] = 0
+    lrhs, hrls = pair(scale)
+    fused = network(lrhs, hrls)
+    expected = lrhs
+    while expected.shape[-1] < fused.shape[-1]:
+        expected = torch.nn.functional.interpolate(expected, scale_factor=2, mode="bilinear", align_corners=False)
+    inner = (..., slice(2 * scale, -2 * scale), slice(2 * scale, -2 * scale))
+    torch.testing.assert_close(fused[inner], expected[inner])
+
+
+def test_scale_that_is_no_power_of_two_is_refused() -> None:
+    with pytest.raises(ValueError, match="got 3"):
+        MultiResolutionFusion(3)
+
+
+# Losses
+
+
+def test_robust_loss_by_hand() -> None:
+    """Errors of 0, 0.1 and 0.9 with beta 0.1 cost 0, 0.5 and 0.9."""
+    loss = losses.robust(torch.tensor([1.0, 0.1, -0.9]), torch.tensor([1.0, 0.0, 0.0]))
+    assert loss.item() == pytest.approx((0 + 0.5 + 0.9) / 3)
+
+
+def test_robust_loss_is_bounded_and_so_is_its_gradient() -> None:
+    error = torch.logspace(-6, 6, 100).requires_grad_()
+    loss = losses.robust(error, torch.zeros(100))
+    loss.backward()
+    assert loss.item() < 1
+    assert error.grad.max() * 100 <= 1 / losses.BETA  # * 100: the mean over elements
+
+
+def test_display_loss_is_the_error_of_the_picture_and_some_of_highlights() -> None:
+    grey = torch.full((1, 3, 8, 8), 0.5)
+    white, brighter = torch.full_like(grey, 1.5), torch.full_like(grey, 1.6)
+    picture = transforms.srgb(transforms.expand(np.array([0.5, 0.6], np.float32), 1.0))
+    expected = 10 * float(np.diff(picture)[0]) ** 2 + 0.3 * 0.1
+    assert losses.display(grey + 0.1, grey).item() == pytest.approx(expected, rel=1e-3)
+    assert losses.display(brighter, white).item() == pytest.approx(0.3 * 0.1, rel=1e-3)
+
+
+def test_relative_loss_counts_light_in_the_dark() -> None:
+    """As RelMSE does, but no pixel for more than four."""
+    dark = torch.full((1, 3, 8, 8), 0.02)
+    for step, at_most in ((0.02, None), (3.0, 4.0)):
+        extra = (losses.relative(dark + step, dark) - losses.display(dark + step, dark)).item()
+        relmse = metrics.relmse(*(log_decode(x)[0].permute(1, 2, 0).numpy() for x in (dark + step, dark)))
+        assert extra == pytest.approx(at_most or relmse, rel=0.05)
+
+
+def test_hrls_is_the_mean_of_passes(views: Path) -> None:
+    (view,) = Folder(views).split("train")
+    everything = slice(0, SIZE)
+    passes = read_hrls(view, [2, 5], everything, everything)
+    expected = (view.hr[2, ..., :3].astype(np.float32) + view.hr[5, ..., :3]) / 2
+    np.testing.assert_array_equal(passes.mean(0)[..., :3], expected)
+
+
+def drawn(views: Path, scale: int, patch: int, count: int, sampling: data.Sampling, seed: int = 0) -> data.Batch:
+    tensors = data.view_tensors(Folder(views), "train", torch.device("cpu"))
+    return data.draw(tensors, scale, patch, count, np.random.default_rng(seed), sampling)
+
+
+def test_variance_is_that_of_the_mean_and_unbiased(views: Path) -> None:
+    """n passes with noise of deviation 0.02 have a mean of variance 0.02^2 / n, however small n is."""
+    for n in (2, 3):
+        only_n = tuple(float(i + 1 == n) for i in range(8))
+        sampling = data.Sampling(
+            hrls_spp=only_n, drop_each=0, drop_variance=0, drop_all=0, exposure_stops=0, gain_stops=0, grey=0
+        )
+        batch = drawn(views, 4, SIZE, 4, sampling)
+        deviation = transforms.expand(batch["hrls"][:, -1].numpy(), 1.0)
+        exposure = transforms.expand(batch["target"].numpy(), 1.0).max()  # the brightest pixel of the views is 1
+        assert np.square(deviation / exposure).mean() == pytest.approx(0.02**2 / n, rel=0.03)
+
+
+def test_sample_shapes_ranges_and_agreement(views: Path) -> None:
+    """The parts of a pair show the same pixels: without noise, LRHS and target agree after downsampling."""
+    for seed in range(20):
+        batch = drawn(views, 4, 32, 3, data.Sampling(), seed)
+        assert batch["lrhs"].shape == (3, 3, 8, 8)
+        assert batch["hrls"].shape == (3, 16, 32, 32)
+        assert batch["target"].shape == (3, 3, 32, 32)
+        assert all(part.isfinite().all() for part in batch.values())
+        down = torch.nn.functional.avg_pool2d(batch["target"], 4)
+        torch.testing.assert_close(down, batch["lrhs"], atol=0.01, rtol=0)
+
+
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_an_lrhs_with_a_filter_of_its_own_is_read_as_it_was_rendered(views: Path, tmp_path: Path, scale: int) -> None:
+    """Passes at 1/s of the resolution are no means of pixels, and have no nearest ones; one scale alone is no view."""
+    rendered = {s: np.full((5, SIZE // s, SIZE // s, 3), s / 10, np.float16) for s in schema.SCALES}
+    with np.load(views / "train.npz") as stored:
+        others = {name: stored[name] for name in stored if name != "lr"}
+    wide = tmp_path / "wide"
+    wide.mkdir()
+    np.savez(wide / "one.npz", **others, lr_x2=rendered[2])
+    np.savez(wide / "all.npz", **others, **{f"lr_x{s}": passes for s, passes in rendered.items()})
+    (view,) = Folder(wide).split("train")
+    for nearest in (False, True):
+        np.testing.assert_array_equal(mean_lrhs(view, [0, 3], scale, nearest=nearest), rendered[scale][0])
+        sampling = data.Sampling(nearest=float(nearest), exposure_stops=0, gain_stops=0, grey=0)
+        lrhs = drawn(wide, scale, 32, 2, sampling)["lrhs"]
+        # A flat picture is exposed to the key
+        expected = transforms.compress(np.full((2, 3, 32 // scale, 32 // scale), transforms.KEY, np.float32), 1.0)
+        np.testing.assert_allclose(lrhs, expected, rtol=1e-3)
+
+
+def test_absent_layers_have_their_defaults(views: Path) -> None:
+    batch = drawn(views, 4, 32, 1, data.Sampling(drop_all=1.0))
+    layers = features_of(batch["hrls"][0].permute(1, 2, 0).numpy())
+    assert all((layers[name] == schema.DEFAULTS[name]).all() for name in schema.OPTIONAL_FEATURES)
+    assert layers[schema.RGB].std() > 0
+
+
+def test_training_transforms_as_inference_does() -> None:
+    """What batches compute in PyTorch is what the library computes in NumPy."""
+    rng = np.random.default_rng(0)
+    layers = {name: rng.exponential(1.0, (5, 6, n)).astype(np.float32) for name, n in schema.HRLS_FEATURES.items()}
+    layers[schema.NORMAL] -= 1
+    low = rng.exponential(1.0, (7, 9, 3)).astype(np.float32)
+    low[2:4] = 0
+    exposure = encoding.exposure_of(torch.from_numpy(low)[None])
+    assert exposure.item() == pytest.approx(transforms.exposure_of(low), rel=1e-3)
+    packed = encoding.pack({name: torch.from_numpy(values)[None] for name, values in layers.items()}, exposure)
+    expected = tensors.pack(layers, schema.HRLS_FEATURES, exposure.item())
+    np.testing.assert_allclose(packed[0].numpy(), expected, atol=1e-5)
+    assert encoding.exposure_of(torch.zeros(1, 4, 4, 3)).item() == transforms.exposure_of(
+        np.zeros((4, 4, 3), np.float32)
+    )
+
+
+def test_exposure_of_training_is_that_of_inference() -> None:
+    """Also of frames with black pixels, with traces of light, and of black ones."""
+    rng = np.random.default_rng(0)
+    frames = rng.gamma(1.0, 0.3, (4, 12, 16, 3)).astype(np.float32)
+    frames[1, :4], frames[2, 4:], frames[3] = 0, 1e-20, 0
+    expected = [transforms.exposure_of(frame) for frame in frames]
+    np.testing.assert_allclose(encoding.exposure_of(torch.from_numpy(frames)), expected, rtol=1e-4)
+
+
+@pytest.mark.parametrize("determinant", [1, -1])
+def test_normals_are_turned_with_the_right_handedness(determinant: int) -> None:
+    turned = data.random_orthogonal(np.random.default_rng(0), determinant)
+    np.testing.assert_allclose(turned @ turned.T, np.eye(3), atol=1e-6)
+    assert np.linalg.det(turned) == pytest.approx(determinant)
+
+
+def test_normals_keep_their_lengths_and_angles(views: Path) -> None:
+    """The normal turns from one column to the next, before and after all augmentation, by the same angle."""
+    keep = data.Sampling(drop_each=0, drop_lobes=0, drop_all=0)
+    step = np.cos(np.pi * 0.8 / (SIZE - 1))
+    for seed in range(8):
+        hrls = drawn(views, 2, 32, 1, keep, seed)["hrls"][0].permute(1, 2, 0).numpy()
+        normal = features_of(hrls)[schema.NORMAL]
+        np.testing.assert_allclose(np.linalg.norm(normal, axis=-1), 1, atol=2e-3)
+        along, across = np.sum(normal[:, 1:] * normal[:, :-1], -1), np.sum(normal[1:] * normal[:-1], -1)
+        np.testing.assert_allclose(sorted([along.mean(), across.mean()]), [step, 1], atol=2e-3)
+
+
+def test_new_views_are_found_and_broken_ones_wait(views: Path) -> None:
+    folder = Folder(views)
+    (views / "late.npz").write_bytes((views / "train.npz").read_bytes()[:1000])
+    folder.scan()
+    assert len(folder.split("train")) == 1
+    (views / "late.npz").write_bytes((views / "train.npz").read_bytes())
+    folder.scan()
+    assert len(folder.split("train")) == 2
+
+
+# Training and export
+
+
+@pytest.fixture
+def tiny_network() -> MultiResolutionFusion:
+    torch.manual_seed(0)
+    return MultiResolutionFusion(4, **TINY).eval()
+
+
+def test_run_ends_on_sigterm_and_continues(views: Path, tmp_path: Path) -> None:
+    """SIGTERM leaves a checkpoint, and the same command goes on from it."""
+    root = Path(__file__).parents[2]
+    command = [
+        sys.executable, "-m", "training.train", "--scale", "2", "--data", str(views), "--out", str(tmp_path / "run"),
+        "--minutes", "5", "--batch", "1", "--patch", "16", "--val-patch", "16", "--checkpoint-seconds", "0.5",
+    ]  # fmt: skip
+    for _ in range(2):
+        with subprocess.Popen(command, cwd=root, stderr=subprocess.PIPE, text=True) as process:
+            lines = []
+            for line in process.stderr:
+                lines.append(line)
+                if sum(" step " in text for text in lines) == 2:
+                    process.send_signal(signal.SIGTERM)
+            assert process.wait() == 0, "".join(lines)
+    assert any("continues at step" in line for line in lines)
+    state = torch.load(tmp_path / "run" / "checkpoint.pt", weights_only=True)
+    assert state["step"] > 0 and state["training_spp"] == {"2": {"hrls": [1, 8], "lrhs": [4, 64]}}
+
+
+def test_the_loader_draws_what_the_data_set_does(views: Path) -> None:
+    """In its own process, from the same seed; and that process ends with the iterator."""
+    pairs = data.Batches(views, (2,), 16, 1, data.Sampling(), 0, torch.device("cpu"))
+    loaded = iter(pairs.loader())
+    for _, expected, batch in zip(range(6), pairs, loaded, strict=False):
+        assert batch["lrhs"].shape == (1, 3, 8, 8)
+        for name, values in expected.items():
+            torch.testing.assert_close(batch[name], values, rtol=0, atol=0)
+    (worker,) = loaded._workers
+    del loaded
+    worker.join(timeout=30)
+    assert not worker.is_alive()
+
+
+def test_the_schedule_follows_the_clock() -> None:
+    """Warm-up from 0, the peak, the end of the cosine; a group's share scales it."""
+    run = Mock(spec_set=["optimizer", "peak_lr", "args", "recipe", "elapsed"], peak_lr=1e-3, elapsed=0.0)
+    run.args.minutes, run.recipe = 1, train.RECIPES["ours"]
+    run.optimizer = torch.optim.SGD([{"params": [torch.zeros(1)], "share": 0.5}], lr=1.0)
+    schedule = train.Run.new_schedule(run)
+    for elapsed, share in ((0.0, 1e-3), (0.9, 0.5), (1.8, 1.0), (60.0, train.FINAL)):
+        run.elapsed = elapsed
+        run.optimizer.step()
+        schedule.step()
+        assert run.optimizer.param_groups[0]["lr"] == pytest.approx(share * 0.5e-3)
+
+
+def test_the_moving_average_starts_with_a_short_memory() -> None:
+    """It follows the weights quickly at first; the decay then grows to EMA_DECAY."""
+    network = PyramidFusion(channels=(8,) * 5, own_size=(3,) * 5)
+    average = train.averaged(network)
+    expected = network.error.bias.detach().clone()
+    for step in range(1, 4):
+        network.error.bias.data += 1
+        average.update_parameters(network)
+        decay = (1 + step) / (10 + step)
+        expected = decay * expected + (1 - decay) * network.error.bias.detach()
+        torch.testing.assert_close(average.module.error.bias, expected)
+
+
+def test_larger_scale_starts_as_the_smaller_one(tiny_network: MultiResolutionFusion, tmp_path: Path) -> None:
+    """Warm-started with a x4 network, a x8 one answers alike to images without detail (away from the border)."""
+    torch.save({"ema": tiny_network.state_dict()}, tmp_path / "x4.pt")
+    larger = MultiResolutionFusion(8, **TINY)
+    checkpoints.warm_start(larger, tmp_path / "x4.pt")
+    colour, layers = torch.rand(1, 3, 1, 1), torch.rand(1, 16, 1, 1)
+    middles = [
+        network(colour.expand(1, 3, 40, 40), layers.expand(1, 16, 40 * network.scale, 40 * network.scale))[
+            ..., 20 * network.scale, 20 * network.scale
+        ]
+        for network in (tiny_network, larger)
+    ]
+    torch.testing.assert_close(*middles)
+
+
+@pytest.mark.parametrize("half", [False, True])
+def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, tmp_path: Path, half: bool) -> None:
+    """One operator for each of the network's, the same numbers, and the contract comes back as it went in."""
+    pytest.importorskip("onnxscript")
+    onnx = pytest.importorskip("onnx")
+    onnxruntime = pytest.importorskip("onnxruntime")
+    from training import export
+
+    path = tmp_path / "tiny.onnx"
+    contract = Contract(name="tiny-x4", scale=4, overlap=12, training_spp={"hrls": [1, 8], "lrhs": [16, 256]})
+    onnx.save(export.to_onnx(tiny_network, contract, half=half), path)
+
+    assert export.parity(tiny_network, 4, path) < (5e-3 if half else 1e-5)
+    kinds = {node.op_type for node in onnx.load(path).graph.node}
+    assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
+    assert str(Path(__file__).parents[2]).encode() not in path.read_bytes()
+    session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])
+    metadata = session.get_modelmeta().custom_metadata_map
+    assert Contract.from_json(metadata[METADATA_KEY], str(path)) == contract
+
+
+# The kernel-predicting network
+
+
+@pytest.fixture
+def tiny_pyramid() -> PyramidFusion:
+    torch.manual_seed(0)
+    return PyramidFusion(channels=(16, 16, 16, 16, 16), own_size=(3, 3, 3, 3, 3)).eval()
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("scale", schema.SCALES)
+def test_one_pyramid_serves_every_scale(tiny_pyramid: PyramidFusion, scale: int) -> None:
+    lrhs, hrls = pair(scale, 64 // scale, 96 // scale)
+    fused, log_error = tiny_pyramid(lrhs, hrls)
+    assert (fused.shape, log_error.shape) == ((2, 3, 64, 96), (2, 1, 64, 96))
+    assert torch.isfinite(fused).all()
+
+
+@torch.inference_mode()
+def test_pyramid_never_leaves_the_range_of_its_inputs(tiny_pyramid: PyramidFusion) -> None:
+    """Even with wild weights, and bright light beside black: what is bright or dark stays where it was."""
+    for parameter in tiny_pyramid.parameters():
+        parameter.copy_(3 * torch.randn_like(parameter))
+    lrhs, hrls = pair(4, 16, 24)
+    hrls[:, :3, 30:34, 40:44] = 4.2
+    lrhs[:, :, :8], hrls[:, :3, :32] = 0.1, 0.2
+    fused, _ = tiny_pyramid(lrhs, hrls)
+    assert fused[:, :, :20].min() >= 0.1 and fused[:, :, :20].max() <= 0.2
+    far = torch.ones(64, 96, dtype=torch.bool)
+    far[20:44, 30:54] = False
+    assert fused[..., far].max() <= 1.0 < fused.max() <= 4.2
+
+
+#: Phases of the weights and of the image, taps across, pixels between them.
+SUMS = [(1, 1, 3, 1), (1, 1, 5, 1), (1, 1, 3, 2), (4, 4, 3, 1), (4, 4, 5, 1), (4, 1, 3, 2)]
+
+
+@pytest.mark.parametrize(("phases", "of_image", "size", "dilation"), SUMS)
+def test_gradient_of_the_weighted_sum(phases: int, of_image: int, size: int, dilation: int) -> None:
+    generator = torch.Generator().manual_seed(0)
+    weights = torch.rand(2, size**2, phases, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    image = torch.rand(2, 2, of_image, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(lambda w, i: weighted_sum(w, i, dilation), (weights, image))
+    with torch.no_grad():
+        plain = weighted_sum(weights, image, dilation)
+    torch.testing.assert_close(weighted_sum(weights, image, dilation).detach(), plain)
+
+
+@torch.inference_mode()
+@pytest.mark.parametrize("size", [3, 5])
+def test_weighted_sum_of_phases_is_that_of_the_picture(size: int) -> None:
+    """By hand, tap by tap, over the whole picture; an image of half the size counts as every pixel four times."""
+    weights, image, small = torch.rand(1, size**2, 6, 10), torch.rand(1, 3, 6, 10), torch.rand(1, 3, 3, 5)
+
+    def by_hand(image: torch.Tensor, dilation: int) -> torch.Tensor:
+        reach = size // 2 * dilation
+        padded = torch.nn.functional.pad(image, (reach,) * 4)
+        return sum(
+            weights[:, [tap]] * padded[..., y : y + image.shape[-2], x : x + image.shape[-1]]
+            for tap, (y, x) in enumerate((dilation * y, dilation * x) for y in range(size) for x in range(size))
+        )
+
+    of_phases = weighted_sum(to_phases(weights), to_phases(image))
+    torch.testing.assert_close(from_phases(of_phases), by_hand(image, 1))
+    large = torch.nn.functional.interpolate(small, scale_factor=2)
+    torch.testing.assert_close(from_phases(weighted_sum(to_phases(weights), small.unsqueeze(2), 2)), by_hand(large, 2))
+
+
+def test_a_predicted_error_is_that_of_the_output_in_the_mean() -> None:
+    """The loss of the prediction is least at the mean error; the output learns nothing from it."""
+    output, reference = torch.rand(1, 3, 8, 8), torch.rand(1, 3, 8, 8)
+    mean = (output - reference).abs().mean().log().expand(1, 1, 8, 8)
+    least = losses.error_likelihood(mean, output, reference)
+    assert least < min(losses.error_likelihood(mean + change, output, reference) for change in (-0.1, 0.1))
+    network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5)
+    fused, log_error = network(torch.rand(1, 3, 16, 16), torch.rand(1, 16, 64, 64))
+    losses.error_likelihood(log_error, fused.detach(), torch.rand(1, 3, 64, 64)).backward()
+    assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}
+
+
+def test_a_pyramid_begins_with_the_middle_of_larger_kernels(tmp_path: Path) -> None:
+    channels = (8, 8, 8, 8, 8)
+    wide, narrow = (PyramidFusion(channels=channels, own_size=(size, 5, 5, 5, 5)) for size in (5, 3))
+    torch.save({"ema": wide.state_dict(), "config": wide.config}, tmp_path / "wide.pt")
+    checkpoints.warm_start(narrow, tmp_path / "wide.pt")
+    ours, theirs = (network.heads[0].weight.unflatten(0, (-1, 4)) for network in (narrow, wide))
+    assert torch.equal(ours[4], theirs[12])  # the middle ones
+    assert torch.equal(ours[0], theirs[6])  # above and left of it
+    assert torch.equal(ours[9:], theirs[25:])
+    torch.save({"ema": narrow.state_dict(), "config": narrow.config}, tmp_path / "narrow.pt")
+    with pytest.raises(SystemExit, match="has 3x3 kernels, which cannot grow"):
+        checkpoints.warm_start(wide, tmp_path / "narrow.pt")
+    torch.save({"ema": {}, "config": {"scale": 4}}, tmp_path / "paper.pt")
+    with pytest.raises(SystemExit, match="not a pyramid network"):
+        checkpoints.warm_start(wide, tmp_path / "paper.pt")
+
+
+@torch.inference_mode()
+def test_pyramid_sees_an_even_picture_as_even(tiny_pyramid: PyramidFusion) -> None:
+    """Borders included: what lies beyond the picture has no weight."""
+    lrhs, hrls = torch.full((1, 3, 16, 16), 0.3), torch.full((1, 16, 64, 64), 0.5)
+    hrls[:, :3], hrls[:, 3:6] = 0.3, 1.0
+    torch.testing.assert_close(tiny_pyramid(lrhs, hrls)[0], torch.full((1, 3, 64, 64), 0.3), atol=1e-5, rtol=0)
+
+
+def test_onnx_file_of_a_pyramid_agrees_with_it(
+    tiny_pyramid: PyramidFusion, views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In float32 to rounding. With 8-bit convolutions a smaller file says nearly the same, and no colour is rounded."""
+    pytest.importorskip("onnxscript")
+    onnx = pytest.importorskip("onnx")
+    from training import export
+    from training.quantise import static
+
+    path = tmp_path / "tiny.onnx"
+    contract = Contract(name="tiny", scale=4, alignment=tiny_pyramid.multiple // 4, overlap=32)
+    plain = export.to_onnx(tiny_pyramid, contract)
+    onnx.save(plain, path)
+    assert export.parity(tiny_pyramid, 4, path) < 1e-4
+
+    monkeypatch.setattr(static, "PATCH", SIZE)
+    quantised = static.quantise(plain, contract, views)
+    assert quantised.ByteSize() < plain.ByteSize()
+    assert {entry.key: entry.value for entry in quantised.metadata_props} == {METADATA_KEY: contract.to_json()}
+    onnx.save(quantised, path)
+    assert export.parity(tiny_pyramid, 4, path) < 0.1
+    rounded = {name for node in quantised.graph.node if node.op_type == "QuantizeLinear" for name in node.input[:1]}
+    readers = {node.op_type for node in quantised.graph.node if rounded & set(node.input)}
+    assert readers == {"QuantizeLinear"}
+
+
+def test_the_mean_of_checkpoints_is_one(tmp_path: Path) -> None:
+    from training import average, export
+
+    def state(value: float, denoiser: str = "", kernels: tuple[int, ...] = (5, 5, 5, 5, 5)) -> dict:
+        network = PyramidFusion(channels=(8, 8, 8, 8, 8), own_size=kernels)
+        weights = {name: torch.full_like(tensor, value) for name, tensor in network.state_dict().items()}
+        return {"ema": weights, "network": weights, "optimizer": {}, "step": 5, "provenance": {"steps": value}} | {
+            "architecture": "pyramid", "config": network.config, "denoiser": denoiser
+        }  # fmt: skip
+
+    both = average.mean([state(1.0), state(2.0)])
+    assert both["provenance"] == {"steps": 2.0, "mean_of": [{"steps": 1.0}, {"steps": 2.0}]}
+    assert "network" not in both and "optimizer" not in both
+    torch.save(both, tmp_path / "mean.pt")
+    network, _ = export.load(tmp_path / "mean.pt")
+    assert all((parameter == 1.5).all() for parameter in network.parameters())
+    with pytest.raises(SystemExit, match="different networks"):
+        average.mean([state(1.0), state(1.0, "high")])
+    torch.save(average.mean([state(1.0), state(2.0, kernels=(3, 5, 5, 1, 1))]), tmp_path / "mean.pt")
+    network, _ = export.load(tmp_path / "mean.pt")
+    assert list(network.own_size) == [3, 5, 5, 1, 1]
+    assert all((parameter == 1.5).all() for parameter in network.parameters())

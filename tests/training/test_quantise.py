@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quantisation of Open Image Denoise's networks: the choice of weights and slices, and the graph."""
+
+from __future__ import annotations
+
+import itertools
+
+import numpy as np
+import pytest
+
+from oiio_msspl import denoiser, eight_bit, runtime, transforms
+from tests.conftest import noisy, picture
+
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+
+from training.oidn import BASE_HDR, run_unet  # noqa: E402
+from training.quantise import gptq  # noqa: E402
+from training.quantise.graph import Graph  # noqa: E402
+
+#: Without VNNI instructions, sums of two 8-bit products overflow. The package then refuses its 8-bit networks.
+needs_exact_eight_bits = pytest.mark.skipif(
+    not denoiser.eight_bits_work(), reason="no pyoidn, or this processor overflows in 8 bits"
+)
+
+
+def layers(height, width, seed=0):
+    clean = picture(height, width)
+    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+    return {"colour": transforms.compress(noisy(clean, 4, seed), 1.0), "albedo": clean.clip(0, 1), "normal": normal}
+
+
+def test_gptq_beats_rounding_to_the_nearest_step():
+    random = torch.Generator().manual_seed(0)
+    mixing = torch.randn(24, 24, generator=random)
+    inputs = (torch.randn(4000, 24, generator=random) @ mixing).relu()
+    weights = torch.randn(5, 25, generator=random)
+    outputs = inputs @ weights[:, :24].T + weights[:, 24]
+
+    def error(chosen, step, bias):
+        return float((inputs @ (chosen * step[:, None]).T + bias - outputs).square().mean())
+
+    chosen, step, bias = gptq.gptq(inputs, outputs, weights, weights[:, :24])
+    assert chosen.abs().max() <= 127
+    torch.testing.assert_close(chosen, chosen.round())
+    step_of_weights = weights[:, :24].abs().amax(1) / 127
+    nearest = (weights[:, :24] / step_of_weights[:, None]).round()
+    assert error(chosen, step, bias) < 0.6 * error(nearest, step_of_weights, weights[:, 24])
+
+
+def test_slices_are_distributed_for_the_least_noise():
+    """No other distribution of the same number of slices has less noise."""
+    noise = torch.tensor([9.0, 4.0, 1.5, 0.0])
+    slices = gptq.slices_per_channel(noise, 6)
+    ways = [torch.tensor(way) for way in itertools.product(range(1, 8), repeat=4) if sum(way) == 10]
+    assert int(slices.sum()) == 10
+    assert slices[-1] == 1
+    assert float((noise / slices**2).sum()) == pytest.approx(min(float((noise / way**2).sum()) for way in ways))
+
+
+@needs_exact_eight_bits
+def test_the_graph_computes_what_was_fitted(tmp_path):
+    """From pretrained weights and differences, ONNX Runtime computes the same codes as PyTorch, for a small network."""
+    shape, random = gptq.SHAPES[BASE_HDR], torch.Generator().manual_seed(0)
+    weights: dict[str, torch.Tensor] = {}
+
+    def conv(name, channels):
+        out = 3 if name == shape.last else 8
+        scale = (2 / (9 * channels)) ** 0.5
+        weights[f"{name}.weight"] = (torch.randn(out, channels, 3, 3, generator=random) * scale).half().float()
+        weights[f"{name}.bias"] = (0.1 * torch.rand(out, generator=random)).half().float()
+        return out
+
+    def same(channels):
+        return channels
+
+    run_unet(shape, [9], conv, same, same, lambda one, other: one + other)
+    images = [layers(64, 48, seed) for seed in range(2)]
+    fit = gptq.quantise(BASE_HDR, weights, weights, images)
+    onnx.save(Graph(fit).model(), tmp_path / "base.onnx")
+    halves = {name: values.half().numpy() for name, values in weights.items()}
+    session = runtime.load(tmp_path / "base.onnx", 1, initializers=halves)
+    codes = gptq.quantise_inputs(images).codes[0]
+    found = session.run(["codes"], {"layers": codes[0].permute(1, 2, 0).numpy().astype(np.uint8)[None]})[0][0]
+
+    expected = run_unet(
+        shape,
+        [codes],
+        lambda name, x: fit.layers[name](x),
+        lambda x: torch.nn.functional.max_pool2d(x, 2),
+        lambda x: torch.nn.functional.interpolate(x, scale_factor=2),
+        lambda one, other: torch.cat([one, other], dim=1),
+    )
+    slices = expected[0, : 3 * eight_bit.SLICES_OUT].unflatten(0, (-1, 3)).sum(dim=0).permute(1, 2, 0).numpy()
+    assert np.ptp(slices) > 100
+    # PyTorch rounds halves to even, ONNX Runtime rounds them up, and later layers amplify the difference
+    assert np.abs(found - slices).mean() < 1

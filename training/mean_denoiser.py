@@ -1,0 +1,80 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Open Image Denoise's large network, fine-tuned to denoise the mean of both renders at the LRHS's resolution.
+
+The large network expects a noise-free albedo and normal, and estimates the noise of the colour itself. Here albedo and
+normal are means of s x s HRLS pixels, which are noisy at x2, and the difference of the two renders gives an estimate of
+the colour's noise. The fine-tuned network reads all of these as they are. Its outer levels are trained.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from oiio_msspl.denoiser import Layers
+from oiio_msspl.eight_bit import MULTIPLE
+from oiio_msspl.render import Array
+from training.encoding import log_to_pu, pu_to_log
+from training.oidn import LARGE, LARGE_HDR, FineTunedConv, convolutions, pretrained_weights, run_unet_on_tensors
+
+#: Convolutions that keep the pretrained weights: those of the two lowest levels, two thirds of all weights.
+FROZEN = ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b")
+#: The extra input channel is the noise. These convolutions read the input.
+EXTRA = 1
+READERS = ("enc_conv1a", "dec_conv1a")
+
+
+class MeanDenoiser(nn.Module):
+    """See the module's docstring."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        pretrained = pretrained_weights(LARGE_HDR)
+        self.convs = nn.ModuleDict(
+            {
+                name: FineTunedConv(
+                    pretrained[f"{name}.weight"],
+                    pretrained[f"{name}.bias"],
+                    EXTRA if name in READERS else 0,
+                    frozen=name in FROZEN,
+                )
+                for name in convolutions(pretrained)
+            }
+        )
+
+    def forward(self, mean: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """
+        Args:
+            mean: (N, 3, h, w), the mean of both renders, log-encoded.
+            noise: (N, 1, h, w), see :func:`oiio_msspl.denoiser.merged`.
+            albedo, normal: (N, 3, h, w), the HRLS's, means of s x s pixels.
+
+        Returns:
+            The denoised mean (N, 3, h, w), log-encoded.
+        """
+        inputs = torch.cat([log_to_pu(mean), albedo.clamp(0, 1), 0.5 * normal + 0.5, noise], dim=1)
+        height, width = mean.shape[2:]
+        inputs = F.pad(inputs, (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")
+
+        def conv(name: str, values: Tensor) -> Tensor:
+            return F.relu(self.convs[name](values))
+
+        colour = run_unet_on_tensors(LARGE, [inputs], conv)[..., :height, :width]
+        return pu_to_log(colour.float().clamp_max(1.0))
+
+    def weights(self) -> dict[str, Tensor]:
+        """Weights and biases of all convolutions, by Open Image Denoise's names."""
+        pairs = {name: conv.total() for name, conv in self.convs.items()}
+        return {
+            f"{name}.{kind}": values.detach()
+            for name, pair in pairs.items()
+            for kind, values in zip(("weight", "bias"), pair, strict=True)
+        }
+
+    @torch.inference_mode()
+    def denoise(self, layers: Layers) -> Array:
+        """Denoise one image given as NumPy layers; return log-encoded radiance (h, w, 3)."""
+        images = (layers[name] for name in ("colour", "noise", "albedo", "normal"))
+        result = self(*(torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))
+        return result[0].permute(1, 2, 0).numpy()

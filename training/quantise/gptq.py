@@ -1,0 +1,343 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Quantise a U-Net of Open Image Denoise's layout to 8 bits, layer after layer.
+
+Activations are unsigned 8-bit codes. A value whose rounding would be visible is split into slices: its range is cut
+into n equal parts, and each part has a code channel that says how far it is filled. The sum of the channels is the
+value.
+
+Weights are chosen on images of training views. First they are refitted by least squares, so that the codes of the layer
+before give the outputs that its exact values gave. Then they are rounded one by one, and the remaining weights of the
+row compensate for the error (Frantar et al. 2023, "GPTQ", after Hassibi and Stork 1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence, Set
+from dataclasses import dataclass, field
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from oiio_msspl import eight_bit
+from oiio_msspl.denoiser import Layers
+from training.oidn import BASE, BASE_ALBEDO, BASE_HDR, LARGE, LARGE_HDR, Shape, Weights, convolutions, run_unet
+from training.ops import upsample
+
+#: The package's name of the fine-tuned denoiser of both renders' mean (:mod:`training.mean_denoiser`).
+MEAN_DENOISER = "together"
+SHAPES = {BASE_HDR: BASE, BASE_ALBEDO: BASE, LARGE_HDR: LARGE, MEAN_DENOISER: LARGE}
+
+#: Pixels of each image that a layer's weights are fitted to.
+PIXELS = 4000
+#: Share of a layer's values, in every image, that the range of its codes covers.
+COVERED = 0.9995
+#: Channel ranges lie between one range for the whole layer (0) and a range of its own for each channel (1). In between,
+#: neither the values of a weak channel nor the weights that read it have too few codes.
+OWN_RANGE = 0.75
+#: Strength of the regularisation towards the original weights, relative to the power of the inputs, if there are as
+#: many weights per output as pixels.
+DAMPING = 1.0
+#: Largest absolute code of a weight.
+MAX_WEIGHT = 127
+#: Further code channels for each layer of the last level, for slices: rounding errors there go straight into the
+#: colour, mostly from a few channels. The large network's last level has fewer pixels, so it affords more.
+EXTRA_SLICES, EXTRA_SLICES_LARGE = 16, 32
+#: Convolutions that read a layer of the U-Net but are no part of it. Their outputs, and the last layer's outputs after
+#: the colours, are logits and logarithms: signed, in [-SIGNED_RANGE, SIGNED_RANGE], with SIGNED_ZERO as the code of 0.
+HEADS = ("head1", "head2", "head3")
+COLOURS, SIGNED_RANGE, SIGNED_ZERO = 3, 10.0, 128
+
+
+@dataclass
+class CodeLayout:
+    """How values are stored in code channels.
+
+    Attributes:
+        scale: (K,), dequantises each code channel.
+        source_channel: (K,), the value channel that each code channel contributes to. Slices of one value share it.
+    """
+
+    scale: Tensor
+    source_channel: Tensor
+
+    def dequantise(self, codes: Tensor) -> Tensor:
+        """Codes (K, H, W) to values (C, H, W)."""
+        result = torch.zeros(int(self.source_channel.max()) + 1, *codes.shape[1:])
+        return result.index_add_(0, self.source_channel, codes * self.scale[:, None, None])
+
+
+@dataclass
+class Activations:
+    """A layer's outputs for all images: exact values (1, C, H, W), and codes (1, K, H, W) of the 8-bit layers."""
+
+    exact: list[Tensor]
+    codes: list[Tensor]
+    layout: CodeLayout
+
+
+@dataclass
+class QuantisedConv:
+    """A convolution in 8 bits.
+
+    Attributes:
+        weights: (O, I, 3, 3), integers; times ``step`` they are the weights of the input's codes.
+        step: (O,).
+        bias: (O,), of values.
+        inputs, outputs: layouts of the codes that are read and written.
+        offset: (K,), the value at which the slice of each output code channel starts.
+    """
+
+    weights: Tensor
+    step: Tensor
+    bias: Tensor
+    inputs: CodeLayout
+    outputs: CodeLayout
+    offset: Tensor
+
+    def __call__(self, codes: Tensor) -> Tensor:
+        weights = self.weights * self.step[:, None, None, None]
+        values = F.conv2d(codes, weights, self.bias, padding=1)[:, self.outputs.source_channel]
+        in_codes = (values - self.offset[:, None, None]) / self.outputs.scale[:, None, None]
+        return in_codes.round_().clamp_(0, 255)
+
+
+# The inputs of Open Image Denoise's networks
+
+
+def quantise_inputs(images: Sequence[Layers]) -> Activations:
+    """The inputs of a network as codes, and the values that the codes stand for."""
+    layout = input_layout(set(images[0]))
+    codes = [torch.from_numpy(eight_bit.pack(**layers)).permute(2, 0, 1).float() for layers in images]
+    return Activations([layout.dequantise(image)[None] for image in codes], [image[None] for image in codes], layout)
+
+
+def input_layout(layers: Set[str]) -> CodeLayout:
+    """The layout in which :func:`oiio_msspl.eight_bit.pack` stores an albedo, or a colour and its AOVs."""
+    slices, whole = (eight_bit.SLICES_IN, 6) if "colour" in layers else (eight_bit.SLICES_OF_ALBEDO, 0)
+    last = (1 / 255, 3 + whole) if "noise" in layers else (0.0, 0)
+    scale = [1 / slices / 255] * (3 * slices) + [1 / 255] * whole + [last[0]]
+    return CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), slices), *range(3, 3 + whole), last[1]]))
+
+
+# The fit
+
+
+@dataclass
+class PretrainedConv:
+    """A pretrained convolution that is read from the installed Open Image Denoise when the graph is loaded.
+
+    Attributes:
+        weight, bias: all of its parameters.
+        rows, columns: the outputs and inputs that this network uses, as its first ones.
+    """
+
+    weight: Tensor
+    bias: Tensor
+    rows: Sequence[int]
+    columns: Sequence[int]
+
+    @classmethod
+    def all_of(cls, weights: Weights) -> dict[str, PretrainedConv]:
+        """All convolutions of a network, with all channels."""
+        pairs = {name: (weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in convolutions(weights)}
+        return {
+            name: cls(weight, bias, *(list(range(count)) for count in weight.shape[:2]))
+            for name, (weight, bias) in pairs.items()
+        }
+
+
+@dataclass
+class Fit:
+    """Quantises the layers of a network in the order in which :meth:`conv` is called.
+
+    Attributes:
+        shape: layout of the U-Net.
+        weights: of its convolutions and of the heads.
+        pretrained: convolutions from which the differences are stored; not every convolution needs one.
+        slices_out: slices of the output colour.
+        layers: the result.
+    """
+
+    shape: Shape
+    weights: Weights
+    pretrained: Mapping[str, PretrainedConv]
+    slices_out: int = eight_bit.SLICES_OUT
+    layers: dict[str, QuantisedConv] = field(default_factory=dict)
+    _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
+
+    def conv(self, name: str, inputs: Activations) -> Activations:
+        """Quantise a convolution; return its outputs."""
+        weights, bias = self.weights[f"{name}.weight"], self.weights[f"{name}.bias"]
+        rectified = self._rectified(name, len(bias))
+        patches, outputs, exact = [], [], []
+        for image, codes in zip(inputs.exact, inputs.codes, strict=True):
+            result = F.conv2d(image, weights, bias, padding=1)
+            pixels = torch.randperm(result[0, 0].numel(), generator=self._random)[:PIXELS]
+            patches.append(_patches(codes, pixels))
+            outputs.append(result[0].flatten(1)[:, pixels].T)
+            result[:, :rectified].relu_()
+            exact.append(result)
+        of_codes, pretrained = (
+            w[:, inputs.layout.source_channel] * inputs.layout.scale[:, None, None]
+            for w in (weights, self._pretrained_like(name, weights))
+        )
+        original = torch.cat([of_codes.flatten(1), bias[:, None]], dim=1)
+        chosen, step, bias = gptq(torch.cat(patches), torch.cat(outputs), original, pretrained.flatten(1))
+        layout, offset = self._output_layout(name, exact, rectified)
+        layer = QuantisedConv(chosen.reshape(of_codes.shape), step, bias, inputs.layout, layout, offset)
+        self.layers[name] = layer
+        return Activations(exact, [layer(codes) for codes in inputs.codes], layout)
+
+    def _pretrained_like(self, name: str, weights: Tensor) -> Tensor:
+        """A convolution's pretrained weights, padded with zeros to the shape of ``weights``."""
+        result = torch.zeros_like(weights)
+        if conv := self.pretrained.get(name):
+            result[: len(conv.rows), : len(conv.columns)] = conv.weight[conv.rows][:, conv.columns]
+        return result
+
+    def _rectified(self, name: str, count: int) -> int:
+        """How many of a layer's ``count`` outputs pass a ReLU: the first ones. The others are signed."""
+        if name in HEADS:
+            return 0
+        return COLOURS if name == self.shape.last else count
+
+    def _noise_gain(self, name: str) -> Tensor:
+        """Power of the noise in the colours per power of noise in each channel of a layer of the last level.
+
+        ReLUs are ignored.
+        """
+        level = self.shape.up[-1]
+        result = torch.zeros(len(self.weights[f"{self.shape.last}.bias"]))
+        result[:COLOURS] = 1
+        for reader in (self.shape.last, *level[: level.index(name) : -1]):
+            result = result @ self.weights[f"{reader}.weight"].square().sum(dim=(2, 3))
+        return result
+
+    def _output_layout(self, name: str, exact: list[Tensor], rectified: int) -> tuple[CodeLayout, Tensor]:
+        """The layout of a layer's output codes, and the value at which each code channel's slice starts."""
+        count = len(exact[0][0])
+        if name == self.shape.last or rectified < count:
+            tops, slices = torch.ones(rectified), torch.full((rectified,), self.slices_out)
+        else:
+            tops = torch.stack([_quantile(image[0].flatten(1), COVERED) for image in exact]).amax(dim=0)
+            tops = tops.clamp_min(1e-3 * tops.max())
+            tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
+            slices = torch.ones(rectified, dtype=torch.long)
+            if name in self.shape.up[-1]:
+                extra = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
+                slices = slices_per_channel(self._noise_gain(name) * tops**2, extra)
+        # The first slice of every channel, then the second slice of those that have one, ...
+        nth, source = (torch.arange(int(slices.sum()))[:, None] < slices).nonzero(as_tuple=True)
+        width = (tops / slices)[source]
+        offset, scale = nth * width, width / 255
+        signed = torch.arange(rectified, count)
+        source = torch.cat([source, signed])
+        scale = torch.cat([scale, torch.full(signed.shape, 2 * SIGNED_RANGE / 255)])
+        offset = torch.cat([offset, torch.full(signed.shape, -SIGNED_ZERO * 2 * SIGNED_RANGE / 255)])
+        if name == self.shape.last or rectified < count:
+            source, scale, offset = (F.pad(x, (0, -len(x) % 16), value=x[0]) for x in (source, scale, offset))
+        return CodeLayout(scale, source), offset
+
+
+def slices_per_channel(noise: Tensor, extra: int) -> Tensor:
+    """Distribute ``extra`` slices, beyond one per channel, for the least total noise.
+
+    Args:
+        noise: (C,), each channel's noise with one slice; n slices divide it by n².
+    """
+    slices = torch.ones(len(noise), dtype=torch.long)
+    for _ in range(extra):
+        slices[(noise * (1 / slices**2 - 1 / (slices + 1) ** 2)).argmax()] += 1
+    return slices
+
+
+def _quantile(values: Tensor, share: float) -> Tensor:
+    """Quantile of each row."""
+    return values.kthvalue(max(round(share * values.shape[1]), 1), dim=1).values
+
+
+def _patches(image: Tensor, pixels: Tensor) -> Tensor:
+    """The 3 x 3 neighbourhoods of some pixels of an image (1, C, H, W): (P, 9 C), ordered as a kernel's weights."""
+    width = image.shape[3]
+    padded, rows, columns = F.pad(image[0], (1, 1, 1, 1)), pixels // width, pixels % width
+    parts = [padded[:, rows + y, columns + x] for y in range(3) for x in range(3)]
+    return torch.stack(parts, dim=1).flatten(0, 1).T
+
+
+def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor, pretrained: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Choose integer weights in [-MAX_WEIGHT, MAX_WEIGHT] and their steps, so that inputs give outputs.
+
+    Args:
+        inputs: (P, K).
+        outputs: (P, O).
+        weights: (O, K + 1), the original weights; bias last.
+        pretrained: (O, K); no weight may differ from it by more than MAX_WEIGHT steps.
+
+    Returns:
+        Integers (O, K), the step of each row (O,), bias (O,).
+    """
+    count = inputs.shape[1]
+    x = torch.cat([inputs, torch.ones(len(inputs), 1)], dim=1).double()
+    power = x.T @ x / len(x)
+    damping = torch.diag(DAMPING * count / len(x) * power.diagonal() + 1e-6 * power.diagonal().mean())
+    damping[count, count] = 1e-9
+    original = weights.double()
+    weights = torch.linalg.solve(power + damping, x.T @ outputs.double() / len(x) + damping @ original.T).T
+    # Bounded, so that biases in steps fit into 32 bits
+    step = (weights[:, :count].abs().amax(dim=1) / MAX_WEIGHT).clamp_min(1e-8)
+    # Strong inputs first, while other weights can compensate for their error; the unrounded bias last
+    order = torch.cat([power.diagonal()[:count].argsort(descending=True), torch.tensor([count])])
+    inverse = torch.cholesky_inverse(torch.linalg.cholesky((power + damping)[order][:, order]))
+    upper = torch.linalg.cholesky(inverse, upper=True)
+    rest, chosen = weights[:, order].clone(), torch.zeros(len(weights), count, dtype=torch.double)
+    for i in range(count):
+        nearest = (pretrained[:, order[i]].double() / step).round()
+        # The difference from the pretrained weight is stored in 8 bits
+        steps = torch.clamp((rest[:, i] / step).round(), nearest - MAX_WEIGHT, nearest + MAX_WEIGHT)
+        chosen[:, order[i]] = steps.clamp(-MAX_WEIGHT, MAX_WEIGHT)
+        error = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
+        rest[:, i:] -= error[:, None] * upper[i, i:]
+    return chosen.float(), step.float(), rest[:, count].float()
+
+
+def run_unet_on_activations(
+    shape: Shape, inputs: Sequence[Activations], conv: Callable[[str, Activations], Activations]
+) -> Activations:
+    """Run a U-Net on exact values and codes alike."""
+
+    def each(change: Callable[[Tensor], Tensor], values: Activations) -> Activations:
+        return Activations([change(i) for i in values.exact], [change(i) for i in values.codes], values.layout)
+
+    def concat(one: Activations, other: Activations) -> Activations:
+        exact, codes = (
+            [torch.cat(pair, dim=1) for pair in zip(*images, strict=True)]
+            for images in ((one.exact, other.exact), (one.codes, other.codes))
+        )
+        source = torch.cat([one.layout.source_channel, other.layout.source_channel + one.exact[0].shape[1]])
+        return Activations(exact, codes, CodeLayout(torch.cat([one.layout.scale, other.layout.scale]), source))
+
+    with torch.no_grad():
+        return run_unet(
+            shape,
+            inputs,
+            conv,
+            pool=lambda values: each(lambda image: F.max_pool2d(image, 2), values),
+            upsample=lambda values: each(lambda image: upsample(image, 2), values),
+            concat=concat,
+        )
+
+
+def quantise(name: str, weights: Weights, pretrained: Weights, images: Sequence[Layers]) -> Fit:
+    """Quantise one of the networks that denoise.
+
+    Args:
+        name: a key of ``SHAPES``.
+        weights: in full precision.
+        pretrained: Open Image Denoise's weights, from which the differences are stored.
+        images: inputs of the network.
+    """
+    fit = Fit(SHAPES[name], weights, PretrainedConv.all_of(pretrained))
+    run_unet_on_activations(fit.shape, [quantise_inputs(images)], fit.conv)
+    return fit

@@ -4,7 +4,7 @@
     python -m benchmarks.eight_bit VIEWS
 
 Open Image Denoise on the HRLS, on both renders, and the models that contain it. PSNR is of sRGB pictures, with 1, 2 and
-4 spp in either render, over every third validation view (:mod:`training.views`). In 32 bits the work is done by Open
+4 spp in either render, over every third validation view (:mod:`datagen.views`). In 32 bits the work is done by Open
 Image Denoise itself, and for `joint` by PyTorch. Times are medians for a frame of 1024 x 1024 pixels; both take turns
 in one process.
 """
@@ -24,6 +24,7 @@ import torch
 from benchmarks import results, scenes
 from benchmarks.results import Row
 from benchmarks.runtime import frame
+from datagen.views import Folder
 from oiio_msspl import Render, Session, find_model, fuse
 from oiio_msspl.aovs.features import HRLS_FEATURES, LRHS_FEATURES, RGB
 from oiio_msspl.arrays import Array
@@ -34,9 +35,9 @@ from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.encoding import decode_radiance, encode_features, find_exposure
 from oiio_msspl.model.oidn import OidnDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, denoiser_images, mean_of_renders
-from training import data, export
+from training.checkpoints import load as load_checkpoint
+from training.data import to_tensor
 from training.joint import JointFusion
-from training.train import to_tensor
 
 SPP = (1, 2, 4)
 SIZE, REPEATS = 1024, 5
@@ -78,7 +79,7 @@ class InTorch(Session):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path)
-        network, _ = export.load(CHECKPOINT)
+        network, _ = load_checkpoint(CHECKPOINT)
         assert isinstance(network, JointFusion)
         self._network = network
 
@@ -86,10 +87,8 @@ class InTorch(Session):
         self, lrhs: Array, hrls: Array, *, lrhs_aovs: Images = NO_IMAGES, error: bool = False
     ) -> tuple[Array, Array | None]:
         light = lrhs[..., :3]
-        together = self._network.together.denoised(
-            mean_of_renders(light, denoiser_images(hrls, complete=True), lrhs_aovs)
-        )
-        images = np.concatenate([light, together], axis=-1), hrls
+        mean = mean_of_renders(light, denoiser_images(hrls, complete=True), lrhs_aovs)
+        images = np.concatenate([light, self._network.mean_denoiser.denoise(mean)], axis=-1), hrls
         with torch.inference_mode():
             fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
         return fused[0].permute(1, 2, 0).numpy(), None
@@ -148,7 +147,7 @@ def main() -> None:
     )
     results.add_option(parser)
     args = parser.parse_args()
-    views = [scenes.of_view(view) for view in data.Folder(args.views).split("validation")[::3]]
+    views = [scenes.of_view(view) for view in Folder(args.views).split("validation")[::3]]
     rows = list(measure(views, args.models))
     print(layout(rows))
     if args.table:

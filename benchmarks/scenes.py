@@ -4,7 +4,7 @@
 Models and defaults are chosen by them, so they are no blind test. A folder holds one of two kinds:
 
 - Renders: a folder for each scene, with ``ref.exr``, ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``.
-- Views of :mod:`training.views`: those of the split ``test`` whose reference is clean enough are used.
+- Views of :mod:`datagen.views`: those of the split ``test`` whose reference is clean enough are used.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ from pathlib import Path
 
 import numpy as np
 
+from datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array, box_downsample, repair
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.model.encoding import find_exposure
-from training import data
 
 #: The references of these scenes are full of fireflies. No mean includes them.
 NOISY_REFERENCE = {"veach-bidir"}
@@ -56,7 +56,7 @@ def load(folder: Path) -> list[Scene]:
     """
     if references := sorted(folder.glob("*/ref.exr")):
         return [_render(reference.parent) for reference in references]
-    views = data.Folder(folder).split("test")
+    views = Folder(folder).split("test")
     if clean := [view for view in views if view.meta.get("ref_psnr", 0.0) >= MIN_REFERENCE]:
         return [of_view(view) for view in clean]
     raise SystemExit(f"{folder}: neither scenes with a ref.exr nor views for testing with clean references")
@@ -80,26 +80,24 @@ def _render(folder: Path) -> Scene:
     )
 
 
-def of_view(view: data.View) -> Scene:
+def of_view(view: View) -> Scene:
     """A rendered view as a scene."""
-    reference = data.read(view.ref)
+    reference = as_float32(view.ref)
     exposure = np.float32(find_exposure(reference))
     whole = slice(None)
 
     def hrls(spp: int) -> ReadableRender:
-        passes = data.read_hrls(view, list(range(spp)), whole, whole).mean(axis=0)
-        layers = data.split_features(passes)
+        passes = read_hrls(view, list(range(spp)), whole, whole).mean(axis=0)
+        layers = split_features(passes)
         for name in layers.keys() & set(RADIANCE_FEATURES):
             layers[name] = layers[name] * exposure
         return Render.from_arrays(f"{view.path.name}, {spp} spp", **layers)
 
     def lrhs(scale: int, spp: int) -> ReadableRender:
         chosen = np.flatnonzero(view.lr_spp == spp)[:1]
-        image = data.mean_lrhs(view, chosen, scale) * exposure
+        image = mean_lrhs(view, chosen, scale) * exposure
         # The last passes: the HRLS of the same pair has the first ones, so the noise is independent
-        features = data.split_features(
-            data.read_hrls(view, list(range(len(view.hr)))[-spp:], whole, whole).mean(axis=0)
-        )
+        features = split_features(read_hrls(view, list(range(len(view.hr)))[-spp:], whole, whole).mean(axis=0))
         layers = {name: box_downsample(features[name], scale) for name in (ALBEDO, NORMAL)}
         return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image, **layers)
 
@@ -111,7 +109,7 @@ def of_view(view: data.View) -> Scene:
             chosen is None or 1 not in view.lr
         ):  # an LRHS that was rendered at 1/s of the resolution has no single HRLS pixels
             return None
-        image = data.mean_lrhs(view, chosen, scale, nearest=True) * exposure
+        image = mean_lrhs(view, chosen, scale, nearest=True) * exposure
         return Render.from_arrays(f"{view.path.name}, x{scale} nearest", rgb=image)
 
     return Scene(view.scene, reference * exposure, hrls, lrhs, nearest)

@@ -3,7 +3,7 @@
 
     python -m benchmarks.together VIEWS
 
-Every third validation view (:mod:`training.views`) is used. PSNR is of sRGB pictures, in two places: at the LRHS's
+Every third validation view (:mod:`datagen.views`) is used. PSNR is of sRGB pictures, in two places: at the LRHS's
 resolution, against the mean of the reference over s x s pixels; and at full resolution, where the denoised HRLS gets
 the local means of that picture. OIDN has the quality "high".
 """
@@ -18,13 +18,13 @@ import numpy as np
 from benchmarks import results
 from benchmarks.peers import match_local_means
 from benchmarks.results import Row
+from datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.metrics import psnr
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import lrhs_weight
-from training import data
 
 #: spp of the HRLS, and average spp of the LRHS.
 SPP = (1, 4)
@@ -56,23 +56,23 @@ def ways(lrhs: Array, color: Array, albedo: Array, normal: Array) -> dict[str, A
     }
 
 
-def measure(view: data.View) -> list[Row]:
+def measure(view: View) -> list[Row]:
     """A row for each scale, spp of the HRLS, average spp of the LRHS and way."""
     rows = []
     whole = slice(None)
-    passes = data.read_hrls(view, list(range(max(SPP))), whole, whole)
+    passes = read_hrls(view, list(range(max(SPP))), whole, whole)
     for spp in SPP:
-        layers = data.split_features(passes[:spp].mean(axis=0))
+        layers = split_features(passes[:spp].mean(axis=0))
         for average in SPP:
             chosen = np.flatnonzero(view.lr_spp == average)[:1]
-            exposure = np.float32(find_exposure(data.mean_lrhs(view, chosen, SCALES[0])))
+            exposure = np.float32(find_exposure(mean_lrhs(view, chosen, SCALES[0])))
             color, albedo, normal = layers[RGB] * exposure, layers[ALBEDO], layers[NORMAL]
-            reference = data.read(view.ref) * exposure
+            reference = as_float32(view.ref) * exposure
             alone = denoise(color, albedo, normal)
             for scale in SCALES:
                 small = [box_downsample(image, scale) for image in (color, albedo, normal)]
                 expected = box_downsample(reference, scale)
-                for way, image in ways(data.mean_lrhs(view, chosen, scale) * exposure, *small).items():
+                for way, image in ways(mean_lrhs(view, chosen, scale) * exposure, *small).items():
                     full = match_local_means(alone, image)
                     row: Row = {"scale": scale, "hrls_spp": spp, "lrhs_spp": average, "method": way}
                     row |= {"psnr_low": psnr(image, expected), "psnr_full": psnr(full, reference)}
@@ -111,7 +111,7 @@ def main() -> None:
     parser.add_argument("views", type=Path)
     results.add_option(parser)
     args = parser.parse_args()
-    views = data.Folder(args.views).split("validation")[::3]
+    views = Folder(args.views).split("validation")[::3]
     rows = means([row for view in views for row in measure(view)])
     print(f"Means over {len(views)} views.\n\n{layout(rows)}")
     if args.table:

@@ -5,7 +5,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from oiio_msspl.transforms import KEY, luminance, srgb
+from oiio_msspl.colour import luminance, srgb
+from oiio_msspl.model.encoding import KEY
 
 
 def shows_something(probe: np.ndarray) -> bool:

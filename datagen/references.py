@@ -19,8 +19,8 @@ from pathlib import Path
 import numpy as np
 
 from datagen import views
-from oiio_msspl import schema
-from oiio_msspl.transforms import MAX_RADIANCE
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.model.encoding import MAX_RADIANCE
 
 
 def denoised(view: views.View) -> views.Array:
@@ -31,8 +31,8 @@ def denoised(view: views.View) -> views.Array:
     guides = views.split_features(np.mean(views.read_hrls(view, list(range(len(view.hr))), whole, whole), axis=0))
     return pyoidn.denoise(
         views.as_float32(view.ref),
-        albedo=np.ascontiguousarray(guides[schema.ALBEDO].clip(0, 1)),
-        normal=np.ascontiguousarray(guides[schema.NORMAL]),
+        albedo=np.ascontiguousarray(guides[ALBEDO].clip(0, 1)),
+        normal=np.ascontiguousarray(guides[NORMAL]),
         hdr=True,
         quality="high",
     )

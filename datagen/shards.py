@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from datagen.views import SPLITS, Folder, View
-from oiio_msspl.output import replacing
+from oiio_msspl.exr.atomic import replacing
 
 LIMIT = 60_000_000
 MANIFEST = "manifest.json"

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 
 from datagen.quality import log_mean
-from oiio_msspl import metrics
-from oiio_msspl.transforms import KEY
-from oiio_msspl.transforms import luminance as luminance_of
+from oiio_msspl.colour import luminance as luminance_of
+from oiio_msspl.metrics import psnr
+from oiio_msspl.model.encoding import KEY
 
 _MEASURES = {
     "psnr": "1-spp PSNR in sRGB [dB]",
@@ -40,7 +40,7 @@ def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dic
     across = np.abs(np.diff(albedo, axis=1)).max(-1)[1:] > 0.08
     down = np.abs(np.diff(albedo, axis=0)).max(-1)[:, 1:] > 0.08
     return {
-        "psnr": metrics.psnr(noisy * exposure, reference * exposure),
+        "psnr": psnr(noisy * exposure, reference * exposure),
         "log_mean": float(np.log10(mean)),
         "range": float(np.log10(max(high, 1e-9) / max(low, 1e-6 * high, 1e-9))),
         "black": float((noisy.max(-1) <= 0).mean()),

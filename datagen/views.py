@@ -36,8 +36,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.quality import log_mean
-from oiio_msspl import schema, transforms
-from oiio_msspl.output import replacing
+from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL, VARIANCE
+from oiio_msspl.arrays import box_downsample, repair
+from oiio_msspl.colour import luminance
+from oiio_msspl.exr.atomic import replacing
+from oiio_msspl.model.contract import SCALES
 
 Array = NDArray[np.float32]
 log = logging.getLogger(__name__)
@@ -51,7 +54,7 @@ SPLITS = ("train", "validation", "test")
 FILTERS = ("box", "blackman-harris")
 
 #: Features that a renderer writes, in the channel order of ``hr``. The variance is computed from the passes.
-PASS_FEATURES = tuple(name for name in schema.HRLS_FEATURES if name != schema.VARIANCE)
+PASS_FEATURES = tuple(name for name in HRLS_FEATURES if name != VARIANCE)
 
 
 # Names
@@ -91,15 +94,15 @@ def pack(
         ref: (H, W, 3).
         meta: entries of ``meta``; the exposure is added.
     """
-    luminance = transforms.luminance(ref)
+    y = luminance(ref)
     target = 10 ** rng.uniform(-1.5, 1.3)
     scale = target / log_mean(ref)
     hr = hr.copy()
     hr[..., :3] *= scale
     hr[..., 9:] *= scale
     exposure = {
-        "scale": scale, "log_mean": target, "mean": float(luminance.mean() * scale),
-        "p1": float(np.percentile(luminance, 1) * scale), "p99": float(np.percentile(luminance, 99) * scale),
+        "scale": scale, "log_mean": target, "mean": float(y.mean() * scale),
+        "p1": float(np.percentile(y, 1) * scale), "p99": float(np.percentile(y, 99) * scale),
     }  # fmt: skip
     return {
         "hr": _half(hr),
@@ -166,19 +169,17 @@ class View:
         self.source: str = f"{meta.get('renderer', 'unknown renderer')}, generator {meta.get('generator', '?')}"
         """Renderer and generator version, for the provenance of a model."""
         self.hr, self.ref = arrays["hr"], arrays["ref"]
-        self.lr: dict[int, NDArray] = {
-            scale: arrays[key] for scale in (1, *schema.SCALES) if (key := lr_key(scale)) in arrays
-        }
+        self.lr: dict[int, NDArray] = {scale: arrays[key] for scale in (1, *SCALES) if (key := lr_key(scale)) in arrays}
         """LRHS passes by scale: scale 1 alone, or all other scales."""
         if denoised_reference(path).exists():
             self.ref = np.load(denoised_reference(path), mmap_mode="c")
         self.lr_spp = np.asarray(arrays["lr_spp"], dtype=np.int64)
-        channels = sum(schema.HRLS_FEATURES[name] for name in PASS_FEATURES)
+        channels = sum(HRLS_FEATURES[name] for name in PASS_FEATURES)
         shapes = {scale: passes.shape for scale, passes in self.lr.items()}
         if (
             self.hr.ndim != 4
             or self.hr.shape[-1] != channels
-            or not (1 in shapes or shapes.keys() >= set(schema.SCALES))
+            or not (1 in shapes or shapes.keys() >= set(SCALES))
             or any(shape[0] != len(self.lr_spp) for shape in shapes.values())
         ):
             raise ValueError(f"{path}: hr is {self.hr.shape}, lr {shapes}, lr_spp {self.lr_spp.shape}")
@@ -210,14 +211,14 @@ def split_features(passes: Array) -> dict[str, Array]:
     """Split passes (..., 15), in the channel order of ``hr``, into named features (..., 3)."""
     features, start = {}, 0
     for name in PASS_FEATURES:
-        features[name] = passes[..., start : start + schema.HRLS_FEATURES[name]]
-        start += schema.HRLS_FEATURES[name]
+        features[name] = passes[..., start : start + HRLS_FEATURES[name]]
+        start += HRLS_FEATURES[name]
     return features
 
 
 def as_float32(values: NDArray, *, signed: bool = False) -> Array:
     """Stored half floats as finite float32, non-negative unless ``signed``."""
-    return transforms.repair(values.astype(np.float32), signed=signed)[0]
+    return repair(values.astype(np.float32), signed=signed)[0]
 
 
 def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int, *, nearest: bool = False) -> Array:
@@ -236,13 +237,13 @@ def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int, *, 
     if nearest:
         return mean[scale // 2 :: scale, scale // 2 :: scale]
     height, width = (n // scale * scale for n in mean.shape[:2])
-    return transforms.box_downsample(mean[:height, :width], scale)
+    return box_downsample(mean[:height, :width], scale)
 
 
 def read_hrls(view: View, passes: NDArray[np.int64] | list[int], rows: slice, columns: slice) -> Array:
     """Read a crop of some ``hr`` passes, (n, H, W, 15): finite, and non-negative except for normals."""
     values = as_float32(np.stack([view.hr[p, rows, columns] for p in passes]), signed=True)
     for name, part in split_features(values).items():
-        if name != schema.NORMAL:
+        if name != NORMAL:
             np.maximum(part, 0.0, out=part)
     return values

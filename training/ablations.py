@@ -26,8 +26,11 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
 from datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
-from oiio_msspl import metrics, schema, tensors, transforms
-from oiio_msspl.comparison import upsample_bicubic
+from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.compare import upsample_bicubic
+from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
 from training import losses
 from training.data import to_tensor
 from training.encoding import log_decode
@@ -39,10 +42,10 @@ BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
 POOL = 400
 #: Features by the tables' names; each entry includes those before it.
 LAYERS = {
-    "RGB": [schema.RGB],
-    "and albedo": [schema.ALBEDO],
-    "and normal": [schema.NORMAL],
-    "and diffuse, specular": [schema.DIFFUSE, schema.SPECULAR],
+    "RGB": [RGB],
+    "and albedo": [ALBEDO],
+    "and normal": [NORMAL],
+    "and diffuse, specular": [DIFFUSE, SPECULAR],
 }
 NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
 #: The paper's upper bound of radiance.
@@ -81,7 +84,7 @@ VARIANTS = [
 
 @dataclass(frozen=True)
 class Pair:
-    """One crop of one view, encoded; channels in the order of :data:`oiio_msspl.schema.HRLS_FEATURES`."""
+    """One crop of one view, encoded; channels in the order of :data:`oiio_msspl.aovs.features.HRLS_FEATURES`."""
 
     lrhs: np.ndarray
     """(h, w, 16)"""
@@ -96,14 +99,14 @@ def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int
     """A crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
     rows, columns = slice(top, top + patch), slice(left, left + patch)
     colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
-    exposure = transforms.exposure_of(colour)
+    exposure = find_exposure(colour)
     low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
 
     def packed(passes: np.ndarray) -> np.ndarray:
-        return tensors.pack(split_features(passes), schema.HRLS_FEATURES, exposure)
+        return encode_features(split_features(passes), HRLS_FEATURES, exposure)
 
     others = [p for p in range(len(view.hr)) if p != chosen]
-    low = transforms.box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
+    low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
     low[..., :3] = colour[low_rows, low_columns]
     high = read_hrls(view, [chosen], rows, columns)[0]
     return Pair(packed(low), packed(high), as_float32(view.ref[rows, columns]), exposure)
@@ -113,7 +116,7 @@ def channels_of(name: str) -> Tensor:
     """Mask (1, 16, 1, 1) of the channels that a branch reads."""
     names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
     read = {feature for layers in names for feature in LAYERS[layers]}
-    return torch.cat([torch.full((n,), float(f in read)) for f, n in schema.HRLS_FEATURES.items()])[None, :, None, None]
+    return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
 
 
 @functools.lru_cache(maxsize=1)  # some GB; VARIANTS are sorted by scale
@@ -129,7 +132,7 @@ def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tens
         stacks = (
             [pair.lrhs for pair in pairs],
             [pair.hrls for pair in pairs],
-            [transforms.compress(pair.target, pair.exposure) for pair in pairs],
+            [encode_radiance(pair.target, pair.exposure) for pair in pairs],
         )
         lrhs, hrls, target = (to_tensor(np.stack(images), torch.device("cpu")) for images in stacks)
         batches.append((lrhs, hrls, target))
@@ -167,9 +170,9 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View
         lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
         fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
         reference = pair.target * pair.exposure
-        bicubic = upsample_bicubic(transforms.expand(pair.lrhs[..., :3], 1.0), width, height)
-        images = (transforms.expand(fused.numpy(), 1.0), bicubic)
-        found.append([measure(i, reference) for i in images for measure in (metrics.psnr, metrics.relmse)])
+        bicubic = upsample_bicubic(decode_radiance(pair.lrhs[..., :3], 1.0), width, height)
+        images = (decode_radiance(fused.numpy(), 1.0), bicubic)
+        found.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
     return dict(zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(found, axis=0).tolist(), strict=True))
 
 

@@ -21,7 +21,19 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from datagen.views import PASS_FEATURES, Array, Folder, View
-from oiio_msspl import schema
+from oiio_msspl.aovs.features import (
+    ALBEDO,
+    DEFAULTS,
+    DIFFUSE,
+    HRLS_FEATURES,
+    NORMAL,
+    OPTIONAL_FEATURES,
+    RADIANCE_FEATURES,
+    RGB,
+    SPECULAR,
+    VARIANCE,
+)
+from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from training.encoding import compress, exposure_of, luminance, pack, repair
 from training.ops import box_downsample
 
@@ -179,21 +191,21 @@ def draw(
         [np.eye(3)[rng.permutation(3) if rng.random() < sampling.permute else range(3)] for _ in chosen]
     )
     light = on_device(np.stack([_random_light(rng, sampling) for _ in chosen]) @ permutation)[:, None]
-    for name in schema.RADIANCE_FEATURES:
+    for name in RADIANCE_FEATURES:
         features[name] = features[name].clamp(0.0, sampling.clip)
-    variance = luminance(features[schema.RGB] @ light[:, None]).var(dim=1) / n if n > 1 else None
+    variance = luminance(features[RGB] @ light[:, None]).var(dim=1) / n if n > 1 else None
     features = {name: values.mean(dim=1) for name, values in features.items()}
-    for name in schema.RADIANCE_FEATURES:
+    for name in RADIANCE_FEATURES:
         features[name] = features[name] @ light
-    features[schema.ALBEDO] = features[schema.ALBEDO].clamp_min(0.0) @ on_device(permutation)[:, None]
+    features[ALBEDO] = features[ALBEDO].clamp_min(0.0) @ on_device(permutation)[:, None]
     lrhs, target = lrhs @ light, target @ light
-    features[schema.VARIANCE] = torch.zeros_like(target[..., :1]) if variance is None else variance[..., None]
+    features[VARIANCE] = torch.zeros_like(target[..., :1]) if variance is None else variance[..., None]
 
     # Mirroring and rotation by quarter turns. Normals may be in any space, so each view gets a random rotation of them;
     # it mirrors if the image is mirrored.
     mirrored, turns = rng.random() < 0.5, int(rng.integers(4))
     turn = on_device(np.stack([random_orthogonal(rng, -1 if mirrored else 1) for _ in chosen]))
-    features[schema.NORMAL] = features[schema.NORMAL] @ turn[:, None]
+    features[NORMAL] = features[NORMAL] @ turn[:, None]
 
     # Exposure, estimated from the whole LRHS as at inference
     jitter = on_device(2.0 ** rng.uniform(-sampling.exposure_stops, sampling.exposure_stops, count))
@@ -217,15 +229,15 @@ def draw(
 
 
 def _per_channel(values: dict[str, Any]) -> np.ndarray:
-    return np.concatenate([np.full(channels, values[name]) for name, channels in schema.HRLS_FEATURES.items()])
+    return np.concatenate([np.full(channels, values[name]) for name, channels in HRLS_FEATURES.items()])
 
 
-_DEFAULTS = _per_channel({schema.RGB: 0.0} | schema.DEFAULTS)
+_DEFAULTS = _per_channel({RGB: 0.0} | DEFAULTS)
 
 
 def _split(passes: Tensor) -> dict[str, Tensor]:
     """Split passes (..., 15), in the channel order of ``hr``, into named features."""
-    parts = passes.split([schema.HRLS_FEATURES[name] for name in PASS_FEATURES], dim=-1)
+    parts = passes.split([HRLS_FEATURES[name] for name in PASS_FEATURES], dim=-1)
     return dict(zip(PASS_FEATURES, parts, strict=True))
 
 
@@ -236,20 +248,20 @@ def _normalised(weights: tuple[float, ...]) -> np.ndarray:
 def _random_light(rng: np.random.Generator, sampling: Sampling) -> np.ndarray:
     """A 3x3 matrix L that changes the colour of the light: radiance @ L."""
     if rng.random() < sampling.grey:
-        return np.repeat(np.asarray(schema.LUMINANCE)[:, None], 3, axis=1)
+        return np.repeat(np.asarray(LUMINANCE_WEIGHTS)[:, None], 3, axis=1)
     return np.diag(2.0 ** rng.uniform(-sampling.gain_stops, sampling.gain_stops, 3))
 
 
 def _present(rng: np.random.Generator, sampling: Sampling, *, has_variance: bool) -> np.ndarray:
     """1 for each HRLS channel whose feature is present, 0 for the others."""
-    absence = dict.fromkeys(schema.OPTIONAL_FEATURES, sampling.drop_each) | {schema.VARIANCE: sampling.drop_variance}
-    present = {schema.RGB: 1.0} | {name: float(rng.random() >= share) for name, share in absence.items()}
+    absence = dict.fromkeys(OPTIONAL_FEATURES, sampling.drop_each) | {VARIANCE: sampling.drop_variance}
+    present = {RGB: 1.0} | {name: float(rng.random() >= share) for name, share in absence.items()}
     if rng.random() < sampling.drop_lobes:
-        present[schema.DIFFUSE] = present[schema.SPECULAR] = 0.0
+        present[DIFFUSE] = present[SPECULAR] = 0.0
     if not has_variance:
-        present[schema.VARIANCE] = 0.0
+        present[VARIANCE] = 0.0
     if rng.random() < sampling.drop_all:
-        present |= dict.fromkeys(schema.OPTIONAL_FEATURES, 0.0)
+        present |= dict.fromkeys(OPTIONAL_FEATURES, 0.0)
     return _per_channel(present)
 
 

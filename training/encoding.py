@@ -12,41 +12,54 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from oiio_msspl import eight_bit, schema, transforms
-from oiio_msspl.eight_bit import BOUNDS, EXPONENT, FACTOR, LOG_FACTOR, LOG_OFFSET, LOG_SHIFT, OFFSET, SLOPE
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, RADIANCE_FEATURES, VARIANCE
+from oiio_msspl.colour import LUMINANCE_WEIGHTS
+from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, MAX_RADIANCE, MU, NO_LIGHT
+from oiio_msspl.model.pu_curve import (
+    BOUNDS,
+    EXPONENT,
+    FACTOR,
+    LOG_FACTOR,
+    LOG_OFFSET,
+    LOG_SHIFT,
+    OFFSET,
+    PU_MAX,
+    SLOPE,
+    pu_encode,
+)
 
-_LOG_SCALE = 1.0 / math.log1p(transforms.MU)
+_LOG_SCALE = 1.0 / math.log1p(MU)
 
 
 # Log-encoded radiance, what every network reads and writes
 
 
 def log_encode(radiance: Tensor) -> Tensor:
-    """Exposed radiance >= 0 to log-encoded radiance, as :func:`oiio_msspl.transforms.compress`."""
-    return torch.log1p(transforms.MU * radiance) * _LOG_SCALE
+    """Exposed radiance >= 0 to log-encoded radiance, as :func:`oiio_msspl.model.encoding.encode_radiance`."""
+    return torch.log1p(MU * radiance) * _LOG_SCALE
 
 
 def log_decode(encoded: Tensor) -> Tensor:
-    """Inverse of :func:`log_encode`, as :func:`oiio_msspl.transforms.expand`."""
-    return torch.expm1(encoded / _LOG_SCALE) / transforms.MU
+    """Inverse of :func:`log_encode`, as :func:`oiio_msspl.model.encoding.decode_radiance`."""
+    return torch.expm1(encoded / _LOG_SCALE) / MU
 
 
 # The PU curve, what Open Image Denoise's networks read and write
 
 
 def log_to_pu(encoded: Tensor) -> Tensor:
-    """Log-encoded radiance to PU-encoded radiance in [0, 1], as :func:`oiio_msspl.eight_bit.encode`."""
-    radiance = log_decode(encoded.float()).clamp(0, transforms.MAX_RADIANCE)
+    """Log-encoded radiance to PU-encoded radiance in [0, 1], as :func:`oiio_msspl.model.pu_curve.pu_encode`."""
+    radiance = log_decode(encoded.float()).clamp(0, MAX_RADIANCE)
     low, middle = BOUNDS
     power = FACTOR * radiance.clamp_min(low) ** EXPONENT + OFFSET
     curve = torch.where(radiance <= middle, power, LOG_FACTOR * torch.log(radiance + LOG_SHIFT) + LOG_OFFSET)
-    return torch.where(radiance <= low, SLOPE * radiance, curve) / eight_bit.top()
+    return torch.where(radiance <= low, SLOPE * radiance, curve) / PU_MAX()
 
 
 def pu_to_log(encoded: Tensor) -> Tensor:
-    """Inverse of :func:`log_to_pu`, as :func:`oiio_msspl.eight_bit.decode`."""
-    curve = encoded * eight_bit.top()
-    low, middle = (eight_bit.encode(np.asarray(BOUNDS)) * eight_bit.top()).tolist()
+    """Inverse of :func:`log_to_pu`, as :func:`oiio_msspl.model.pu_curve.pu_decode`."""
+    curve = encoded * PU_MAX()
+    low, middle = (pu_encode(np.asarray(BOUNDS)) * PU_MAX()).tolist()
     # The branches are bounded: an infinity that torch.where discards would still make its gradient NaN.
     power = ((curve.clamp(low, middle) - OFFSET) / FACTOR) ** (1 / EXPONENT)
     logarithm = torch.exp((curve.clamp_min(middle) - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT
@@ -59,7 +72,7 @@ def pu_to_log(encoded: Tensor) -> Tensor:
 
 def luminance(rgb: Tensor) -> Tensor:
     """Rec. 709 luminance of (..., 3) linear RGB: (...)."""
-    return rgb @ rgb.new_tensor(schema.LUMINANCE)
+    return rgb @ rgb.new_tensor(LUMINANCE_WEIGHTS)
 
 
 def srgb(exposed: Tensor) -> Tensor:
@@ -70,35 +83,35 @@ def srgb(exposed: Tensor) -> Tensor:
 
 def repair(values: Tensor, *, signed: bool = False) -> Tensor:
     """Stored half floats as finite float32, non-negative unless ``signed``."""
-    values = torch.nan_to_num(values.float(), nan=0.0, posinf=transforms.MAX_RADIANCE, neginf=-transforms.MAX_RADIANCE)
+    values = torch.nan_to_num(values.float(), nan=0.0, posinf=MAX_RADIANCE, neginf=-MAX_RADIANCE)
     return values if signed else values.clamp_min(0.0)
 
 
 def exposure_of(lrhs: Tensor) -> Tensor:
-    """Exposure of each image of a batch (N, h, w, 3), as :func:`oiio_msspl.transforms.exposure_of`: (N,)."""
+    """Exposure of each image of a batch (N, h, w, 3), as :func:`oiio_msspl.model.encoding.find_exposure`: (N,)."""
     y = luminance(lrhs).flatten(1)
     y = torch.where(y > 0, y, torch.nan)
-    y = torch.where(y >= transforms.TRACE * y.nanquantile(0.99, dim=1, keepdim=True), y, torch.nan)
+    y = torch.where(y >= NO_LIGHT * y.nanquantile(0.99, dim=1, keepdim=True), y, torch.nan)
     epsilon = 1e-4 * y.nanmedian(dim=1, keepdim=True).values
-    return torch.nan_to_num(transforms.KEY / torch.exp(torch.log(y + epsilon).nanmean(dim=1)), nan=1.0)
+    return torch.nan_to_num(KEY / torch.exp(torch.log(y + epsilon).nanmean(dim=1)), nan=1.0)
 
 
 def compress(radiance: Tensor, exposure: Tensor) -> Tensor:
     """Scene-linear (N, H, W, C), with an exposure (N,) for each image, to log-encoded radiance."""
-    return log_encode((radiance * exposure[:, None, None, None]).clamp(0.0, transforms.MAX_RADIANCE))
+    return log_encode((radiance * exposure[:, None, None, None]).clamp(0.0, MAX_RADIANCE))
 
 
 def pack(features: dict[str, Tensor], exposure: Tensor) -> Tensor:
     """Encode all features of an HRLS, (N, H, W, C) each, and stack them in the schema's order: (N, H, W, 16)."""
     stack = []
-    for name in schema.HRLS_FEATURES:
+    for name in HRLS_FEATURES:
         values = features[name]
-        if name in schema.RADIANCE_FEATURES:
+        if name in RADIANCE_FEATURES:
             values = compress(values, exposure)
-        elif name == schema.VARIANCE:
+        elif name == VARIANCE:
             values = compress(values.clamp_min(0.0).sqrt(), exposure)
-        elif name == schema.ALBEDO:
-            values = values.clamp(0.0, transforms.MAX_ALBEDO)
+        elif name == ALBEDO:
+            values = values.clamp(0.0, MAX_ALBEDO)
         else:
             values = values.clamp(-1.0, 1.0)
         stack.append(values)

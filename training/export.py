@@ -30,9 +30,10 @@ from torch import nn
 from torch.utils._pytree import tree_map
 
 from datagen.views import Folder, View
-from oiio_msspl import runtime, schema
-from oiio_msspl.contract import METADATA_KEY, Contract
-from oiio_msspl.denoiser import installed_weights
+from oiio_msspl.aovs.features import channel_names
+from oiio_msspl.model.contract import METADATA_KEY, Contract, network_inputs
+from oiio_msspl.model.oidn_weights import require_weights
+from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
 from training.joint import JointFusion
 from training.networks import Network, run
@@ -55,10 +56,10 @@ HALF_ELEMENTS = 256
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """The contract of a checkpoint's network for one of its scales."""
     denoiser = state.get("denoiser") or ""
-    lrhs, hrls = schema.inputs(denoiser)
+    lrhs, hrls = network_inputs(denoiser)
     return Contract(
-        lrhs=schema.channel_names(lrhs),
-        hrls=schema.channel_names(hrls),
+        lrhs=channel_names(lrhs),
+        hrls=channel_names(hrls),
         denoiser=denoiser,
         weights=BASE_HDR if isinstance(network, JointFusion) else "",
         bytes_per_pixel=MEMORY_WITH_DENOISER if denoiser else MEMORY,
@@ -278,7 +279,7 @@ def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int 
 
 def _loaded(path: Path) -> onnxruntime.InferenceSession:
     weights = Contract.of_file(path).weights
-    return runtime.load(path, initializers=installed_weights(weights) if weights else None)
+    return load_network(path, initializers=require_weights(weights) if weights else None)
 
 
 def _check_casts(path: Path) -> None:

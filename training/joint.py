@@ -20,9 +20,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl import schema
-from oiio_msspl.denoiser import layers_of, merged
-from oiio_msspl.render import Array
+from oiio_msspl.arrays import Array
+from oiio_msspl.model.contract import MEAN_DENOISER, network_inputs
+from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
 from training.encoding import log_to_pu, pu_to_log
 from training.mean_denoiser import MeanDenoiser
 from training.mix import COARSEST, FINER, blend
@@ -30,8 +30,6 @@ from training.oidn import BASE, BASE_HDR, FineTunedConv, convolutions, pretraine
 from training.ops import box_downsample, log2_scale, upsample
 from training.paper import LRHS_CHANNELS
 
-#: The package's name of the denoising that precedes this network.
-DENOISER = "together"
 #: Extra input channels at H/2, the denoised mean and the LRHS, and the convolutions that read them.
 EXTRA = 6
 READERS = ("enc_conv2", "dec_conv2a")
@@ -59,7 +57,7 @@ class JointFusion(nn.Module):
         super().__init__()
         self.kept = dict(kept or {})
         self.config = {"kept": self.kept}
-        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in schema.inputs(DENOISER))
+        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in network_inputs(MEAN_DENOISER))
         self.pretrained = pretrained_weights(BASE_HDR)
         self.mean_denoiser = MeanDenoiser()
         self.convs = nn.ModuleDict()
@@ -150,5 +148,5 @@ class JointFusion(nn.Module):
 
 def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
     """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
-    low = merged(lrhs, layers_of(hrls, complete=True))
+    low = mean_of_renders(lrhs, denoiser_images(hrls, complete=True))
     return np.concatenate([lrhs, low["colour"], low["noise"]], axis=-1), hrls

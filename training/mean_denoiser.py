@@ -12,9 +12,9 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.denoiser import Layers
-from oiio_msspl.eight_bit import MULTIPLE
-from oiio_msspl.render import Array
+from oiio_msspl.arrays import Array
+from oiio_msspl.model.quantised import ALIGNMENT
+from oiio_msspl.model.render_mean import Images
 from training.encoding import log_to_pu, pu_to_log
 from training.oidn import LARGE, LARGE_HDR, FineTunedConv, convolutions, pretrained_weights, run_unet_on_tensors
 
@@ -47,7 +47,7 @@ class MeanDenoiser(nn.Module):
         """
         Args:
             mean: (N, 3, h, w), the mean of both renders, log-encoded.
-            noise: (N, 1, h, w), see :func:`oiio_msspl.denoiser.merged`.
+            noise: (N, 1, h, w), see :func:`oiio_msspl.model.render_mean.mean_of_renders`.
             albedo, normal: (N, 3, h, w), the HRLS's, means of s x s pixels.
 
         Returns:
@@ -55,7 +55,7 @@ class MeanDenoiser(nn.Module):
         """
         inputs = torch.cat([log_to_pu(mean), albedo.clamp(0, 1), 0.5 * normal + 0.5, noise], dim=1)
         height, width = mean.shape[2:]
-        inputs = F.pad(inputs, (0, -width % MULTIPLE, 0, -height % MULTIPLE), mode="replicate")
+        inputs = F.pad(inputs, (0, -width % ALIGNMENT, 0, -height % ALIGNMENT), mode="replicate")
 
         def conv(name: str, values: Tensor) -> Tensor:
             return F.relu(self.convs[name](values))
@@ -73,7 +73,7 @@ class MeanDenoiser(nn.Module):
         }
 
     @torch.inference_mode()
-    def denoise(self, layers: Layers) -> Array:
+    def denoise(self, layers: Images) -> Array:
         """Denoise one image given as NumPy layers; return log-encoded radiance (h, w, 3)."""
         images = (layers[name] for name in ("colour", "noise", "albedo", "normal"))
         result = self(*(torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))

@@ -5,9 +5,10 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from oiio_msspl.denoiser import Denoiser
+from oiio_msspl.model.contract import MEAN_DENOISER, OIDN
+from oiio_msspl.model.oidn import OidnDenoiser
 from training.data import Prepare
-from training.joint import DENOISER, JointFusion, with_mean
+from training.joint import JointFusion, with_mean
 from training.mix import MixFusion
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
@@ -20,15 +21,15 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[Mix
     "joint": JointFusion,
 }
 
-#: The denoising that precedes a network, see :func:`oiio_msspl.denoiser.for_model`.
-DENOISERS = {"mix": "high", "joint": DENOISER}
+#: The denoising that precedes a network, see :func:`oiio_msspl.model.session.make_denoiser`.
+DENOISERS = {"mix": OIDN, "joint": MEAN_DENOISER}
 
 
 def preparation(architecture: str, threads: int) -> Prepare | None:
     """The function that adds a network's further input channels to a pair; None if it has none."""
     if architecture == "joint":
         return with_mean
-    return Denoiser(threads) if architecture == "mix" else None
+    return OidnDenoiser(threads) if architecture == "mix" else None
 
 
 def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:

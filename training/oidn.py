@@ -16,22 +16,22 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.denoiser import installed_weights
+from oiio_msspl.model.oidn_weights import require_weights
 from training.ops import upsample
 
-#: The package's names of Open Image Denoise's networks ``rt_hdr_alb_nrm``, ``rt_hdr_calb_cnrm_large`` and ``rt_alb``.
-BASE_HDR, LARGE_HDR, BASE_ALBEDO = "usual", "large", "albedo"
+#: Open Image Denoise's names of its networks, see :data:`oiio_msspl.model.oidn_weights.NETWORKS`.
+BASE_HDR, LARGE_HDR, BASE_ALBEDO = "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large", "rt_alb"
 
 Weights = Mapping[str, Tensor]
 
 
 def pretrained_weights(network: str) -> dict[str, Tensor]:
-    """Weights of one of :data:`oiio_msspl.eight_bit.NETWORKS`, by Open Image Denoise's names.
+    """Weights of one of :data:`oiio_msspl.model.oidn_weights.NETWORKS`, by Open Image Denoise's names.
 
     Raises:
         InputError: pyoidn is not installed, or has other weights.
     """
-    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in installed_weights(network).items()}
+    return {name: torch.from_numpy(values.astype(np.float32)) for name, values in require_weights(network).items()}
 
 
 def convolutions(weights: Weights) -> list[str]:

@@ -30,11 +30,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl import schema
+from oiio_msspl.aovs.features import HRLS_FEATURES, LRHS_FEATURES
+from oiio_msspl.model.contract import SCALES
 from training.ops import conv3x3
 
-LRHS_CHANNELS = sum(schema.LRHS_FEATURES.values())
-HRLS_CHANNELS = sum(schema.HRLS_FEATURES.values())
+LRHS_CHANNELS = sum(LRHS_FEATURES.values())
+HRLS_CHANNELS = sum(HRLS_FEATURES.values())
 
 
 class Deshuffle(nn.Module):
@@ -105,7 +106,7 @@ class RDG(nn.Module):
 
 
 class MultiResolutionFusion(nn.Module):
-    """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, both encoded as in :mod:`oiio_msspl.transforms`."""
+    """``I_SR`` from ``I_LRHS`` and ``I_HRLS``, both encoded as in :mod:`oiio_msspl.model.encoding`."""
 
     def __init__(
         self,
@@ -118,8 +119,8 @@ class MultiResolutionFusion(nn.Module):
         lrhs_channels: int = LRHS_CHANNELS,  # more than 3 if the LRHS has AOVs, for ablations
     ) -> None:
         super().__init__()
-        if scale not in schema.SCALES:
-            raise ValueError(f"scale must be one of {schema.SCALES}, got {scale}")
+        if scale not in SCALES:
+            raise ValueError(f"scale must be one of {SCALES}, got {scale}")
         self.config = {
             "scale": scale,
             "channels": channels,

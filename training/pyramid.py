@@ -131,7 +131,7 @@ class PyramidFusion(Trunk):
         """
         Args:
             lrhs: (N, 3, h, w), log-encoded radiance.
-            hrls: (N, 16, s*h, s*w), encoded features in the order of :mod:`oiio_msspl.schema`.
+            hrls: (N, 16, s*h, s*w), encoded features in the order of :mod:`oiio_msspl.aovs.features`.
 
         Returns:
             The fused image (N, 3, s*h, s*w), log-encoded, and the logarithm of its expected absolute error

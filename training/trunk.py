@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl import schema
+from oiio_msspl.model.contract import network_inputs
 from training.encoding import log_encode
 from training.ops import Pyramid, conv3x3, upsample
 
@@ -23,7 +23,7 @@ class Trunk(nn.Module):
 
     Args:
         channels: of the levels H/2, H/4, H/8, ...
-        denoiser: denoiser whose results are appended to the inputs, see :func:`oiio_msspl.schema.inputs`.
+        denoiser: its results are appended to the inputs, see :func:`oiio_msspl.model.contract.network_inputs`.
         stem_size: kernel size of the first convolution over the HRLS; even.
         refined: whether level H/2 ends with a convolution, as the coarser levels do.
     """
@@ -34,7 +34,7 @@ class Trunk(nn.Module):
         finest, *coarser = channels
 
         # Down: H/2 reads every pixel of the HRLS; each coarser level also reads the downsampled colours of both renders
-        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in schema.inputs(denoiser))
+        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in network_inputs(denoiser))
         self.stem = nn.Conv2d(self.hrls_channels, finest, stem_size, stride=2, padding=stem_size // 2 - 1)
         self.stem_low = conv3x3(self.lrhs_channels, finest)
         self.down = nn.ModuleList(nn.Conv2d(above, here, 3, stride=2, padding=1) for above, here in pairwise(channels))

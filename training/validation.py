@@ -11,7 +11,9 @@ import numpy as np
 import torch
 
 from datagen.views import Array, View, as_float32, mean_lrhs, read_hrls, split_features
-from oiio_msspl import metrics, schema, tensors, transforms
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
 from training.data import Prepare, to_tensor
 from training.networks import Network, run
 from training.ops import upsample
@@ -36,10 +38,10 @@ class ValidationPair:
         top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
         rows, columns = slice(top, top + patch), slice(left, left + patch)
         lrhs = mean_lrhs(view, [0], scale)
-        exposure = transforms.exposure_of(lrhs)
-        hrls = tensors.pack(split_features(read_hrls(view, [0], rows, columns)[0]), schema.HRLS_FEATURES, exposure)
+        exposure = find_exposure(lrhs)
+        hrls = encode_features(split_features(read_hrls(view, [0], rows, columns)[0]), HRLS_FEATURES, exposure)
         lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
-        lrhs = transforms.compress(lrhs, exposure)
+        lrhs = encode_radiance(lrhs, exposure)
         if prepare is not None:
             lrhs, hrls = prepare(lrhs, hrls)
         return cls(
@@ -59,16 +61,16 @@ def evaluate(network: Network, pairs: Iterable[ValidationPair], device: torch.de
     scores: dict[str, list[float]] = collections.defaultdict(list)
     for pair in pairs:
         fused, _ = run(network, to_tensor(pair.lrhs[None], device), to_tensor(pair.hrls[None], device))
-        output = transforms.expand(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
+        output = decode_radiance(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
         scale = pair.hrls.shape[0] // pair.lrhs.shape[0]
-        lrhs = transforms.expand(pair.lrhs[None, ..., :3], pair.exposure)
+        lrhs = decode_radiance(pair.lrhs[None, ..., :3], pair.exposure)
         bicubic = upsample(to_tensor(lrhs, torch.device("cpu")), scale, "bicubic").clamp(min=0)
         bicubic = bicubic[0].permute(1, 2, 0).numpy()
         reference = pair.reference * pair.exposure
         for prefix, image in (("", output), ("bicubic_", bicubic)):
-            psnr = metrics.psnr(image * pair.exposure, reference)
-            scores[prefix + "psnr"].append(psnr)
+            score = psnr(image * pair.exposure, reference)
+            scores[prefix + "psnr"].append(score)
             if not prefix:
-                scores[f"psnr_x{scale}"].append(psnr)
-            scores[prefix + "relmse"].append(metrics.relmse(image * pair.exposure, reference))
+                scores[f"psnr_x{scale}"].append(score)
+            scores[prefix + "relmse"].append(relmse(image * pair.exposure, reference))
     return {name: float(np.mean(values)) for name, values in scores.items()}

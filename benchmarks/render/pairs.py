@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 
 from benchmarks.render.film import CROP, frame_size, set_crop, write_exr
+from datagen.mitsuba.start import start as start_mitsuba
+from datagen.views import FILTERS
 from oiio_msspl.model.contract import SCALES
-from training import mitsuba_start, views
 
 HRLS = (1, 2, 3, 4, 6, 7, 8)
 #: Samples of the LRHS for every HRLS pixel.
@@ -32,7 +33,7 @@ CHANNELS = [layer + c for layer in LAYERS for c in ("XYZ" if layer == "nn." else
 
 
 class SensorCamera:
-    """A scene's own camera, for :func:`training.mitsuba_views.trace.render_passes`."""
+    """A scene's own camera, for :func:`datagen.mitsuba.trace.render_passes`."""
 
     def __init__(self, mi: Any, sensor: Any) -> None:
         self.mi, self.sensor = mi, sensor
@@ -52,7 +53,8 @@ class SensorCamera:
 def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
     """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
     import mitsuba as mi
-    from training.mitsuba_views.trace import blackman_harris, box, render_passes
+
+    from datagen.mitsuba.trace import blackman_harris, box, render_passes
 
     scene = mi.load_file(str(file))
     camera = SensorCamera(mi, scene.sensors()[0])
@@ -81,11 +83,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
-    parser.add_argument("--filter", choices=views.FILTERS, default="blackman-harris")
+    parser.add_argument("--filter", choices=FILTERS, default="blackman-harris")
     parser.add_argument("--reference", type=int, default=2048, help="spp")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args()
-    mitsuba_start.start(args.threads)
+    start_mitsuba(args.threads)
     for file in sorted(args.scenes.glob("*/scene.xml")):
         start = time.perf_counter()
         render(file, args.out / file.parent.name, args.filter, args.reference)

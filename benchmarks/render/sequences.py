@@ -29,8 +29,8 @@ from typing import Any
 import numpy as np
 
 from benchmarks.render.film import set_crop, write_exr
+from datagen.mitsuba.start import start as start_mitsuba
 from oiio_msspl.errors import InputError, MssplError
-from training import mitsuba_start
 
 SCALE = 4
 FRAMES = 10
@@ -73,7 +73,7 @@ def render_sequences(folder: Path, scenes: Path, names: list[str]) -> None:
         InputError: no such scene, or no Mitsuba.
     """
     try:
-        mi = mitsuba_start.start()
+        mi = start_mitsuba()
     except ImportError as error:
         raise InputError("rendering needs Mitsuba 3: pip install '.[train]'") from error
     for name in names:

@@ -15,7 +15,7 @@ import numpy as np
 
 from benchmarks.render.film import CROP, frame_size, set_crop, write_exr
 from benchmarks.render.sequences import AOVS, CHANNELS, MAX_DEPTH
-from training import mitsuba_start
+from datagen.mitsuba.start import start as start_mitsuba
 
 #: Scene -> longer side of the whole frame, and where the crop begins (x, y), as found by matching albedo and normals.
 CROPS = {
@@ -30,7 +30,7 @@ SPP = (3, 6, 7)
 
 def render(file: Path, folder: Path, longer: int, offset: tuple[int, int]) -> None:
     """Render the files of one scene that do not exist yet."""
-    mi = mitsuba_start.start()
+    mi = start_mitsuba()
     scene = mi.load_file(str(file))
     sensor = scene.sensors()[0]
     set_crop(mi, mi.traverse(sensor), frame_size(sensor, longer), CROP, offset)

@@ -5,7 +5,7 @@
     python -m benchmarks.stability VIEWS --scale 4 --model paper-x4 --model my.onnx
 
 Without arguments it uses analytic scenes and all shipped models for x4. VIEWS adds the held-out views of a folder of
-rendered views (see training/data.py). :mod:`benchmarks.stability.report` says what is measured.
+rendered views (see datagen/views.py). :mod:`benchmarks.stability.report` says what is measured.
 """
 
 from __future__ import annotations

@@ -10,11 +10,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.stability import analytic
+from datagen import views as rendered_views
+from datagen.views import Folder, as_float32, mean_lrhs, read_hrls, split_features
 from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.arrays import Array
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Render
-from training import data
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,9 +94,9 @@ class Analytic(Base):
 
 
 class View(Base):
-    """A rendered view in the format of :mod:`training.data`."""
+    """A rendered view in the format of :mod:`datagen.views`."""
 
-    def __init__(self, view: data.View) -> None:
+    def __init__(self, view: rendered_views.View) -> None:
         super().__init__()
         self.name, self.view = view.path.stem, view
 
@@ -105,15 +106,15 @@ class View(Base):
         if hr_spp > len(self.view.hr) or not found:
             raise LookupError(f"{self.name} has no HRLS of {hr_spp} spp with an LRHS of {lr_spp}")
         height, width = (n // scale * scale for n in self.view.ref.shape[:2])
-        low = data.mean_lrhs(self.view, found[:1], scale, nearest=nearest)[: height // scale, : width // scale]
-        samples = data.read_hrls(self.view, list(range(hr_spp)), slice(0, height), slice(0, width))
-        features = data.split_features(samples)
+        low = mean_lrhs(self.view, found[:1], scale, nearest=nearest)[: height // scale, : width // scale]
+        samples = read_hrls(self.view, list(range(hr_spp)), slice(0, height), slice(0, width))
+        features = split_features(samples)
         layers = {name: values.mean(axis=0) for name, values in features.items()}
         if hr_spp > 1:
             grey = luminance(features[RGB])
             layers[VARIANCE] = grey.var(axis=0, ddof=1)[..., None] / hr_spp
         high = Render.from_arrays("HRLS", **layers)
-        return Pair(Render.from_arrays("LRHS", rgb=low), high, data.read(self.view.ref[:height, :width]))
+        return Pair(Render.from_arrays("LRHS", rgb=low), high, as_float32(self.view.ref[:height, :width]))
 
 
 def views(folder: Path) -> list[View]:
@@ -122,7 +123,7 @@ def views(folder: Path) -> list[View]:
     Raises:
         SystemExit: there is none.
     """
-    scenes = {view.scene: view for view in reversed(data.Folder(folder).split("test"))}
+    scenes = {view.scene: view for view in reversed(Folder(folder).split("test"))}
     if not scenes:
-        raise SystemExit(f"{folder}: holds no view of the split 'test' (see training/data.py)")
+        raise SystemExit(f"{folder}: holds no view of the split 'test' (see datagen/views.py)")
     return [View(view) for _, view in sorted(scenes.items())]

@@ -11,7 +11,7 @@ import mitsuba as mi
 import numpy as np
 
 from datagen import quality, views
-from oiio_msspl.schema import SCALES
+from oiio_msspl.model.contract import SCALES
 
 from . import scenes
 from .assets import Assets

@@ -3,13 +3,14 @@
 
 from __future__ import annotations
 
-from importlib import resources
 from importlib.util import find_spec
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.model.oidn import quantised_networks_work
 
+#: Folder of the models: ``NAME.onnx`` for each.
+WEIGHTS = Path(__file__).parent / "weights"
 #: The name that lets :func:`find_model` choose.
 AUTO = "auto"
 #: Families that ``auto`` chooses from: the best one needs OIDN's weights and a processor that computes 8-bit networks
@@ -19,8 +20,7 @@ BEST, WITH_OIDN, WITHOUT_OIDN = "joint", "mix", "pyramid"
 
 def shipped_models() -> dict[str, Path]:
     """Name (``paper-x4``) -> ONNX file of each model inside the package."""
-    folder = Path(str(resources.files("oiio_msspl.model").joinpath("weights")))
-    return {path.stem: path for path in sorted(folder.glob("*.onnx"))}
+    return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx"))}
 
 
 def find_model(scale: int, name: str | None = None) -> Path:

@@ -157,7 +157,7 @@ class OidnDenoiser:
             import pyoidn
         except (ImportError, OSError) as error:  # not installed, or without its library
             raise InputError(
-                "this model reads results of Open Image Denoise: pip install pyoidn, or choose another --model"
+                "this model reads results of Open Image Denoise: pip install pyoidn==2.5.1, or choose another --model"
             ) from error
         device = pyoidn.Device()
         device.set_int("numThreads", threads)

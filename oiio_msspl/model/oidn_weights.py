@@ -65,7 +65,7 @@ def require_weights(network: str) -> Weights:
         weights = find_weights(CONTRACT_NAMES.get(network, network))
     except (ImportError, OSError) as error:
         raise InputError(
-            "this model needs the weights of Open Image Denoise: pip install pyoidn, or choose another --model"
+            "this model needs the weights of Open Image Denoise: pip install pyoidn==2.5.1, or choose another --model"
         ) from error
     if weights is None:
         raise InputError(

@@ -9,7 +9,7 @@ value.
 from __future__ import annotations
 
 import functools
-from importlib import resources
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,8 @@ NETWORK_IMAGES = {
     "rt_alb": {"albedo"},
     "mean_denoiser": {"colour", "albedo", "normal", "noise"},
 }
+#: Folder of the networks: ``NAME.onnx`` for each.
+WEIGHTS = Path(__file__).parent / "weights" / "denoisers"
 #: Height and width of a network's input are multiples of this.
 ALIGNMENT = 16
 #: Slices of a colour channel and of an albedo channel at the input, and of any channel at the output.
@@ -61,9 +63,7 @@ class QuantisedDenoiser:
 
     def __init__(self, name: str, weights: Weights, threads: int = 0) -> None:
         self.images = NETWORK_IMAGES[name]
-        file = resources.files("oiio_msspl.model").joinpath("weights", "denoisers", f"{name}.onnx")
-        with resources.as_file(file) as path:
-            self._session = load_network(path, threads, initializers=weights)
+        self._session = load_network(WEIGHTS / f"{name}.onnx", threads, initializers=weights)
 
     def __call__(
         self,

@@ -74,7 +74,7 @@ class Session:
             weights = require_weights(self.contract.weights)
             if not quantised_networks_work():
                 raise InputError(
-                    f"model {self.contract.name} computes in 8 bits, which this processor does wrongly; "
+                    f"model {self.contract.name} computes in 8 bits, which this processor does wrongly (no VNNI); "
                     "choose another --model"
                 )
         self._session = load_network(path, threads, providers, weights)

@@ -11,10 +11,10 @@ import pytest
 pytest.importorskip("torch")
 
 from benchmarks import chart, paper, quality, results, scenes, tables
+from datagen import views
 from oiio_msspl import Render
 from oiio_msspl.model.encoding import find_exposure
 from tests.conftest import downsample, picture, rgb, write_exr
-from training import views
 
 BROWSER = next(
     (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from datagen import command_line, quality, shards, views
-from oiio_msspl.transforms import luminance
+from oiio_msspl.colour import luminance
 
 
 def _write(folder, seed=20, brightness=1.0):

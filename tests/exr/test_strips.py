@@ -4,10 +4,10 @@
 import numpy as np
 import OpenEXR
 import pytest
+from oiio_msspl.exr.reader.strips import ROWS_PER_STRIP, strip_rows
 
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
-from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
 from tests.conftest import picture, rgb, write_exr
 
 HEIGHT, WIDTH = 300, 40

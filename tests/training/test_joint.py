@@ -8,9 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from oiio_msspl import denoiser, transforms
-from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import Denoiser, Together, layers_of
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.encoding import encode_radiance
+from oiio_msspl.model.mean_denoiser import MeanDenoiser as QuantisedMeanDenoiser
+from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
 from tests.conftest import noisy, picture
 
 pytest.importorskip("pyoidn")
@@ -31,10 +34,10 @@ def pairs(scale, prepare, count=2, size=64):
     result = []
     for seed in range(count):
         clean = picture(size, size)
-        values = [transforms.compress(noisy(clean, 4, seed + i), 1.0) for i in range(2)]
+        values = [encode_radiance(noisy(clean, 4, seed + i), 1.0) for i in range(2)]
         normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
         hrls = np.concatenate([values[0], clean.clip(0, 1), normal], axis=-1)
-        images = prepare(transforms.box_downsample(values[1], scale), hrls)
+        images = prepare(box_downsample(values[1], scale), hrls)
         result.append(tuple(torch.from_numpy(np.ascontiguousarray(i.transpose(2, 0, 1)[None])) for i in images))
     return result
 
@@ -44,10 +47,10 @@ def test_a_new_network_is_open_image_denoise():
     for head in network.heads:  # blend with the U-Net's result only
         head.weight.data.zero_()
         head.bias.data[1] = 60.0
-    ((lrhs, hrls),) = pairs(2, Together(threads=1), count=1)
+    ((lrhs, hrls),) = pairs(2, QuantisedMeanDenoiser(threads=1), count=1)
     with torch.inference_mode():
         fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
-    expected = Denoiser(threads=1, exact=True).hrls(layers_of(hrls[0].permute(1, 2, 0).numpy()))
+    expected = OidnDenoiser(threads=1, exact=True).hrls(denoiser_images(hrls[0].permute(1, 2, 0).numpy()))
     assert np.abs(fused - expected).mean() < 1e-3
     assert not any(parameter.any() for parameter in network.differences())
 
@@ -62,7 +65,7 @@ def test_the_graph_computes_what_the_network_does(scale, tmp_path):
         parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
     state = {"denoiser": "together", "architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
     contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
-    drawn = pairs(scale, Together(threads=1))
+    drawn = pairs(scale, QuantisedMeanDenoiser(threads=1))
     path = tmp_path / "joint.onnx"
     onnx.save(export.joint_to_onnx(network, contract, drawn), path)
     assert Contract.of_file(path).weights == BASE_HDR
@@ -114,10 +117,10 @@ def test_a_new_mean_denoiser_is_open_image_denoise():
     """The weights of the estimated noise start at zero."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=96)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
-    layers = denoiser.merged(low, layers_of(high, complete=True))
+    layers = mean_of_renders(low, denoiser_images(high, complete=True))
     found = MeanDenoiser().eval().denoise(layers)
     del layers["noise"]
-    expected = Denoiser(threads=1, exact=True).both(layers)
+    expected = OidnDenoiser(threads=1, exact=True).both(layers)
     assert np.abs(found - expected).mean() < 1e-3
 
 
@@ -126,9 +129,9 @@ def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint():
     """To a tenth of the noise, also for sides that are no multiple of 16."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
-    layers = denoiser.merged(low, layers_of(high, complete=True))
+    layers = mean_of_renders(low, denoiser_images(high, complete=True))
     expected = checkpoints.load_mean_denoiser(CHECKPOINT).denoise(layers)
-    found = Together(threads=1)(low, high)[0][..., 3:]
+    found = QuantisedMeanDenoiser(threads=1)(low, high)[0][..., 3:]
     assert np.abs(found - expected).mean() < 0.1 * np.abs(layers["colour"] - expected).mean()
 
 

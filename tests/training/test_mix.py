@@ -8,10 +8,10 @@ from pathlib import Path
 import pytest
 
 torch = pytest.importorskip("torch")
-from oiio_msspl.contract import Contract  # noqa: E402
 from torch.nn import functional as F  # noqa: E402
 
-from oiio_msspl import schema  # noqa: E402
+from oiio_msspl.aovs.features import channel_names  # noqa: E402
+from oiio_msspl.model.contract import SCALES, Contract, network_inputs  # noqa: E402
 from training import train  # noqa: E402
 from training.encoding import log_encode  # noqa: E402
 from training.mix import MixFusion, distillation_loss, mixed  # noqa: E402
@@ -46,7 +46,7 @@ def prefer(network: MixFusion, finer: int, coarsest: int = DENOISED_MEAN) -> Non
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("scale", schema.SCALES)
+@pytest.mark.parametrize("scale", SCALES)
 def test_one_network_serves_every_scale(network: MixFusion, scale: int) -> None:
     fused, log_error = network(*pair(scale))
     assert (fused.shape, log_error.shape) == ((1, 3, HEIGHT, WIDTH), (1, 1, HEIGHT, WIDTH))
@@ -62,7 +62,7 @@ def test_weights_are_those_of_a_softmax() -> None:
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("scale", schema.SCALES)
+@pytest.mark.parametrize("scale", SCALES)
 def test_every_fine_candidate_can_be_chosen(network: MixFusion, scale: int) -> None:
     """With noisy renders of even light, a denoised HRLS that is 1.5 times too dark, and a striped albedo."""
     lrhs, hrls = pair(scale)
@@ -83,7 +83,7 @@ def test_every_fine_candidate_can_be_chosen(network: MixFusion, scale: int) -> N
 
 
 @torch.inference_mode()
-@pytest.mark.parametrize("scale", schema.SCALES)
+@pytest.mark.parametrize("scale", SCALES)
 def test_every_coarse_candidate_can_be_chosen(network: MixFusion, scale: int) -> None:
     """The coarsest candidate sets the brightness of the result, if finer levels follow it."""
     lrhs, hrls = pair(scale)
@@ -130,8 +130,8 @@ def test_its_onnx_file_agrees_with_it(network: MixFusion, tmp_path: Path) -> Non
 
     for head in network.heads:
         torch.nn.init.normal_(head.weight, std=0.3)
-    for scale in schema.SCALES:
-        lrhs, hrls = (schema.channel_names(features) for features in schema.inputs("high"))
+    for scale in SCALES:
+        lrhs, hrls = (channel_names(features) for features in network_inputs("high"))
         contract = Contract("tiny", scale, network.multiple // scale, 32, lrhs=lrhs, hrls=hrls, denoiser="high")
         onnx.save(export.to_onnx(network, contract), tmp_path / "tiny.onnx")
         assert export.parity(network, scale, tmp_path / "tiny.onnx") < 1e-4

@@ -8,7 +8,10 @@ import itertools
 import numpy as np
 import pytest
 
-from oiio_msspl import denoiser, eight_bit, runtime, transforms
+from oiio_msspl.model.encoding import encode_radiance
+from oiio_msspl.model.oidn import quantised_networks_work
+from oiio_msspl.model.quantised import OUTPUT_SLICES
+from oiio_msspl.model.runtime import load_network
 from tests.conftest import noisy, picture
 
 torch = pytest.importorskip("torch")
@@ -20,14 +23,14 @@ from training.quantise.graph import Graph  # noqa: E402
 
 #: Without VNNI instructions, sums of two 8-bit products overflow. The package then refuses its 8-bit networks.
 needs_exact_eight_bits = pytest.mark.skipif(
-    not denoiser.eight_bits_work(), reason="no pyoidn, or this processor overflows in 8 bits"
+    not quantised_networks_work(), reason="no pyoidn, or this processor overflows in 8 bits"
 )
 
 
 def layers(height, width, seed=0):
     clean = picture(height, width)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
-    return {"colour": transforms.compress(noisy(clean, 4, seed), 1.0), "albedo": clean.clip(0, 1), "normal": normal}
+    return {"colour": encode_radiance(noisy(clean, 4, seed), 1.0), "albedo": clean.clip(0, 1), "normal": normal}
 
 
 def test_gptq_beats_rounding_to_the_nearest_step():
@@ -79,7 +82,7 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
     fit = gptq.quantise(BASE_HDR, weights, weights, images)
     onnx.save(Graph(fit).model(), tmp_path / "base.onnx")
     halves = {name: values.half().numpy() for name, values in weights.items()}
-    session = runtime.load(tmp_path / "base.onnx", 1, initializers=halves)
+    session = load_network(tmp_path / "base.onnx", 1, initializers=halves)
     codes = gptq.quantise_inputs(images).codes[0]
     found = session.run(["codes"], {"layers": codes[0].permute(1, 2, 0).numpy().astype(np.uint8)[None]})[0][0]
 
@@ -91,7 +94,7 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
         lambda x: torch.nn.functional.interpolate(x, scale_factor=2),
         lambda one, other: torch.cat([one, other], dim=1),
     )
-    slices = expected[0, : 3 * eight_bit.SLICES_OUT].unflatten(0, (-1, 3)).sum(dim=0).permute(1, 2, 0).numpy()
+    slices = expected[0, : 3 * OUTPUT_SLICES].unflatten(0, (-1, 3)).sum(dim=0).permute(1, 2, 0).numpy()
     assert np.ptp(slices) > 100
     # PyTorch rounds halves to even, ONNX Runtime rounds them up, and later layers amplify the difference
     assert np.abs(found - slices).mean() < 1

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write Open Image Denoise's networks in 8 bits, which :mod:`oiio_msspl.eight_bit` runs.
+"""Write Open Image Denoise's networks in 8 bits, which :mod:`oiio_msspl.model.quantised` runs.
 
     python -m training.quantise VIEWS
 
-Writes ``oiio_msspl/denoisers/NAME.onnx`` for each network, and prints how close it is to the network in 32 bits.
+Writes ``oiio_msspl/model/weights/denoisers/NAME.onnx`` for each network, and prints how close it is to the network in 32 bits.
 """
 
 from __future__ import annotations
@@ -16,9 +16,12 @@ from pathlib import Path
 import numpy as np
 import onnx
 
-from oiio_msspl import eight_bit, transforms
-from oiio_msspl.denoiser import Denoiser, Layers, installed_weights, layers_of, merged
-from oiio_msspl.schema import SCALES
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.oidn_weights import require_weights
+from oiio_msspl.model.quantised import NETWORK_IMAGES, WEIGHTS, QuantisedDenoiser
+from oiio_msspl.model.render_mean import Images, denoiser_images, mean_of_renders
 from training.checkpoints import load_mean_denoiser
 from training.data import fixed_batches
 from training.mean_denoiser import MeanDenoiser
@@ -26,7 +29,6 @@ from training.oidn import BASE_ALBEDO, BASE_HDR, LARGE_HDR, pretrained_weights
 from training.quantise.gptq import MEAN_DENOISER, SHAPES, quantise
 from training.quantise.graph import Graph
 
-FOLDER = Path(eight_bit.__file__).parent / "denoisers"
 CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "joint.pt"
 #: Calibration images, and their width.
 IMAGES, PATCH = 96, 256
@@ -34,33 +36,33 @@ IMAGES, PATCH = 96, 256
 PATIENCE = 200
 
 
-def network_inputs(views: Path, split: str, name: str) -> Iterator[Layers]:
+def network_inputs(views: Path, split: str, name: str) -> Iterator[Images]:
     """Inputs of a network, from views as training draws them; images without the necessary AOVs are left out."""
-    denoiser, rng = Denoiser(exact=True), np.random.default_rng(0)
+    denoiser, rng = OidnDenoiser(exact=True), np.random.default_rng(0)
     scales = [2] if name == BASE_ALBEDO else SCALES
     left_out = 0
     for batch in fixed_batches(views, split, scales, PATCH, 1, rng=rng):
         lrhs, hrls = (batch[key][0].permute(1, 2, 0).numpy() for key in ("lrhs", "hrls"))
-        layers = layers_of(hrls)
+        layers = denoiser_images(hrls)
         if name == MEAN_DENOISER:
-            layers = merged(lrhs, layers_of(hrls, complete=True))
+            layers = mean_of_renders(lrhs, denoiser_images(hrls, complete=True))
         elif name == LARGE_HDR:
             layers = denoiser.merged(lrhs, layers)
         elif name == BASE_ALBEDO and "albedo" in layers:
-            albedo = transforms.box_downsample(layers["albedo"], scales[0])
+            albedo = box_downsample(layers["albedo"], scales[0])
             # Depth of field, hair and glass make an albedo noisier than it is in these views
             noise = rng.normal(0, rng.choice([0, 0, 0.1, 0.3]), albedo.shape)
             layers = {"albedo": (albedo + noise).clip(0, 1).astype(np.float32)}
-        if layers.keys() == eight_bit.READS[name]:
+        if layers.keys() == NETWORK_IMAGES[name]:
             left_out = 0
             yield layers
         elif (left_out := left_out + 1) > PATIENCE:
             raise SystemExit(f"{views}: too few {split} views have an albedo and a normal, which {name} reads")
 
 
-def compare(name: str, network: eight_bit.EightBit, views: Path, mean_denoiser: MeanDenoiser) -> None:
+def compare(name: str, network: QuantisedDenoiser, views: Path, mean_denoiser: MeanDenoiser) -> None:
     """Print the difference of a network in 8 bits from the same network in 32 bits, on validation views."""
-    exact = Denoiser(exact=True)
+    exact = OidnDenoiser(exact=True)
     peers = {
         BASE_HDR: exact.hrls,
         LARGE_HDR: exact.both,
@@ -86,8 +88,8 @@ def main() -> None:
         pretrained = pretrained_weights(original)
         weights = mean_denoiser.weights() if name == MEAN_DENOISER else pretrained
         images = list(islice(network_inputs(args.views, "train", name), IMAGES))
-        onnx.save(Graph(quantise(name, weights, pretrained, images)).model(), FOLDER / f"{name}.onnx")
-        compare(name, eight_bit.EightBit(name, installed_weights(original)), args.views, mean_denoiser)
+        onnx.save(Graph(quantise(name, weights, pretrained, images)).model(), WEIGHTS / f"{name}.onnx")
+        compare(name, QuantisedDenoiser(name, require_weights(original)), args.views, mean_denoiser)
 
 
 if __name__ == "__main__":

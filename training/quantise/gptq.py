@@ -20,13 +20,14 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from oiio_msspl import eight_bit
-from oiio_msspl.denoiser import Layers
+from oiio_msspl.model.quantised import ALBEDO_SLICES, COLOUR_SLICES, OUTPUT_SLICES
+from oiio_msspl.model.quantised import quantise as quantise_images
+from oiio_msspl.model.render_mean import Images
 from training.oidn import BASE, BASE_ALBEDO, BASE_HDR, LARGE, LARGE_HDR, Shape, Weights, convolutions, run_unet
 from training.ops import upsample
 
 #: The package's name of the fine-tuned denoiser of both renders' mean (:mod:`training.mean_denoiser`).
-MEAN_DENOISER = "together"
+MEAN_DENOISER = "mean_denoiser"
 SHAPES = {BASE_HDR: BASE, BASE_ALBEDO: BASE, LARGE_HDR: LARGE, MEAN_DENOISER: LARGE}
 
 #: Pixels of each image that a layer's weights are fitted to.
@@ -106,16 +107,16 @@ class QuantisedConv:
 # The inputs of Open Image Denoise's networks
 
 
-def quantise_inputs(images: Sequence[Layers]) -> Activations:
+def quantise_inputs(images: Sequence[Images]) -> Activations:
     """The inputs of a network as codes, and the values that the codes stand for."""
     layout = input_layout(set(images[0]))
-    codes = [torch.from_numpy(eight_bit.pack(**layers)).permute(2, 0, 1).float() for layers in images]
+    codes = [torch.from_numpy(quantise_images(**layers)).permute(2, 0, 1).float() for layers in images]
     return Activations([layout.dequantise(image)[None] for image in codes], [image[None] for image in codes], layout)
 
 
 def input_layout(layers: Set[str]) -> CodeLayout:
-    """The layout in which :func:`oiio_msspl.eight_bit.pack` stores an albedo, or a colour and its AOVs."""
-    slices, whole = (eight_bit.SLICES_IN, 6) if "colour" in layers else (eight_bit.SLICES_OF_ALBEDO, 0)
+    """The layout in which :func:`oiio_msspl.model.quantised.quantise` stores an albedo, or a colour and its AOVs."""
+    slices, whole = (COLOUR_SLICES, 6) if "colour" in layers else (ALBEDO_SLICES, 0)
     last = (1 / 255, 3 + whole) if "noise" in layers else (0.0, 0)
     scale = [1 / slices / 255] * (3 * slices) + [1 / 255] * whole + [last[0]]
     return CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), slices), *range(3, 3 + whole), last[1]]))
@@ -163,7 +164,7 @@ class Fit:
     shape: Shape
     weights: Weights
     pretrained: Mapping[str, PretrainedConv]
-    slices_out: int = eight_bit.SLICES_OUT
+    slices_out: int = OUTPUT_SLICES
     layers: dict[str, QuantisedConv] = field(default_factory=dict)
     _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
 
@@ -329,7 +330,7 @@ def run_unet_on_activations(
         )
 
 
-def quantise(name: str, weights: Weights, pretrained: Weights, images: Sequence[Layers]) -> Fit:
+def quantise(name: str, weights: Weights, pretrained: Weights, images: Sequence[Images]) -> Fit:
     """Quantise one of the networks that denoise.
 
     Args:

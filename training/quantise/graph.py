@@ -12,7 +12,7 @@ import numpy as np
 import onnx
 from onnx import TensorProto, helper, numpy_helper
 
-from oiio_msspl import eight_bit
+from oiio_msspl.model.quantised import INPUT_CHANNELS
 from training.oidn import run_unet
 from training.quantise.gptq import COLOURS, Fit
 
@@ -33,7 +33,7 @@ class Graph:
         self.colours(["layers"], "codes")
         return self.finished(
             "oidn",
-            [helper.make_tensor_value_info("layers", TensorProto.UINT8, [1, "h", "w", eight_bit.CHANNELS_IN])],
+            [helper.make_tensor_value_info("layers", TensorProto.UINT8, [1, "h", "w", INPUT_CHANNELS])],
             [helper.make_tensor_value_info("codes", TensorProto.INT32, [1, "h", "w", 3])],
         )
 

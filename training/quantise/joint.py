@@ -14,9 +14,10 @@ from onnx import TensorProto, compose, helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl import eight_bit
-from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import for_model
+from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.pu_curve import largest_log_encoded, pu_encode_log
+from oiio_msspl.model.quantised import log_encoded_of_code
+from oiio_msspl.model.session import make_denoiser
 from training.data import fixed_batches
 from training.encoding import log_to_pu
 from training.joint import DECODED, OUTPUTS, JointFusion
@@ -102,7 +103,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Acti
 
 def calibration_pairs(views: Path, contract: Contract, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
     """Inputs of the network, from views as training draws them."""
-    batches = fixed_batches(views, "train", [contract.scale], PATCH, 1, for_model(contract.denoiser, 0))
+    batches = fixed_batches(views, "train", [contract.scale], PATCH, 1, make_denoiser(contract.denoiser, 0))
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 
@@ -148,11 +149,11 @@ class JointGraph(Graph):
         super().__init__(fit)
         self._scale = scale
         self.initializers |= {
-            "entries": np.float32((ENTRIES - 1) / eight_bit.largest()),
+            "entries": np.float32((ENTRIES - 1) / largest_log_encoded()),
             "nothing": np.float32(0),
             "last_entry": np.float32(ENTRIES - 1),
-            "seen": eight_bit.seen(ENTRIES).astype(np.float32),
-            "unseen": eight_bit.values_by_code(SLICES_OUT),
+            "seen": pu_encode_log(ENTRIES).astype(np.float32),
+            "unseen": log_encoded_of_code(SLICES_OUT),
         }
 
     def whole(

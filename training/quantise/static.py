@@ -16,8 +16,8 @@ import onnx
 from onnx import helper
 from onnxruntime.quantization import CalibrationDataReader, QuantFormat, QuantType, quantize_static
 
-from oiio_msspl.contract import Contract
-from oiio_msspl.denoiser import for_model
+from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.session import make_denoiser
 from training.data import fixed_batches
 
 #: Batches from which the ranges of activations are calibrated, with training's augmentations.
@@ -87,7 +87,7 @@ class _Samples(CalibrationDataReader):
     """Calibration pairs, one at a time."""
 
     def __init__(self, contract: Contract, views: Path) -> None:
-        denoiser = for_model(contract.denoiser, 0)
+        denoiser = make_denoiser(contract.denoiser, 0)
         batches = fixed_batches(views, "train", [contract.scale], PATCH, BATCH, denoiser)
         self._feeds = (
             {"lrhs": lrhs[None].contiguous().numpy(), "hrls": hrls[None].contiguous().numpy()}

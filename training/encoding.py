@@ -53,13 +53,13 @@ def log_to_pu(encoded: Tensor) -> Tensor:
     low, middle = BOUNDS
     power = FACTOR * radiance.clamp_min(low) ** EXPONENT + OFFSET
     curve = torch.where(radiance <= middle, power, LOG_FACTOR * torch.log(radiance + LOG_SHIFT) + LOG_OFFSET)
-    return torch.where(radiance <= low, SLOPE * radiance, curve) / PU_MAX()
+    return torch.where(radiance <= low, SLOPE * radiance, curve) / PU_MAX
 
 
 def pu_to_log(encoded: Tensor) -> Tensor:
     """Inverse of :func:`log_to_pu`, as :func:`oiio_msspl.model.pu_curve.pu_decode`."""
-    curve = encoded * PU_MAX()
-    low, middle = (pu_encode(np.asarray(BOUNDS)) * PU_MAX()).tolist()
+    curve = encoded * PU_MAX
+    low, middle = (pu_encode(np.asarray(BOUNDS)) * PU_MAX).tolist()
     # The branches are bounded: an infinity that torch.where discards would still make its gradient NaN.
     power = ((curve.clamp(low, middle) - OFFSET) / FACTOR) ** (1 / EXPONENT)
     logarithm = torch.exp((curve.clamp_min(middle) - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT

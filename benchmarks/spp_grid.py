@@ -27,12 +27,12 @@ def measure(clean: list[scenes.Scene]) -> list[Row]:
     """A row for each pair of spp."""
     session = Session(find_model(SCALE, MODEL))
 
-    def psnr(scene: scenes.Scene, low: int, high: int) -> float:
+    def score(scene: scenes.Scene, low: int, high: int) -> float:
         pair = scene.lrhs(SCALE, low // SCALE**2), scene.hrls(high)
         return psnr(fuse(*pair, session).rgb, scene.reference)
 
     return [
-        {"lrhs_spp": low, "hrls_spp": high, "psnr": float(np.mean([psnr(scene, low, high) for scene in clean]))}
+        {"lrhs_spp": low, "hrls_spp": high, "psnr": float(np.mean([score(scene, low, high) for scene in clean]))}
         for low in LRHS_SPP
         for high in HRLS_SPP
     ]

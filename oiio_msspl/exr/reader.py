@@ -133,6 +133,9 @@ class ExrFile:
     def native_strips(self, part: Part, first: int, last: int) -> Iterator[tuple[int, int, NDArray[Any]]]:
         """All rows of neighbouring channels in their stored pixel type, for copying them bit for bit.
 
+        Inside :meth:`cache_strips`, all channels of that pixel type are decoded together and kept, because a part that
+        is split into layers is read once for each layer.
+
         Args:
             first, last: indices of the first channel and of the one after the last. All have one pixel type.
 
@@ -144,7 +147,24 @@ class ExrFile:
         """
         window = part.data_window
         for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
-            yield y0, y1, self._decode(part, y0, y1, first, last, part.channels[first].type)
+            if self._cache.max_bytes:
+                yield y0, y1, self._cached_native_strip(part, y0, y1, first, last)
+            else:
+                yield y0, y1, self._decode(part, y0, y1, first, last, part.channels[first].type)
+
+    def _cached_native_strip(self, part: Part, y0: int, y1: int, first: int, last: int) -> NDArray[Any]:
+        kind = part.channels[first].type
+        indices = tuple(channel.index for channel in part.channels if channel.type == kind)
+        key = StripKey(self.path, part.index, indices, y0, y1)
+        strip = self._cache.get(key)
+        if strip is None:
+            start, stop = indices[0], indices[-1] + 1
+            strip = self._decode(part, y0, y1, start, stop, kind)
+            if len(indices) < stop - start:  # channels of other types are among them
+                strip = strip[..., [i - start for i in indices]]
+            self._cache.keep(key, strip)
+        position = indices.index(first)
+        return strip[..., position : position + last - first]
 
     def _read_part(
         self,

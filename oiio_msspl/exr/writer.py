@@ -37,6 +37,7 @@ def write_fused(
     *,
     error: Array | None = None,
     overwrite: bool = False,
+    cache_bytes: int = 0,
 ) -> list[str]:
     """Write the fused frame to ``path``, atomically.
 
@@ -50,6 +51,8 @@ def write_fused(
         options: layout, compression, pixel type and layers.
         error: predicted error, (height, width, 1); becomes the layer ``error``.
         overwrite: replace an existing file.
+        cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
+            each layer.
 
     Returns:
         Warnings, one sentence each.
@@ -65,7 +68,7 @@ def write_fused(
         if options.layout == "multilayer":
             write_single_part(temporary, output)
         else:
-            _write_parts(temporary, output)
+            _write_parts(temporary, output, cache_bytes)
     return [
         f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
         for part in source.parts
@@ -73,7 +76,7 @@ def write_fused(
     ]
 
 
-def _write_parts(path: Path, output: Output) -> None:
+def _write_parts(path: Path, output: Output, cache_bytes: int) -> None:
     """Write a file of several parts: the beauty, the error if there is one, and what is passed on."""
     beauty = beauty_spec(output)
     taken = {str(beauty.getattribute("oiio:subimagename"))}
@@ -89,14 +92,20 @@ def _write_parts(path: Path, output: Output) -> None:
     if error is not None:
         ok = ok and writer.open(str(path), error, "AppendSubimage")
         ok = ok and _write_rows(writer, error, output.pixels.error_rows)
-    for part in passed_on:
-        ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
-        ok = ok and _copy(output.source, part, writer)
+    with output.source.cache_strips(cache_bytes if _is_split(passed_on) else 0):
+        for part in passed_on:
+            ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
+            ok = ok and _copy(output.source, part, writer)
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
         reason = " ".join(writer.geterror().split()) or "disk full?"
         raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
+
+
+def _is_split(parts: Sequence[PassedOnPart]) -> bool:
+    """Whether several parts are made of one part of the source."""
+    return len({part.source.index for part in parts}) < len(parts)
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:

@@ -46,6 +46,11 @@ class FusedFrame:
     seconds: float = 0.0
     """Time in the network alone."""
 
+    @property
+    def nbytes(self) -> int:
+        """Memory of colour, alpha (whether there is one or not) and, if asked for, error."""
+        return self.rgb.nbytes // 3 * (4 if self.error is None else 5)
+
 
 def fuse(
     lr: ReadableRender,
@@ -76,7 +81,7 @@ def fuse(
         lrhs_repaired: dict[str, int] = {}
         lrhs = read_lrhs(lr, alignment, grid, [RGB, *session.lrhs_aovs, "alpha"], lrhs_repaired)
         frame = _blank_frame(alignment, find_exposure(lrhs[RGB][alignment.grid.slices(grid)]), error=error)
-        frame_bytes = _bytes_of(frame) + sum(values.nbytes for values in lrhs.values())
+        frame_bytes = frame.nbytes + sum(values.nbytes for values in lrhs.values())
         largest = largest_tile(session.contract, frame_bytes, max_memory)
         tiles = plan_tiles(grid, largest, session.contract.overlap, session.contract.alignment)
         empty_regions, averages = EmptyRegions(lrhs[RGB]), HrlsAverages(alignment)
@@ -109,11 +114,6 @@ def _blank_frame(alignment: Alignment, exposure: float, *, error: bool) -> Fused
     size = (alignment.hr_data_window.height, alignment.hr_data_window.width)
     errors = np.zeros((*size, 1), dtype=np.float32) if error else None
     return FusedFrame(np.zeros((*size, 3), dtype=np.float32), None, errors, alignment, exposure, {})
-
-
-def _bytes_of(frame: FusedFrame) -> int:
-    """Memory of the result: colour, alpha and, if asked for, error."""
-    return frame.rgb.nbytes // 3 * (4 if frame.error is None else 5)
 
 
 def _fuse_tile(pair: TilePair, empty: Mask | None, session: Session, frame: FusedFrame) -> None:

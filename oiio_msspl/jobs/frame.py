@@ -21,7 +21,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
-from oiio_msspl.fusion.tiling import MAX_MEMORY
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
@@ -131,7 +131,8 @@ def fuse_files(
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
-    write_frame(report, fused, write, overwrite=overwrite)
+    cache_bytes = max(0, max_memory - FIXED_MEMORY - fused.nbytes)
+    write_frame(report, fused, write, overwrite=overwrite, cache_bytes=cache_bytes)
     write_frame_preview(report, fused, view_transform, overwrite=overwrite)
     report.seconds = {
         "read": opened - start,
@@ -142,8 +143,14 @@ def fuse_files(
     return report
 
 
-def write_frame(report: FrameReport, fused: FusedFrame, options: WriteOptions, *, overwrite: bool) -> None:
-    """Write the EXR that the report names, and add the writer's warnings to the report."""
+def write_frame(
+    report: FrameReport, fused: FusedFrame, options: WriteOptions, *, overwrite: bool, cache_bytes: int = 0
+) -> None:
+    """Write the EXR that the report names, and add the writer's warnings to the report.
+
+    Args:
+        cache_bytes: see :func:`oiio_msspl.exr.writer.write_fused`.
+    """
     report.warnings += write_fused(
         report.output,
         report.hr.file,
@@ -154,6 +161,7 @@ def write_frame(report: FrameReport, fused: FusedFrame, options: WriteOptions, *
         options,
         error=fused.error,
         overwrite=overwrite,
+        cache_bytes=cache_bytes,
     )
 
 

@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import pytest
-from oiio_msspl.aovs.matching.renderers import renderers
 
 from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from tests.aovs.renders import H, W, found, layer, mapped, plane

@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
-from oiio_msspl.aovs.matching.renderers import renderers, view_layer_of
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.aovs.mapping import check_mapping
+from oiio_msspl.aovs.renderers import renderers, view_layer_of
 
 
 def test_the_shipped_table_has_no_mistakes():

@@ -4,11 +4,11 @@
 import numpy as np
 import OpenEXR
 import pytest
-from oiio_msspl.exr.reader.strips import ROWS_PER_STRIP, strip_rows
 
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
-from tests.conftest import picture, rgb, write_exr
+from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
+from tests.conftest import picture, rgb, same_bits, write_exr
 
 HEIGHT, WIDTH = 300, 40
 
@@ -150,3 +150,18 @@ def test_a_strip_holds_whole_chunks(tmp_path, compression, rows):
     code = getattr(OpenEXR, f"{compression}_COMPRESSION")
     file = open_exr(write_exr(tmp_path / "a.exr", rgb(picture(300, 8)), compression=code))
     assert file.parts[0].strip_height == rows
+
+
+def test_split_parts_are_decoded_once_and_copied_bit_for_bit(tmp_path, decoded):
+    """Half, float and uint channels alternate in one part; NaN keep their payload."""
+    random = np.random.default_rng(0)
+    bits = {name: random.integers(0, 1 << 16, (70, 9), dtype=np.uint16).view(np.float16) for name in ("a.x", "c.x")}
+    bits |= {"b.x": random.integers(0, 1 << 32, (70, 9), dtype=np.uint32).view(np.float32)}
+    bits |= {"d.x": random.integers(0, 1 << 32, (70, 9), dtype=np.uint32)}
+    file = open_exr(write_exr(tmp_path / "mixed.exr", bits))
+    (part,) = file.parts
+    with file.cache_strips(10**6):
+        for channel in part.channels:
+            rows = np.concatenate([s for _, _, s in file.native_strips(part, channel.index, channel.index + 1)])
+            assert same_bits(np.ascontiguousarray(rows[..., 0]), bits[channel.name])
+    assert len(decoded) == 2 * 3  # two strips, three pixel types

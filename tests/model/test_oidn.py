@@ -122,7 +122,7 @@ def test_without_noise_both_renders_count_alike():
 
 def test_without_the_package_the_way_out_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoidn", None)
-    with pytest.raises(InputError, match="pip install pyoidn==2.5.1, or choose another --model"):
+    with pytest.raises(InputError, match=r"pip install pyoidn==2\.5\.1, or choose another --model"):
         OidnDenoiser()
 
 

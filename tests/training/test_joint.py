@@ -120,7 +120,7 @@ def test_a_new_mean_denoiser_is_open_image_denoise():
     layers = mean_of_renders(low, denoiser_images(high, complete=True))
     found = MeanDenoiser().eval().denoise(layers)
     del layers["noise"]
-    expected = OidnDenoiser(threads=1, exact=True).both(layers)
+    expected = OidnDenoiser(threads=1, exact=True).mean(layers)
     assert np.abs(found - expected).mean() < 1e-3
 
 

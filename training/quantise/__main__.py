@@ -47,7 +47,7 @@ def network_inputs(views: Path, split: str, name: str) -> Iterator[Images]:
         if name == MEAN_DENOISER:
             layers = mean_of_renders(lrhs, denoiser_images(hrls, complete=True))
         elif name == LARGE_HDR:
-            layers = denoiser.merged(lrhs, layers)
+            layers = denoiser.clean_mean(lrhs, layers)
         elif name == BASE_ALBEDO and "albedo" in layers:
             albedo = box_downsample(layers["albedo"], scales[0])
             # Depth of field, hair and glass make an albedo noisier than it is in these views
@@ -65,7 +65,7 @@ def compare(name: str, network: QuantisedDenoiser, views: Path, mean_denoiser: M
     exact = OidnDenoiser(exact=True)
     peers = {
         BASE_HDR: exact.hrls,
-        LARGE_HDR: exact.both,
+        LARGE_HDR: exact.mean,
         BASE_ALBEDO: exact.albedo,
         MEAN_DENOISER: mean_denoiser.denoise,
     }

@@ -4,11 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
-from oiio_msspl.aovs.features import LRHS_FEATURES, RGB
+from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
@@ -17,11 +18,11 @@ from oiio_msspl.fusion.alpha import fuse_alpha
 from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import MAX_MEMORY, aligned_grid, largest_tile, plan_tiles, spare_bytes
+from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, largest_tile, plan_tiles
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import limit_threads
+from oiio_msspl.parallel import in_background, limit_threads
 
 
 @dataclass
@@ -80,21 +81,31 @@ def fuse(
         grid = aligned_grid(alignment.grid, session.contract.alignment)
         lrhs_repaired: dict[str, int] = {}
         lrhs = read_lrhs(lr, alignment, grid, [RGB, *session.lrhs_aovs, "alpha"], lrhs_repaired)
-        frame = _blank_frame(alignment, find_exposure(lrhs[RGB][alignment.grid.slices(grid)]), error=error)
+        lrhs_rgb = lrhs[RGB][alignment.grid.slices(grid)]
+        frame = _blank_frame(alignment, find_exposure(lrhs_rgb), error=error)
         frame_bytes = frame.nbytes + sum(values.nbytes for values in lrhs.values())
         largest = largest_tile(session.contract, frame_bytes, max_memory)
         tiles = plan_tiles(grid, largest, session.contract.overlap, session.contract.alignment)
         empty_regions, averages = EmptyRegions(lrhs[RGB]), HrlsAverages(alignment)
         hrls_repaired: dict[str, int] = {}
-        with hr.cache_strips(spare_bytes(session.contract, tiles, frame_bytes, max_memory)):
-            for done, tile in enumerate(tiles, start=1):
-                features = [*session.contract.features, "alpha"]
-                pair = read_tile(tile, lrhs, grid, hr, alignment, features, hrls_repaired)
-                averages.add(pair)
-                _fuse_tile(pair, empty_regions.mask(pair, tile.area.slices(grid)), session, frame)
+
+        def prepare(tile: Tile) -> _PreparedTile:
+            features = [*session.contract.features, "alpha"]
+            pair = read_tile(tile, lrhs, grid, hr, alignment, features, hrls_repaired)
+            averages.add(pair)
+            empty = empty_regions.mask(pair, tile.area.slices(grid))
+            return _prepare_tile(pair, empty, session, frame.exposure)
+
+        with hr.cache_strips(int(max_memory * STRIPS_SHARE)):
+            upcoming = in_background(lambda: prepare(tiles[0]))
+            for done, following in enumerate([*tiles[1:], None], start=1):
+                prepared = upcoming()
+                if following is not None:  # read it while the network works on this tile
+                    upcoming = in_background(partial(prepare, following))
+                _fuse_tile(prepared, session, frame)
                 if progress is not None:
                     progress(done, len(tiles))
-        frame.warnings += check_pair(lrhs[RGB][alignment.grid.slices(grid)], averages, lr.name, hr.name)
+        frame.warnings += check_pair(lrhs_rgb, averages, lr.name, hr.name)
     if frame.alpha is not None and "alpha" not in lrhs:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     frame.repaired = {f"lrhs.{name}": count for name, count in lrhs_repaired.items()}
@@ -116,42 +127,62 @@ def _blank_frame(alignment: Alignment, exposure: float, *, error: bool) -> Fused
     return FusedFrame(np.zeros((*size, 3), dtype=np.float32), None, errors, alignment, exposure, {})
 
 
-def _fuse_tile(pair: TilePair, empty: Mask | None, session: Session, frame: FusedFrame) -> None:
-    """Fuse a tile and write its core into the frame."""
+@dataclass
+class _PreparedTile:
+    """A tile that is ready for the network."""
+
+    pair: TilePair
+    """Without the features that the network input replaces."""
+    empty: Mask | None
+    """See :meth:`oiio_msspl.fusion.guards.EmptyRegions.mask`."""
+    lrhs_aovs: Images
+    lrhs: Array | None = None
+    """Network input, encoded; None for a tile that is empty everywhere."""
+    hrls: Array | None = None
+    noise_free: bool = False
+    """There is no noise to remove: the HRLS is the result."""
+
+
+def _prepare_tile(pair: TilePair, empty: Mask | None, session: Session, exposure: float) -> _PreparedTile:
+    """Dim fireflies and encode the features of a tile."""
+    contract, hrls = session.contract, pair.hrls
+    lrhs_aovs = {name: encode_feature(name, pair.lrhs[name], 1.0) for name in session.lrhs_aovs if name in pair.lrhs}
+    needed_for_alpha = {name: hrls[name] for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls}
+    tile = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
+    if empty is None or not empty.all():
+        lrhs_rgb, hrls = dim_fireflies(pair)
+        tile.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, exposure, len(contract.lrhs))
+        tile.hrls = encode_features(hrls, contract.features, exposure, len(contract.hrls))
+        tile.noise_free = is_noise_free(pair, tile.lrhs, hrls[RGB], exposure)
+    return tile
+
+
+def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None:
+    """Run the network on a tile and write its core into the frame."""
+    pair, empty = tile.pair, tile.empty
     target = pair.hrls_target.slices(frame.alignment.hr_data_window)
     core = pair.hrls_target.slices(pair.hrls_area)
-    lrhs_aovs: Images = {
-        name: encode_feature(name, pair.lrhs[name], 1.0) for name in session.lrhs_aovs if name in pair.lrhs
-    }
-    if empty is None or not empty.all():
-        encoded, log_error = _run_network(pair, session, lrhs_aovs, frame)
+    if tile.lrhs is not None and tile.hrls is not None:
+        encoded_error: Array | None
+        if tile.noise_free:
+            encoded, encoded_error = tile.hrls[..., :3], np.zeros_like(tile.hrls[..., :1])
+        else:
+            encoded, encoded_error = session.run(
+                tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, error=frame.error is not None
+            )
         rgb = frame.rgb[target]
         decode_radiance(encoded[core], frame.exposure, rgb)
         if empty is not None:
             rgb *= ~empty[core]
-        if frame.error is not None and log_error is not None:
-            error = _scene_linear_error(encoded, log_error, frame.exposure)
+        if frame.error is not None and encoded_error is not None:
+            error = _scene_linear_error(encoded, encoded_error, frame.exposure)
             if empty is not None:
                 error *= ~empty
             frame.error[target] = error[core]
     if "alpha" in pair.hrls:
         if frame.alpha is None:
             frame.alpha = np.empty((*frame.rgb.shape[:2], 1), dtype=np.float32)
-        frame.alpha[target] = fuse_alpha(pair, session, lrhs_aovs)[core]
-
-
-def _run_network(pair: TilePair, session: Session, lrhs_aovs: Images, frame: FusedFrame) -> tuple[Array, Array | None]:
-    """Log-encoded colour (s*h, s*w, 3) of a tile and, if asked for, its expected error (s*h, s*w, 1).
-
-    A tile without noise passes through: its HRLS is the result.
-    """
-    contract = session.contract
-    lrhs_rgb, hrls_features = dim_fireflies(pair)
-    lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, frame.exposure, len(contract.lrhs))
-    hrls = encode_features(hrls_features, contract.features, frame.exposure, len(contract.hrls))
-    if is_noise_free(pair, lrhs, hrls_features[RGB], frame.exposure):
-        return hrls[..., :3], np.zeros_like(hrls[..., :1])
-    return session.run(lrhs, hrls, lrhs_aovs=lrhs_aovs, error=frame.error is not None)
+        frame.alpha[target] = fuse_alpha(pair, session, tile.lrhs_aovs)[core]
 
 
 def _scene_linear_error(encoded: Array, error: Array, exposure: float) -> Array:

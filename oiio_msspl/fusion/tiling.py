@@ -13,6 +13,8 @@ from oiio_msspl.model.contract import Contract
 MAX_MEMORY = 3 << 30
 #: Memory that does not grow with the frame: interpreter, libraries, weights.
 FIXED_MEMORY = 350 << 20
+#: Share of the memory for decoded rows that neighbouring tiles read. ``bytes_per_pixel`` of a model leaves room for it.
+STRIPS_SHARE = 1 / 6
 #: HRLS pixels of the largest tile; larger ones are no faster.
 LARGEST_TILE = 2048 * 2048
 #: Shortest side of a tile's core, in LRHS pixels; smaller ones would spend nearly all work on the overlap.
@@ -51,12 +53,6 @@ def largest_tile(contract: Contract, frame_bytes: int, max_memory: int) -> int:
         needed = (FIXED_MEMORY + frame_bytes) / 2**30
         raise InputError(f"--max-memory: this frame alone takes {needed:.1f} GiB; allow at least {needed + 0.5:.1f}G")
     return int(pixels) // contract.scale**2
-
-
-def spare_bytes(contract: Contract, tiles: list[Tile], frame_bytes: int, max_memory: int) -> int:
-    """Memory that neither the frame nor a tile needs; at least 0."""
-    largest = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
-    return max(0, max_memory - FIXED_MEMORY - frame_bytes - largest * contract.bytes_per_pixel)
 
 
 def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> list[Tile]:

@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,7 @@ from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
+from oiio_msspl.parallel import in_background, limit_threads
 
 
 @dataclass(frozen=True)
@@ -132,8 +134,8 @@ def fuse_files(
 
     report = report_on(lr, hr, session, fused, output, preview_path)
     cache_bytes = max(0, max_memory - FIXED_MEMORY - fused.nbytes)
-    write_frame(report, fused, write, overwrite=overwrite, cache_bytes=cache_bytes)
-    write_frame_preview(report, fused, view_transform, overwrite=overwrite)
+    with limit_threads(threads), _frame_preview(report, fused, view_transform, overwrite=overwrite):
+        write_frame(report, fused, write, overwrite=overwrite, cache_bytes=cache_bytes)
     report.seconds = {
         "read": opened - start,
         "fuse": computed - opened,
@@ -163,6 +165,25 @@ def write_frame(
         overwrite=overwrite,
         cache_bytes=cache_bytes,
     )
+
+
+@contextmanager
+def _frame_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, overwrite: bool) -> Iterator[None]:
+    """Write the preview while the ``with`` block writes the EXR. If the block fails, nothing is left of the preview."""
+    if any(path is not None and path.exists() for path in (report.output, report.preview)):
+        yield  # the old preview stays until the EXR has been replaced
+        write_frame_preview(report, fused, view, overwrite=overwrite)
+        return
+    preview = report.preview
+    wait = in_background(lambda: write_frame_preview(report, fused, view, overwrite=overwrite))
+    try:
+        yield
+    except BaseException:
+        wait()
+        if preview is not None:
+            preview.unlink(missing_ok=True)
+        raise
+    wait()
 
 
 def write_frame_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, overwrite: bool) -> None:

@@ -253,6 +253,19 @@ def test_snippets_run(block: Block, folder: Path, monkeypatch: pytest.MonkeyPatc
     exec(compile(block.text, str(block), "exec"), {"__name__": "__main__"})
 
 
+def without_times(printed: str) -> list[str]:
+    """Lines without what differs from machine to machine: seconds, and the model that ``auto`` takes."""
+    return re.sub(r"\d+\.\d s|(joint|mix|pyramid)(?=-x\d)", "*", printed).splitlines()
+
+
+def test_the_guide_shows_what_is_printed(folder: Path) -> None:
+    """On the page about fusing, the first command is followed by what it prints."""
+    page = ROOT / "docs/guide/fuse.md"
+    (shown,) = (block for block in blocks("text") if block.page == page)
+    command = next(block for block in blocks("sh") if block.page == page).commands[0]
+    assert without_times(run(command, folder).stdout) == without_times(shown.text)
+
+
 def anchors(page: Path) -> set[str]:
     """What GitHub makes of the headings."""
     headings = re.findall(r"^#+ (.*)$", page.read_text(encoding="utf-8"), re.MULTILINE)

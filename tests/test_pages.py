@@ -8,10 +8,9 @@ program's own parser must accept every option.
 
 from __future__ import annotations
 
+import argparse
 import ast
-import contextlib
 import functools
-import io
 import os
 import re
 import runpy
@@ -24,6 +23,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib.util import find_spec
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -32,6 +32,8 @@ EXAMPLES = ROOT / "examples"
 PAGES = [
     ROOT / "README.md",
     EXAMPLES / "README.md",
+    ROOT / "benchmarks/README.md",
+    ROOT / "datagen/README.md",
     *sorted((ROOT / "docs/guide").glob("*.md")),
     *sorted((ROOT / "docs/design").glob("*.md")),
 ]
@@ -44,11 +46,12 @@ NOT_RUN = {
     "python -m pytest": "a test does not run all tests",
     "msspl-render": "needs Blender",
     "blender": "needs Blender",
-    "dask": "runs until it is stopped; tests/test_farm.py starts a scheduler and workers",
+    "dask": "runs until it is stopped; tests/jobs/test_dask_cluster.py starts a scheduler and workers",
     "deadline": "needs a farm",
     "python -m training": "needs rendered views and hours",
     "python -m datagen": "renders for hours",
     "python -m benchmarks": "needs rendered scenes and an hour",
+    "python datagen/": "needs a renderer",
 }
 #: An option and its value -> the same.
 NOT_RUN_WITH = {"--scheduler": "needs a running Dask scheduler", "--device cuda": "needs a GPU"}
@@ -59,6 +62,7 @@ OTHER_PACKAGES = {
     "onnxruntime-gpu": "takes the place of onnxruntime",
     "bpy": "datagen.cycles, in an environment of its own",
     "pillow": "datagen.cycles, in an environment of its own",
+    "pyluxcore": "datagen/luxcore_pair.py, in an environment of its own",
 }
 
 
@@ -99,7 +103,7 @@ def blocks(language: str) -> list[Block]:
 
 def why_not_run(command: str) -> str | None:
     for start, why in NOT_RUN.items():
-        if f"{command} ".startswith((f"{start} ", f"{start}.")):
+        if f"{command} ".startswith((f"{start} ", f"{start}.") if start[-1] != "/" else start):
             return why
     return next((why for option, why in NOT_RUN_WITH.items() if option in command), None)
 
@@ -154,11 +158,13 @@ def test_commands_run_and_write_what_they_name(block: Block, folder: Path) -> No
             assert new & set(folder.glob(pattern)), f"{command}: wrote no {output}"
 
 
-@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")  # training's modules import each other
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")  # a module that others import, too
 @pytest.mark.parametrize(
     ("block", "command", "why"), OTHERS, ids=[f"{block} {command} ({why})" for block, command, why in OTHERS]
 )
-def test_commands_that_are_not_run_are_accepted(block: Block, command: str, why: str, folder: Path) -> None:
+def test_commands_that_are_not_run_are_accepted(
+    block: Block, command: str, why: str, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """What can't be run here is at least a command that the program accepts."""
     words = shlex.split(command)
     if words[0] == "pip":
@@ -166,7 +172,9 @@ def test_commands_that_are_not_run_are_accepted(block: Block, command: str, why:
     elif command == "python -m pytest":
         assert find_spec("pytest") is not None
     elif words[:2] == ["python", "-m"]:
-        check_module(words[2], words[3:])
+        check_arguments(words[2], words[3:], monkeypatch)
+    elif words[0] == "python":
+        check_arguments(words[1], words[2:], monkeypatch)
     elif words[0] == "blender":
         assert (ROOT / words[words.index("--source-dir") + 1] / "blender_manifest.toml").is_file()
     elif words[0] == "deadline":
@@ -197,25 +205,65 @@ def check_pip(words: list[str]) -> None:
             assert extra_name in PROJECT["optional-dependencies"], f"{word}: no such extra"
 
 
-def check_module(name: str, arguments: list[str]) -> None:
-    """The module's argparse takes these values, and knows every option: they stand in its help."""
-    said = io.StringIO()
-    argv = sys.argv
-    sys.argv = [name, *arguments, "--help"]
-    try:
-        with contextlib.redirect_stdout(said), contextlib.redirect_stderr(said), pytest.raises(SystemExit) as ended:
-            runpy.run_module(name, run_name="__main__", alter_sys=True)
-    finally:
-        sys.argv = argv
-    assert ended.value.code in (0, None), said.getvalue()
-    for option in (word for word in arguments if re.match(r"--?[a-z]", word)):
-        assert re.search(rf"(?<![\w-]){re.escape(option)}(?![\w-])", said.getvalue()), f"{name} has no {option}"
+class Accepted(Exception):
+    """The program's parser took the arguments."""
+
+
+def check_arguments(program: str, arguments: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    """The argparse parser of a module, or of a script by its path, takes these arguments. Nothing runs after it."""
+    parse_args = argparse.ArgumentParser.parse_args
+
+    def parse_only(*args: object, **kwargs: object) -> None:
+        parse_args(*args, **kwargs)  # type: ignore[call-overload]
+        raise Accepted
+
+    monkeypatch.setattr(argparse.ArgumentParser, "parse_args", parse_only)
+    monkeypatch.setattr(sys, "argv", [program, *arguments])
+    with pytest.raises(Accepted):
+        if not program.endswith(".py"):
+            runpy.run_module(program, run_name="__main__", alter_sys=True)
+        else:
+            for renderer in ("bpy", "mathutils", "pyluxcore"):  # imported before the arguments are read
+                monkeypatch.setitem(sys.modules, renderer, MagicMock(**{"app.version": (5, 0, 0)}))
+            runpy.run_path(str(ROOT / program), run_name="__main__")
+
+
+IN_TEXT = [
+    (page, command.split(" > ")[0])
+    for page in PAGES
+    for command in re.findall(r"`(python -m (?!pytest)[^`]+)`", page.read_text(encoding="utf-8").replace("\n", " "))
+]
+
+
+@pytest.mark.filterwarnings("ignore:.*found in sys.modules:RuntimeWarning")
+@pytest.mark.parametrize(("page", "command"), IN_TEXT, ids=[f"{page.name} {command}" for page, command in IN_TEXT])
+def test_commands_in_sentences_and_tables_are_accepted(
+    page: Path, command: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = shlex.split(command)
+    if len(words) > 3:
+        check_arguments(words[2], words[3:], monkeypatch)
+    else:  # the sentence may leave out what the command needs
+        assert find_spec(words[2]) is not None
 
 
 @pytest.mark.parametrize("block", blocks("python"), ids=str)
 def test_snippets_run(block: Block, folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(folder)
     exec(compile(block.text, str(block), "exec"), {"__name__": "__main__"})
+
+
+def without_times(printed: str) -> list[str]:
+    """Lines without what differs from machine to machine: seconds, and the model that ``auto`` takes."""
+    return re.sub(r"\d+\.\d s|(joint|mix|pyramid)(?=-x\d)", "*", printed).splitlines()
+
+
+def test_the_guide_shows_what_is_printed(folder: Path) -> None:
+    """On the page about fusing, the first command is followed by what it prints."""
+    page = ROOT / "docs/guide/fuse.md"
+    (shown,) = (block for block in blocks("text") if block.page == page)
+    command = next(block for block in blocks("sh") if block.page == page).commands[0]
+    assert without_times(run(command, folder).stdout) == without_times(shown.text)
 
 
 def anchors(page: Path) -> set[str]:
@@ -243,30 +291,33 @@ def test_every_renderer_of_the_table_is_on_the_page() -> None:
     assert names == {name for name in re.findall(r"^\| ([^|]+?) \|", page, re.MULTILINE) if name in names}
 
 
-def literals() -> list[str]:
-    """All texts in the code of the programs."""
+def texts() -> list[str]:
+    """All texts in the code of the programs, with ``...`` for each value that is put into them."""
     sources = [
         path for name in ("oiio_msspl", "cli", "nuke_gizmo", "blender_addon") for path in (ROOT / name).rglob("*.py")
     ]
-    return [
-        node.value
-        for source in sources
-        for node in ast.walk(ast.parse(source.read_text(encoding="utf-8")))
-        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+    nodes = [node for source in sources for node in ast.walk(ast.parse(source.read_text(encoding="utf-8")))]
+    formatted = [node for node in nodes if isinstance(node, ast.JoinedStr)]
+    plain = [node.value for node in nodes if isinstance(node, ast.Constant) and isinstance(node.value, str)]
+    return plain + [
+        "".join(str(part.value) if isinstance(part, ast.Constant) else "..." for part in node.values)
+        for node in formatted
     ]
 
 
 def test_the_messages_of_the_troubleshooting_page_are_those_of_the_code() -> None:
-    """Between ``...``, each message is text that stands in the code."""
+    """What stands around ``...`` in a message stands in one text of the code, in this order."""
     page = (ROOT / "docs/guide/troubleshooting.md").read_text(encoding="utf-8")
     messages = re.findall(r"^\| `([^`]+)` \|", page, re.MULTILINE)
     assert len(messages) > 40
-    code = "\0".join(literals())
+    code = texts()
     missing = [
-        f"{part!r} of {message!r}"
+        message
         for message in messages
-        for part in map(str.strip, message.split("..."))
-        if part and part not in code
+        if not any(
+            re.search(".*".join(re.escape(part.strip()) for part in message.split("...")), text, re.DOTALL)
+            for text in code
+        )
     ]
     assert not missing, missing
 

@@ -4,7 +4,7 @@
     python -m benchmarks.paper > docs/paper.md
 
 Everything is read from `benchmarks/results`. The tables there come from `benchmarks.quality`, `benchmarks.runtime`,
-`benchmarks.spp_grid` and `training.ablations`.
+`benchmarks.spp_grid` and `benchmarks.ablations`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ SUPER_RESOLUTION = {2: (30.57, 32.03, 38.40), 4: (25.39, 30.73, 34.27), 8: (22.3
 #: spp of the LRHS -> PSNR at x4 for an HRLS of 1, 2 and 4 spp (its table 6).
 GRID = {16: (33.94, 34.88, 35.71), 32: (34.22, 35.21, 36.06), 64: (34.42, 35.44, 36.31)}
 
-#: Rows of `training.ablations` that several tables show.
+#: Rows of `benchmarks.ablations` that several tables show.
 SAME, ALL_LAYERS = "both RGB, l1", "HRLS: and diffuse, specular"
 
 Found = Mapping[Hashable, Row]

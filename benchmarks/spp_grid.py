@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks import results, scenes
 from benchmarks.results import Row
 from oiio_msspl import fuse
+from oiio_msspl.metrics import psnr
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 

@@ -5,5 +5,4 @@ Networks: ``paper`` is the paper's, ``pyramid``, ``mix`` and ``joint`` are ours;
 ``encoding``, ``trunk``, ``oidn`` and ``mean_denoiser`` are what they are made of.
 Training: ``data`` draws pairs from views of :mod:`datagen`, ``losses``, ``validation``, ``train``, ``checkpoints``.
 Checkpoints: ``average``, ``prune`` and ``error`` change one; ``export`` and ``quantise`` make a model of it.
-``ablations`` repeats the paper's.
 """

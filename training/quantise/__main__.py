@@ -3,7 +3,8 @@
 
     python -m training.quantise VIEWS
 
-Writes ``oiio_msspl/model/weights/denoisers/NAME.onnx`` for each network, and prints how close it is to the network in 32 bits.
+Writes ``oiio_msspl/model/weights/denoisers/NAME.onnx`` for each network, and prints how close it is to the network in
+32 bits.
 """
 
 from __future__ import annotations

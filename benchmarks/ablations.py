@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
 
-    python -m training.ablations VIEWS --json benchmarks/results/ablations.json
+    python -m benchmarks.ablations VIEWS --table benchmarks/results/ablations.csv
 
 As in the paper, the HRLS has 1 spp, the LRHS has far more (all ``lr`` passes of a view, 256 spp at x4), and the branch
 that is not varied reads colour only. For every row a reduced network of the paper's architecture is trained from
@@ -14,17 +14,16 @@ from __future__ import annotations
 
 import argparse
 import functools
-import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
+from benchmarks import results
 from datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
 from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
 from oiio_msspl.arrays import box_downsample
@@ -179,22 +178,22 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of views")
-    parser.add_argument("--json", type=Path, required=True, help="table to write or complete")
+    parser.add_argument("--table", type=Path, required=True, help="table to write or complete")
     parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(1)
-    result: dict[str, Any] = json.loads(args.json.read_text()) if args.json.exists() else {"rows": []}
+    rows = results.read(args.table) if args.table.exists() else []
     folder = Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
-    result |= {"steps": args.steps, "network": REDUCED, "train_views": len(views), "held_out_views": len(held_out)}
-    done = {row["name"] for row in result["rows"]}
+    effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
+    done = {row["name"] for row in rows}
     for variant in VARIANTS:
         if variant.name not in done:
             network = train(variant, views, args.steps)
-            row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out)}
+            row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
             print(row, flush=True)
-            result["rows"].append(row)
-            args.json.write_text(json.dumps(result, indent=1) + "\n")
+            rows.append(row)
+            results.write(args.table, rows)
 
 
 if __name__ == "__main__":

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The paper's tables, with our results beside the paper's own.
 
-    python -m benchmarks.paper > docs/paper.md
+    python -m benchmarks.paper
 
 Everything is read from `benchmarks/results`. The tables there come from `benchmarks.quality`, `benchmarks.runtime`,
 `benchmarks.spp_grid` and `benchmarks.ablations`.

@@ -78,7 +78,7 @@ def when_it_pays() -> str:
             relative = "0"  # nothing is computed
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
         body.append([name, needs, *cells, relative])
-    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time of OIDN's"]
+    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time / OIDN's"]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
 

@@ -21,7 +21,7 @@ _UNLIMITED = 100_000
 _STYLES = {"fused": "green", "failed": "red", "missing": "red", "not done": "yellow", "warning": "yellow"}
 
 #: Printed for a feature that the render lacks. All other features are optional.
-_NONE_FOUND = {"albedo": "none found: expect blur, render an albedo"}
+_NONE_FOUND = {"albedo": "none found: expect blur; render an albedo, or name it with --map albedo=LAYER"}
 
 
 def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 2) -> None:
@@ -38,11 +38,13 @@ def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 
 
     console = _console(stderr=False)
     grid = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-    for _ in rows[0]:
+    # rich would fold the cells before a column that is empty.
+    filled = [column for column in range(len(rows[0])) if any(row[column] for row in rows)]
+    for _ in filled:
         grid.add_column(overflow="fold")
     for index, row in enumerate(rows):
         style = "bold" if header and index == 0 else ""
-        grid.add_row(*(Text(cell, style=_STYLES.get(cell, "")) for cell in row), style=style)
+        grid.add_row(*(Text(row[column], style=_STYLES.get(row[column], "")) for column in filled), style=style)
     with console.capture() as captured:
         console.print(Padding.indent(grid, indent))
     for line in captured.get().splitlines():

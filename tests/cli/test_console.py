@@ -25,7 +25,7 @@ def test_a_piped_table_is_plain_text(capsys):
 @pytest.mark.parametrize(
     ("row", "text"),
     [
-        (("albedo", "default", ""), "none found: expect blur, render an albedo"),
+        (("albedo", "default", ""), "none found: expect blur; render an albedo, or name it with --map albedo=LAYER"),
         (("variance", "default", ""), "none found (optional)"),
         (("normal", "found", "N"), "found: N"),
         (("diffuse", "computed", "a + b"), "computed: a + b (scaled)"),

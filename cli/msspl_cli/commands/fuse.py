@@ -315,7 +315,8 @@ def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
 def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each step."""
     spp = report.spp_avg
-    print(f"{report.hr.renderer} pair at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
+    renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
+    print(f"{renderer} at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
     console.aov_table(report.aovs(), report.hr.notes)
     if lrhs_aovs := report.found_lrhs_aovs():
         print("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))

@@ -107,7 +107,8 @@ def summary(rows: Sequence[Row]) -> str:
         mine = [row for row in rows if row["method"] == method]
         counts = [str(sum(row["verdict"] == grade for row in mine)) for grade in ("holds", "suffers", "fails")]
         worst = max(mine, key=lambda row: row["range"])
-        where = f"x{float(f"{worst['range']:.3g}"):g} ({worst['group']}: {worst['case']})" if worst["range"] > EXCESS else "inside"
+        factor = f"x{float(format(worst['range'], '.3g')):g}"
+        where = f"{factor} ({worst['group']}: {worst['case']})" if worst["range"] > EXCESS else "inside"
         body.append([method, *counts, where])
     return results.markdown(["method", "holds", "suffers", "fails", "furthest outside the inputs' range"], body)
 

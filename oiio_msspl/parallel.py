@@ -11,14 +11,16 @@ import contextlib
 import contextvars
 import functools
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
+from functools import partial
 from typing import TypeVar
 
 #: Values of a block: 512 KiB of float32.
 BLOCK_VALUES = 1 << 17
 
+S = TypeVar("S")
 T = TypeVar("T")
 
 _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
@@ -68,6 +70,21 @@ def in_background(work: Callable[[], T]) -> Callable[[], T]:
     if (_thread_limit.get() or available_cores()) == 1:
         return work
     return _background_pool().submit(contextvars.copy_context().run, work).result
+
+
+def one_ahead(function: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
+    """Yield ``function(item)`` for each item; while the caller uses a result, the next one is computed.
+
+    ``function`` never runs twice at the same time.
+    """
+    remaining = iter(items)
+    for first in remaining:
+        pending = in_background(partial(function, first))
+        for item in remaining:
+            result = pending()
+            pending = in_background(partial(function, item))
+            yield result
+        yield pending()
 
 
 def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:

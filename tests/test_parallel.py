@@ -8,7 +8,7 @@ import pytest
 from oiio_msspl import parallel
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
-from oiio_msspl.parallel import _thread_limit, for_row_blocks, in_background, limit_threads
+from oiio_msspl.parallel import _thread_limit, for_row_blocks, in_background, limit_threads, one_ahead
 from tests.conftest import picture
 
 
@@ -101,3 +101,22 @@ def test_work_begins_aside_if_there_are_threads_for_it(count):
         thread, threads = result()
     assert (thread is threading.current_thread()) == (count == 1)
     assert threads == count
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_one_ahead_computes_the_next_item_and_never_two_at_once(count):
+    running, started = [], []
+
+    def square(item):
+        running.append(item)
+        assert len(running) == 1
+        started.append(item)
+        running.remove(item)
+        return item * item
+
+    with limit_threads(count):
+        assert list(one_ahead(square, range(5))) == [0, 1, 4, 9, 16]
+        assert list(one_ahead(square, [])) == []
+        results = one_ahead(square, iter([7, 8, 9]))
+        assert next(results) == 49
+    assert 9 not in started[5:]

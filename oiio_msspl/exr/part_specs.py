@@ -12,8 +12,8 @@ from typing import Any
 
 import OpenImageIO as oiio
 
+from oiio_msspl.exr.contents import FileContents, lossless
 from oiio_msspl.exr.layers import layers_of
-from oiio_msspl.exr.output import Output, lossless
 from oiio_msspl.exr.reader import Channel, Part
 from oiio_msspl.exr.write_options import ERROR_LAYER
 
@@ -44,64 +44,64 @@ class PassedOnPart:
     part, in its mixed pixel types."""
 
 
-def beauty_spec(output: Output) -> Any:
+def beauty_spec(contents: FileContents) -> Any:
     """The part of the fused beauty."""
-    home = output.home
-    if output.options.layout == "nuke":
-        name, channels = _nuke_name("rgba", home.view), ["R", "G", "B", "A"][: len(output.beauty)]
+    home = contents.home
+    if contents.options.layout == "nuke":
+        name, channels = _nuke_name("rgba", home.view), ["R", "G", "B", "A"][: len(contents.beauty)]
     else:
-        name, channels = home.name or "rgba", [channel.name for channel in output.beauty]
-    spec = _spec(home, name, channels, output.pixels.kind)
-    spec.attribute("compression", output.compression)
-    for key, value in output.attributes.items():
+        name, channels = home.name or "rgba", [channel.name for channel in contents.beauty]
+    spec = _spec(home, name, channels, contents.pixels.kind)
+    spec.attribute("compression", contents.compression)
+    for key, value in contents.attributes.items():
         spec.attribute(key, value)
     return spec
 
 
-def error_spec(output: Output, taken: set[str]) -> Any:
+def error_spec(contents: FileContents, taken: set[str]) -> Any:
     """The part of the predicted error; its name is not among ``taken`` and is added to them."""
-    channel = "Y" if output.options.layout == "nuke" else f"{ERROR_LAYER}.Y"
-    spec = _spec(output.home, _unique(ERROR_LAYER, taken), [channel], output.pixels.kind)
+    channel = "Y" if contents.options.layout == "nuke" else f"{ERROR_LAYER}.Y"
+    spec = _spec(contents.home, _unique(ERROR_LAYER, taken), [channel], contents.pixels.kind)
     _drop_repeated_attributes(spec)
-    spec.attribute("compression", output.compression)
+    spec.attribute("compression", contents.compression)
     return spec
 
 
-def passed_on_parts(output: Output, taken: set[str]) -> Iterator[PassedOnPart]:
+def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedOnPart]:
     """The parts with all channels of the HRLS but the fused and the dropped ones.
 
     A part stays whole if it can. The others are split into one part for each layer and pixel type.
 
     Args:
-        output: what is written.
+        contents: what is written.
         taken: names of the parts so far; those of the new parts are added.
     """
-    layer_of = {c: layer for layer in layers_of(output.source) for c in layer.channels.values()}
-    for part in output.source.parts:
+    layer_of = {c: layer for layer in layers_of(contents.source) for c in layer.channels.values()}
+    for part in contents.source.parts:
         if part.deep:
             continue
-        if _stays_whole(part, output):
+        if _stays_whole(part, contents):
             yield _whole_part(part, taken)
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
-            if channel not in output.beauty and channel not in output.dropped:
+            if channel not in contents.beauty and channel not in contents.dropped:
                 layer = layer_of.get(channel)
                 # A channel in no layer means the same as another one (foo.r beside foo.R): it gets its own part.
                 key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
                 groups.setdefault(key, []).append(channel)
         # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
-        repeats_metadata = not set(output.beauty).isdisjoint(part.channels)
+        repeats_metadata = not set(contents.beauty).isdisjoint(part.channels)
         for (view, layer_name, _), channels in groups.items():
-            yield _layer_part(output, part, view, layer_name, channels, taken, repeats_metadata)
+            yield _layer_part(contents, part, view, layer_name, channels, taken, repeats_metadata)
             repeats_metadata = True
 
 
-def _stays_whole(part: Part, output: Output) -> bool:
+def _stays_whole(part: Part, contents: FileContents) -> bool:
     """Whether all channels of a part can be copied into one part of the same name."""
-    if output.options.layout == "nuke":
+    if contents.options.layout == "nuke":
         return False
-    if any(c in output.beauty or c in output.dropped for c in part.channels):
+    if any(c in contents.beauty or c in contents.dropped for c in part.channels):
         return False
     # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. A part of a single pixel type
     # is rewritten as scan lines; OpenImageIO can't do so with mixed types.
@@ -122,7 +122,7 @@ def _whole_part(part: Part, taken: set[str]) -> PassedOnPart:
 
 
 def _layer_part(
-    output: Output,
+    contents: FileContents,
     part: Part,
     view: str,
     layer: str,
@@ -131,7 +131,7 @@ def _layer_part(
     repeats_metadata: bool,
 ) -> PassedOnPart:
     """A part for the channels of one layer and pixel type."""
-    nuke = output.options.layout == "nuke"
+    nuke = contents.options.layout == "nuke"
     plain = layer or ("depth" if [c.name for c in channels] == ["Z"] else "other")
     name = _unique(_nuke_name(plain, view) if nuke else plain, taken)
     names = [c.name.rpartition(".")[2] for c in channels] if nuke else [c.name for c in channels]

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.output import Output
+from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.write_options import ERROR_LAYER
 
@@ -22,7 +22,7 @@ from oiio_msspl.exr.write_options import ERROR_LAYER
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
 
 
-def write_single_part(path: Path, output: Output) -> None:
+def write_single_part(path: Path, contents: FileContents) -> None:
     """Write all channels into one part of the file ``path``.
 
     Raises:
@@ -31,9 +31,9 @@ def write_single_part(path: Path, output: Output) -> None:
     """
     import OpenEXR
 
-    channels = _fused_channels(output)
-    _add_passed_on_channels(output, channels)
-    header = _header(output)
+    channels = _fused_channels(contents)
+    _add_passed_on_channels(contents, channels)
+    header = _header(contents)
     try:
         with OpenEXR.File(header, channels) as file:
             file.write(str(path))
@@ -41,21 +41,21 @@ def write_single_part(path: Path, output: Output) -> None:
         raise MssplError(f"{path.parent}: the result can't be written ({error}); the target is as it was") from error
 
 
-def _fused_channels(output: Output) -> dict[str, NDArray[Any]]:
+def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
     """The fused beauty and its error: (height, width) by channel name."""
-    height = output.pixels.rgb.shape[0]
-    beauty = output.pixels.rows(0, height)
-    channels = {c.name: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate(output.beauty)}
-    if output.pixels.error is not None:
-        channels[f"{ERROR_LAYER}.Y"] = np.ascontiguousarray(output.pixels.error_rows(0, height)[..., 0])
+    height = contents.pixels.rgb.shape[0]
+    beauty = contents.pixels.rows(0, height)
+    channels = {c.name: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate(contents.beauty)}
+    if contents.pixels.error is not None:
+        channels[f"{ERROR_LAYER}.Y"] = np.ascontiguousarray(contents.pixels.error_rows(0, height)[..., 0])
     return channels
 
 
-def _add_passed_on_channels(output: Output, channels: dict[str, NDArray[Any]]) -> None:
+def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[Any]]) -> None:
     """Add the channels of the HRLS that are neither fused nor dropped."""
-    file, home = output.source, output.home
+    file, home = contents.source, contents.home
     for part in file.parts:
-        if part.deep or output.dropped.issuperset(part.channels):
+        if part.deep or contents.dropped.issuperset(part.channels):
             continue
         if part.data_window != home.data_window:
             raise InputError(
@@ -63,9 +63,9 @@ def _add_passed_on_channels(output: Output, channels: dict[str, NDArray[Any]]) -
                 f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
             )
         for channel in part.channels:
-            if channel in output.beauty or channel in output.dropped:
+            if channel in contents.beauty or channel in contents.dropped:
                 continue
-            name = _name(output, channel)
+            name = _name(contents, channel)
             if name in channels:
                 raise InputError(
                     f"--layout multilayer: two parts of {file.path} hold a channel '{name}'; use --layout spec"
@@ -74,24 +74,24 @@ def _add_passed_on_channels(output: Output, channels: dict[str, NDArray[Any]]) -
             channels[name] = np.concatenate(strips)[..., 0]
 
 
-def _name(output: Output, channel: Channel) -> str:
+def _name(contents: FileContents, channel: Channel) -> str:
     """The channel's own name, or the part's name in front of it if only that names the layer."""
-    if "." in channel.name or channel.part == output.home.index:
+    if "." in channel.name or channel.part == contents.home.index:
         return channel.name
-    part = output.source.parts[channel.part]
+    part = contents.source.parts[channel.part]
     return f"{part.name or f'part{part.index}'}.{channel.name}"
 
 
-def _header(output: Output) -> dict[str, Any]:
-    """The header of the HRLS's beauty, with the compression and the attributes of the output."""
+def _header(contents: FileContents) -> dict[str, Any]:
+    """The header of the HRLS's beauty, with the compression and the attributes of the contents."""
     import OpenEXR
 
-    with OpenEXR.File(str(output.source.path), header_only=True) as source:
-        header = dict(source.parts[output.home.index].header)
+    with OpenEXR.File(str(contents.source.path), header_only=True) as source:
+        header = dict(source.parts[contents.home.index].header)
     for key in _STRUCTURE:
         header.pop(key, None)
-    name = "NO" if output.compression == "none" else output.compression.upper()
+    name = "NO" if contents.compression == "none" else contents.compression.upper()
     header["compression"] = getattr(OpenEXR, f"{name}_COMPRESSION")
     header["type"] = OpenEXR.scanlineimage
-    header.update(output.attributes)
+    header.update(contents.attributes)
     return header

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.exr.output import FusedPixels, Output, dropped_channels, widest_type
+from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
 from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, error_spec, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, unreadable
 from oiio_msspl.exr.single_part import write_single_part
@@ -63,12 +63,12 @@ def write_fused(
     """
     pixels = FusedPixels(rgb, alpha, error, options.pixel_type or widest_type(beauty))
     dropped = dropped_channels(source, beauty, options.layers)
-    output = Output(source, tuple(beauty), dropped, pixels, attributes, options)
+    contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options)
     with replacing(path, overwrite=overwrite) as temporary:
         if options.layout == "multilayer":
-            write_single_part(temporary, output)
+            write_single_part(temporary, contents)
         else:
-            _write_parts(temporary, output, cache_bytes)
+            _write_parts(temporary, contents, cache_bytes)
     return [
         f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
         for part in source.parts
@@ -76,26 +76,26 @@ def write_fused(
     ]
 
 
-def _write_parts(path: Path, output: Output, cache_bytes: int) -> None:
+def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     """Write a file of several parts: the beauty, the error if there is one, and what is passed on."""
-    beauty = beauty_spec(output)
+    beauty = beauty_spec(contents)
     taken = {str(beauty.getattribute("oiio:subimagename"))}
-    passed_on = list(passed_on_parts(output, taken))
-    error = error_spec(output, taken) if output.pixels.error is not None else None
+    passed_on = list(passed_on_parts(contents, taken))
+    error = error_spec(contents, taken) if contents.pixels.error is not None else None
     specs = [beauty, *([error] if error is not None else []), *(part.spec for part in passed_on)]
 
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:
         raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
     ok = writer.open(str(path), specs) if len(specs) > 1 else writer.open(str(path), beauty)
-    ok = ok and _write_rows(writer, beauty, output.pixels.rows)
+    ok = ok and _write_rows(writer, beauty, contents.pixels.rows)
     if error is not None:
         ok = ok and writer.open(str(path), error, "AppendSubimage")
-        ok = ok and _write_rows(writer, error, output.pixels.error_rows)
-    with output.source.cache_strips(cache_bytes if _is_split(passed_on) else 0):
+        ok = ok and _write_rows(writer, error, contents.pixels.error_rows)
+    with contents.source.cache_strips(cache_bytes if _is_split(passed_on) else 0):
         for part in passed_on:
             ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
-            ok = ok and _copy(output.source, part, writer)
+            ok = ok and _copy(contents.source, part, writer)
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
-from functools import partial
 
 import numpy as np
 
@@ -22,7 +21,7 @@ from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_gri
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import in_background, limit_threads
+from oiio_msspl.parallel import limit_threads, one_ahead
 
 
 @dataclass
@@ -78,39 +77,20 @@ def fuse(
     _check_model(session, alignment.scale, error)
     seconds = session.seconds
     with limit_threads(session.threads):
-        grid = aligned_grid(alignment.grid, session.contract.alignment)
-        lrhs_repaired: dict[str, int] = {}
-        lrhs = read_lrhs(lr, alignment, grid, [RGB, *session.lrhs_aovs, "alpha"], lrhs_repaired)
-        lrhs_rgb = lrhs[RGB][alignment.grid.slices(grid)]
-        frame = _blank_frame(alignment, find_exposure(lrhs_rgb), error=error)
-        frame_bytes = frame.nbytes + sum(values.nbytes for values in lrhs.values())
-        largest = largest_tile(session.contract, frame_bytes, max_memory)
-        tiles = plan_tiles(grid, largest, session.contract.overlap, session.contract.alignment)
-        empty_regions, averages = EmptyRegions(lrhs[RGB]), HrlsAverages(alignment)
-        hrls_repaired: dict[str, int] = {}
-
-        def prepare(tile: Tile) -> _PreparedTile:
-            features = [*session.contract.features, "alpha"]
-            pair = read_tile(tile, lrhs, grid, hr, alignment, features, hrls_repaired)
-            averages.add(pair)
-            empty = empty_regions.mask(pair, tile.area.slices(grid))
-            return _prepare_tile(pair, empty, session, frame.exposure)
-
+        pair = _Pair(lr, hr, alignment, session)
+        frame = _blank_frame(alignment, pair.exposure, error=error)
+        largest = largest_tile(session.contract, frame.nbytes + pair.nbytes, max_memory)
+        tiles = plan_tiles(pair.grid, largest, session.contract.overlap, session.contract.alignment)
         with hr.cache_strips(int(max_memory * STRIPS_SHARE)):
-            upcoming = in_background(lambda: prepare(tiles[0]))
-            for done, following in enumerate([*tiles[1:], None], start=1):
-                prepared = upcoming()
-                if following is not None:  # read it while the network works on this tile
-                    upcoming = in_background(partial(prepare, following))
-                _fuse_tile(prepared, session, frame)
+            # The next tile is read and encoded while the network works on this one.
+            for done, tile in enumerate(one_ahead(pair.prepare, tiles), start=1):
+                _fuse_tile(tile, session, frame)
                 if progress is not None:
                     progress(done, len(tiles))
-        frame.warnings += check_pair(lrhs_rgb, averages, lr.name, hr.name)
-    if frame.alpha is not None and "alpha" not in lrhs:
+        frame.warnings += pair.check()
+    frame.repaired, frame.tiles, frame.seconds = pair.repaired, len(tiles), session.seconds - seconds
+    if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
-    frame.repaired = {f"lrhs.{name}": count for name, count in lrhs_repaired.items()}
-    frame.repaired |= {f"hrls.{name}": count for name, count in hrls_repaired.items()}
-    frame.tiles, frame.seconds = len(tiles), session.seconds - seconds
     return frame
 
 
@@ -143,18 +123,58 @@ class _PreparedTile:
     """There is no noise to remove: the HRLS is the result."""
 
 
-def _prepare_tile(pair: TilePair, empty: Mask | None, session: Session, exposure: float) -> _PreparedTile:
-    """Dim fireflies and encode the features of a tile."""
-    contract, hrls = session.contract, pair.hrls
-    lrhs_aovs = {name: encode_feature(name, pair.lrhs[name], 1.0) for name in session.lrhs_aovs if name in pair.lrhs}
-    needed_for_alpha = {name: hrls[name] for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls}
-    tile = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
-    if empty is None or not empty.all():
-        lrhs_rgb, hrls = dim_fireflies(pair)
-        tile.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, exposure, len(contract.lrhs))
-        tile.hrls = encode_features(hrls, contract.features, exposure, len(contract.hrls))
-        tile.noise_free = is_noise_free(pair, tile.lrhs, hrls[RGB], exposure)
-    return tile
+class _Pair:
+    """The LRHS in memory, and the HRLS that is read tile by tile."""
+
+    def __init__(self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session) -> None:
+        self._lr, self._hr, self._alignment, self._session = lr, hr, alignment, session
+        self.grid = aligned_grid(alignment.grid, session.contract.alignment)
+        self._lrhs_repaired: dict[str, int] = {}
+        self._hrls_repaired: dict[str, int] = {}
+        features = [RGB, *session.lrhs_aovs, "alpha"]
+        self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_repaired)
+        self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
+        self.exposure = find_exposure(self._lrhs_rgb)
+        self._empty_regions, self._averages = EmptyRegions(self._lrhs[RGB]), HrlsAverages(alignment)
+
+    @property
+    def nbytes(self) -> int:
+        """Memory of the LRHS."""
+        return sum(values.nbytes for values in self._lrhs.values())
+
+    @property
+    def lrhs_has_alpha(self) -> bool:
+        return "alpha" in self._lrhs
+
+    @property
+    def repaired(self) -> dict[str, int]:
+        """See :attr:`FusedFrame.repaired`."""
+        lrhs = {f"lrhs.{name}": count for name, count in self._lrhs_repaired.items()}
+        return lrhs | {f"hrls.{name}": count for name, count in self._hrls_repaired.items()}
+
+    def prepare(self, tile: Tile) -> _PreparedTile:
+        """Read a tile, dim fireflies and encode its features."""
+        contract, grid = self._session.contract, self.grid
+        features = [*contract.features, "alpha"]
+        pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_repaired)
+        self._averages.add(pair)
+        empty = self._empty_regions.mask(pair, tile.area.slices(grid))
+        lrhs_aovs = {
+            name: encode_feature(name, pair.lrhs[name], 1.0) for name in self._session.lrhs_aovs if name in pair.lrhs
+        }
+        hrls = pair.hrls
+        needed_for_alpha = {name: hrls[name] for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls}
+        prepared = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
+        if empty is None or not empty.all():
+            lrhs_rgb, hrls = dim_fireflies(pair)
+            prepared.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
+            prepared.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
+            prepared.noise_free = is_noise_free(pair, prepared.lrhs, hrls[RGB], self.exposure)
+        return prepared
+
+    def check(self) -> list[str]:
+        """Compare the two renders once all tiles are prepared, see :func:`check_pair`."""
+        return check_pair(self._lrhs_rgb, self._averages, self._lr.name, self._hr.name)
 
 
 def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None:

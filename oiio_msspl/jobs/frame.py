@@ -15,7 +15,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
-from oiio_msspl.exr.output import dropped_channels
+from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.preview import check_view, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.write_options import WriteOptions

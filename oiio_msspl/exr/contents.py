@@ -56,7 +56,7 @@ class FusedPixels:
 
 
 @dataclass(frozen=True)
-class Output:
+class FileContents:
     """Everything that a writer needs to know."""
 
     source: ExrFile

@@ -133,7 +133,9 @@ def fuse_files(
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
-    cache_bytes = max(0, max_memory - FIXED_MEMORY - fused.nbytes)
+    del session  # its memory is for the writer's cache
+    # Half of what is left: compression and the preview need memory, too.
+    cache_bytes = max(0, max_memory - FIXED_MEMORY - fused.nbytes) // 2
     with limit_threads(threads), _frame_preview(report, fused, view_transform, overwrite=overwrite):
         write_frame(report, fused, write, overwrite=overwrite, cache_bytes=cache_bytes)
     report.seconds = {
@@ -174,14 +176,13 @@ def _frame_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, 
         yield  # the old preview stays until the EXR has been replaced
         write_frame_preview(report, fused, view, overwrite=overwrite)
         return
-    preview = report.preview
     wait = in_background(lambda: write_frame_preview(report, fused, view, overwrite=overwrite))
     try:
         yield
     except BaseException:
         wait()
-        if preview is not None:
-            preview.unlink(missing_ok=True)
+        if report.preview is not None:  # None if it was not written, because somebody else's file came first
+            report.preview.unlink(missing_ok=True)
         raise
     wait()
 

@@ -1,12 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and accuracy of the networks in 8 bits beside the same networks in 32 bits.
+"""Time and accuracy of the `joint` models in 8 bits beside the same networks in 32 bits, computed by PyTorch.
 
     python -m benchmarks.eight_bit VIEWS
 
-Open Image Denoise on the HRLS, on both renders, and the models that contain it. PSNR is of sRGB pictures, with 1, 2 and
-4 spp in either render, over every third validation view (:mod:`datagen.views`). In 32 bits the work is done by Open
-Image Denoise itself, and for `joint` by PyTorch. Times are medians for a frame of 1024 x 1024 pixels; both take turns
-in one process.
+PSNR is of sRGB pictures, with 1, 2 and 4 spp in either render, over every third validation view
+(:mod:`datagen.views`). Times are medians for a frame of 1024 x 1024 pixels; both take turns in one process.
 """
 
 from __future__ import annotations
@@ -26,14 +24,11 @@ from benchmarks.results import Row
 from benchmarks.runtime import frame
 from datagen.views import Folder
 from oiio_msspl import Render, Session, find_model, fuse
-from oiio_msspl.aovs.features import HRLS_FEATURES, LRHS_FEATURES, RGB
+from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array
 from oiio_msspl.exr.render import ReadableRender
-from oiio_msspl.fusion.tile_features import read_features
 from oiio_msspl.metrics import psnr
-from oiio_msspl.model.contract import SCALES, Contract
-from oiio_msspl.model.encoding import decode_radiance, encode_features, find_exposure
-from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, denoiser_images, mean_of_renders
 from training.checkpoints import load as load_checkpoint
 from training.data import to_tensor
@@ -67,13 +62,6 @@ def accuracy(
     ]
 
 
-def denoised(denoiser: OidnDenoiser, lr: ReadableRender, hr: ReadableRender) -> Array:
-    """The denoised HRLS, with the exposure that fusion would choose."""
-    exposure = find_exposure(scenes.beauty(lr))
-    layers = encode_features(read_features(hr, hr.data_window, hr.data_window), HRLS_FEATURES, exposure)
-    return decode_radiance(denoiser.hrls(denoiser_images(layers)), exposure)
-
-
 class InTorch(Session):
     """A joint model computed by PyTorch in 32 bits, from its checkpoint."""
 
@@ -87,51 +75,39 @@ class InTorch(Session):
         self, lrhs: Array, hrls: Array, *, lrhs_aovs: Images = NO_IMAGES, error: bool = False
     ) -> tuple[Array, Array | None]:
         light = lrhs[..., :3]
-        mean = mean_of_renders(light, denoiser_images(hrls, complete=True), lrhs_aovs)
+        mean = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs)
         images = np.concatenate([light, self._network.mean_denoiser.denoise(mean)], axis=-1), hrls
         with torch.inference_mode():
             fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
         return fused[0].permute(1, 2, 0).numpy(), None
 
 
-def in_32_bits(name: str) -> Session:
-    """A model that computes everything in 32 bits, as far as it can."""
-    path = find_model(0, name)
-    return InTorch(path) if Contract.of_file(path).weights else Session(path, exact=True)
-
-
-def row(name: str, seconds: list[float], psnr: Sequence[float] = ()) -> Row:
+def row(name: str, seconds: list[float], psnr: Sequence[float]) -> Row:
     """One row, from pairs of figures in 32 and in 8 bits."""
     columns = [f"psnr_{spp}spp_{bits}bit" for spp in SPP for bits in (32, 8)]
     return {
         "method": name,
         "seconds_32bit": seconds[0],
         "seconds_8bit": seconds[1],
-        **dict(zip(columns, psnr, strict=False)),
+        **dict(zip(columns, psnr, strict=True)),
     }
 
 
 def layout(rows: list[Row]) -> str:
-    """A line for each method. OIDN on both has times only."""
+    """A line for each model."""
     head = ["", "seconds", "in 8 bits", *(cell for spp in SPP for cell in (f"PSNR at {spp} spp", "in 8 bits"))]
     columns = [column for column in rows[0] if column != "method"]
-    body = [[r["method"], *(f"{r[c]:.2f}" if c in r else "" for c in columns)] for r in rows]
+    body = [[r["method"], *(f"{r[c]:.2f}" for c in columns)] for r in rows]
     return results.markdown(head, body)
 
 
 def measure(views: list[scenes.Scene], models: list[str]) -> Iterator[Row]:
-    """A row for each method."""
+    """A row for each model."""
     layers = frame(SIZE, SIZE)
-    hrls = encode_features(layers, HRLS_FEATURES, 1.0)
-    both = [OidnDenoiser(exact=exact) for exact in (True, False)]
-    seconds = medians([partial(denoiser.hrls, denoiser_images(hrls)) for denoiser in both])
-    yield row("OIDN on the HRLS", seconds, accuracy(views, 2, [partial(denoised, denoiser) for denoiser in both]))
-    for scale in SCALES[:2]:
-        low = encode_features({RGB: layers[RGB][::scale, ::scale]}, LRHS_FEATURES, 1.0)
-        yield row(f"OIDN on both, x{scale}", medians([partial(denoiser.denoise_mean, low, hrls) for denoiser in both]))
     hr = Render.from_arrays("hr", **layers)
     for name in models:
-        sessions = [in_32_bits(name), Session(find_model(0, name))]
+        path = find_model(0, name)
+        sessions = [InTorch(path), Session(path)]
         scale = sessions[0].contract.scale
         lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
         seconds = medians([partial(fuse, lr, hr, session) for session in sessions])
@@ -142,9 +118,7 @@ def measure(views: list[scenes.Scene], models: list[str]) -> Iterator[Row]:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path)
-    parser.add_argument(
-        "--models", nargs="+", default=[f"{family}-x{scale}" for family in ("mix", "joint") for scale in SCALES]
-    )
+    parser.add_argument("--models", nargs="+", default=[f"joint-x{scale}" for scale in SCALES])
     results.add_option(parser)
     args = parser.parse_args()
     views = [scenes.of_view(view) for view in Folder(args.views).split("validation")[::3]]

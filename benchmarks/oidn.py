@@ -7,6 +7,7 @@ Images are (h, w, 3) and linear. Both functions need pyoidn: ``pip install '.[be
 from __future__ import annotations
 
 import functools
+import math
 from typing import Any
 
 import numpy as np
@@ -29,21 +30,25 @@ def denoise_prefiltered(color: Array, albedo: Array | None = None, normal: Array
     quality "high". See https://github.com/RenderKit/oidn, "prefiltering".
     """
     auxiliary = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
-    clean = {name: _run({name: image}) for name, image in auxiliary.items()}
-    return _run({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
+    clean = {name: run_filter({name: image}) for name, image in auxiliary.items()}
+    return run_filter({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
 
 
-def _run(images: dict[str, Array], **flags: bool) -> Array:
-    """The output of one OIDN filter. It denoises the color, or the only image that it gets."""
+def run_filter(images: dict[str, Array], *, input_scale: float = math.nan, **flags: bool) -> Array:
+    """The output of one OIDN filter. It denoises the color, or the only image that it gets.
+
+    Args:
+        input_scale: brings the color to OIDN's range; OIDN finds it if it is not a number.
+        flags: parameters of OIDN's filter.
+    """
     import pyoidn
 
     images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
     output = np.empty_like(next(iter(images.values())))
-    oidn_filter = _filter(tuple(images))
+    oidn_filter = _filter(tuple(images), **flags)
     for name, image in {**images, pyoidn.OIDN_IMAGE_OUTPUT: output}.items():
         oidn_filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
-    for flag, value in flags.items():
-        oidn_filter.set_bool(flag, value)
+    oidn_filter.set_float("inputScale", input_scale)
     oidn_filter.commit()
     oidn_filter.execute()
     if error := _device().get_error():
@@ -52,12 +57,14 @@ def _run(images: dict[str, Array], **flags: bool) -> Array:
 
 
 @functools.cache
-def _filter(inputs: tuple[str, ...]) -> Any:
+def _filter(inputs: tuple[str, ...], **flags: bool) -> Any:
     """A filter for these inputs. It is used again for the next picture, as in pyoidn's plain call."""
     import pyoidn
 
     oidn_filter = pyoidn.Filter(_device(), pyoidn.OIDN_FILTER_TYPE_RT)
     oidn_filter.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+    for flag, value in flags.items():
+        oidn_filter.set_bool(flag, value)
     return oidn_filter
 
 

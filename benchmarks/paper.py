@@ -53,9 +53,7 @@ def title(method: str) -> str:
 def comparison(rows: list[Row], paper: dict[str, tuple[Any, ...]], averages: tuple[int, ...]) -> str:
     """PSNR and RelMSE by average spp, and the paper's own."""
     means = results.index((row for row in rows if row["scene"] == MEAN), "spp", "method")
-    models = sorted(
-        {row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid-", "mix-", "joint-"))}
-    )
+    models = sorted({row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid-", "joint-"))})
     body = []
     for method in [
         "full resolution",

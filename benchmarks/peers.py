@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.oidn import denoise, denoise_prefiltered
+from benchmarks.oidn import denoise, denoise_prefiltered, run_filter
 from benchmarks.scenes import beauty
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.arrays import Array, box_downsample, repair
@@ -13,8 +13,7 @@ from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.tile_features import read_features
 from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
-from oiio_msspl.model.oidn import OidnDenoiser
-from oiio_msspl.model.render_mean import useful_lrhs_aovs
+from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders, useful_lrhs_aovs
 
 
 def oidn(source: ReadableRender, quality: str = "high") -> Array:
@@ -36,15 +35,25 @@ def _inputs(source: ReadableRender) -> dict[str, Array]:
 
 
 def oidn_on_average(lrhs: ReadableRender, hrls: ReadableRender) -> Array:
-    """OIDN on the weighted mean of both renders at the LRHS's resolution, in 32 bits; linear (h / s, w / s, 3)."""
+    """OIDN on the weighted mean of both renders at the LRHS's resolution; linear (h / s, w / s, 3).
+
+    Albedo and normal are means of many pixels and have hardly any noise, so ``cleanAux`` is set. At x2 they are means
+    of four, so the albedo is prefiltered.
+    """
     low = beauty(lrhs)
     exposure = find_exposure(low)
     layers = read_features(hrls, hrls.data_window, hrls.data_window)
     packed = encode_features(layers, HRLS_FEATURES, exposure)
-    names = useful_lrhs_aovs(packed.shape[0] // low.shape[0])
+    scale = packed.shape[0] // low.shape[0]
+    names = useful_lrhs_aovs(scale)
     lrhs_aovs = read_features(lrhs, lrhs.data_window, lrhs.data_window, features=names) if names else {}
-    denoised = OidnDenoiser(exact=True).denoise_mean(encode_radiance(low, exposure), packed, lrhs_aovs)
-    return decode_radiance(denoised, exposure)
+    mean = mean_of_renders(encode_radiance(low, exposure), denoiser_images(packed), lrhs_aovs)
+    auxiliary = {name: mean[name] for name in ("albedo", "normal") if name in layers and "albedo" in layers}
+    if scale == 2 and auxiliary:
+        auxiliary["albedo"] = run_filter({"albedo": auxiliary["albedo"]})
+    return run_filter(
+        {"color": decode_radiance(mean["colour"], exposure), **auxiliary}, hdr=True, cleanAux=bool(auxiliary)
+    )
 
 
 def match_local_means(image: Array, low: Array) -> Array:

@@ -26,7 +26,7 @@ from benchmarks.stability import report as stability_report
 from oiio_msspl.model.contract import SCALES
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "pyramid", "mix", "joint")
+FAMILIES = ("paper", "pyramid", "joint")
 #: Methods of :mod:`benchmarks.quality` that most tables compare the models with.
 PEERS = (
     "OIDN on the HRLS",
@@ -41,8 +41,8 @@ WHEN_IT_PAYS = {
     "HRLS": ("HRLS alone", "HRLS"),
     "paper-x2": ("`paper-x2`", "LRHS and HRLS"),
     "pyramid-x4": ("`pyramid-x4`", "LRHS and HRLS"),
-    "joint-x2": ("`joint-x2`", "LRHS and HRLS, pyoidn"),
-    "joint-x4": ("`joint-x4`", "LRHS and HRLS, pyoidn"),
+    "joint-x2": ("`joint-x2`", "LRHS and HRLS"),
+    "joint-x4": ("`joint-x4`", "LRHS and HRLS"),
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
@@ -97,7 +97,7 @@ def filters() -> str:
     tables = {"box": results.read("quality_box"), "Blackman-Harris": results.read("quality_blackman_harris")}
     means = {name: means_of(rows) for name, rows in tables.items()}
     names = [*PEERS, *models(SCALES[:2], FAMILIES[1:])]
-    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("mix", "joint")) for a, b in quality.UNEVEN]
+    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("joint",)) for a, b in quality.UNEVEN]
     head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in tables for spp in quality.AVERAGES)]
     cases = [(name, spp) for name in tables for spp in quality.AVERAGES]
     body = _measured(

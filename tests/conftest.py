@@ -10,8 +10,6 @@ import OpenEXR
 import pytest
 
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
-from oiio_msspl.model.oidn import quantised_networks_work
-from oiio_msspl.model.oidn_weights import find_weights
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -133,20 +131,3 @@ def bilinear_models(tmp_path_factory):
         made[scale] = folder / f"bilinear-x{scale}.onnx"
         onnx.save(model, made[scale])
     return made
-
-
-@pytest.fixture
-def quantised_networks():
-    """Skip where 8-bit networks cannot run: pyoidn is missing, or the processor has no VNNI instructions."""
-    if not quantised_networks_work():
-        pytest.skip("8-bit networks do not run here")
-
-
-@pytest.fixture
-def forget_pyoidn():
-    """Clear what is cached about the installed pyoidn, before and after."""
-    for known in (find_weights, quantised_networks_work):
-        known.cache_clear()
-    yield
-    for known in (find_weights, quantised_networks_work):
-        known.cache_clear()

@@ -45,7 +45,7 @@ def mean(states: list[State], kernels: list[int] | None = None, initial: tuple[f
         if kernels and "own_size" in state["config"]:
             checkpoints.crop_kernels(state["ema"], state["config"]["own_size"], kernels)
             state["config"]["own_size"] = kernels
-    if any((state["config"], state["denoiser"]) != (last["config"], last["denoiser"]) for state in states):
+    if any((state["architecture"], state["config"]) != (last["architecture"], last["config"]) for state in states):
         raise SystemExit("these checkpoints are of different networks")
     if any(initial) and last["architecture"] != "joint":
         raise SystemExit("--initial: only a joint network has an initial state worth averaging with")

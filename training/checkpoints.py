@@ -6,7 +6,7 @@ A checkpoint is a dictionary that ``torch.save`` wrote:
 * ``architecture`` and ``config``: the network's name and its constructor's arguments;
 * ``ema``: the averaged weights, which are exported;
 * ``network`` and ``optimizer``: the state of the run, if it is to continue;
-* ``denoiser``, ``training_spp``, ``provenance``: for the exported model's contract.
+* ``training_spp``, ``provenance``: for the exported model's contract.
 """
 
 from __future__ import annotations

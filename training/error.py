@@ -62,7 +62,7 @@ def main() -> None:
         raise SystemExit(f"{args.checkpoint}: the paper's network does not predict its error")
     network.reset_error()
     scales = [int(scale) for scale in state["training_spp"]]
-    loss = fit(network, args.data, scales, preparation(state["architecture"], args.threads), args.steps)
+    loss = fit(network, args.data, scales, preparation(state["architecture"]), args.steps)
     state["ema"] = network.state_dict()
     state["provenance"]["error_steps"] = args.steps
     checkpoints.save(state, args.checkpoint)

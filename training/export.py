@@ -31,13 +31,13 @@ from torch.utils._pytree import tree_map
 
 from datagen.views import Folder, View
 from oiio_msspl.aovs.features import channel_names
-from oiio_msspl.model.contract import METADATA_KEY, Contract, network_inputs
-from oiio_msspl.model.oidn_weights import require_weights
+from oiio_msspl.model.contract import METADATA_KEY, NO_DENOISER, Contract, network_inputs
+from oiio_msspl.model.mean_denoiser import ALIGNMENT
 from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
 from training.joint import JointFusion
-from training.networks import Network, run
-from training.oidn import BASE_HDR
+from training.networks import DENOISERS, Network, run
+from training.oidn import BASE_HDR, provenance
 from training.paper import MultiResolutionFusion
 from training.quantise import joint, static
 from training.validation import ValidationPair
@@ -46,7 +46,7 @@ from training.validation import ValidationPair
 OPSET, IR_VERSION = 18, 8
 
 #: Memory of a tile in bytes per HRLS pixel, measured with ``benchmarks.runtime`` and rounded up: of the network, and of
-#: the network with Open Image Denoise, which keeps its buffers.
+#: the network and the denoiser before it, which keeps its buffers.
 MEMORY, MEMORY_WITH_DENOISER = 1000, 1900
 
 #: Smaller tensors, such as biases, stay float32.
@@ -55,21 +55,23 @@ HALF_ELEMENTS = 256
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """The contract of a checkpoint's network for one of its scales."""
-    denoiser = state.get("denoiser") or ""
+    denoiser = DENOISERS.get(state["architecture"], NO_DENOISER)
     lrhs, hrls = network_inputs(denoiser)
+    # Tiles begin on the grid of the denoiser's lowest level, too, so that it divides a tile as it divides the frame.
+    alignment = ALIGNMENT if denoiser else network.multiple // scale
     return Contract(
         lrhs=channel_names(lrhs),
         hrls=channel_names(hrls),
         denoiser=denoiser,
-        weights=BASE_HDR if isinstance(network, JointFusion) else "",
         bytes_per_pixel=MEMORY_WITH_DENOISER if denoiser else MEMORY,
         name=name,
         scale=scale,
-        alignment=network.multiple // scale,
+        alignment=alignment,
         overlap=overlap,
         training_spp=state["training_spp"][str(scale)],
         provenance=state["provenance"]
-        | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()},
+        | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()}
+        | (provenance(BASE_HDR) if isinstance(network, JointFusion) else {}),
     )
 
 
@@ -228,7 +230,7 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
 
 def parity(network: Network, scale: int, path: Path) -> float:
     """Largest difference of an exported file's output from the network's, log-encoded."""
-    session = _loaded(path)
+    session = load_network(path)
     block = network.multiple // scale
     block *= -(-6 // block)  # at least six pixels
     worst = 0.0
@@ -277,11 +279,6 @@ def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int 
     return image[..., part, part]
 
 
-def _loaded(path: Path) -> onnxruntime.InferenceSession:
-    weights = Contract.of_file(path).weights
-    return load_network(path, initializers=require_weights(weights) if weights else None)
-
-
 def _check_casts(path: Path) -> None:
     """Refuse a file whose weights ONNX Runtime would cast in every run."""
     options = onnxruntime.SessionOptions()
@@ -300,12 +297,10 @@ def _check_casts(path: Path) -> None:
 
 def describe(network: Network, scale: int, path: Path) -> None:
     """Print the operators of a file, and how long ONNX Runtime takes."""
-    model = onnx.load(path, load_external_data=False)
+    model = onnx.load(path)
     counts = collections.Counter(node.op_type for node in model.graph.node)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
-    if not Contract.of_file(path).weights:
-        _check_casts(path)
-    session = _loaded(path)
+    session = load_network(path)
     lrhs, hrls = (image.numpy() for image in example(network, scale, 64, 64))
     seconds = min(timeit.repeat(lambda: session.run(None, {"lrhs": lrhs, "hrls": hrls}), number=1, repeat=3))
     print(f"64x64 LRHS pixels: {seconds:.2f} s")
@@ -348,6 +343,8 @@ def main() -> None:
             if args.int8:
                 model = static.quantise(model, contract, args.int8)
         onnx.save(model, args.output)
+        if args.half:
+            _check_casts(args.output)
         describe(network, scale, args.output)
         print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")
 

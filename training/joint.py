@@ -4,7 +4,7 @@
 At H the U-Net reads the HRLS's colour, albedo and normal, as in Open Image Denoise (OIDN). At H/2 it also reads LRHS
 and the denoised mean of both renders at the LRHS's resolution (:mod:`training.mean_denoiser`). Their weights start at
 zero, so that training starts from OIDN. All weights are trained. Heads predict the logits with which
-:func:`training.mix.blend` blends the result with both renders.
+:func:`training.blend.blend` blends the result with both renders.
 
 The parameters are differences from OIDN's weights, so weight decay pulls towards OIDN.
 """
@@ -23,9 +23,9 @@ from torch.nn import functional as F
 from oiio_msspl.arrays import Array
 from oiio_msspl.model.contract import MEAN_DENOISER, network_inputs
 from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
+from training.blend import COARSEST, FINER, blend
 from training.encoding import log_to_pu, pu_to_log
 from training.mean_denoiser import MeanDenoiser
-from training.mix import COARSEST, FINER, blend
 from training.oidn import BASE, BASE_HDR, FineTunedConv, convolutions, pretrained_weights, run_unet_on_tensors
 from training.ops import box_downsample, log2_scale, upsample
 from training.paper import LRHS_CHANNELS
@@ -148,5 +148,5 @@ class JointFusion(nn.Module):
 
 def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
     """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
-    low = mean_of_renders(lrhs, denoiser_images(hrls, complete=True))
+    low = mean_of_renders(lrhs, denoiser_images(hrls))
     return np.concatenate([lrhs, low["colour"], low["noise"]], axis=-1), hrls

@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.arrays import Array
-from oiio_msspl.model.quantised import ALIGNMENT
+from oiio_msspl.model.mean_denoiser import ALIGNMENT
 from oiio_msspl.model.render_mean import Images
 from training.encoding import log_to_pu, pu_to_log
 from training.oidn import LARGE, LARGE_HDR, FineTunedConv, convolutions, pretrained_weights, run_unet_on_tensors

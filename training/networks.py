@@ -5,31 +5,26 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from oiio_msspl.model.contract import MEAN_DENOISER, OIDN
-from oiio_msspl.model.oidn import OidnDenoiser
+from oiio_msspl.model.contract import MEAN_DENOISER
 from training.data import Prepare
 from training.joint import JointFusion, with_mean
-from training.mix import MixFusion
 from training.paper import MultiResolutionFusion
 from training.pyramid import PyramidFusion
 
-Network = MultiResolutionFusion | PyramidFusion | MixFusion | JointFusion
-NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[MixFusion] | type[JointFusion]] = {
+Network = MultiResolutionFusion | PyramidFusion | JointFusion
+NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[JointFusion]] = {
     "paper": MultiResolutionFusion,
     "pyramid": PyramidFusion,
-    "mix": MixFusion,
     "joint": JointFusion,
 }
 
 #: The denoising that precedes a network, see :func:`oiio_msspl.model.session.make_denoiser`.
-DENOISERS = {"mix": OIDN, "joint": MEAN_DENOISER}
+DENOISERS = {"joint": MEAN_DENOISER}
 
 
-def preparation(architecture: str, threads: int) -> Prepare | None:
+def preparation(architecture: str) -> Prepare | None:
     """The function that adds a network's further input channels to a pair; None if it has none."""
-    if architecture == "joint":
-        return with_mean
-    return OidnDenoiser(threads) if architecture == "mix" else None
+    return with_mean if architecture == "joint" else None
 
 
 def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:

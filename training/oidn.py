@@ -16,22 +16,27 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.model.oidn_weights import require_weights
+from training.oidn_weights import require_weights
 from training.ops import upsample
 
-#: Open Image Denoise's names of its networks, see :data:`oiio_msspl.model.oidn_weights.NETWORKS`.
-BASE_HDR, LARGE_HDR, BASE_ALBEDO = "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large", "rt_alb"
+#: Open Image Denoise's names of its networks, see :data:`training.oidn_weights.NETWORKS`.
+BASE_HDR, LARGE_HDR = "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large"
 
 Weights = Mapping[str, Tensor]
 
 
 def pretrained_weights(network: str) -> dict[str, Tensor]:
-    """Weights of one of :data:`oiio_msspl.model.oidn_weights.NETWORKS`, by Open Image Denoise's names.
+    """Weights of one of :data:`training.oidn_weights.NETWORKS`, by Open Image Denoise's names.
 
     Raises:
         InputError: pyoidn is not installed, or has other weights.
     """
     return {name: torch.from_numpy(values.astype(np.float32)) for name, values in require_weights(network).items()}
+
+
+def provenance(network: str) -> dict[str, str]:
+    """What a model's file says about the weights that its training began from."""
+    return {"initial_weights": f"Open Image Denoise 2.5.1, {network} (Apache-2.0)"}
 
 
 def convolutions(weights: Weights) -> list[str]:

@@ -64,7 +64,7 @@ class PyramidFusion(Trunk):
     """
 
     def __init__(self, channels: Sequence[int] = PYRAMID_CHANNELS, own_size: Sequence[int] = (5, 5, 5, 5, 5)) -> None:
-        super().__init__(channels, "", stem_size=6, refined=True)
+        super().__init__(channels)
         self.config = {"channels": list(channels), "own_size": list(own_size)}
         self.own_size = own_size
 

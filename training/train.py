@@ -32,10 +32,8 @@ from datagen.views import Folder
 from training import checkpoints, losses
 from training.data import PAPER_PATCH, PAPER_SAMPLING, Batches, Sampling, spp_range
 from training.joint import JointFusion
-from training.mix import MIX_CHANNELS, MixFusion, blend, distillation_loss
-from training.networks import DENOISERS, NETWORKS, Network, preparation, run
-from training.ops import log2_scale
-from training.paper import HRLS_CHANNELS, MultiResolutionFusion
+from training.networks import NETWORKS, Network, preparation, run
+from training.paper import MultiResolutionFusion
 from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion
 from training.validation import ValidationPair, evaluate
 
@@ -46,8 +44,6 @@ log = logging.getLogger(__name__)
 SPIKE = 4.0
 #: A run that falls this many dB behind its best checkpoint returns to it, with half the learning rate.
 COLLAPSE = 2.0
-#: Weight of the distillation loss, about that of the loss itself at the start of training.
-DISTILLATION = 0.1
 #: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
 WARM_UP, FINAL = 0.03, 0.01
 #: Largest decay of the averaged weights.
@@ -126,20 +122,6 @@ def averaged(network: Network) -> AveragedModel:
     return average
 
 
-def fuse_and_distil(
-    network: Network, teacher: MixFusion | None, lrhs: Tensor, hrls: Tensor
-) -> tuple[Tensor, Tensor | float]:
-    """The fused image, and the weighted distillation loss, 0 without a teacher."""
-    if teacher is None:
-        return run(network, lrhs, hrls)[0], 0.0
-    assert isinstance(network, MixFusion)
-    logits, _ = network.predict_logits(lrhs, hrls)
-    with torch.no_grad():
-        wanted, _ = teacher.predict_logits(lrhs, hrls)
-    fused = blend(lrhs, hrls, hrls[:, HRLS_CHANNELS:], logits)
-    return fused, DISTILLATION * distillation_loss(logits, wanted, log2_scale(lrhs, hrls))
-
-
 # The run
 
 
@@ -147,8 +129,6 @@ def new_network(args: argparse.Namespace) -> Network:
     """An untrained network, as the command line describes it."""
     if args.network == "pyramid":
         return PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels)
-    if args.network == "mix":
-        return MixFusion(args.channels or MIX_CHANNELS, args.stem)
     if args.network == "joint":
         started = args.out / "checkpoint.pt"
         earlier = started if started.exists() else args.init
@@ -156,16 +136,6 @@ def new_network(args: argparse.Namespace) -> Network:
     if len(args.scale) > 1:
         raise SystemExit("--network paper: a network has one --scale")
     return MultiResolutionFusion(args.scale[0])
-
-
-def load_teacher(args: argparse.Namespace, device: torch.device) -> MixFusion | None:
-    """The network of ``--teacher``."""
-    if not args.teacher:
-        return None
-    teacher, _ = checkpoints.load(args.teacher)
-    if args.network != "mix" or not isinstance(teacher, MixFusion):
-        raise SystemExit("--teacher: works only if both networks are mix networks")
-    return teacher.to(device, memory_format=torch.channels_last).requires_grad_(False)
 
 
 def parameter_groups(network: Network, args: argparse.Namespace, peak_lr: float) -> list[dict[str, Any]]:
@@ -207,7 +177,6 @@ class Run:
 
         # Network: from the last checkpoint, from another run, or new
         self.network = new_network(args)
-        self.teacher = load_teacher(args, self.device)
         state = checkpoints.read(self.checkpoint_path) if self.checkpoint_path.exists() else None
         if state is None and args.init:
             checkpoints.warm_start(self.network, args.init)
@@ -224,7 +193,7 @@ class Run:
         self.schedule = self.new_schedule()
         self.pairs = Batches(
             args.data, self.scales, self.patch, self.batch, self.recipe.sampling, args.seed + self.step, self.device,
-            functools.partial(preparation, args.network, args.threads),
+            functools.partial(preparation, args.network),
         )  # fmt: skip
         self.reset_statistics()
 
@@ -278,8 +247,8 @@ class Run:
         pair = next(batches)
         self.since["waited"] += time.monotonic() - before
         with torch.autocast(self.device.type, torch.bfloat16, enabled=self.args.precision == "bf16"):
-            output, loss = fuse_and_distil(self.network, self.teacher, pair["lrhs"], pair["hrls"])
-        loss = loss + losses.LOSSES[self.loss_name](output.float(), pair["target"])
+            output, _ = run(self.network, pair["lrhs"], pair["hrls"])
+        loss = losses.LOSSES[self.loss_name](output.float(), pair["target"])
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
         learning = [parameter for group in self.optimizer.param_groups for parameter in group["params"]]
@@ -319,7 +288,7 @@ class Run:
     def evaluate(self) -> dict[str, float]:
         """Scores of the averaged weights on the validation views of the run's start."""
         if not self.validation:  # views that are added later would make scores incomparable
-            prepare = preparation(self.args.network, self.args.threads)
+            prepare = preparation(self.args.network)
             for view in self.folder.split("validation")[: self.args.val_views]:
                 for scale in self.scales:
                     pair = ValidationPair.centre(view, scale, self.args.val_patch, prepare)
@@ -354,7 +323,6 @@ class Run:
             "optimizer": self.optimizer.state_dict(),
             "architecture": self.args.network,
             "config": self.network.config,
-            "denoiser": DENOISERS.get(self.args.network, ""),
             "step": self.step,
             "seconds": self.elapsed,
             "best_gain": self.best_gain,
@@ -414,7 +382,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         nargs="+",
         help="channels at H/2, H/4, ... (default: those of the shipped network)",
     )
-    parser.add_argument("--stem", type=int, default=2, help="mix: kernel size of the first convolution over the HRLS")
     parser.add_argument(
         "--kernels",
         type=int,
@@ -425,7 +392,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     )
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
-    parser.add_argument("--teacher", type=Path, help="mix: checkpoint of a larger mix network to distil")
     parser.add_argument("--only", default="", help="train only the part of the network with this name, such as heads")
     parser.add_argument("--batch", type=int, help="(default: the preset's)")
     parser.add_argument("--patch", type=int, help="width in HRLS pixels (default: the preset's)")

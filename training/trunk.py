@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The U-Net that reads both renders, on which the kernel-predicting and the mixing network build."""
+"""The U-Net of the kernel-predicting network."""
 
 from __future__ import annotations
 
@@ -11,31 +11,31 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.model.contract import network_inputs
+from oiio_msspl.model.contract import NO_DENOISER, network_inputs
 from training.encoding import log_encode
 from training.ops import Pyramid, conv3x3, upsample
 
+#: Kernel size of the first convolution over the HRLS.
+STEM_SIZE = 6
+
 
 class Trunk(nn.Module):
-    """U-Net that reads both renders and returns features from H/2 down. Subclasses add heads.
+    """U-Net that reads both renders and returns features from H/2 down. The subclass adds heads.
 
     Sizes must be multiples of ``multiple`` HRLS pixels.
 
     Args:
         channels: of the levels H/2, H/4, H/8, ...
-        denoiser: its results are appended to the inputs, see :func:`oiio_msspl.model.contract.network_inputs`.
-        stem_size: kernel size of the first convolution over the HRLS; even.
-        refined: whether level H/2 ends with a convolution, as the coarser levels do.
     """
 
-    def __init__(self, channels: Sequence[int], denoiser: str, stem_size: int, refined: bool) -> None:
+    def __init__(self, channels: Sequence[int]) -> None:
         super().__init__()
         self.multiple = 2 ** len(channels)
         finest, *coarser = channels
 
         # Down: H/2 reads every pixel of the HRLS; each coarser level also reads the downsampled colours of both renders
-        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in network_inputs(denoiser))
-        self.stem = nn.Conv2d(self.hrls_channels, finest, stem_size, stride=2, padding=stem_size // 2 - 1)
+        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in network_inputs(NO_DENOISER))
+        self.stem = nn.Conv2d(self.hrls_channels, finest, STEM_SIZE, stride=2, padding=STEM_SIZE // 2 - 1)
         self.stem_low = conv3x3(self.lrhs_channels, finest)
         self.down = nn.ModuleList(nn.Conv2d(above, here, 3, stride=2, padding=1) for above, here in pairwise(channels))
         self.mix = nn.ModuleList(conv3x3(here + 3 + self.lrhs_channels, here) for here in coarser)
@@ -44,8 +44,6 @@ class Trunk(nn.Module):
         self.skip = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
         self.up = nn.ModuleList(conv3x3(below, here) for here, below in pairwise(channels))
         self.refine = nn.ModuleList(conv3x3(here, here) for here in channels[:-1])
-        if not refined:
-            self.refine[0] = nn.Identity()
         self.error = nn.Conv2d(finest, 4, 1)
 
     @torch.no_grad()

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.model.catalogue import AUTO, WITHOUT_OIDN, find_model
+from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, find_model
 from oiio_msspl.model.session import Session
 
 if TYPE_CHECKING:
@@ -78,8 +78,8 @@ def fuse_frames(
 
     neighbours = _most_workers_on_a_machine(client)
     if stages.model in (None, AUTO):
-        # `auto` depends on what a machine has installed. All frames of a shot need the same model.
-        stages = replace(stages, model=WITHOUT_OIDN)
+        # A worker with another version, which would choose another family, then refuses the frame.
+        stages = replace(stages, model=DEFAULT_FAMILY)
     elif Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))
     find_model(2, stages.model)  # refuses an unknown model before any task is submitted

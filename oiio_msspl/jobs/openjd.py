@@ -18,7 +18,7 @@ from oiio_msspl.exr.atomic import check_folder, replacing
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
 from oiio_msspl.jobs.shot_checks import check_no_input
-from oiio_msspl.model.catalogue import AUTO, WITHOUT_OIDN, find_model, shipped_models
+from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, find_model, shipped_models
 from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.session import PROVIDERS
 
@@ -97,7 +97,8 @@ def make_job(
         check_view(view)
     options = [*(["--device", device] if device != "cpu" else []), *(["--view", view] if view else []), *options]
     files = {"--map-file": map_file} if map_file else {}
-    name = WITHOUT_OIDN if model is None or model == AUTO else model
+    # The job names its model: a worker with another version, which would choose another family, then refuses the frame.
+    name = DEFAULT_FAMILY if model is None or model == AUTO else model
     if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in SCALES)}:
         options += ["--model", name]
     else:

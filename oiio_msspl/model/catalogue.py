@@ -3,19 +3,14 @@
 
 from __future__ import annotations
 
-from importlib.util import find_spec
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.oidn import quantised_networks_work
 
 #: Folder of the models: ``NAME.onnx`` for each.
 WEIGHTS = Path(__file__).parent / "weights"
-#: The name that lets :func:`find_model` choose.
-AUTO = "auto"
-#: Families that ``auto`` chooses from: the best one needs OIDN's weights and a processor that computes 8-bit networks
-#: correctly, the second any pyoidn, the third nothing.
-BEST, WITH_OIDN, WITHOUT_OIDN = "joint", "mix", "pyramid"
+#: The name that lets :func:`find_model` choose, and the family that it chooses.
+AUTO, DEFAULT_FAMILY = "auto", "joint"
 
 
 def shipped_models() -> dict[str, Path]:
@@ -28,15 +23,14 @@ def find_model(scale: int, name: str | None = None) -> Path:
 
     Args:
         scale: 2, 4 or 8.
-        name: ``auto`` or None for the best family that runs here, a family (``paper``), a model (``paper-x4``), or an
-            ONNX file.
+        name: ``auto`` or None for the best family, a family (``paper``), a model (``paper-x4``), or an ONNX file.
 
     Raises:
         InputError: there is no such model.
     """
     models = shipped_models()
     if name in (None, AUTO):
-        name = (BEST if quantised_networks_work() else WITH_OIDN) if find_spec("pyoidn") else WITHOUT_OIDN
+        name = DEFAULT_FAMILY
     for known in (name, f"{name}-x{scale}"):
         if known in models:
             return models[known]

@@ -10,21 +10,23 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, LRHS_FEATURES, NORMAL, RGB, channel_names
 from oiio_msspl.errors import InputError
 from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, MAX_RADIANCE, MU
-from oiio_msspl.model.onnx_metadata import read_metadata
+from oiio_msspl.model.runtime import load_network
+
+if TYPE_CHECKING:
+    import onnxruntime
 
 #: Upsampling factors from the LRHS to the HRLS.
 SCALES = (2, 4, 8)
 
-#: Values of ``Contract.denoiser``, as shipped files spell them: none; OIDN on both renders
-#: (:class:`oiio_msspl.model.oidn.OidnDenoiser`); our denoiser of their mean
+#: Values of ``Contract.denoiser``: none; the denoiser of both renders' mean
 #: (:class:`oiio_msspl.model.mean_denoiser.MeanDenoiser`).
-NO_DENOISER, OIDN, MEAN_DENOISER = "", "high", "together"
-#: Channels of a denoised image, behind a render's own.
+NO_DENOISER, MEAN_DENOISER = "", "mean"
+#: Channels of the denoised mean, behind the LRHS's own.
 DENOISED_FEATURES: dict[str, int] = {"denoised": 3}
 
 #: Key of the contract in the metadata of an ONNX file.
@@ -37,10 +39,7 @@ def network_inputs(denoiser: str) -> tuple[dict[str, int], dict[str, int]]:
     """Features of the two network inputs, LRHS and HRLS, for a value of ``Contract.denoiser``."""
     if denoiser == NO_DENOISER:
         return LRHS_FEATURES, HRLS_FEATURES
-    lrhs = LRHS_FEATURES | DENOISED_FEATURES
-    if denoiser == MEAN_DENOISER:  # the model itself denoises the HRLS, from the features that denoisers read
-        return lrhs, {name: HRLS_FEATURES[name] for name in (RGB, ALBEDO, NORMAL)}
-    return lrhs, HRLS_FEATURES | DENOISED_FEATURES
+    return LRHS_FEATURES | DENOISED_FEATURES, {name: HRLS_FEATURES[name] for name in (RGB, ALBEDO, NORMAL)}
 
 
 def current_transforms() -> dict[str, Any]:
@@ -83,10 +82,7 @@ class Contract:
     defaults: dict[str, float] = field(default_factory=lambda: dict(DEFAULTS))
     """Encoded values of missing features."""
     denoiser: str = NO_DENOISER
-    """What is denoised before the model runs: ``NO_DENOISER``, ``OIDN`` or ``MEAN_DENOISER``."""
-    weights: str = ""
-    """The network of Open Image Denoise that the file stores the difference to, a key of
-    :data:`oiio_msspl.model.oidn_weights.CONTRACT_NAMES`; empty if the file has all weights."""
+    """What is denoised before the model runs: ``NO_DENOISER`` or ``MEAN_DENOISER``."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -105,15 +101,24 @@ class Contract:
 
     @classmethod
     def of_file(cls, path: str | Path) -> Contract:
-        """Read the contract of an ONNX file. The network is not loaded, so what it depends on may be missing.
+        """Read the contract of an ONNX file.
 
         Raises:
             InputError: no such file, no ONNX file, or no contract that fits this version.
         """
-        try:
-            metadata = read_metadata(Path(path))
-        except (OSError, ValueError, IndexError) as error:
-            raise InputError(f"{path}: can't be read as an ONNX file ({error})") from error
+        return cls.of_network(load_network(path, optimise=False), path)
+
+    @classmethod
+    def of_network(cls, network: onnxruntime.InferenceSession, path: str | Path) -> Contract:
+        """Read the contract of a loaded network.
+
+        Args:
+            path: the file that errors name.
+
+        Raises:
+            InputError: no contract that fits this version.
+        """
+        metadata = network.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
             raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m training.export")
         return cls.from_json(metadata[METADATA_KEY], str(path))

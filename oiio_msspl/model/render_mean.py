@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The weighted mean of both renders at the LRHS's resolution: the input of the low-resolution denoisers.
+"""The weighted mean of both renders at the LRHS's resolution: the input of the low-resolution denoiser.
 
 The LRHS and the HRLS are independent samples of one scene. At the LRHS's resolution, the mean of the LRHS and of the
 box-averaged HRLS therefore has less noise than either, and the box-averaged albedo and normal of the HRLS have hardly
@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array, box_downsample, clip
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 
@@ -41,18 +41,13 @@ def useful_lrhs_aovs(scale: int) -> tuple[str, ...]:
     return (ALBEDO, NORMAL) if scale == 2 else ()
 
 
-def denoiser_images(hrls: Array, *, complete: bool = False) -> Images:
-    """Colour, albedo and normal of an encoded HRLS, (h, w, 9 or more).
-
-    Args:
-        complete: keep albedo and normal that are absent, as their default. Open Image Denoise itself must not get
-            these, and takes no normal without an albedo.
-    """
-    colour, normal = {"colour": _feature(hrls, RGB)}, _feature(hrls, NORMAL)
-    albedo = clip(_feature(hrls, ALBEDO), 0.0, 1.0)
-    if complete or normal.any():
-        return colour | {"albedo": albedo, "normal": normal}
-    return colour | ({"albedo": albedo} if (albedo != DEFAULTS[ALBEDO]).any() else {})
+def denoiser_images(hrls: Array) -> Images:
+    """Colour, albedo and normal of an encoded HRLS, (h, w, 9 or more). An absent AOV is its default."""
+    return {
+        "colour": _feature(hrls, RGB),
+        ALBEDO: clip(_feature(hrls, ALBEDO), 0.0, 1.0),
+        NORMAL: _feature(hrls, NORMAL),
+    }
 
 
 def mean_of_renders(lrhs: Array, hrls_images: Images, lrhs_aovs: Images = NO_IMAGES) -> Images:

@@ -12,10 +12,8 @@ import numpy as np
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.model.contract import MEAN_DENOISER, NO_DENOISER, Contract
+from oiio_msspl.model.contract import NO_DENOISER, Contract
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
-from oiio_msspl.model.oidn import OidnDenoiser, quantised_networks_work
-from oiio_msspl.model.oidn_weights import require_weights
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, useful_lrhs_aovs
 from oiio_msspl.model.runtime import CPU, available_providers, load_network, runtime_version
 
@@ -38,11 +36,9 @@ def usable_devices() -> list[str]:
     return [device for device, provider in PROVIDERS.items() if provider in available]
 
 
-def make_denoiser(mode: str, threads: int, *, exact: bool = False) -> OidnDenoiser | MeanDenoiser | None:
+def make_denoiser(mode: str, threads: int = 0) -> MeanDenoiser | None:
     """The denoiser that runs before a model, for its contract's ``denoiser``."""
-    if mode == NO_DENOISER:
-        return None
-    return MeanDenoiser(threads) if mode == MEAN_DENOISER else OidnDenoiser(threads, exact=exact)
+    return None if mode == NO_DENOISER else MeanDenoiser(threads)
 
 
 class Session:
@@ -51,15 +47,13 @@ class Session:
     Args:
         path: an ONNX file with a contract.
         device: a key of ``PROVIDERS``.
-        threads: CPU threads of ONNX Runtime, Open Image Denoise and NumPy alike; 0 for one a core.
-        exact: let Open Image Denoise run in 32 bits. The model's own 8-bit convolutions stay as they are.
+        threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
 
     Raises:
-        InputError: no model, no contract, a device that this onnxruntime was not built for, or a model that needs
-            Open Image Denoise where it is not installed or has other weights.
+        InputError: no model, no contract, or a device that this onnxruntime was not built for.
     """
 
-    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, exact: bool = False) -> None:
+    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
         if device not in PROVIDERS:
             raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
         if device not in usable_devices():
@@ -68,17 +62,9 @@ class Session:
                 f"usable here: {', '.join(usable_devices())}"
             )
         providers = list(dict.fromkeys([PROVIDERS[device], CPU]))
-        self.contract = Contract.of_file(path)
-        weights = None
-        if self.contract.weights:
-            weights = require_weights(self.contract.weights)
-            if not quantised_networks_work():
-                raise InputError(
-                    f"model {self.contract.name} computes in 8 bits, which this processor does wrongly (no VNNI); "
-                    "choose another --model"
-                )
-        self._session = load_network(path, threads, providers, weights)
-        self._denoiser = make_denoiser(self.contract.denoiser, threads, exact=exact)
+        self._session = load_network(path, threads, providers)
+        self.contract = Contract.of_network(self._session, path)
+        self._denoiser = make_denoiser(self.contract.denoiser, threads)
         self._outputs = [output.name for output in self._session.get_outputs()]
         self.path = Path(path)
         self.threads = threads
@@ -123,8 +109,7 @@ class Session:
             if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
                 self._denoiser.fill(lrhs, hrls, lrhs_aovs)
             else:
-                lrhs, hrls = self._denoiser(lrhs, hrls, lrhs_aovs)
-                hrls = hrls[..., : len(self.contract.hrls)]
+                lrhs, hrls = self._denoiser(lrhs, hrls[..., : len(self.contract.hrls)], lrhs_aovs)
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),

@@ -16,7 +16,7 @@ from tests.shots import make_shot
         (["lr", "hr", "-o", "out", "--json"], "--json has no meaning in a job"),
         (["lr", "hr", "-o", "out", "--layout", "x"], "--layout 'x': use one of"),
         (["lr", "hr", "-o", "out", "--model", "x"], "no model 'x'"),
-        (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: can't be read as an ONNX file"),
+        (["lr", "hr", "-o", "out", "--model", "text.onnx"], "text.onnx: onnxruntime can't load it"),
         (["lr", "hr", "-o", "out", "--device", "abacus"], "--device 'abacus': use one of cpu"),
         (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
         (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
@@ -41,7 +41,7 @@ def test_what_no_task_could_do_is_said_at_submission(tmp_path, monkeypatch, argu
 
 
 @pytest.mark.parametrize(
-    ("given", "model"), [([], "pyramid"), (["--model", "auto"], "pyramid"), (["--model", "paper-x4"], "paper-x4")]
+    ("given", "model"), [([], "joint"), (["--model", "auto"], "joint"), (["--model", "paper-x4"], "paper-x4")]
 )
 def test_a_shipped_model_goes_by_its_name_and_is_the_same_for_all_tasks(tmp_path, given, model):
     make_shot(tmp_path, 1)

@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from oiio_msspl.arrays import box_downsample
-from oiio_msspl.model.contract import Contract
-from oiio_msspl.model.encoding import encode_radiance
+from oiio_msspl.model.contract import MEAN_DENOISER, Contract
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.mean_denoiser import MeanDenoiser as QuantisedMeanDenoiser
-from oiio_msspl.model.oidn import OidnDenoiser
 from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
+from oiio_msspl.model.runtime import load_network
 from tests.conftest import noisy, picture
 
 pytest.importorskip("pyoidn")
@@ -21,11 +21,11 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 
-from tests.training.test_quantise import needs_exact_eight_bits  # noqa: E402
+from benchmarks.oidn import run_filter  # noqa: E402
 from training import average, checkpoints, export, prune  # noqa: E402
 from training.joint import JointFusion, with_mean  # noqa: E402
 from training.mean_denoiser import FROZEN, MeanDenoiser  # noqa: E402
-from training.oidn import BASE, BASE_HDR  # noqa: E402
+from training.oidn import BASE  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT  # noqa: E402
 
 
@@ -42,6 +42,20 @@ def pairs(scale, prepare, count=2, size=64):
     return result
 
 
+def open_image_denoise(images, **flags):
+    """OIDN on encoded images, with their exposure: log-encoded (h, w, 3)."""
+    colour = decode_radiance(images["colour"], 1.0)
+    return encode_radiance(
+        run_filter(
+            {"color": colour, "albedo": images["albedo"], "normal": images["normal"]},
+            hdr=True,
+            input_scale=1.0,
+            **flags,
+        ),
+        1.0,
+    )
+
+
 def test_a_new_network_is_open_image_denoise():
     network = JointFusion().eval()
     for head in network.heads:  # blend with the U-Net's result only
@@ -50,26 +64,28 @@ def test_a_new_network_is_open_image_denoise():
     ((lrhs, hrls),) = pairs(2, QuantisedMeanDenoiser(threads=1), count=1)
     with torch.inference_mode():
         fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
-    expected = OidnDenoiser(threads=1, exact=True).hrls(denoiser_images(hrls[0].permute(1, 2, 0).numpy()))
+    expected = open_image_denoise(denoiser_images(hrls[0].permute(1, 2, 0).numpy()))
     assert np.abs(fused - expected).mean() < 1e-3
     assert not any(parameter.any() for parameter in network.differences())
 
 
 @pytest.mark.parametrize("scale", [2, 8])
 def test_the_graph_computes_what_the_network_does(scale, tmp_path):
-    """With random differences and pruned channels. The contract names the external weights."""
+    """With random differences and pruned channels."""
     torch.manual_seed(0)
     ups = [name for level in BASE.up for name in level]
     network = JointFusion(kept={name: list(range(i, 16 + i)) for i, name in enumerate(ups)}).eval()
     for name, parameter in network.named_parameters():
         parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
-    state = {"denoiser": "together", "architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
+    state = {"architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
     contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
     drawn = pairs(scale, QuantisedMeanDenoiser(threads=1))
     path = tmp_path / "joint.onnx"
     onnx.save(export.joint_to_onnx(network, contract, drawn), path)
-    assert Contract.of_file(path).weights == BASE_HDR
-    model = export._loaded(path)
+    contract = Contract.of_file(path)
+    assert (contract.denoiser, contract.alignment) == (MEAN_DENOISER, 16)
+    assert "Open Image Denoise" in contract.provenance["initial_weights"]
+    model = load_network(path)
     for lrhs, hrls in drawn:
         fused, log_error = model.run(["fused", "log_error"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
         with torch.inference_mode():
@@ -102,7 +118,7 @@ def test_the_mean_may_include_the_initial_state():
     bias = network.heads[0].bias.detach().clone()
     for parameter in network.parameters():
         parameter.data += 0.5
-    state = {"architecture": "joint", "config": network.config, "ema": network.state_dict(), "denoiser": "together"}
+    state = {"architecture": "joint", "config": network.config, "ema": network.state_dict()}
     mean = average.mean([state | {"provenance": {}}], initial=(0.25, 0.75))
     assert mean["provenance"] == {"share_of_initial_state": [0.25, 0.75]}
     assert (mean["ema"]["convs.enc_conv0.weight"] == 0.375).all()
@@ -110,26 +126,25 @@ def test_the_mean_may_include_the_initial_state():
     torch.testing.assert_close(mean["ema"]["heads.0.bias"].float(), bias + 0.375)
     torch.testing.assert_close(mean["ema"]["error.bias"], network.error.bias.half())
     with pytest.raises(SystemExit, match="only a joint network"):
-        average.mean([state | {"architecture": "mix", "config": {}, "provenance": {}}], initial=(0.25, 0))
+        average.mean([state | {"architecture": "paper", "config": {}, "provenance": {}}], initial=(0.25, 0))
 
 
 def test_a_new_mean_denoiser_is_open_image_denoise():
     """The weights of the estimated noise start at zero."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=96)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
-    layers = mean_of_renders(low, denoiser_images(high, complete=True))
+    layers = mean_of_renders(low, denoiser_images(high))
     found = MeanDenoiser().eval().denoise(layers)
     del layers["noise"]
-    expected = OidnDenoiser(threads=1, exact=True).mean(layers)
+    expected = open_image_denoise(layers, cleanAux=True)
     assert np.abs(found - expected).mean() < 1e-3
 
 
-@needs_exact_eight_bits
 def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint():
     """To a tenth of the noise, also for sides that are no multiple of 16."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
-    layers = mean_of_renders(low, denoiser_images(high, complete=True))
+    layers = mean_of_renders(low, denoiser_images(high))
     expected = checkpoints.load_mean_denoiser(CHECKPOINT).denoise(layers)
     found = QuantisedMeanDenoiser(threads=1)(low, high)[0][..., 3:]
     assert np.abs(found - expected).mean() < 0.1 * np.abs(layers["colour"] - expected).mean()

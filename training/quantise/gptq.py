@@ -12,7 +12,7 @@ row compensate for the error (Frantar et al. 2023, "GPTQ", after Hassibi and Sto
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence, Set
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -20,15 +20,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from oiio_msspl.model.quantised import ALBEDO_SLICES, COLOUR_SLICES, OUTPUT_SLICES
-from oiio_msspl.model.quantised import quantise as quantise_images
+from oiio_msspl.model.mean_denoiser import INPUT_SLICES, OUTPUT_SLICES
+from oiio_msspl.model.mean_denoiser import quantise as quantise_images
 from oiio_msspl.model.render_mean import Images
-from training.oidn import BASE, BASE_ALBEDO, BASE_HDR, LARGE, LARGE_HDR, Shape, Weights, convolutions, run_unet
+from training.oidn import LARGE, Shape, Weights, run_unet
 from training.ops import upsample
-
-#: The package's name of the fine-tuned denoiser of both renders' mean (:mod:`training.mean_denoiser`).
-MEAN_DENOISER = "mean_denoiser"
-SHAPES = {BASE_HDR: BASE, BASE_ALBEDO: BASE, LARGE_HDR: LARGE, MEAN_DENOISER: LARGE}
 
 #: Pixels of each image that a layer's weights are fitted to.
 PIXELS = 4000
@@ -104,49 +100,23 @@ class QuantisedConv:
         return in_codes.round_().clamp_(0, 255)
 
 
-# The inputs of Open Image Denoise's networks
+# The inputs of the denoiser of both renders' mean
 
 
 def quantise_inputs(images: Sequence[Images]) -> Activations:
     """The inputs of a network as codes, and the values that the codes stand for."""
-    layout = input_layout(set(images[0]))
+    layout = input_layout()
     codes = [torch.from_numpy(quantise_images(**layers)).permute(2, 0, 1).float() for layers in images]
     return Activations([layout.dequantise(image)[None] for image in codes], [image[None] for image in codes], layout)
 
 
-def input_layout(layers: Set[str]) -> CodeLayout:
-    """The layout in which :func:`oiio_msspl.model.quantised.quantise` stores an albedo, or a colour and its AOVs."""
-    slices, whole = (COLOUR_SLICES, 6) if "colour" in layers else (ALBEDO_SLICES, 0)
-    last = (1 / 255, 3 + whole) if "noise" in layers else (0.0, 0)
-    scale = [1 / slices / 255] * (3 * slices) + [1 / 255] * whole + [last[0]]
-    return CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), slices), *range(3, 3 + whole), last[1]]))
+def input_layout() -> CodeLayout:
+    """The layout in which :func:`oiio_msspl.model.mean_denoiser.quantise` stores colour, albedo, normal and noise."""
+    scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
+    return CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
 
 
 # The fit
-
-
-@dataclass
-class PretrainedConv:
-    """A pretrained convolution that is read from the installed Open Image Denoise when the graph is loaded.
-
-    Attributes:
-        weight, bias: all of its parameters.
-        rows, columns: the outputs and inputs that this network uses, as its first ones.
-    """
-
-    weight: Tensor
-    bias: Tensor
-    rows: Sequence[int]
-    columns: Sequence[int]
-
-    @classmethod
-    def all_of(cls, weights: Weights) -> dict[str, PretrainedConv]:
-        """All convolutions of a network, with all channels."""
-        pairs = {name: (weights[f"{name}.weight"], weights[f"{name}.bias"]) for name in convolutions(weights)}
-        return {
-            name: cls(weight, bias, *(list(range(count)) for count in weight.shape[:2]))
-            for name, (weight, bias) in pairs.items()
-        }
 
 
 @dataclass
@@ -156,14 +126,12 @@ class Fit:
     Attributes:
         shape: layout of the U-Net.
         weights: of its convolutions and of the heads.
-        pretrained: convolutions from which the differences are stored; not every convolution needs one.
         slices_out: slices of the output colour.
         layers: the result.
     """
 
     shape: Shape
     weights: Weights
-    pretrained: Mapping[str, PretrainedConv]
     slices_out: int = OUTPUT_SLICES
     layers: dict[str, QuantisedConv] = field(default_factory=dict)
     _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
@@ -180,23 +148,13 @@ class Fit:
             outputs.append(result[0].flatten(1)[:, pixels].T)
             result[:, :rectified].relu_()
             exact.append(result)
-        of_codes, pretrained = (
-            w[:, inputs.layout.source_channel] * inputs.layout.scale[:, None, None]
-            for w in (weights, self._pretrained_like(name, weights))
-        )
+        of_codes = weights[:, inputs.layout.source_channel] * inputs.layout.scale[:, None, None]
         original = torch.cat([of_codes.flatten(1), bias[:, None]], dim=1)
-        chosen, step, bias = gptq(torch.cat(patches), torch.cat(outputs), original, pretrained.flatten(1))
+        chosen, step, bias = gptq(torch.cat(patches), torch.cat(outputs), original)
         layout, offset = self._output_layout(name, exact, rectified)
         layer = QuantisedConv(chosen.reshape(of_codes.shape), step, bias, inputs.layout, layout, offset)
         self.layers[name] = layer
         return Activations(exact, [layer(codes) for codes in inputs.codes], layout)
-
-    def _pretrained_like(self, name: str, weights: Tensor) -> Tensor:
-        """A convolution's pretrained weights, padded with zeros to the shape of ``weights``."""
-        result = torch.zeros_like(weights)
-        if conv := self.pretrained.get(name):
-            result[: len(conv.rows), : len(conv.columns)] = conv.weight[conv.rows][:, conv.columns]
-        return result
 
     def _rectified(self, name: str, count: int) -> int:
         """How many of a layer's ``count`` outputs pass a ReLU: the first ones. The others are signed."""
@@ -267,14 +225,13 @@ def _patches(image: Tensor, pixels: Tensor) -> Tensor:
     return torch.stack(parts, dim=1).flatten(0, 1).T
 
 
-def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor, pretrained: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Choose integer weights in [-MAX_WEIGHT, MAX_WEIGHT] and their steps, so that inputs give outputs.
 
     Args:
         inputs: (P, K).
         outputs: (P, O).
         weights: (O, K + 1), the original weights; bias last.
-        pretrained: (O, K); no weight may differ from it by more than MAX_WEIGHT steps.
 
     Returns:
         Integers (O, K), the step of each row (O,), bias (O,).
@@ -294,10 +251,7 @@ def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor, pretrained: Tensor) -
     upper = torch.linalg.cholesky(inverse, upper=True)
     rest, chosen = weights[:, order].clone(), torch.zeros(len(weights), count, dtype=torch.double)
     for i in range(count):
-        nearest = (pretrained[:, order[i]].double() / step).round()
-        # The difference from the pretrained weight is stored in 8 bits
-        steps = torch.clamp((rest[:, i] / step).round(), nearest - MAX_WEIGHT, nearest + MAX_WEIGHT)
-        chosen[:, order[i]] = steps.clamp(-MAX_WEIGHT, MAX_WEIGHT)
+        chosen[:, order[i]] = (rest[:, i] / step).round().clamp(-MAX_WEIGHT, MAX_WEIGHT)
         error = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
         rest[:, i:] -= error[:, None] * upper[i, i:]
     return chosen.float(), step.float(), rest[:, count].float()
@@ -330,15 +284,13 @@ def run_unet_on_activations(
         )
 
 
-def quantise(name: str, weights: Weights, pretrained: Weights, images: Sequence[Images]) -> Fit:
-    """Quantise one of the networks that denoise.
+def quantise_mean_denoiser(weights: Weights, images: Sequence[Images]) -> Fit:
+    """Quantise the denoiser of both renders' mean.
 
     Args:
-        name: a key of ``SHAPES``.
         weights: in full precision.
-        pretrained: Open Image Denoise's weights, from which the differences are stored.
         images: inputs of the network.
     """
-    fit = Fit(SHAPES[name], weights, PretrainedConv.all_of(pretrained))
+    fit = Fit(LARGE, weights)
     run_unet_on_activations(fit.shape, [quantise_inputs(images)], fit.conv)
     return fit

@@ -15,13 +15,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.mean_denoiser import log_encoded_of_code
 from oiio_msspl.model.pu_curve import largest_log_encoded, pu_encode_log
-from oiio_msspl.model.quantised import log_encoded_of_code
 from oiio_msspl.model.session import make_denoiser
+from training.blend import blend
 from training.data import fixed_batches
 from training.encoding import log_to_pu
 from training.joint import DECODED, OUTPUTS, JointFusion
-from training.mix import blend
 from training.oidn import BASE
 from training.ops import upsample
 from training.paper import LRHS_CHANNELS
@@ -32,7 +32,6 @@ from training.quantise.gptq import (
     Activations,
     CodeLayout,
     Fit,
-    PretrainedConv,
     run_unet_on_activations,
 )
 from training.quantise.graph import Graph
@@ -103,7 +102,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Acti
 
 def calibration_pairs(views: Path, contract: Contract, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
     """Inputs of the network, from views as training draws them."""
-    batches = fixed_batches(views, "train", [contract.scale], PATCH, 1, make_denoiser(contract.denoiser, 0))
+    batches = fixed_batches(views, "train", [contract.scale], PATCH, 1, make_denoiser(contract.denoiser))
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 
@@ -112,12 +111,9 @@ def calibration_pairs(views: Path, contract: Contract, count: int = PAIRS) -> li
 
 def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> Fit:
     """Quantise the U-Net and its heads."""
-    weights, pretrained = {}, {}
+    weights = {}
     for name, conv in network.convs.items():
         weights[f"{name}.weight"], weights[f"{name}.bias"] = conv.total()
-        pretrained[name] = PretrainedConv(
-            *(network.pretrained[f"{name}.{kind}"] for kind in ("weight", "bias")), *network.pretrained_channels(name)
-        )
     for kind in ("weight", "bias"):
         heads = [getattr(head, kind) for head in network.heads]
         last = f"{BASE.last}.{kind}"
@@ -125,7 +121,7 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
         # The expected error, four pixels for each pixel of H/2, is predicted with that level's logits
         heads[1] = torch.cat([heads[1], getattr(network.error, kind)])
         weights |= {f"head{level}.{kind}": heads[level] for level in range(1, len(heads))}
-    fit = Fit(BASE, {name: value.detach() for name, value in weights.items()}, pretrained, SLICES_OUT)
+    fit = Fit(BASE, {name: value.detach() for name, value in weights.items()}, SLICES_OUT)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
     def conv(name: str, values: Activations) -> Activations:

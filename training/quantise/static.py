@@ -87,7 +87,7 @@ class _Samples(CalibrationDataReader):
     """Calibration pairs, one at a time."""
 
     def __init__(self, contract: Contract, views: Path) -> None:
-        denoiser = make_denoiser(contract.denoiser, 0)
+        denoiser = make_denoiser(contract.denoiser)
         batches = fixed_batches(views, "train", [contract.scale], PATCH, BATCH, denoiser)
         self._feeds = (
             {"lrhs": lrhs[None].contiguous().numpy(), "hrls": hrls[None].contiguous().numpy()}

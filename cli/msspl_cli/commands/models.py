@@ -30,7 +30,6 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
                 "name": name,
                 "scale": contract.scale,
                 "size_mb": round(path.stat().st_size / 1e6, 1),
-                "needs": "pyoidn" if contract.denoiser else None,
                 "training_spp": contract.training_spp,
                 "provenance": contract.provenance,
             }
@@ -39,15 +38,12 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
     if as_json:
         print(json.dumps({"models": rows, "devices": devices}, indent=2))
         return
-    header = ("model", "scale", "size", "trained LRHS spp", "trained HRLS spp", "needs")
+    header = ("model", "scale", "size", "trained LRHS spp", "trained HRLS spp")
     spans = [["{}-{}".format(*row["training_spp"].get(key, ("?", "?"))) for key in ("lrhs", "hrls")] for row in rows]
     console.table(
         [
             header,
-            *(
-                (r["name"], f"x{r['scale']}", f"{r['size_mb']} MB", *s, r["needs"] or "")
-                for r, s in zip(rows, spans, strict=True)
-            ),
+            *((r["name"], f"x{r['scale']}", f"{r['size_mb']} MB", *s) for r, s in zip(rows, spans, strict=True)),
         ],
         header=True,
         indent=0,

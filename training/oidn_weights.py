@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Weights of Open Image Denoise's networks, read from the library that the user has installed.
 
-The `joint` models and the 8-bit versions of these networks store only their difference to these weights, so they need
-exactly these: a digest identifies them.
+Training of the `joint` network begins from these weights, and its checkpoints store the difference to them. So it
+needs exactly these: a digest identifies them.
 """
 
 from __future__ import annotations
@@ -19,14 +19,11 @@ from numpy.typing import NDArray
 from oiio_msspl.errors import InputError
 
 #: Networks of Open Image Denoise 2.5 by its own names, with the size in bytes and the SHA-256 of their weights: HDR
-#: colour with albedo and normal; the large network for noise-free albedo and normal; albedo alone.
+#: colour with albedo and normal; the large network for noise-free albedo and normal.
 NETWORKS = {
     "rt_hdr_alb_nrm": (1841160, "e586ef2ff48d7fbb7611986405220ed8fc5c13ca79bfc40be4dc742fbf959e1a"),
     "rt_hdr_calb_cnrm_large": (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
-    "rt_alb": (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
 }
-#: Names in the contracts of the shipped `joint` models -> Open Image Denoise's own names.
-CONTRACT_NAMES = {"usual": "rt_hdr_alb_nrm", "large": "rt_hdr_calb_cnrm_large"}
 
 _TZA_MAGIC = b"\xd7\x41\x02"
 
@@ -56,21 +53,21 @@ def find_weights(network: str) -> Weights | None:
 
 
 def require_weights(network: str) -> Weights:
-    """Weights of a key of ``NETWORKS``, or of its name in a contract.
+    """Weights of a key of ``NETWORKS``.
 
     Raises:
         InputError: pyoidn is not installed, or has other weights.
     """
     try:
-        weights = find_weights(CONTRACT_NAMES.get(network, network))
+        weights = find_weights(network)
     except (ImportError, OSError) as error:
         raise InputError(
-            "this model needs the weights of Open Image Denoise: pip install pyoidn==2.5.1, or choose another --model"
+            "the joint network begins from the weights of Open Image Denoise: pip install pyoidn==2.5.1"
         ) from error
     if weights is None:
         raise InputError(
-            "this model needs the weights of Open Image Denoise 2.5, and the installed pyoidn has others: "
-            "pip install pyoidn==2.5.1, or choose another --model"
+            "the joint network begins from the weights of Open Image Denoise 2.5, and the installed pyoidn has others: "
+            "pip install pyoidn==2.5.1"
         )
     return weights
 

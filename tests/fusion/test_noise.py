@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether the pixel filter has spread the noise."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl import Render
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.noise import is_noise_spread
+from tests.conftest import noisy, picture
+
+
+def spread(image, sigma):
+    """An image whose pixels are Gaussian means of their neighbours, as a filter of ``sigma`` pixels makes them."""
+    taps = np.exp(-0.5 * (np.arange(-2, 3) / sigma) ** 2)
+    for axis in (0, 1):
+        padded = np.pad(image, [(2, 2) if a == axis else (0, 0) for a in range(3)], mode="edge")
+        shifted = [np.take(padded, np.arange(i, i + image.shape[axis]), axis) for i in range(5)]
+        image = np.tensordot(taps / taps.sum(), shifted, 1)
+    return image.astype(np.float32)
+
+
+def asked(clean, scale, spp, sigma=None):
+    low, high = noisy(box_downsample(clean, scale), 4 * spp, seed=1), noisy(clean, spp)
+    if sigma is not None:
+        low, high = spread(low, sigma), spread(high, sigma)
+    lr, hr = Render.from_arrays("lr", rgb=low), Render.from_arrays("hr", rgb=high)
+    return is_noise_spread(lr, hr, align(lr, hr))
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+@pytest.mark.parametrize("spp", [1, 8])
+def test_a_filter_that_spreads_samples_is_noticed(scale, spp):
+    clean = picture(512, 760)
+    assert not asked(clean, scale, spp)
+    for sigma in (0.5, 1.0):
+        assert asked(clean, scale, spp, sigma)
+
+
+def test_texture_is_no_noise():
+    """Neighbouring pixels of a texture are alike, but the noise on it is not."""
+    rng = np.random.default_rng(0)
+    texture = 0.2 + spread(rng.random((512, 512, 1), dtype=np.float32), 1.0) * np.ones(3, np.float32)
+    assert not asked(texture, 4, 1000)
+
+
+def test_frames_without_noise_are_not_spread():
+    for clean in (picture(300, 200), np.zeros((64, 64, 3), np.float32), np.ones((6, 6, 3), np.float32)):
+        pair = Render.from_arrays("lr", rgb=box_downsample(clean, 2)), Render.from_arrays("hr", rgb=clean)
+        assert not is_noise_spread(*pair, align(*pair))

@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, find_model
+from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 
 if TYPE_CHECKING:
@@ -77,10 +77,7 @@ def fuse_frames(
     from distributed.comm import CommClosedError
 
     neighbours = _most_workers_on_a_machine(client)
-    if stages.model in (None, AUTO):
-        # A worker with another version, which would choose another family, then refuses the frame.
-        stages = replace(stages, model=DEFAULT_FAMILY)
-    elif Path(stages.model).is_file():
+    if stages.model is not None and Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))
     find_model(2, stages.model)  # refuses an unknown model before any task is submitted
     address = client.scheduler.address

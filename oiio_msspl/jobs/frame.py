@@ -22,9 +22,10 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
-from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY, find_model
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import in_background, limit_threads
 
@@ -72,6 +73,22 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
     features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
     rgb_only = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
     return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
+
+
+def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
+    """The model that is meant: ``auto`` and None are a family that suits the pair's noise.
+
+    Raises:
+        InputError: the pair does not fit together.
+    """
+    if model not in (None, AUTO):
+        return model
+    if not is_noise_spread(lr, hr, align(lr, hr)):
+        return DEFAULT_FAMILY
+    hr.notes.append(
+        f"the pixel filter has spread the noise over neighbouring pixels, so --model auto takes {SPREAD_NOISE_FAMILY}"
+    )
+    return SPREAD_NOISE_FAMILY
 
 
 def fuse_files(
@@ -126,7 +143,7 @@ def fuse_files(
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
     dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
-    session = Session(find_model(align(lr, hr).scale, model), device, threads)
+    session = Session(find_model(align(lr, hr).scale, resolve_auto(lr, hr, model)), device, threads)
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)

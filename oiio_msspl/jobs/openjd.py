@@ -16,9 +16,10 @@ from typing import Any
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, replacing
 from oiio_msspl.exr.preview import check_view
+from oiio_msspl.jobs.frame import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
-from oiio_msspl.jobs.shot_checks import check_no_input
-from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, find_model, shipped_models
+from oiio_msspl.jobs.shot_checks import check_no_input, model_of_shot
+from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.session import PROVIDERS
 
@@ -61,6 +62,7 @@ def make_job(
     output: Path,
     *,
     frames: str | Iterable[int] | None = None,
+    inputs: InputOptions = InputOptions(),
     model: str | None = None,
     map_file: Path | None = None,
     device: str = "cpu",
@@ -74,8 +76,9 @@ def make_job(
     Args:
         lr, hr, output, frames: as in :func:`oiio_msspl.jobs.sequence.find_shot`. Frames without a partner are part of
             the job, because the partner may exist when their task runs.
-        model: as in :func:`oiio_msspl.fuse_files`. None and ``auto`` mean the model that runs on every machine, because
-            all frames of a shot need the same one.
+        inputs: what the options say of the files, to read the first pair.
+        model: as in :func:`oiio_msspl.fuse_files`. None and ``auto`` are a family that suits the noise of the first
+            pair; the job names it, because all frames of a shot need the same one.
         map_file: TOML file with the user's mapping.
         device: a key of :data:`oiio_msspl.model.session.PROVIDERS`. It need not be usable on this machine.
         view: None, or the OpenColorIO view of the previews.
@@ -97,15 +100,15 @@ def make_job(
         check_view(view)
     options = [*(["--device", device] if device != "cpu" else []), *(["--view", view] if view else []), *options]
     files = {"--map-file": map_file} if map_file else {}
+    shot = find_shot(lr, hr, output, frames)
     # The job names its model: a worker with another version, which would choose another family, then refuses the frame.
-    name = DEFAULT_FAMILY if model is None or model == AUTO else model
+    name = model_of_shot(shot, inputs, model)
     if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in SCALES)}:
         options += ["--model", name]
     else:
         files["--model"] = find_model(0, name)
         Contract.of_file(files["--model"])
 
-    shot = find_shot(lr, hr, output, frames)
     if not any(frame.lr and frame.hr for frame in shot.frames):
         raise InputError(f"no frame is in both {shot.lr.pattern} and {shot.hr.pattern}; nothing to submit")
     check_no_input(shot)

@@ -23,7 +23,7 @@ from oiio_msspl.jobs.dask_cluster import fuse_frames
 from oiio_msspl.jobs.frame import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.sequence import Frame, find_shot
-from oiio_msspl.jobs.shot_checks import known_result, prepare_output
+from oiio_msspl.jobs.shot_checks import known_result, model_of_shot, prepare_output
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
 
@@ -125,7 +125,7 @@ def fuse_shot(
     stages = Stages(
         inputs=inputs,
         write_options=write,
-        model=model,
+        model=model_of_shot(shot, inputs, model),
         device=device,
         threads=threads,
         max_memory=max_memory,

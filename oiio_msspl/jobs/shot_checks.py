@@ -3,13 +3,18 @@
 
 from __future__ import annotations
 
+import logging
 import os
 
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_target
+from oiio_msspl.jobs.frame import InputOptions, map_pair, resolve_auto
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import is_left_over
+from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY
+
+log = logging.getLogger(__name__)
 
 
 def prepare_output(shot: Shot) -> None:
@@ -24,6 +29,26 @@ def prepare_output(shot: Shot) -> None:
         folder.mkdir(exist_ok=True)
     check_folder(shot.output.path(0))
     check_no_input(shot)
+
+
+def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
+    """The model of all frames: ``auto`` and None are a family that suits the noise of the first pair.
+
+    All frames need the same model, also those of other runs and machines. A pair that can't be used is passed over,
+    because the run says so when its turn comes.
+    """
+    if model not in (None, AUTO):
+        return model
+    for frame in shot.frames:
+        if frame.lr and frame.hr:
+            try:
+                lr, hr = map_pair(frame.lr, frame.hr, inputs)
+                family = resolve_auto(lr, hr, model)
+                log.info("frame %d: %s", frame.number, "; ".join([*hr.notes, f"the model is {family}"]))
+                return family
+            except MssplError as error:
+                log.debug("frame %d: %s", frame.number, error)
+    return DEFAULT_FAMILY
 
 
 def check_no_input(shot: Shot) -> None:

@@ -9,8 +9,9 @@ from oiio_msspl.errors import InputError
 
 #: Folder of the models: ``NAME.onnx`` for each.
 WEIGHTS = Path(__file__).parent / "weights"
-#: The name that lets :func:`find_model` choose, and the family that it chooses.
-AUTO, DEFAULT_FAMILY = "auto", "joint"
+#: The name that lets the package choose; the family that it chooses; and the one for noise that a pixel filter has
+#: spread over neighbouring pixels (:mod:`oiio_msspl.fusion.noise`).
+AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY = "auto", "joint", "paper"
 
 
 def shipped_models() -> dict[str, Path]:
@@ -23,7 +24,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
 
     Args:
         scale: 2, 4 or 8.
-        name: ``auto`` or None for the best family, a family (``paper``), a model (``paper-x4``), or an ONNX file.
+        name: ``auto`` or None for the default family, a family (``paper``), a model (``paper-x4``), or an ONNX file.
 
     Raises:
         InputError: there is no such model.

@@ -56,7 +56,7 @@ def submit(
     from oiio_msspl.jobs.sequence import format_frames
 
     # Options with a wrong value are refused here, and not by every task.
-    options.make_inputs(*(given[name] for name in ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp")))
+    inputs = options.make_inputs(*(given[name] for name in ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp")))
     options.make_write_options(*(given[name] for name in ("layout", "compression", "half", "layers", "error_layer")))
     options.parse_bytes(given["max_memory"])
     job = make_job(
@@ -64,6 +64,7 @@ def submit(
         given["hr"],
         given["output"],
         frames=given["frames"],
+        inputs=inputs,
         model=given["model"],
         map_file=given["map_file"],
         device=given["device"],

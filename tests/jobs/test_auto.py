@@ -1,0 +1,42 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The model that ``auto`` takes: for a frame, for a shot, and for a job."""
+
+import pytest
+
+from oiio_msspl import fuse_files, fuse_shot, open_exr
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.jobs.openjd import make_job
+from tests.conftest import noisy, picture, rgb, write_exr
+from tests.fusion.test_noise import spread
+
+
+def write_pair(folder, name, sigma):
+    clean = picture(128, 192)
+    images = noisy(box_downsample(clean, 4), 16, seed=1), noisy(clean, 1)
+    for render, image in zip(("lr", "hr"), images, strict=True):
+        (folder / render).mkdir(exist_ok=True)
+        write_exr(folder / render / f"{name}.exr", rgb(image if sigma is None else spread(image, sigma)))
+
+
+@pytest.mark.parametrize(("sigma", "family"), [(None, "joint"), (0.5, "paper")])
+def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, family):
+    write_pair(tmp_path, "a", sigma)
+    report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "out.exr")
+    assert report.model == f"{family}-x4"
+    assert any("spread the noise" in note for note in report.as_dict()["notes"]) == (family == "paper")
+    report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "named.exr", model="pyramid")
+    assert report.model == "pyramid-x4"
+
+
+def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path):
+    """Also in a second run that begins with another frame. A broken pair is passed over."""
+    for number, sigma in ((1, None), (2, 0.5), (3, None)):
+        write_pair(tmp_path, f"a.{number:04}", sigma)
+    (tmp_path / "hr/a.0001.exr").write_bytes(b"broken")
+    pair = tmp_path / "lr", tmp_path / "hr", tmp_path / "out"
+    for frames in ([1, 2], None):
+        report = fuse_shot(*pair, frames=frames, skip_existing=True)
+    assert [result.status for _, result in sorted(report.results.items())] == ["failed", "skipped", "fused"]
+    assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "paper-x4"
+    action = make_job(*pair).template["steps"][0]["script"]["actions"]["onRun"]
+    assert action["args"][-2:] == ["--model", "paper"]

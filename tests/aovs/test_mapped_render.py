@@ -7,7 +7,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
 from tests.aovs.renders import H, W, layer, mapped, plane
-from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
+from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
 
 
 @pytest.mark.parametrize(
@@ -98,3 +98,9 @@ def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_pat
         with readable.cache_strips(10**6):
             first, second = (readable.read(Window(x, 0, x + 4, H), ["rgb"])["rgb"] for x in (0, 4))
         np.testing.assert_array_equal(first, second)
+
+
+def test_the_users_spp_win_over_the_headers():
+    file = open_exr(EXAMPLES / "hr.exr")
+    assert map_render(file).spp == 1
+    assert map_render(file, spp=7).spp == 7

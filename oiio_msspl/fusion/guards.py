@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import NORMAL, RADIANCE_FEATURES, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import encode_radiance
@@ -131,8 +131,9 @@ def _all_in_15x15(mask: Mask) -> Mask:
 
 
 def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
-    """Where alpha or normal is zero, (h, w, 1); everywhere if the HRLS has neither."""
-    signs = [np.all(hrls[name] == 0, axis=-1, keepdims=True) for name in ("alpha", NORMAL) if name in hrls]
+    """Where alpha or normal is zero, or the albedo if there are neither, (h, w, 1); everywhere without any of these."""
+    names = [name for name in ("alpha", NORMAL) if name in hrls] or [name for name in (ALBEDO,) if name in hrls]
+    signs = [np.all(hrls[name] == 0, axis=-1, keepdims=True) for name in names]
     return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)
 
 

@@ -10,7 +10,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any
 
-from oiio_msspl.exr.layers import Layer
+from oiio_msspl.exr.layers import Layer, same_spelling
 from oiio_msspl.exr.reader import ExrFile
 
 
@@ -56,17 +56,13 @@ def view_layer_of(layer: str, alias: str) -> str | None:
         ``ViewLayer`` for ``ViewLayer.Combined`` and the alias ``combined``; empty if the layer has just the alias as
         its name; None if it is another layer.
     """
-    name, wanted = _without_spelling(layer), _without_spelling(alias)
+    name, wanted = same_spelling(layer), same_spelling(alias)
     if name == wanted or ("*" in wanted and fnmatchcase(name, wanted)):
         return ""
     if wanted and name.endswith("." + wanted):
         # Cut the stored name as many dots from its end as the alias takes.
         return layer.rsplit(".", wanted.count(".") + 1)[0]
     return None
-
-
-def _without_spelling(name: str) -> str:
-    return re.sub(r"[ _-]", "", name).lower()
 
 
 def _holds(condition: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:

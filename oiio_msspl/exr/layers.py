@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
 
@@ -55,6 +56,27 @@ def layers_of(file: ExrFile) -> list[Layer]:
             layer = layers.setdefault((view, name), Layer(name, view))
             layer.channels.setdefault(component, channel)
     return list(layers.values())
+
+
+def same_spelling(name: str) -> str:
+    """A name without what programs spell differently: case, spaces, ``_`` and ``-``."""
+    return re.sub(r"[ _-]", "", name).lower()
+
+
+def matches_layer(pattern: str, name: str, component: str = "") -> bool:
+    """Whether a pattern such as ``crypto*`` means a layer, or a channel of it.
+
+    Case, spaces, ``_`` and ``-`` make no difference. The pattern may leave out the view layer or part in front of the
+    name: ``crypto*`` means ``ViewLayer.CryptoObject00``.
+
+    Args:
+        pattern: text with ``*`` for any text, ``?`` for any character.
+        name: the layer's name, perhaps with a part's or a view layer's in front.
+        component: the channel's own name, such as ``R``; the pattern may name it behind the layer.
+    """
+    wanted, words = same_spelling(pattern), same_spelling(name).split(".")
+    ends = [".".join(words[start:]) for start in range(len(words))]
+    return any(fnmatchcase(end, wanted) or fnmatchcase(f"{end}.{same_spelling(component)}", wanted) for end in ends)
 
 
 def _views(file: ExrFile) -> list[str]:

@@ -264,6 +264,59 @@ def test_a_mapping_may_add_layers_or_name_another_file(tmp_path):
     assert values["albedo"][0, 0, 0] == 7
 
 
+def beside(tmp_path, channels, mapping, stem="other", **options):
+    """A plain render whose features are mapped to another EXR with these channels."""
+    other = write_exr(tmp_path / f"{stem}.exr", channels)
+    return mapped(tmp_path, layer("", 1), parse_map_options([each.format(other) for each in mapping]), **options)
+
+
+def test_a_feature_of_another_exr_is_found_by_the_table_of_renderers(tmp_path):
+    """--map albedo=other.exr reads its albedo, not its beauty."""
+    other = layer("v.Combined", 5) | layer("v.Denoising Albedo", 7) | layer("v.DiffDir", 2) | layer("v.DiffInd", 3)
+    other |= layer("v.DiffCol", 4)
+    render = beside(tmp_path, other, ["albedo={}", "diffuse={}"])
+    values = render.read(render.data_window)
+    assert (values["albedo"][0, 0, 0], values["diffuse"][0, 0, 0]) == (7, 20)
+    assert found(render)["albedo"] == "other.exr: v.Denoising Albedo"
+
+
+def test_a_layer_of_another_exr_can_be_named(tmp_path):
+    """Case and view layer need not be typed, as in --map without a file."""
+    other = layer("v.Combined", 5) | layer("v.Denoising Albedo", 7) | layer("v.Paint", 8)
+    for name in ("paint", "v.Paint", "V.PAINT"):
+        render = beside(tmp_path, other, [f"albedo={{}}:{name}"])
+        assert render.read(render.data_window)["albedo"][0, 0, 0] == 8
+        assert found(render)["albedo"] == "other.exr: v.Paint"
+    with pytest.raises(InputError, match=r"other.exr: has no layer 'Pint'; name one, as --map 'albedo=other.exr:v"):
+        beside(tmp_path, other, ["albedo={}:Pint"])
+
+
+@pytest.mark.parametrize(
+    ("channels", "message"),
+    [
+        (layer("Combined", 5), "no layer among Combined is known as albedo; name one"),
+        (layer("", 5) | layer("paint", 7), "no layer among R G B, paint is known as albedo; .*'albedo=other.exr:paint"),
+        ({"Z": plane(1)}, "no layer in it is known as albedo; name one, as --map 'albedo=other.exr:LAYER'"),
+        (
+            layer("a.Combined", 1) | layer("a.Denoising Albedo", 2) | layer("b.Denoising Albedo", 3),
+            "has 2 layers for it: a.Denoising Albedo, b.Denoising Albedo; .*'albedo=other.exr:a.Denoising Albedo'",
+        ),
+    ],
+    ids=["only a beauty", "unknown names", "no colour", "two view layers"],
+)
+def test_another_exr_with_no_albedo_or_several_is_refused(tmp_path, channels, message):
+    with pytest.raises(InputError, match=f"other.exr: {message}"):
+        beside(tmp_path, channels, ["albedo={}"])
+
+
+def test_of_two_view_layers_of_another_exr_that_of_the_render_is_read(tmp_path):
+    names = [f"{view}.{name}" for view in "ab" for name in ("Combined", "Denoising Albedo")]
+    channels = {c: p for i, name in enumerate(names) for c, p in layer(name, i).items()}
+    other = write_exr(tmp_path / "other.exr", channels)
+    render = mapped(tmp_path, channels, parse_map_options([f"albedo={other}"]), view="b")
+    assert render.read(render.data_window)["albedo"][0, 0, 0] == 3
+
+
 def test_a_mapping_file_takes_what_the_table_takes(tmp_path):
     (tmp_path / "map.toml").write_text('diffuse = { sum = ["a", "b"], times = "c" }\n')
     channels = layer("", 1) | layer("a", 2) | layer("b", 3) | layer("c", 4)

@@ -148,6 +148,16 @@ def test_opencolorio_views_of_the_preview(files, bilinear_models):
     assert np.abs(pictures[0] - pictures[2]).mean() > 5
 
 
+@pytest.mark.parametrize("pattern", ["crypto*", "CRYPTO*", "viewlayer.crypto*", "*Crypto*"])
+def test_layers_of_the_example_are_chosen_by_any_spelling(tmp_path, bilinear_models, pattern):
+    """The example's layers are called ViewLayer.CryptoObject00 and so on."""
+    options = ("--model", bilinear_models[4], "--no-preview", "--layers", pattern)
+    done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr", *options)
+    assert done.returncode == 0, done.stderr
+    names = {channel.name.split(".")[1] for part in open_exr(tmp_path / "out.exr").parts for channel in part.channels}
+    assert names == {"Combined", "CryptoObject00"}
+
+
 def test_the_readmes_first_command_shows_a_result(tmp_path):
     """Our own example pair through the shipped model: finite, as bright as the LRHS, cryptomatte still there."""
     done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr", "--json")

@@ -7,6 +7,7 @@ it becomes a formula.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ from typing import Any
 from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapping import split_exr
-from oiio_msspl.aovs.renderers import detect_renderer, view_layer_of
+from oiio_msspl.aovs.renderers import detect_renderer, layer_of_source, view_layer_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr
@@ -24,8 +25,10 @@ from oiio_msspl.exr.reader import Channel, ExrFile, open_exr
 class LayerFinder:
     """Finds the layers of candidates in one view and view layer of a file."""
 
-    def __init__(self, file: ExrFile, layers: list[Layer], view: str, view_layer: str) -> None:
-        self._file = file
+    def __init__(
+        self, file: ExrFile, layers: list[Layer], renderer: dict[str, Any], view: str, view_layer: str
+    ) -> None:
+        self._file, self._renderer = file, renderer
         self._layers = [layer for layer in layers if layer.view in (view, "")]
         self._view, self._view_layer = view, view_layer
 
@@ -89,7 +92,7 @@ class LayerFinder:
         found: dict[tuple[Channel, ...], FeatureFormula] = {}
         for candidate in renderer.get(feature, []):
             for view, view_layer in _views_and_view_layers(layers, (self._view, self._view_layer)):
-                formula = LayerFinder(other, layers, view, view_layer).formula(feature, candidate, [])
+                formula = LayerFinder(other, layers, renderer, view, view_layer).formula(feature, candidate, [])
                 if formula is not None:
                     found.setdefault(tuple(formula.channels), formula)
                 if found and (view, view_layer) == (self._view, self._view_layer):
@@ -112,9 +115,10 @@ class LayerFinder:
         """The layer that an alias names: of the chosen view layer, or else of none."""
         if alias.startswith("file:"):
             return self._layer_of_file(feature, alias.removeprefix("file:"))
-        for view_layer in (self._view_layer, ""):
+        names = [alias, layer_of_source(self._renderer, self._file, alias)]
+        for name, view_layer in itertools.product(filter(None, names), (self._view_layer, "")):
             for layer in self._layers:
-                if view_layer_of(layer.name, alias) == view_layer:
+                if view_layer_of(layer.name, name) == view_layer:
                     return layer
         return None
 
@@ -133,9 +137,10 @@ class LayerFinder:
         path = Path(named)
         other = self._open(path)
         layers = layers_of(other)
+        renderer = detect_renderer(other, layers)
         if not wanted:
-            return replace(_only_layer(path, layers, feature, detect_renderer(other, layers)), name=path.name)
-        own = LayerFinder(other, layers, self._view, self._view_layer)._layer(feature, wanted)
+            return replace(_only_layer(path, layers, feature, renderer), name=path.name)
+        own = LayerFinder(other, layers, renderer, self._view, self._view_layer)._layer(feature, wanted)
         meant = [own] if own else [layer for layer in layers if view_layer_of(layer.name, wanted) is not None]
         if len(meant) != 1:
             texts = [each.name for each in meant or layers if each.name]

@@ -47,6 +47,20 @@ def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) 
     return None
 
 
+def layer_of_source(renderer: dict[str, Any], file: ExrFile, aov: str) -> str | None:
+    """The layer that holds an AOV under another name, as the header says; None if it names none or several.
+
+    Several layers hold the same AOV where lights are split into groups: none of them is the whole.
+    """
+    rule = re.compile(renderer["source"]) if "source" in renderer else None
+    found = {
+        match[1]
+        for key, value in file.metadata.items()
+        if rule and (match := rule.search(key)) and same_spelling(str(value)) == same_spelling(aov)
+    }
+    return found.pop() if len(found) == 1 else None
+
+
 def view_layer_of(layer: str, alias: str) -> str | None:
     """The view layer in front of ``alias`` in a layer's name.
 

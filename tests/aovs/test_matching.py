@@ -196,6 +196,16 @@ def test_blender_5_writes_the_layer_in_part_and_channel(tmp_path):
     np.testing.assert_allclose(values["diffuse"][0, 0], np.array([5, 5.2, 5.4]) * np.array([4, 4.1, 4.2]), rtol=1e-6)
 
 
+def test_arnolds_header_says_which_aov_a_layer_holds(tmp_path):
+    """An AOV of N may have any name; where several layers hold an AOV, none of them is the whole."""
+    channels = layer("", 1) | layer("normals", 0, "XYZ") | layer("key_diffuse", 2) | layer("fill_diffuse", 3)
+    sources = {"normals": "N", "key_diffuse": "diffuse", "fill_diffuse": "diffuse"}
+    attributes = {f"arnold/aovs/{name}/source": source for name, source in sources.items()}
+    assert found(mapped(tmp_path, channels, attributes=attributes)) == {"rgb": "R G B", "normal": "normals"}
+    both = channels | layer("N", 0, "XYZ")
+    assert found(mapped(tmp_path, both, attributes=attributes))["normal"] == "N"
+
+
 def test_luxcores_files_are_layers_of_one_frame(tmp_path):
     """One file an AOV: the others are found beside the RGB, and each alone is explained."""
     for stem, value in (("ALBEDO", 2), ("DIRECT_DIFFUSE", 3), ("INDIRECT_DIFFUSE", 4)):

@@ -74,6 +74,20 @@ def test_colours_and_vectors_are_triples_and_a_single_channel_is_a_scalar(tmp_pa
     assert layers["two"].triple() is layers["two"].scalar() is None
 
 
+@pytest.mark.parametrize("name", ["rgba_main", "rgba.main", "rgb_main", "main", "RGBA_MAIN", "part1.main"])
+def test_plain_parts_are_known_by_name(tmp_path, name):
+    plane = np.zeros((2, 2), np.float32)
+    parts = [(name, dict.fromkeys("RGB", plane), (0, 0)), ("albedo", dict.fromkeys("RGB", plane), (0, 0))]
+    assert [layer.name for layer in layers_of(open_exr(write_exr(tmp_path / "a.exr", parts)))] == ["", "albedo"]
+
+
+def test_the_only_part_names_no_layer(tmp_path):
+    plane = np.zeros((2, 2), np.float32)
+    channels = dict.fromkeys([*"RGB", "albedo.R"], plane)
+    file = open_exr(write_exr(tmp_path / "a.exr", [("shot_010 beauty v3", channels, (0, 0))]))
+    assert [layer.name for layer in layers_of(file)] == ["", "albedo"]
+
+
 @pytest.mark.parametrize(
     ("pattern", "matches"),
     [

@@ -159,9 +159,7 @@ def _fuse_frame(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict
     # skip_existing lets this frame replace the preview that a dead worker left without its EXR.
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
     try:
-        loaded = stages.read(frame)
-        report, fused = stages.fuse(loaded, stages.session(loaded))
-        stages.write(report, fused)
+        report = stages.run(frame)
     except InputError as error:
         # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
         return None if not stages.overwrite and frame.output.exists() else error

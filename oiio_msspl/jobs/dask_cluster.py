@@ -47,7 +47,7 @@ def connect(scheduler: str) -> Client:
     try:
         from dask.distributed import Client
     except ImportError as error:
-        raise InputError("--scheduler needs Dask: pip install 'oiio-msspl[farm]'") from error
+        raise InputError("--scheduler needs Dask: pip install 'dask[distributed]'") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks repeat our messages
     try:
         return Client(scheduler_file=scheduler) if Path(scheduler).is_file() else Client(scheduler)

@@ -6,6 +6,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -246,9 +247,10 @@ def _fuser(
     Raises:
         InputError: the model or the device can't be used. No frame was rendered for nothing.
     """
+    from oiio_msspl.jobs.frame import map_pair, resolve_auto
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
-    from oiio_msspl.model.catalogue import find_model
+    from oiio_msspl.model.catalogue import AUTO, find_model
     from oiio_msspl.model.session import Session
     from oiio_msspl.parallel import limit_threads
 
@@ -262,7 +264,10 @@ def _fuser(
     )
 
     def fuse(lr: Path, hr: Path, output: Path) -> list[str]:
+        nonlocal stages
         with limit_threads(threads):
+            if stages.model == AUTO:  # all frames get the model that suits the first pair
+                stages = replace(stages, model=resolve_auto(*map_pair(lr, hr, stages.inputs), AUTO))
             return stages.run(Frame(0, lr, hr, output)).warnings
 
     return fuse

@@ -50,7 +50,9 @@ def beauty_spec(contents: FileContents) -> Any:
     if contents.options.layout == "nuke":
         name, channels = _nuke_name("rgba", home.view), ["R", "G", "B", "A"][: len(contents.beauty)]
     else:
-        name, channels = home.name or "rgba", [channel.name for channel in contents.beauty]
+        # In a file of one part, its name says nothing; in the result, it would name a layer of plain channels.
+        named = home.name and (len(contents.source.parts) > 1 or "." in contents.beauty[0].name)
+        name, channels = home.name if named else "rgba", [channel.name for channel in contents.beauty]
     spec = _spec(home, name, channels, contents.pixels.kind)
     spec.attribute("compression", contents.compression)
     for key, value in contents.attributes.items():

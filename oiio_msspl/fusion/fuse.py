@@ -16,7 +16,7 @@ from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import fuse_alpha
 from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
-from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
+from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, largest_tile, plan_tiles
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
@@ -39,7 +39,9 @@ class FusedFrame:
     exposure: float
     """Factor that the scene was multiplied by for the network."""
     repaired: dict[str, int]
-    """Numbers of values that were NaN, infinite or (except in normals) negative, by layer, as ``lrhs.rgb``."""
+    """Numbers of values that were NaN or infinite, by layer, as ``lrhs.rgb``."""
+    negative: dict[str, int] = field(default_factory=dict)
+    """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
     """One sentence each."""
     tiles: int = 1
@@ -88,7 +90,8 @@ def fuse(
                 if progress is not None:
                     progress(done, len(tiles))
         frame.warnings += pair.check()
-    frame.repaired, frame.tiles, frame.seconds = pair.repaired, len(tiles), session.seconds - seconds
+    frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
+    frame.tiles, frame.seconds = len(tiles), session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     return frame
@@ -129,10 +132,9 @@ class _Pair:
     def __init__(self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session) -> None:
         self._lr, self._hr, self._alignment, self._session = lr, hr, alignment, session
         self.grid = aligned_grid(alignment.grid, session.contract.alignment)
-        self._lrhs_repaired: dict[str, int] = {}
-        self._hrls_repaired: dict[str, int] = {}
+        self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         features = [RGB, *session.lrhs_aovs, "alpha"]
-        self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_repaired)
+        self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_counts)
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         self.exposure = find_exposure(self._lrhs_rgb)
         self._empty_regions, self._averages = EmptyRegions(self._lrhs[RGB]), HrlsAverages(alignment)
@@ -146,17 +148,16 @@ class _Pair:
     def lrhs_has_alpha(self) -> bool:
         return "alpha" in self._lrhs
 
-    @property
-    def repaired(self) -> dict[str, int]:
-        """See :attr:`FusedFrame.repaired`."""
-        lrhs = {f"lrhs.{name}": count for name, count in self._lrhs_repaired.items()}
-        return lrhs | {f"hrls.{name}": count for name, count in self._hrls_repaired.items()}
+    def counts(self, kind: str) -> dict[str, int]:
+        """What :attr:`FusedFrame.repaired` (``repaired``) or :attr:`FusedFrame.negative` (``negative``) holds."""
+        renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
+        return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
 
     def prepare(self, tile: Tile) -> _PreparedTile:
         """Read a tile, dim fireflies and encode its features."""
         contract, grid = self._session.contract, self.grid
         features = [*contract.features, "alpha"]
-        pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_repaired)
+        pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
         self._averages.add(pair)
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
         lrhs_aovs = {

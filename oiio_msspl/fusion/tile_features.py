@@ -4,9 +4,10 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.arrays import Array, interpolate, repair
@@ -16,6 +17,23 @@ from oiio_msspl.fusion.tiling import Tile
 
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
+
+
+@dataclass
+class RepairCounts:
+    """How many values of a render were changed, by feature."""
+
+    repaired: dict[str, int] = field(default_factory=dict)
+    """NaN or infinite."""
+    negative: dict[str, int] = field(default_factory=dict)
+    """Negative and set to 0: colours out of gamut, in files that are otherwise sound."""
+
+    def add(self, feature: str, values: Array, changed: NDArray[np.bool_]) -> None:
+        """Count values; ``changed`` is the mask of :func:`oiio_msspl.arrays.repair`."""
+        broken = int(np.count_nonzero(~np.isfinite(values)))
+        for counts, count in ((self.repaired, broken), (self.negative, int(np.count_nonzero(changed)) - broken)):
+            if count:
+                counts[feature] = counts.get(feature, 0) + count
 
 
 @dataclass
@@ -46,21 +64,21 @@ def read_tile(
     hr: ReadableRender,
     alignment: Alignment,
     features: Iterable[str],
-    repaired: dict[str, int],
+    counts: RepairCounts,
 ) -> TilePair:
     """Read both renders over a tile.
 
     Args:
         lrhs: features of the LRHS over ``grid``, see :func:`read_lrhs`.
         features: names of the HRLS's features to read.
-        repaired: numbers of repaired values of the HRLS by feature; those of the tile's core are added.
+        counts: repaired values of the HRLS; those of the tile's core are added.
     """
     scale = alignment.scale
     area, core = _in_hrls_pixels(tile.area, scale), _in_hrls_pixels(tile.core, scale)
     window = tile.area.slices(grid)
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},
-        hrls=read_features(hr, area, alignment.hr_data_window, features, counts=repaired, counted=core),
+        hrls=read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core),
         scale=scale,
         lrhs_area=tile.area,
         hrls_area=area,
@@ -71,17 +89,17 @@ def read_tile(
 
 
 def read_lrhs(
-    lr: ReadableRender, alignment: Alignment, grid: Window, features: Iterable[str], repaired: dict[str, int]
+    lr: ReadableRender, alignment: Alignment, grid: Window, features: Iterable[str], counts: RepairCounts
 ) -> dict[str, Array]:
     """Read features of the LRHS over ``grid``, those that it has. Where an odd size was rounded, they are resampled.
 
     Args:
-        repaired: numbers of repaired values by feature are added here.
+        counts: repaired values are added here.
     """
     data = alignment.lr_data_window
     if alignment.stretch == (1.0, 1.0):
-        return read_features(lr, grid, data, features, counts=repaired, counted=grid)
-    layers = read_features(lr, data, data, features, counts=repaired, counted=data)
+        return read_features(lr, grid, data, features, counts=counts, counted=grid)
+    layers = read_features(lr, data, data, features, counts=counts, counted=data)
     stretch_x, stretch_y = alignment.stretch
     for axis, first, last, stretch, origin in (
         (0, grid.y0, grid.y1, stretch_y, data.y0),
@@ -98,7 +116,7 @@ def read_features(
     data_window: Window,
     features: Iterable[str] | None = None,
     *,
-    counts: dict[str, int] | None = None,
+    counts: RepairCounts | None = None,
     counted: Window | None = None,
 ) -> dict[str, Array]:
     """Read and repair features over a window. Outside the data window the nearest pixel is repeated.
@@ -106,8 +124,7 @@ def read_features(
     Args:
         window, data_window: both relative to the top left of the display window.
         features: names of features; all if None. Those that the render lacks are left out.
-        counts: numbers of repaired values by feature; those inside ``counted`` are added, because overlaps are read
-            twice.
+        counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
     """
     rows = np.clip(np.arange(window.y0, window.y1), data_window.y0, data_window.y1 - 1)
     columns = np.clip(np.arange(window.x0, window.x1), data_window.x0, data_window.x1 - 1)
@@ -117,8 +134,8 @@ def read_features(
     for name, values in layers.items():
         repaired, bad = repair(values, signed=name in SIGNED_FEATURES)
         if bad is not None and counts is not None and counted is not None:
-            changed = int(np.count_nonzero(bad[counted.intersect(stored).slices(stored)]))
-            counts[name] = counts.get(name, 0) + changed
+            inside = counted.intersect(stored).slices(stored)
+            counts.add(name, values[inside], bad[inside])
         repeated = (rows[:, None] - stored.y0, columns[None, :] - stored.x0)
         result[name] = repaired if stored == window else repaired[repeated]
     return result

@@ -64,6 +64,17 @@ class Stages:
     sessions: dict[Path, Session] = field(default_factory=dict)
     """Models that are loaded, by file."""
 
+    def run(self, frame: Frame) -> FrameReport:
+        """Take a frame through all stages, one after the other.
+
+        Raises:
+            InputError, MssplError: see the stages.
+        """
+        loaded = self.read(frame)
+        report, fused = self.fuse(loaded, self.session(loaded))
+        self.write(report, fused)
+        return report
+
     def read(self, frame: Frame) -> LoadedFrame:
         """Open and map a pair, and read its pixels if two frames fit into half of the memory.
 

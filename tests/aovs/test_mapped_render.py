@@ -6,7 +6,7 @@ from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
-from tests.aovs.renders import H, W, layer, mapped, plane
+from tests.aovs.renders import H, W, found, layer, mapped, plane
 from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
 
 
@@ -53,16 +53,27 @@ def test_cycles_layers_add_up_to_the_beauty():
 def test_the_table_says_what_each_feature_is_read_from(tmp_path):
     channels = layer("", 1, "RGBA") | layer("denoise_albedo", 2) | layer("diffuse_direct", 3)
     render = mapped(tmp_path, channels | layer("diffuse_indirect", 4))
-    rows = {row["feature"]: (row["status"], row["source"]) for row in render.table()}
+    rows = {
+        row["feature"]: (row["status"], row["source"])
+        for row in render.table({"rgb", "albedo", "normal", "diffuse", "specular"})
+    }
     assert rows == {
         "rgb": ("found", "R G B"),
         "albedo": ("found", "denoise_albedo"),
-        "normal": ("default", "none found (optional)"),
+        "normal": ("default", ""),
         "diffuse": ("computed", "diffuse_direct + diffuse_indirect"),
-        "specular": ("default", "none found (optional)"),
-        "variance": ("default", "none found (optional)"),
+        "specular": ("default", ""),
+        "variance": ("unused", ""),
         "alpha": ("found", "A"),
     }
+
+
+def test_layers_of_another_view_are_told_apart(tmp_path):
+    """In a stereo file, the albedo of the left eye is read and that of the right eye is passed through."""
+    channels = layer("", 1) | layer("albedo", 2) | layer("right", 3) | layer("albedo.right", 4)
+    render = mapped(tmp_path, channels, attributes={"multiView": ["left", "right"]})
+    assert (render.view, found(render)["albedo"]) == ("left", "albedo")
+    assert render.unread_layers() == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
 
 
 def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):

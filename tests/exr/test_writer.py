@@ -58,6 +58,13 @@ def test_only_the_chosen_layers_are_passed_on(tmp_path, layout, source):
     assert all(same_bits(result[key], plane) for key, plane in chosen.items())
 
 
+def test_a_file_of_one_part_with_any_name_is_read_again(tmp_path):
+    """The result has more parts than one, so the name of the source's only part would name a layer."""
+    parts = [("shot_010", rgb(picture(8, 8)) | rgb(picture(8, 8), "albedo."), (0, 0))]
+    written(tmp_path, parts, WriteOptions())
+    assert map_render(open_exr(tmp_path / "out.exr")).table()[1]["source"] == "albedo"
+
+
 def test_layers_none_leaves_the_beauty_alone_and_a_misspelt_layer_is_named(tmp_path):
     _, _, after = written(tmp_path, everything(), WriteOptions(layers=("none",)))
     assert [list(channels) for _, channels in after] == [["A", "B", "G", "R"]]

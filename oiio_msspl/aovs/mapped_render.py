@@ -101,6 +101,7 @@ class MappedRender:
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
         """Features over a rectangle: float32 (height, width, channels), in the units of the features.
 
+        Each channel is contiguous in memory. Features that are read from one file may share the memory of all of them.
         Values are as the renderer wrote them: NaN and infinities may be among them.
 
         Args:
@@ -116,7 +117,9 @@ class MappedRender:
         place = {channel: i for i, channel in enumerate(channels)}
 
         def take(group: Sequence[Channel]) -> Array:
-            return pixels[..., [place[c] for c in group]]
+            places = [place[c] for c in group]
+            adjacent = places == list(range(places[0], places[-1] + 1))
+            return pixels[..., places[0] : places[-1] + 1] if adjacent else pixels[..., places]
 
         result: dict[str, Array] = {}
         with np.errstate(all="ignore"):  # the caller repairs and counts NaN and infinities

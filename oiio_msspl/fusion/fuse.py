@@ -164,7 +164,9 @@ class _Pair:
             name: encode_feature(name, pair.lrhs[name], 1.0) for name in self._session.lrhs_aovs if name in pair.lrhs
         }
         hrls = pair.hrls
-        needed_for_alpha = {name: hrls[name] for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls}
+        # Copies, because views would keep the memory of all features.
+        for_alpha = [name for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls]
+        needed_for_alpha = {name: hrls[name].copy("K") for name in for_alpha}
         prepared = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
         if empty is None or not empty.all():
             lrhs_rgb, hrls = dim_fireflies(pair)

@@ -102,6 +102,17 @@ def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):
     np.testing.assert_array_equal(loaded.layers["rgb"], values)
 
 
+def test_features_of_neighbouring_channels_are_not_copied(tmp_path):
+    """Each channel is contiguous, as the network wants it, whatever the order of the file."""
+    values = picture(H, W)
+    path = write_exr(tmp_path / "hr.exr", rgb(values) | rgb(values * 2, "albedo.") | {"Z": values[..., 0]})
+    features = map_render(open_exr(path)).read(Window(0, 0, W, H), ["albedo", "rgb"])
+    assert features["rgb"].base is features["albedo"].base is not None
+    for feature, factor in (("rgb", 1), ("albedo", 2)):
+        assert features[feature].transpose(2, 0, 1).flags.c_contiguous
+        np.testing.assert_array_equal(features[feature], values * factor)
+
+
 def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_path):
     """Whoever reads tiles asks both kinds of render in the same way."""
     render = mapped(tmp_path, layer("", 1))

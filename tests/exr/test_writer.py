@@ -225,6 +225,16 @@ def test_pixel_type_and_compression_of_the_beauty(tmp_path, kind, compression):
     assert same_bits(flat(parts)[("id", "X")], source["id.X"])
 
 
+def test_zip_is_fast_rather_than_small(tmp_path):
+    """The zlib header of a chunk names the effort: here of the only chunk, in a file of 2 KB."""
+    values = picture(16, 16)
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(values.astype(np.float16)))))
+    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, values, None, {}, WriteOptions())
+    fastest, default = b"\x78\x01", b"\x78\x5e"
+    assert fastest in (tmp_path / "out.exr").read_bytes()
+    assert default in (tmp_path / "hr.exr").read_bytes()
+
+
 def test_lossy_sources_are_not_compressed_a_second_time(tmp_path):
     """Layers decoded from DWA are stored without loss: encoding them again would change them."""
     path = write_exr(tmp_path / "hr.exr", everything(), compression=OpenEXR.DWAA_COMPRESSION)

@@ -14,7 +14,14 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import fuse_alpha
-from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
+from oiio_msspl.fusion.guards import (
+    EmptyRegions,
+    Mask,
+    check_finite,
+    dim_fireflies,
+    is_noise_free,
+    lights_above_ceiling,
+)
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, largest_tile, plan_tiles
@@ -72,6 +79,7 @@ def fuse(
 
     Raises:
         InputError: the pair does not fit together, or the model is for another scale or does not predict its error.
+        MssplError: the network failed, or returned NaN or infinite values.
     """
     alignment = align(lr, hr)
     _check_model(session, alignment.scale, error)
@@ -119,6 +127,8 @@ class _PreparedTile:
     lrhs: Array | None = None
     """Network input, encoded; None for a tile that is empty everywhere."""
     hrls: Array | None = None
+    lights: Array | None = None
+    """See :func:`oiio_msspl.fusion.guards.lights_above_ceiling`."""
     noise_free: bool = False
     """There is no noise to remove: the HRLS is the result."""
 
@@ -167,6 +177,7 @@ class _Pair:
         prepared = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
         if empty is None or not empty.all():
             lrhs_rgb, hrls = dim_fireflies(pair)
+            prepared.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
             prepared.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
             prepared.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
             prepared.noise_free = is_noise_free(pair, prepared.lrhs, hrls[RGB], self.exposure)
@@ -190,8 +201,11 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None
             encoded, encoded_error = session.run(
                 tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, error=frame.error is not None
             )
+        check_finite(session, encoded, encoded_error)
         rgb = frame.rgb[target]
         decode_radiance(encoded[core], frame.exposure, rgb)
+        if tile.lights is not None:
+            np.maximum(rgb, tile.lights[core], out=rgb)
         if empty is not None:
             rgb *= ~empty[core]
         if frame.error is not None and encoded_error is not None:

@@ -97,7 +97,7 @@ def read_lrhs(
     for axis, pixels, stretch, origin in zip(
         (0, 1), _mirrored_pixels(grid, alignment.grid), (stretch_y, stretch_x), (data.y0, data.x0), strict=True
     ):
-        positions = (pixels + 0.5) * stretch - 0.5 - origin
+        positions = (pixels.astype(np.float64) + 0.5) * stretch - 0.5 - origin
         layers = {name: interpolate(values, positions, axis) for name, values in layers.items()}
     return layers
 

@@ -5,9 +5,9 @@ import numpy as np
 import pytest
 
 from oiio_msspl import find_model, fuse
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.render import Render, Window
-from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture
 
@@ -100,6 +100,115 @@ def test_a_pixel_that_the_lrhs_rules_out_is_dimmed_before_it_is_fused(session, s
         high.layers["rgb"][2 * scale, 2 * scale] = value
         results.append(fuse(low, high, session).rgb)
     np.testing.assert_array_equal(*results)
+
+
+LAMP_ROWS, LAMP_COLUMNS = slice(45, 72), slice(67, 102)  # not along the borders of LRHS pixels
+
+
+@pytest.mark.parametrize("family", ["pyramid", "paper"])
+@pytest.mark.parametrize(("lamp", "room"), [(5000, 0.002), (60_000, 0.05), (1e7, 0.05)])
+def test_a_lamp_is_as_bright_as_in_both_renders(scale, family, lamp, room):
+    """However dark the room is: inside, along the rim, and where it is smaller than an LRHS pixel; without a halo."""
+    clean = np.full((144, 192, 3), room, np.float32)
+    low_clean, high = downsample(clean, scale), noisy(clean, 1, seed=1)
+    clean[LAMP_ROWS, LAMP_COLUMNS] = lamp
+    clean[121, 31] = lamp
+    on = clean == lamp
+    high[on] = lamp
+    mean = downsample(clean.astype(np.float64), scale)
+    low = np.where(mean > 2 * room, mean, noisy(low_clean, scale**2))
+    fused = fuse(*renders(low, high), Session(find_model(scale, family))).rgb
+    np.testing.assert_allclose(fused[on], lamp, rtol=1e-6)
+    assert fused[~on].max() < 0.2 * 65504 * room / 0.18  # a fifth of the ceiling: what the networks themselves spread
+
+
+def test_the_rim_of_a_lamp_is_whole_under_a_wide_pixel_filter(session, scale):
+    """The LRHS's filter is as wide in its own pixels, so it is darker than the lamp along the rim."""
+    lamp = np.zeros((144, 192, 3), np.float32)
+    lamp[LAMP_ROWS, LAMP_COLUMNS] = 1e6
+    high, low = (downsample(_blurred(lamp, pixel), pixel) + np.float32(0.05) for pixel in (1, scale))
+    fused = fuse(*renders(low, high), session).rgb
+    ceiling = 65504 / find_exposure(low.astype(np.float32))
+    np.testing.assert_allclose(fused[high > ceiling], high[high > ceiling], rtol=0.06)
+    assert fused[high < 0.1].max() <= 1.001 * ceiling
+
+
+def _blurred(values, width):
+    """Tent filter of two pixels of ``width``."""
+    tent = np.convolve(np.ones(width), np.ones(width)) / width**2
+    for axis in (0, 1):
+        values = np.apply_along_axis(lambda line: np.convolve(line, tent, "same"), axis, values)
+    return values
+
+
+@pytest.mark.parametrize("in_lrhs", [False, True])
+@pytest.mark.parametrize("place", ["room", "beside the lamp", "lamp"])
+def test_a_firefly_in_one_render_alone_is_no_light(session, scale, in_lrhs, place):
+    clean = np.full((96, 128, 3), 0.05, np.float32)
+    clean[32:64, 32:64] = 1e5
+    low, high = downsample(clean, scale), noisy(clean, 4)
+    high[32:64, 32:64] = 1e5
+    expected = fuse(*renders(low, high), session).rgb
+    row, column = {"room": (16, 96), "beside the lamp": (48, 65), "lamp": (48, 48)}[place]
+    (low if in_lrhs else high)[(row // scale, column // scale) if in_lrhs else (row, column)] = 1e9
+    fused = fuse(*renders(low, high), session).rgb
+    lamp = np.zeros(fused.shape[:2], bool)
+    lamp[32:64, 32:64] = True
+    np.testing.assert_allclose(fused[lamp], 1e5, rtol=1e-6)
+    assert fused[~lamp].max() <= max(65504 / find_exposure(low.astype(np.float32)), expected[~lamp].max()) * 1.001
+
+
+def renders(low, high):
+    return [Render.from_arrays(name, rgb=values.astype(np.float32)) for name, values in (("lr", low), ("hr", high))]
+
+
+@pytest.mark.parametrize("light", [1e-45, 1e-40, 1e-38])
+def test_the_end_of_a_fade_stays_finite(scale, light):
+    """Light so weak that the exposure would be infinite."""
+    low = np.full((96 // scale, 128 // scale, 3), light, np.float32)
+    high = low.repeat(scale, 0).repeat(scale, 1) * np.random.default_rng(0).integers(0, 3, (96, 128, 1))
+    fused = fuse(*renders(low, high), Session(find_model(scale, "pyramid")))
+    assert np.isfinite(np.float32(fused.exposure))
+    assert np.isfinite(fused.rgb).all()
+    assert fused.rgb.max() <= 4 * light
+
+
+@pytest.mark.parametrize("light", [1e37, 1e38, 3e38])
+@pytest.mark.parametrize("everywhere", [False, True])
+@pytest.mark.filterwarnings("error")
+def test_light_near_the_end_of_float32_is_fused(session, scale, light, everywhere):
+    clean = picture(64 * scale, 64 * scale)
+    if everywhere:
+        clean *= np.float32(light / clean.max())
+    else:
+        clean[16:32, 16:32] = light
+    fused = fuse(*renders(downsample(clean.astype(np.float64), scale), clean), session)
+    assert np.isfinite(fused.rgb).all()
+    assert fused.rgb.max() > 0.9 * light
+    assert fused.warnings == []
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+@pytest.mark.parametrize("what", ["colour", "error", "alpha"])
+def test_a_network_that_fails_is_an_error_and_no_frame(bilinear_models, monkeypatch, bad, what):
+    session = Session(bilinear_models[4])
+    low, high, _ = pair_of(4)
+    if what == "alpha":
+        for render in (low, high):
+            render.layers["alpha"] = np.full((*render.layers["rgb"].shape[:2], 1), 0.5, np.float32)
+    run, calls = session.run, []
+
+    def broken(*arrays, **more):
+        calls.append(arrays)
+        colour, error = (None if image is None else image.copy() for image in run(*arrays, **more))
+        image = error if what == "error" else colour
+        if len(calls) == (2 if what == "alpha" else 1):
+            image[3, 5] = bad
+        return colour, error
+
+    monkeypatch.setattr(session, "run", broken)
+    with pytest.raises(MssplError, match="bilinear-x4 on CPUExecutionProvider returned NaN or infinite values"):
+        fuse(low, high, session, error=what == "error")
 
 
 def test_crop_regions_with_negative_origins(session, scale):

@@ -24,7 +24,7 @@ from oiio_msspl.fusion.guards import (
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, largest_tile, plan_tiles
+from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, check_memory, plan_tiles
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
@@ -66,6 +66,7 @@ def fuse(
     *,
     error: bool = False,
     max_memory: int = MAX_MEMORY,
+    held: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedFrame:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
@@ -74,11 +75,13 @@ def fuse(
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
-        max_memory: bytes that the whole process should stay below.
+        max_memory: bytes that the whole process should stay below. The result does not depend on it.
+        held: bytes that the caller holds beside this frame.
         progress: called with (tiles done, tiles in all).
 
     Raises:
-        InputError: the pair does not fit together, or the model is for another scale or does not predict its error.
+        InputError: the pair does not fit together or into memory, or the model is for another scale or does not
+            predict its error.
         MssplError: the network failed, or returned NaN or infinite values.
     """
     alignment = align(lr, hr)
@@ -87,9 +90,9 @@ def fuse(
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
         frame = _blank_frame(alignment, pair.exposure, error=error)
-        largest = largest_tile(session.contract, frame.nbytes + pair.nbytes, max_memory)
-        tiles = plan_tiles(pair.grid, largest, session.contract.overlap, session.contract.alignment)
-        with hr.cache_strips(int(max_memory * STRIPS_SHARE)):
+        tiles = plan_tiles(pair.grid, session.contract)
+        check_memory(session.contract, tiles, frame.nbytes + pair.nbytes + held, max_memory)
+        with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             # The next tile is read and encoded while the network works on this one.
             for done, tile in enumerate(one_ahead(pair.prepare, tiles), start=1):
                 _fuse_tile(tile, session, frame)

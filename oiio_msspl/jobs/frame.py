@@ -121,7 +121,7 @@ def fuse_files(
             :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.session.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
-        max_memory: bytes that the process should stay below; tiles shrink to fit.
+        max_memory: bytes that the process should stay below. The result does not depend on it.
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.

@@ -14,10 +14,17 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import fuse_alpha
-from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
+from oiio_msspl.fusion.guards import (
+    EmptyRegions,
+    Mask,
+    check_finite,
+    dim_fireflies,
+    is_noise_free,
+    lights_above_ceiling,
+)
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, largest_tile, plan_tiles
+from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, check_memory, plan_tiles
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
@@ -61,6 +68,7 @@ def fuse(
     *,
     error: bool = False,
     max_memory: int = MAX_MEMORY,
+    held: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedFrame:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
@@ -69,11 +77,14 @@ def fuse(
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
-        max_memory: bytes that the whole process should stay below.
+        max_memory: bytes that the whole process should stay below. The result does not depend on it.
+        held: bytes that the caller holds beside this frame.
         progress: called with (tiles done, tiles in all).
 
     Raises:
-        InputError: the pair does not fit together, or the model is for another scale or does not predict its error.
+        InputError: the pair does not fit together or into memory, or the model is for another scale or does not
+            predict its error.
+        MssplError: the network failed, or returned NaN or infinite values.
     """
     alignment = align(lr, hr)
     _check_model(session, alignment.scale, error)
@@ -81,9 +92,9 @@ def fuse(
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
         frame = _blank_frame(alignment, pair.exposure, error=error)
-        largest = largest_tile(session.contract, frame.nbytes + pair.nbytes, max_memory)
-        tiles = plan_tiles(pair.grid, largest, session.contract.overlap, session.contract.alignment)
-        with hr.cache_strips(int(max_memory * STRIPS_SHARE)):
+        tiles = plan_tiles(pair.grid, session.contract)
+        check_memory(session.contract, tiles, frame.nbytes + pair.nbytes + held, max_memory)
+        with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             # The next tile is read and encoded while the network works on this one.
             for done, tile in enumerate(one_ahead(pair.prepare, tiles), start=1):
                 _fuse_tile(tile, session, frame)
@@ -122,6 +133,8 @@ class _PreparedTile:
     lrhs: Array | None = None
     """Network input, encoded; None for a tile that is empty everywhere."""
     hrls: Array | None = None
+    lights: Array | None = None
+    """See :func:`oiio_msspl.fusion.guards.lights_above_ceiling`."""
     noise_free: bool = False
     """There is no noise to remove: the HRLS is the result."""
 
@@ -170,6 +183,7 @@ class _Pair:
         prepared = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
         if empty is None or not empty.all():
             lrhs_rgb, hrls = dim_fireflies(pair)
+            prepared.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
             prepared.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
             prepared.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
             prepared.noise_free = is_noise_free(pair, prepared.lrhs, hrls[RGB], self.exposure)
@@ -193,8 +207,11 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None
             encoded, encoded_error = session.run(
                 tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, error=frame.error is not None
             )
+        check_finite(session, encoded, encoded_error)
         rgb = frame.rgb[target]
         decode_radiance(encoded[core], frame.exposure, rgb)
+        if tile.lights is not None:
+            np.maximum(rgb, tile.lights[core], out=rgb)
         if empty is not None:
             rgb *= ~empty[core]
         if frame.error is not None and encoded_error is not None:

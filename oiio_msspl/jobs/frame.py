@@ -10,12 +10,15 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
-from oiio_msspl.exr.contents import dropped_channels
+from oiio_msspl.exr.contents import dropped_channels, widest_type
 from oiio_msspl.exr.preview import check_view, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.write_options import WriteOptions
@@ -118,7 +121,7 @@ def fuse_files(
             :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.session.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
-        max_memory: bytes that the process should stay below; tiles shrink to fit.
+        max_memory: bytes that the process should stay below. The result does not depend on it.
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
@@ -167,11 +170,18 @@ def fuse_files(
 def write_frame(
     report: FrameReport, fused: FusedFrame, options: WriteOptions, *, overwrite: bool, cache_bytes: int = 0
 ) -> None:
-    """Write the EXR that the report names, and add the writer's warnings to the report.
+    """Write the EXR that the report names. The number of clipped values and the writer's warnings are added to the
+    report.
 
     Args:
         cache_bytes: see :func:`oiio_msspl.exr.writer.write_fused`.
     """
+    if (options.pixel_type or widest_type(report.hr.beauty_channels)) == "half":
+        report.clipped = int(np.count_nonzero(fused.rgb > HALF_MAX))
+    if report.clipped:
+        report.warnings.append(
+            f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
+        )
     report.warnings += write_fused(
         report.output,
         report.hr.file,

@@ -38,6 +38,8 @@ class FrameReport:
     ``network`` is the part of ``fuse`` that the model's network took, and ``write`` writes EXR and preview."""
     features: frozenset[str]
     """Features of the HRLS that the model reads."""
+    clipped: int = 0
+    """Number of fused values that half could not hold; 0 if the beauty is stored as float."""
     lrhs_aovs: tuple[str, ...] = ()
     """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
 
@@ -75,6 +77,7 @@ class FrameReport:
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "negative": self.negative,
+            "clipped": self.clipped,
             "warnings": self.warnings,
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},

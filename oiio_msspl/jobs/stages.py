@@ -17,7 +17,7 @@ from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.jobs.frame import InputOptions, map_pair, write_frame, write_frame_preview
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame
@@ -76,7 +76,7 @@ class Stages:
         return report
 
     def read(self, frame: Frame) -> LoadedFrame:
-        """Open and map a pair, and read its pixels if two frames fit into half of the memory.
+        """Open and map a pair, and read its pixels if two frames fit into memory beside a tile.
 
         Raises:
             InputError: a file can't be used, or the two renders don't fit together.
@@ -85,7 +85,9 @@ class Stages:
         assert frame.lr is not None and frame.hr is not None
         lr, hr = map_pair(frame.lr, frame.hr, self.inputs)
         align(lr, hr)  # refuses the pair before its pixels are read
-        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= (self.max_memory - FIXED_MEMORY) // 2:
+        result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
+        left = self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr)
+        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= left:
             return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start)
         return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start)
 
@@ -115,7 +117,8 @@ class Stages:
             loaded.hr_pixels,
             session,
             error=self.write_options.error_layer,
-            max_memory=self.max_memory - others,
+            max_memory=self.max_memory,
+            held=others,
         )
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)

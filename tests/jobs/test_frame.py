@@ -1,13 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main job on one pair: what is refused before any work, and what does not stop it."""
 
+import numpy as np
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs import frame
 from oiio_msspl.jobs.frame import map_pair
-from tests.conftest import picture, rgb, write_exr
+from tests.conftest import downsample, picture, read_bits, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
 
 
@@ -64,3 +65,16 @@ def test_the_mapping_is_the_hrls_s_and_only_its_beauty_applies_to_the_lrhs(tmp_p
     assert (set(low.features), set(high.features)) == ({"rgb"}, {"rgb", "albedo"})
     assert (low.features["rgb"].text, high.features["albedo"].text) == ("key", "colours")
     assert (low.spp, high.spp) == (64, 2)
+
+
+@pytest.mark.parametrize(("pixel_type", "lamp", "clipped"), [("half", 65504.0, 3 * 64), ("float", 1e6, 0)])
+def test_values_that_half_cannot_hold_are_clipped_and_counted(tmp_path, bilinear_models, pixel_type, lamp, clipped):
+    clean = np.full((64, 64, 3), 0.5, np.float32)
+    clean[16:24, 40:48] = 1e6
+    lr, hr = write_exr(tmp_path / "lr.exr", rgb(downsample(clean, 4))), write_exr(tmp_path / "hr.exr", rgb(clean))
+    write = WriteOptions(pixel_type=pixel_type)
+    report = fuse_files(lr, hr, tmp_path / "out.exr", write=write, model=str(bilinear_models[4]))
+    assert report.clipped == report.as_dict()["clipped"] == clipped
+    assert any(f"{clipped} values are too bright for half" in warning for warning in report.warnings) == bool(clipped)
+    [(_, channels)] = read_bits(tmp_path / "out.exr")
+    assert (channels["R"][16:24, 40:48] == lamp).all()

@@ -30,7 +30,7 @@ EXAMPLES = """[bold]Examples[/bold]
 
   msspl-fuse lr.exr hr.exr -o out.exr --map albedo=my_albedo --layout nuke --half
 
-  msspl-fuse lr.exr hr.exr -o out.exr --overwrite --no-preview --max-memory 2G --json > report.json
+  msspl-fuse lr.exr hr.exr -o out.exr --overwrite --no-preview --max-memory 4G --json > report.json
 
   msspl-fuse lr/ hr/ -o out/ --skip-existing --report shot.json
 
@@ -90,7 +90,11 @@ def fuse(
     device: options.Device = "cpu",
     max_memory: Annotated[
         str,
-        typer.Option(metavar="SIZE", help="Memory to stay below. Tiles shrink to fit.", rich_help_panel=options.MODEL),
+        typer.Option(
+            metavar="SIZE",
+            help="Memory to stay below; the result does not depend on it.",
+            rich_help_panel=options.MODEL,
+        ),
     ] = "3G",
     threads: Annotated[
         int,

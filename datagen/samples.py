@@ -12,8 +12,8 @@ A file is an uncompressed ``.npz`` named ``<renderer>-<seed>-<view>.samples.npz`
 Others are for the LRHS and independent: ``lr_place``, ``lr_color``, ``lr_albedo``, ``lr_normal``, (L, H, W...). L
 samples a pixel are L * s^2 samples for each LRHS pixel at scale s.
 
-* ``ref``: uint32 (R * H, R * W), the reference at R times the resolution, filtered with a box of one of its own pixels.
-  Filters for the reference are applied to these cells. It is independent of all samples.
+* ``ref``: uint32 (R * H, R * W), the reference at R = ``REF_CELLS`` times the resolution, filtered with a box of one of
+  its own pixels. Filters for the reference are applied to these cells. It is independent of all samples.
 * ``meta``: a JSON string, as in :mod:`datagen.views`.
 """
 
@@ -27,22 +27,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from datagen.quality import log_mean
-from datagen.views import map_npz
+from datagen.views import SAMPLES_SUFFIX
 
-SUFFIX = ".samples.npz"
 #: Height and width of a view in pixels.
 SIZE = 384
 #: Samples per pixel for the HRLS and for the LRHS.
 HR_SAMPLES, LR_SAMPLES = 12, 4
-#: Cells of the reference per pixel, along each side.
-REF_CELLS = 2
 #: The smallest step of :func:`encode`, and its largest mantissa.
 STEP, MANTISSA = 2.0**-24, 511
 
 
 def path_of(out: Path, renderer: str, seed: int, view: int) -> Path:
     """The file of a scene's view."""
-    return out / f"{renderer}-{seed:06d}-{view}{SUFFIX}"
+    return out / f"{renderer}-{seed:06d}-{view}{SAMPLES_SUFFIX}"
 
 
 def encode(radiance: NDArray[Any]) -> NDArray[np.uint32]:
@@ -95,25 +92,3 @@ def pack(
         "ref": encode(ref * scale),
         "meta": np.array(json.dumps({**meta, "exposure": {"scale": scale, "log_mean": target}})),
     }
-
-
-class SampleView:
-    """One view with its samples; the arrays stay on disk.
-
-    Raises:
-        ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile: the file is incomplete or no view.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.arrays = map_npz(path)
-        self.path = path
-        self.meta: dict[str, Any] = json.loads(str(self.arrays["meta"]))
-        self.split: str = self.meta["split"]
-        self.scene: str = str(self.meta["seed"])
-        self.source: str = f"{self.meta['renderer']}, generator {self.meta['generator']}"
-        """Renderer and generator version, for the provenance of a model."""
-        samples, height, width = self.arrays["color"].shape
-        self.hr = self.arrays["color"]
-        self.lr_spp = np.ones(len(self.arrays["lr_color"]), np.int64)
-        if self.arrays["ref"].shape != (REF_CELLS * height, REF_CELLS * width):
-            raise ValueError(f"{path}: ref is {self.arrays['ref'].shape}, color {(samples, height, width)}")

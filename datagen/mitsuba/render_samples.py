@@ -37,7 +37,7 @@ def _reference(scene, camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray
     """
     from datagen.mitsuba.trace import render_samples
 
-    cells, per_step = samples.REF_CELLS, 2 * _BATCH * samples.REF_CELLS**2
+    cells, per_step = views.REF_CELLS, 2 * _BATCH * views.REF_CELLS**2
     names = ("color", "albedo", "normal")
     halves = {name: np.zeros((2, *[cells * samples.SIZE] * 2, 3)) for name in names}
     done = 0
@@ -132,7 +132,7 @@ def main() -> int:
     assets = Assets(args.assets)
 
     def render(seed: int) -> tuple[int, str]:
-        if sum(path.stat().st_size for path in args.out.glob(f"*{samples.SUFFIX}")) > args.max_gib * 2**30:
+        if sum(path.stat().st_size for path in args.out.glob(f"*{views.SAMPLES_SUFFIX}")) > args.max_gib * 2**30:
             raise SystemExit(f"{args.out}: holds more than {args.max_gib} GiB; raise --max-gib to go on")
         return render_scene(args, assets, seed)
 

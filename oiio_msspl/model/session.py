@@ -119,7 +119,7 @@ class Session:
         except Exception as cause:
             raise MssplError(
                 f"{self.contract.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "
-                "try a smaller --max-memory, or --device cpu"
+                "try --device cpu, or another --model"
             ) from cause
         self.seconds += time.perf_counter() - start
         images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}

@@ -32,7 +32,7 @@ from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Render
-from oiio_msspl.fusion.pair_checks import check_renders
+from oiio_msspl.fusion.pair_checks import BOTH_BLACK, check_renders
 
 HALVES = ("all", "tune", "report")
 RIGHT, RIGHT_QUARTER = "right, whole frame", "right, a quarter of the frame"
@@ -222,6 +222,7 @@ def main() -> None:
 
     def measure(kind: str, pair: Pair) -> None:
         warnings = pair.warnings()
+        warnings = [warning for warning in warnings if warning != BOTH_BLACK]
         noticed[kind].append(bool(warnings))
         if args.verbose and bool(warnings) == (kind in (RIGHT, RIGHT_QUARTER)):
             print(f"{pair.name}: {kind}: {'; '.join(warnings) or 'not noticed'}", flush=True)
@@ -229,6 +230,8 @@ def main() -> None:
     for view in views:
         other = next((v for v in views[views.index(view) :] + views if v.scene != view.scene), None)
         for pair in view.pairs():
+            if not pair.hrls[RGB].any():
+                continue  # the camera is inside a wall
             measure(RIGHT, pair)
             for quarter in pair.quarters():
                 measure(RIGHT_QUARTER, quarter)

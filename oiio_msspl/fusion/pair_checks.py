@@ -38,10 +38,9 @@ MAX_SHIFT = (0.75, 0.5)
 MAX_ZOOM = 0.6
 #: A difference of exposure must be this many standard errors from none.
 CERTAIN = 6.0
-#: Side of a block in LRHS pixels -> how many blocks along each side are looked at together.
-BLOCK_GROUPS = {4: 3, 8: 2}
-#: A group of blocks shows different things if its mean of t^2 exceeds this. Groups of matching views reach 9.8.
-DIFFERENT = 12.0
+#: Groups of blocks show different things: the side of a block in LRHS pixels, how many blocks the group has along each
+#: side, and the mean of t^2 from which on it counts. Groups of matching views reach 12.9, 8.2 and 9.8.
+BLOCK_GROUPS = ((4, 2, 16.0), (4, 3, 11.0), (8, 2, 12.0))
 #: No single block counts for more than this t.
 LARGEST_T = 6.0
 #: Pixel filters of different widths move light across edges: this share of a block's contrast is no difference.
@@ -238,7 +237,7 @@ def _log_correlation(hrls: HrlsAverages) -> float:
     low, high = hrls.blocks[..., :3].sum(axis=-1), hrls.blocks[..., 3:6].sum(axis=-1)
     logs = [np.log(v + 1e-3 * v.mean() + 1e-20).ravel() for v in (low, high)]
     noise = float(np.mean(9 * hrls.blocks[..., 7] / np.square(high + 1e-3 * high.mean() + 1e-20)))
-    if low.size < MIN_NOISY_BLOCKS or min(v.var() for v in logs) < max(1e-6, 2 * noise):
+    if low.size < MIN_NOISY_BLOCKS or min(v.var() for v in logs) < max(1e-6, 5 * noise):
         return 1.0
     return float(np.corrcoef(*logs)[0, 1])
 
@@ -265,7 +264,7 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
     it, and from the frame's median, which a difference of the whole frame raises as well.
     """
     floor = 0.05 * np.median(low + high)
-    for size, side in BLOCK_GROUPS.items():
+    for size, side, different in BLOCK_GROUPS:
         if min(low.shape) < size * side:
             continue
         a, b = (_in_blocks(v.astype(np.float64), size) for v in (low, high))  # a squared firefly overflows float32
@@ -275,7 +274,7 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
         t = np.minimum(np.abs((a - b).mean(axis=-1)) / np.maximum(error, 1e-30), LARGEST_T)
         groups = np.lib.stride_tricks.sliding_window_view(np.square(t), (side, side))
         means = groups.mean(axis=(-2, -1))
-        if means.max() > DIFFERENT * max(1.0, float(np.median(means))):
+        if means.max() > different * max(1.0, float(np.median(means))):
             row, column = np.unravel_index(means.argmax(), means.shape)
             y, x = np.unravel_index(groups[row, column].argmax(), (side, side))
             return int((column + x) * size + size // 2), int((row + y) * size + size // 2)

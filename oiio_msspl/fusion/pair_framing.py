@@ -19,6 +19,9 @@ from oiio_msspl.arrays import Array, box_downsample, interpolate
 
 #: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
 FRAMING_CORRELATION = 0.9
+#: It must also explain this share of the difference that is left after tone curve and blur: where a picture has few
+#: edges, noise and filters look like small shifts.
+MIN_EXPLAINED = 0.1
 #: A difference must be this many standard errors from none.
 CERTAIN = 8.0
 #: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
@@ -62,7 +65,7 @@ def find_framing(low: Array, high: Array) -> Framing:
         if np.abs(coarse).max() >= 0.5:
             starts.append(np.clip(coarse, -12, 12))
     fit = min((_fit(low, high, start) for start in starts), key=lambda fit: fit.residual)
-    if fit.correlation < FRAMING_CORRELATION:
+    if fit.correlation < FRAMING_CORRELATION or fit.residual > (1 - MIN_EXPLAINED) * _unmoved_residual(low, high):
         return Framing()
     x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
     return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge))
@@ -111,6 +114,15 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
     a, b = (v[inner, inner] - v[inner, inner].mean() for v in (moved, high))
     correlation = float(np.mean(a * b)) / max(float(a.std() * b.std()), 1e-12)
     return _Fit(estimate, error, residual, correlation)
+
+
+def _unmoved_residual(low: Array, high: Array) -> float:
+    """Mean squared difference that a tone curve and a blur of the LRHS do not explain."""
+    known = [low, np.square(low), smooth(low) - low, np.ones_like(low)]
+    planes = np.stack([*known, high - low])[:, 3:-3, 3:-3].reshape(5, -1).astype(np.float64)
+    dots = planes @ planes.T
+    coefficients = np.linalg.lstsq(dots[:4, :4], dots[:4, 4], rcond=None)[0]
+    return float(dots[4, 4] - coefficients @ dots[:4, 4]) / planes.shape[1]
 
 
 def _move(values: Array, by: NDArray[np.float64]) -> Array:

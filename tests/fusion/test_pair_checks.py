@@ -36,7 +36,8 @@ def scene(scale, seed=0, size=LOW):
 
 
 def pair(scale, seed=0, **changed):
-    """A right pair with 4 spp in the HRLS and as many samples in the LRHS; ``changed`` replaces layers, and ``lr`` the LRHS."""
+    """A right pair with 4 spp in the HRLS and as many samples in the LRHS; ``changed`` replaces layers, ``lr`` the
+    LRHS."""
     colour, albedo, normal = scene(scale, seed)
     low = noisy(downsample(colour, scale), 4 * scale**2, seed + 100)
     layers = {"rgb": noisy(colour, 4, seed + 200), "albedo": albedo, "normal": normal}

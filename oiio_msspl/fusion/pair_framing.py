@@ -31,7 +31,7 @@ MIN_PARTS = 6.0
 #: Side of the central area, in LRHS pixels, in which the framing is compared.
 AREA = 1024
 #: Pictures with a shorter side, in LRHS pixels, have too few edges to judge.
-SMALLEST = 48
+SMALLEST = 44
 #: Largest zoom that is looked for.
 MAX_ZOOM = 0.1
 
@@ -59,7 +59,7 @@ def find_framing(low: Array, high: Array) -> Framing:
     # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
     low, high = (smooth(v / (v + grey)) for v in (low, high))
     starts = [np.zeros(3)]
-    if min(low.shape) >= 16 * JACKKNIFE_PARTS:
+    if min(low.shape) >= 8 * JACKKNIFE_PARTS:
         coarse = _fit(smooth(downsample_4(low)), smooth(downsample_4(high)), np.zeros(3)).estimate * 4
         # A start less than half a pixel away would lead to the same result.
         if np.abs(coarse).max() >= 0.5:

@@ -58,6 +58,8 @@ def find_framing(low: Array, high: Array) -> Framing:
     grey = np.median(low[low > 0]) if low.any() else 1.0
     # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
     low, high = (smooth(v / (v + grey)) for v in (low, high))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return Framing()  # radiance near the limit of float32
     starts = [np.zeros(3)]
     if min(low.shape) >= 8 * JACKKNIFE_PARTS:
         coarse = _fit(smooth(downsample_4(low)), smooth(downsample_4(high)), np.zeros(3)).estimate * 4
@@ -102,11 +104,12 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
         dots = np.stack([part @ part.T for part in flat])
         squares, products = dots[:, :-1, :-1], dots[:, :-1, -1]
         total = squares.sum(0) + 1e-9 * squares.sum(0).trace() * np.eye(len(known))  # solvable without any gradient
-        step = np.linalg.solve(total, products.sum(0))
+        step = np.linalg.pinv(total, hermitian=True) @ products.sum(0)
         estimate = np.clip(estimate + np.clip(step[:3], -1, 1), -largest, largest)
         if np.abs(step[:3]).max() < 0.01:
             break
-    without_part = np.linalg.solve(total - squares, (products.sum(0) - products)[..., None])[:, :3, 0]
+    inverses = np.linalg.pinv(total - squares, hermitian=True)
+    without_part = (inverses @ (products.sum(0) - products)[..., None])[:, :3, 0]
     # A few parts with all the gradients say little about each other.
     shares = squares[:, range(3), range(3)] / np.maximum(squares[:, range(3), range(3)].sum(0), 1e-30)
     error = np.where(np.square(shares).sum(0) * MIN_PARTS > 1, np.inf, jackknife_error(without_part))

@@ -141,3 +141,19 @@ def test_a_wider_pixel_filter_is_no_difference(scale):
     for axis in (0, 1):
         low = 0.25 * np.roll(low, 1, axis) + 0.5 * low + 0.25 * np.roll(low, -1, axis)
     assert warnings(scale, lr=noisy(low, 64), rgb=noisy(colour, 4, seed=1)) == []
+
+
+@pytest.mark.parametrize("side", [44, 48, 50])
+@pytest.mark.parametrize("kind", ["black but for a pixel", "flat", "stripes", "huge"])
+def test_pictures_without_a_framing_are_no_error(side, kind):
+    """Stripes say nothing of the shift along them, so the equations have no single solution."""
+    image = np.full((2 * side, 2 * side, 3), 0.3, np.float32)
+    if kind == "black but for a pixel":
+        image[:] = 0
+        image[10:12, 10:12] = 1
+    elif kind == "stripes":
+        image[:, ::16] = 2
+    elif kind == "huge":
+        image[20:40, 20:40] = 3e38
+    low = Render.from_arrays("lr", rgb=image[::2, ::2].copy())
+    assert not [w for w in check_renders(low, Render.from_arrays("hr", rgb=image)) if "shifted" in w or "tighter" in w]

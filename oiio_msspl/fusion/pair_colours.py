@@ -36,6 +36,10 @@ def different_colours(low: NDArray[np.float64], high: NDArray[np.float64]) -> st
     Args:
         low, high: RGB of the same blocks of both renders, (n, 3).
     """
+    finite = np.isfinite(low + high).all(axis=-1)  # sums of radiance near the limit of float32 are not
+    low, high = low[finite], high[finite]
+    if len(low) < MIN_BLOCKS:
+        return None
     brightness = low.sum(axis=-1) + high.sum(axis=-1)
     lit = (brightness > 0.05 * np.median(brightness)) & (low.sum(axis=-1) > 0) & (high.sum(axis=-1) > 0)
     low, high = low[lit], high[lit]

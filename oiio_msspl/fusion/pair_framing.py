@@ -85,10 +85,12 @@ class _Fit:
 
 def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
     """Refine an estimate: repeated least squares over it, gain and offset, with the LRHS moved each time."""
-    estimate, (height, width) = start, low.shape
+    height, width = low.shape
     half = max(low.shape) / 2
     across, down = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) / np.float32(half) for n in (width, height))
-    largest = np.array([min(low.shape) / 4, min(low.shape) / 4, MAX_ZOOM * half])
+    # Shift and zoom together leave some rows and columns to compare.
+    largest = np.full(3, (min(low.shape) / 2 - 5) / 2).clip(max=(np.inf, np.inf, MAX_ZOOM * half))
+    estimate = np.clip(start, -largest, largest)
     for _ in range(8):
         moved = _move(low, estimate / (1, 1, half))
         margin = int(np.abs(estimate[:2]).max() + abs(estimate[2])) + 3

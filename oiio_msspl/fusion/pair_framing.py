@@ -32,6 +32,8 @@ MIN_PARTS = 6.0
 AREA = 1024
 #: Pictures with a shorter side, in LRHS pixels, have too few edges to judge.
 SMALLEST = 44
+#: Smaller pictures are not searched for shifts of several pixels: at a quarter of their size little is left.
+SMALLEST_COARSE = 80
 #: Largest zoom that is looked for.
 MAX_ZOOM = 0.1
 
@@ -61,7 +63,7 @@ def find_framing(low: Array, high: Array) -> Framing:
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Framing()  # radiance near the limit of float32
     starts = [np.zeros(3)]
-    if min(low.shape) >= 8 * JACKKNIFE_PARTS:
+    if min(low.shape) >= SMALLEST_COARSE:
         coarse = _fit(smooth(downsample_4(low)), smooth(downsample_4(high)), np.zeros(3)).estimate * 4
         # A start less than half a pixel away would lead to the same result.
         if np.abs(coarse).max() >= 0.5:

@@ -7,7 +7,7 @@ from typing import Any
 
 import typer
 
-from msspl_cli.commands import compare, fuse, inspect, models, nuke_install, render, submit
+from msspl_cli.commands import check, compare, fuse, inspect, models, nuke_install, render, submit
 from msspl_cli.errors import run
 from oiio_msspl import __version__
 
@@ -36,6 +36,7 @@ def _main(version: bool = typer.Option(False, "--version", help="Print the versi
 
 
 app.command(epilog=inspect.EXAMPLES)(inspect.inspect)
+app.command(epilog=check.EXAMPLES)(check.check)
 app.command(epilog=models.EXAMPLES)(models.models)
 app.command(epilog=compare.EXAMPLES)(compare.compare)
 app.command(epilog=fuse.EXAMPLES)(fuse.fuse)

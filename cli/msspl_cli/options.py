@@ -90,6 +90,17 @@ SkipExisting = Annotated[
     bool,
     typer.Option("--skip-existing", help="Skip frames that exist. This resumes a run.", rich_help_panel=SHOT),
 ]
+Colourspace = Annotated[
+    str | None,
+    typer.Option(
+        "--colorspace",
+        metavar="NAME",
+        help="Linear RGB space of both renders: lin_rec709, acescg, aces2065-1, lin_rec2020 or lin_p3d65. "
+        "\\[default: as their headers say, or lin_rec709]",
+        rich_help_panel=INPUT,
+        hidden=True,
+    ),
+]
 Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, metavar="", help="Print more; -vv prints all.", hidden=True)
 ]
@@ -112,7 +123,12 @@ def set_up_logging(verbose: int, quiet: bool) -> None:
 
 
 def make_inputs(
-    mapping: list[str], map_file: Path | None, view_layer: str | None, lr_spp: float | None, hr_spp: float | None
+    mapping: list[str],
+    map_file: Path | None,
+    view_layer: str | None,
+    lr_spp: float | None,
+    hr_spp: float | None,
+    colourspace: str | None = None,
 ) -> InputOptions:
     """The options that describe the input files. ``--map`` wins over ``--map-file``.
 
@@ -123,7 +139,7 @@ def make_inputs(
     from oiio_msspl.jobs.frame import InputOptions
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
-    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp)
+    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp, colourspace)
 
 
 def make_write_options(

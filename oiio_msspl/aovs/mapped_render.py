@@ -13,6 +13,7 @@ import numpy as np
 from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.arrays import Array
+from oiio_msspl.colour import REC709, ColourSpace
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile
 from oiio_msspl.exr.render import Render, Window
@@ -38,6 +39,8 @@ class MappedRender:
     spp: float | None
     """Samples per pixel; None if neither the header nor the user says."""
     data_window: Window
+    space: ColourSpace = REC709
+    """Linear RGB space of the beauty, for the preview. :func:`oiio_msspl.jobs.frame.map_pair` finds it."""
     notes: list[str] = field(default_factory=list)
     """What the user should know about the mapping, one sentence each."""
 

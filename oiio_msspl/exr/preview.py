@@ -10,7 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from oiio_msspl.arrays import Array
-from oiio_msspl.colour import srgb
+from oiio_msspl.colour import REC709, ColourSpace, conversion, srgb
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.render import Window
@@ -57,6 +57,7 @@ def write_preview(
     data_window: Window,
     display_window: Window,
     view: str | None = None,
+    space: ColourSpace = REC709,
     *,
     overwrite: bool = False,
 ) -> None:
@@ -69,6 +70,7 @@ def write_preview(
         display_window: the frame, which the PNG shows.
         view: None for the paper's sRGB curve; otherwise a view of OpenColorIO's built-in CG configuration, e.g.
             ``Un-tone-mapped`` or ``ACES 1.0 - SDR Video``.
+        space: linear RGB space of ``rgb``; converted to Rec. 709 for the picture.
         overwrite: replace an existing file.
 
     Raises:
@@ -78,6 +80,8 @@ def write_preview(
     if view is not None:
         check_view(view)
 
+    to_rec709 = None if space == REC709 else conversion(space, REC709).T.astype(np.float32)
+
     def rows(start: int, stop: int) -> Array:
         y0 = display_window.y0
         strip = Window(display_window.x0, y0 + start, display_window.x1, y0 + stop)
@@ -85,6 +89,8 @@ def write_preview(
         rendered = data_window.intersect(strip)
         if rendered.width and rendered.height:
             linear[rendered.slices(strip)] = rgb[rendered.slices(data_window)]
+        if to_rec709 is not None:
+            linear = linear @ to_rec709
         return srgb(linear) if view is None else _through_ocio(linear, view)
 
     _write_png(path, display_window.width, display_window.height, rows, overwrite)

@@ -1,22 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks whether two renders show the same frame, on luminance at the LRHS's resolution."""
+"""Checks whether two renders show the same frame, at the LRHS's resolution.
+
+`benchmarks.pair_checks` measures how many wrong pairs each check notices, and how many right pairs it doubts.
+"""
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import itertools
+from functools import reduce
 
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import ALBEDO, RGB
-from oiio_msspl.arrays import Array, box_downsample, interpolate
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.colour import luminance
 from oiio_msspl.errors import InputError
-from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.tile_features import TilePair
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.alignment import Alignment, align
+from oiio_msspl.fusion.pair_colours import different_colours
+from oiio_msspl.fusion.pair_edges import foreign_aovs
+from oiio_msspl.fusion.pair_framing import find_framing, jackknife_error, parts
+from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
+from oiio_msspl.fusion.tiling import Tile
 from oiio_msspl.parallel import in_background
-
-# The thresholds were measured on matching and on wrong pairs with 1 spp in the HRLS.
 
 #: Two renders hardly show the same frame if the correlation of their log luminance is below this. Matching pairs with
 #: clean references reach 0.83 to 0.99, one lit almost only by fireflies 0.31, different scenes -0.2 to 0.25.
@@ -24,59 +31,125 @@ LOW_CORRELATION = 0.3
 #: Exposures differ if the ratio of the mean luminances, without the brightest percent, exceeds this. Matching pairs
 #: reach at most 1.21.
 EXPOSURE_RATIO = 4 / 3
-#: Framings differ if the shift in HRLS pixels exceeds this, and a fifth of an LRHS pixel. Noise moves the estimate by
-#: up to half a pixel, and the paper's nearest-neighbour LRHS is half a pixel off by its nature.
-MAX_SHIFT = 0.75
-#: A shift counts only if the smoothed pictures, moved by it, correlate at least this much.
-SHIFT_CORRELATION = 0.9
-#: A step of log albedo between neighbouring pixels counts as an edge if it exceeds this.
-ALBEDO_EDGE = 0.2
-#: An albedo with fewer edges says nothing.
-MIN_ALBEDO_EDGES = 200
-#: The albedo is not that of the picture if its edges and the picture's steps correlate less than this. Of 112 matching
-#: views 6, 4 and 3 % are below (x2, x4, x8); with a mirrored albedo 95, 72 and 43 %.
-ALBEDO_CORRELATION = 0.05
-#: A difference of exposure, or a shift, must be this many standard errors from none.
+#: Framings differ if the shift exceeds this in HRLS pixels, because the paper's nearest-neighbour LRHS is half a pixel
+#: off by its nature, and this in LRHS pixels.
+MAX_SHIFT = (0.75, 0.5)
+#: Or if the zoom moves the edge of the frame by more LRHS pixels than this.
+MAX_ZOOM = 0.6
+#: A difference of exposure must be this many standard errors from none.
 CERTAIN = 6.0
-#: Brighter pixels count as this bright, because sums over a frame would overflow float32.
-BRIGHTEST = 1e30
-#: Side of a block in LRHS pixels -> how many standard errors the block's means must differ by to show different things.
-#: Of 77 matching views none has such a block.
-BLOCK_CERTAINTY = {8: 6.0, 4: 8.0}
-#: The means must also differ by this share of their brightness.
-BLOCK_DIFFERENCE = 0.25
-#: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
-JACKKNIFE_PARTS = 6
-#: Side of the central area, in LRHS pixels, in which a shift is looked for.
-SHIFT_AREA = 1024
+#: Brighter pixels count as this bright, because sums of squares over a frame would overflow float32.
+BRIGHTEST = np.float32(1e15)
+#: Groups of blocks show different things: the side of a block in LRHS pixels, how many blocks the group has along each
+#: side, and the mean of t^2 from which on it counts. Groups of matching views reach 12.9, 8.2 and 9.8.
+BLOCK_GROUPS = ((4, 2, 16.0), (4, 3, 11.0), (8, 2, 12.0))
+#: No single block counts for more than this t.
+LARGEST_T = 6.0
+#: Pixel filters of different widths move light across edges: this share of a block's contrast is no difference.
+FILTER_SHARE = 0.1
+#: Side of the blocks, in LRHS pixels, over which noise and colours are summed.
+BLOCK = 4
+#: The LRHS shares the HRLS's noise if, in three of four blocks, they differ by less than this share of the HRLS's
+#: noise. Independent renders differ by both renders' noise, so by more than one.
+SHARED_NOISE = 0.75
+#: A block has noise if its RMS is this share of the block's brightness.
+NOISY = 0.01
+#: With fewer noisy blocks nothing is said of noise.
+MIN_NOISY_BLOCKS = 64
+#: The LRHS is the HRLS's nearest pixels if this share of its noisy pixels equal an HRLS pixel.
+EQUAL_PIXELS = 0.5
+#: The warning for a pair that fits, and shows nothing.
+BOTH_BLACK = "both renders are black (or NaN) everywhere: the result is black"
+#: Pixels of the HRLS that :func:`check_renders` reads at a time.
+PIXELS_PER_READ = 1024 * 1024
 
 
 class HrlsAverages:
-    """Luminance of the HRLS's colour and albedo, averaged over the LRHS's pixels; filled tile by tile.
+    """The HRLS at the LRHS's resolution, and how both differ; filled tile by tile.
 
     Attributes:
-        rgb, albedo: (h, w) over the grid of the alignment; ``albedo`` is None if the HRLS has none.
+        rgb, albedo: luminance (h, w) over the grid of the alignment; ``albedo`` is None if the HRLS has none.
+        normal_edges: (h, w), length of the difference of the normals to the next pixels; None if there are none.
+        blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
+            difference of luminance, and how large it would be by the noise of the HRLS alone.
+        noisy_pixels, equal_pixels: LRHS pixels over which the HRLS is noisy, and those of them that equal one of its
+            pixels.
     """
 
     def __init__(self, alignment: Alignment) -> None:
         self.alignment = alignment
         self.rgb = np.zeros((alignment.grid.height, alignment.grid.width), np.float32)
         self.albedo: Array | None = None
+        self.normal_edges: Array | None = None
+        self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
+        self.noisy_pixels = self.equal_pixels = 0
 
     def add(self, pair: TilePair) -> None:
         """Add the core of a tile."""
         rows, columns = pair.core
         hrls = tuple(slice(part.start * pair.scale, part.stop * pair.scale) for part in (rows, columns))
         origin, grid = pair.lrhs_area, self.alignment.grid
-        target = (
-            slice(rows.start + origin.y0 - grid.y0, rows.stop + origin.y0 - grid.y0),
-            slice(columns.start + origin.x0 - grid.x0, columns.stop + origin.x0 - grid.x0),
-        )
-        self.rgb[target] = luminance(box_downsample(pair.hrls[RGB][hrls], pair.scale))
+        y, x = rows.start + origin.y0 - grid.y0, columns.start + origin.x0 - grid.x0
+        target = (slice(y, y + rows.stop - rows.start), slice(x, x + columns.stop - columns.start))
+        low, high = (np.minimum(v, BRIGHTEST) for v in (pair.lrhs[RGB][rows, columns], pair.hrls[RGB][hrls]))
+        mean = box_downsample(high, pair.scale)
+        self.rgb[target] = luminance(mean)
+        self._add_noise(low, high, mean, y, x)
         if ALBEDO in pair.hrls:
             if self.albedo is None:
                 self.albedo = np.zeros_like(self.rgb)
             self.albedo[target] = luminance(box_downsample(pair.hrls[ALBEDO][hrls], pair.scale))
+        if NORMAL in pair.hrls:
+            if self.normal_edges is None:
+                self.normal_edges = np.zeros_like(self.rgb)
+            normal = box_downsample(pair.hrls[NORMAL][hrls], pair.scale)
+            steps = [np.diff(normal, axis=axis, append=normal.take([-1], axis)) for axis in (0, 1)]
+            self.normal_edges[target] = np.sqrt(sum(np.square(step).sum(axis=-1) for step in steps))
+
+    def _add_noise(self, low: Array, high: Array, mean: Array, y: int, x: int) -> None:
+        """Sum ``blocks`` over a tile whose first pixel is (x, y). ``mean``: the HRLS over the LRHS's pixels."""
+        scale = self.alignment.scale
+        pixels, grey = luminance(high), luminance(low)
+        quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+        # Gradients and straight edges cancel out of a diagonal difference, and the variance of noise is a quarter.
+        variance = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
+        expected = box_downsample(variance, scale // 2) / np.float32(scale**2)
+        noisy = expected > np.square(np.float32(5 * NOISY) * grey)
+        phases = itertools.product(range(scale), repeat=2)
+        nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
+        self.noisy_pixels += int(np.count_nonzero(noisy))
+        self.equal_pixels += int(np.count_nonzero(noisy & (nearest <= 1e-3 * grey)))
+        difference = np.square(luminance(mean) - grey)
+        values = np.dstack([low, mean, difference, expected]).astype(np.float64)
+        for axis, start in ((0, y), (1, x)):
+            stop = start + values.shape[axis]
+            first = np.maximum(np.arange(start // BLOCK * BLOCK, stop, BLOCK) - start, 0)
+            values = np.add.reduceat(values, first, axis)
+        top, left = y // BLOCK, x // BLOCK
+        self.blocks[top : top + values.shape[0], left : left + values.shape[1]] += values
+
+
+def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
+    """Check whether two renders show the same frame, without fusing them.
+
+    Args:
+        lr, hr: files with their layers mapped, or renders in memory.
+
+    Returns:
+        Warnings of :func:`check_pair`.
+
+    Raises:
+        InputError: the pair does not fit together, or can't be read.
+    """
+    alignment = align(lr, hr)
+    grid, counts = alignment.grid, RepairCounts()
+    lrhs = read_lrhs(lr, alignment, grid, [RGB], counts)
+    averages = HrlsAverages(alignment)
+    rows = max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))
+    for top in range(grid.y0, grid.y1, rows):
+        band = Window(grid.x0, top, grid.x1, min(top + rows, grid.y1))
+        averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL], counts))
+    return check_pair(lrhs[RGB], averages, lr.name, hr.name)
 
 
 def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
@@ -93,10 +166,9 @@ def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) 
     Raises:
         InputError: one render is black, most likely a wrong layer, and the other is not.
     """
-    low, high = (np.minimum(values, BRIGHTEST) for values in (luminance(lrhs_rgb), hrls.rgb))
-    alignment = hrls.alignment
+    low, high, alignment = luminance(np.minimum(lrhs_rgb, BRIGHTEST)), hrls.rgb, hrls.alignment
     if not low.any() and not high.any():
-        return ["both renders are black (or NaN) everywhere: the result is black"]
+        return [BOTH_BLACK]
     for name, values, other in ((lr_name, low, hr_name), (hr_name, high, lr_name)):
         if not values.any():
             raise InputError(
@@ -104,28 +176,42 @@ def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) 
                 "check which layer it is (--map rgb=LAYER)"
             )
     warnings = []
-    shift = in_background(lambda: _find_shift(low, high))  # takes as long as all other checks
+    framing = in_background(lambda: find_framing(low, high))  # takes as long as all other checks
+    if _shares_noise(hrls):
+        warnings.append(
+            "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
+            "with more spp, and not made by scaling the HRLS down"
+        )
     ratio, certain = _brightness_ratio(low, high)
     if not 1 / EXPOSURE_RATIO < ratio < EXPOSURE_RATIO and certain:
         warnings.append(f"the HRLS is {ratio:.3g} times as bright as the LRHS: are exposure and view layer the same?")
-    correlation = _log_correlation(low, high)
+    correlation = _log_correlation(hrls)
     if correlation < LOW_CORRELATION:
         warnings.append(
             f"the two renders hardly look alike (correlation {correlation:.2f}): are they the same frame and camera?"
         )
         return warnings
-    if hrls.albedo is not None and _albedo_correlation(low + high, hrls.albedo) < ALBEDO_CORRELATION:
-        warnings.append(
-            "the albedo's edges are not in the picture: is it this frame's albedo? (--map albedo=LAYER says which)"
-        )
-    scale, grid = alignment.scale, alignment.grid
-    x, y = shift() * scale
-    if max(abs(x), abs(y)) > max(MAX_SHIFT, 0.2 * scale):
+    colours = different_colours(hrls.blocks[..., :3].reshape(-1, 3), hrls.blocks[..., 3:6].reshape(-1, 3))
+    if colours is not None:
+        warnings.append(f"{colours}: write both in the same colour space")
+    warnings += [
+        f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
+        for aov in foreign_aovs(low, high, hrls.albedo, hrls.normal_edges)
+    ]
+    scale, grid, found = alignment.scale, alignment.grid, framing()
+    x, y = found.x * scale, found.y * scale
+    if max(abs(x), abs(y)) > max(MAX_SHIFT[0], MAX_SHIFT[1] * scale):
         warnings.append(
             f"the HRLS is shifted against the LRHS by {abs(x):.1f} pixels to the {'right' if x > 0 else 'left'} and "
             f"{abs(y):.1f} pixels {'down' if y > 0 else 'up'}: are camera, crop and overscan the same?"
         )
-    if not warnings and (place := _different_block(low, high)) is not None:
+    if abs(found.zoom_at_edge) > MAX_ZOOM:
+        tighter = "HRLS" if found.zoom > 0 else "LRHS"
+        warnings.append(
+            f"the {tighter} is framed {100 * abs(found.zoom):.1f} % tighter than the other render: are focal length, "
+            "crop and overscan the same?"
+        )
+    if not warnings and (place := _different_place(low, high)) is not None:
         x, y = (start + scale * at for start, at in zip((grid.x0 * scale, grid.y0 * scale), place, strict=True))
         warnings.append(
             f"the two renders show different things, most of all around HRLS pixel ({x}, {y}): are they "
@@ -134,29 +220,28 @@ def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) 
     return warnings
 
 
-def _albedo_correlation(picture: Array, albedo: Array) -> float:
-    """Correlation of the picture's steps of log luminance with the albedo's steps, at edges of the albedo; 1 if it has
-    few.
+def _shares_noise(hrls: HrlsAverages) -> bool:
+    """Whether the LRHS is the HRLS scaled down, by averaging pixels or by keeping some of them."""
+    colours, difference, expected = hrls.blocks[..., :6], hrls.blocks[..., 6], hrls.blocks[..., 7]
+    brightness = colours.sum(axis=-1) / 6
+    noisy = expected * BLOCK**2 > np.square(NOISY * brightness)
+    if int(np.count_nonzero(noisy)) < max(MIN_NOISY_BLOCKS, int(np.count_nonzero(brightness)) // 4):
+        return False
+    shares = difference[noisy] / expected[noisy]
+    scaled_down = float(np.quantile(shares, 0.75)) < SHARED_NOISE
+    return scaled_down or hrls.equal_pixels > EQUAL_PIXELS * max(hrls.noisy_pixels, 1)
 
-    Pixels without albedo are sky, lights or mirrors. Their edges say nothing.
+
+def _log_correlation(hrls: HrlsAverages) -> float:
+    """Pearson correlation of the log brightness of blocks: noise averages out, framing stays.
+
+    1 if there is no framing to compare, because the blocks of either render differ by little more than noise.
     """
-    surface = np.where(albedo > 0.01, np.clip(albedo, 0, 1), np.nan)
-    logs = np.log(picture + 0.1 * np.median(picture[picture > 0]) + 1e-20), np.log(surface + 0.05)
-    steps, edges = (np.concatenate([np.diff(v, axis=axis).ravel() for axis in (0, 1)]) for v in logs)
-    steep = np.abs(edges) > ALBEDO_EDGE
-    if steep.sum() < MIN_ALBEDO_EDGES:
+    low, high = hrls.blocks[..., :3].sum(axis=-1), hrls.blocks[..., 3:6].sum(axis=-1)
+    logs = [np.log(v + 1e-3 * v.mean() + 1e-20).ravel() for v in (low, high)]
+    noise = float(np.mean(9 * hrls.blocks[..., 7] / np.square(high + 1e-3 * high.mean() + 1e-20)))
+    if low.size < MIN_NOISY_BLOCKS or min(v.var() for v in logs) < max(1e-6, 5 * noise):
         return 1.0
-    steps, edges = np.clip(steps[steep], -2, 2), edges[steep]
-    return float((steps * edges).sum() / np.sqrt(np.square(steps).sum() * np.square(edges).sum() + 1e-20))
-
-
-def _log_correlation(low: Array, high: Array) -> float:
-    """Pearson correlation of the log luminance of blocks of 4 x 4 pixels: noise averages out, framing stays."""
-    if min(low.shape) < 16:
-        return 1.0
-    logs = [np.log(v + 1e-3 * v.mean() + 1e-20).ravel() for v in (_downsample_4(low), _downsample_4(high))]
-    if min(v.std() for v in logs) < 1e-3:
-        return 1.0  # a flat frame has no framing to compare
     return float(np.corrcoef(*logs)[0, 1])
 
 
@@ -166,129 +251,41 @@ def _brightness_ratio(low: Array, high: Array) -> tuple[float, bool]:
     lit = (low > 0) | (high > 0)
     ordinary = lit & (low <= np.quantile(low[lit], 0.99)) & (high <= np.quantile(high[lit], 0.99))
     low_sums, high_sums = (
-        np.array([part.sum(dtype=np.float64) for part in _parts(v * ordinary)]) + 1e-30 for v in (low, high)
+        np.array([part.sum(dtype=np.float64) for part in parts(v * ordinary)]) + 1e-30 for v in (low, high)
     )
     log_ratio = np.log(high_sums.sum() / low_sums.sum())
     without_part = [sums.sum() - sums for sums in (low_sums, high_sums)]
-    error = _jackknife_error(np.log(np.maximum(without_part[1], 1e-30) / np.maximum(without_part[0], 1e-30)))
+    error = jackknife_error(np.log(np.maximum(without_part[1], 1e-30) / np.maximum(without_part[0], 1e-30)))
     return float(np.exp(log_ratio)), bool(abs(log_ratio) > CERTAIN * error)
 
 
-def _find_shift(low: Array, high: Array) -> NDArray[np.float64]:
-    """How far the HRLS's picture is to the right of and below the LRHS's, in LRHS pixels: (2,), 0 where not certain.
-
-    The method is Lucas and Kanade 1981, coarse to fine. It finds the shift whose first-order effect on the LRHS,
-    besides a gain and an offset, explains the difference best. The gradients are those of the LRHS, so noise of the
-    HRLS makes the estimate vary and does not bias it.
-    """
-    no_shift = np.zeros(2)
-    if min(low.shape) < 8 * JACKKNIFE_PARTS:
-        return no_shift
-    rows, columns = (slice(max(0, n - SHIFT_AREA) // 2, (n + SHIFT_AREA) // 2) for n in low.shape)
-    grey = np.median(low[low > 0]) if low.any() else 1.0
-    # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
-    low, high = (_smooth(v[rows, columns] / (v[rows, columns] + grey)) for v in (low, high))
-    coarse = 4 * _fit_shift(_smooth(_downsample_4(low)), _smooth(_downsample_4(high)), no_shift).shift
-    # A start less than half a pixel away would lead to the same result.
-    starts = [no_shift] if np.abs(coarse).max() < 0.5 else [no_shift, np.clip(coarse, -12, 12)]
-    fit = min((_fit_shift(low, high, start) for start in starts), key=lambda fit: fit.residual)
-    if fit.correlation < SHIFT_CORRELATION:
-        return no_shift
-    return np.where(np.abs(fit.shift) > CERTAIN * fit.error, fit.shift, 0)
-
-
-class _ShiftFit(NamedTuple):
-    shift: NDArray[np.float64]
-    error: NDArray[np.float64]
-    """Standard error of the shift."""
-    residual: float
-    correlation: float
-
-
-def _fit_shift(low: Array, high: Array, start: NDArray[np.float64]) -> _ShiftFit:
-    """Refine a shift (x, y): repeated least squares over shift, gain and offset, with the LRHS moved each time."""
-    shift = start
-    for _ in range(6):
-        margin = int(np.abs(shift).max()) + 3
-        inner = slice(margin, -margin)
-        moved = _move(low, shift)
-        gy, gx = np.gradient(moved)
-        planes = np.stack([-gx, -gy, moved, np.ones_like(moved), high - moved])[:, inner, inner]
-        # For each part of the frame, the products of all planes with all planes. Double precision, because the planes
-        # are nearly linearly dependent.
-        flat = (part.reshape(len(planes), -1).astype(np.float64) for part in _parts(planes))
-        dots = np.stack([part @ part.T for part in flat])
-        squares, products = dots[:, :4, :4], dots[:, :4, 4]
-        total = squares.sum(0) + 1e-9 * squares.sum(0).trace() * np.eye(4)  # solvable even without any gradient
-        step = np.linalg.solve(total, products.sum(0))
-        shift = np.clip(shift + np.clip(step[:2], -1, 1), -min(low.shape) / 4, min(low.shape) / 4)
-        if np.abs(step[:2]).max() < 0.01:
-            break
-    without_part = np.linalg.solve(total - squares, (products.sum(0) - products)[..., None])[:, :2, 0]
-    residual = float(dots[:, 4, 4].sum() - step @ products.sum(0)) / planes[0].size
-    spread = float(moved[inner, inner].std() * high[inner, inner].std())
-    covariance = float(np.mean((moved - moved[inner, inner].mean())[inner, inner] * high[inner, inner]))
-    return _ShiftFit(shift, _jackknife_error(without_part), residual, covariance / max(spread, 1e-12))
-
-
-def _different_block(low: Array, high: Array) -> tuple[int, int] | None:
+def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
     """Where (x, y), in LRHS pixels, the two pictures differ by more than noise explains; None if nowhere.
 
-    A paired t-test for each block. What both pictures show cancels out, and a single firefly has a t of about 1,
-    however bright it is.
+    A paired t-test for each block: what both pictures show cancels out, and a single firefly has a t of about 1,
+    however bright it is. The mean of t^2 over neighbouring blocks is 1 for noise. A thing that moved stands out from
+    it, and from the frame's median, which a difference of the whole frame raises as well.
     """
     floor = 0.05 * np.median(low + high)
-    for size, certain in BLOCK_CERTAINTY.items():
-        height, width = (n // size for n in low.shape)
-        if height == 0 or width == 0:
+    for size, side, different in BLOCK_GROUPS:
+        if min(low.shape) < size * side:
             continue
-        a, b = (
-            v[: height * size, : width * size]
-            .reshape(height, size, width, size)
-            .swapaxes(1, 2)
-            .reshape(height, width, -1)
-            for v in (low.astype(np.float64), high.astype(np.float64))  # a squared firefly overflows float32
-        )
+        a, b = (_in_blocks(v.astype(np.float64), size) for v in (low, high))  # a squared firefly overflows float32
         brightness = (a + b).mean(axis=-1) / 2
-        difference = np.abs((a - b).mean(axis=-1))
         # Two percent of the brightness do not count, even between renders without noise.
-        error = (a - b).std(axis=-1) / size + 0.02 * brightness
-        t = np.where(difference > BLOCK_DIFFERENCE * (brightness + floor), difference / np.maximum(error, 1e-30), 0)
-        if t.max() > certain:
-            y, x = np.unravel_index(t.argmax(), t.shape)
-            return int(x * size + size // 2), int(y * size + size // 2)
+        error = (a - b).std(axis=-1) / size + 0.02 * (brightness + floor) + FILTER_SHARE * a.std(axis=-1) / size
+        t = np.minimum(np.abs((a - b).mean(axis=-1)) / np.maximum(error, 1e-30), LARGEST_T)
+        groups = np.lib.stride_tricks.sliding_window_view(np.square(t), (side, side))
+        means = groups.mean(axis=(-2, -1))
+        if means.max() > different * max(1.0, float(np.median(means))):
+            row, column = np.unravel_index(means.argmax(), means.shape)
+            y, x = np.unravel_index(groups[row, column].argmax(), (side, side))
+            return int((column + x) * size + size // 2), int((row + y) * size + size // 2)
     return None
 
 
-def _parts(values: Array) -> list[Array]:
-    """Cut planes (..., h, w) into the parts for the jackknife."""
-    rows = np.array_split(values, JACKKNIFE_PARTS, -2)
-    return [part for row in rows for part in np.array_split(row, JACKKNIFE_PARTS, -1)]
-
-
-def _jackknife_error(without_part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard error of an estimate, from the estimates (n, ...) that leave out one of n parts each."""
-    return np.sqrt((len(without_part) - 1) * without_part.var(axis=0))
-
-
-def _move(values: Array, shift: NDArray[np.float64]) -> Array:
-    """Move a picture (h, w) by (x, y) to the right and down; the edge pixel is repeated."""
-    for axis, distance in ((1, shift[0]), (0, shift[1])):
-        values = interpolate(values, np.arange(values.shape[axis]) - distance, axis)
-    return values
-
-
-def _smooth(values: Array) -> Array:
-    """Binomial filter of 5 x 5 pixels."""
-    for axis in (0, 1, 0, 1):
-        size = values.shape[axis]
-        padded = np.pad(values, [(1, 1) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
-        neighbours: Array = padded.take(range(size), axis) + padded.take(range(2, size + 2), axis)
-        values = (neighbours + 2 * values) / np.float32(4)
-    return values
-
-
-def _downsample_4(values: Array) -> Array:
-    """Mean of 4 x 4 pixels; incomplete blocks at the end are left out."""
-    height, width = (n // 4 for n in values.shape)
-    return box_downsample(values[: height * 4, : width * 4], 4)
+def _in_blocks(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
+    """(h, w) to (h / size, w / size, size^2); incomplete blocks at the end are left out."""
+    height, width = (n // size for n in values.shape)
+    blocks = values[: height * size, : width * size].reshape(height, size, width, size)
+    return blocks.swapaxes(1, 2).reshape(height, width, -1)

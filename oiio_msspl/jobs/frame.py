@@ -16,6 +16,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import HALF_MAX
+from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, space_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
 from oiio_msspl.exr.contents import dropped_channels, widest_type
@@ -45,6 +46,9 @@ class InputOptions:
     """Samples per pixel of the LRHS; None to read them from its header."""
     hr_spp: float | None = None
     """Samples per pixel of the HRLS; None to read them from its header."""
+    colourspace: str | None = None
+    """Linear RGB space of both renders, see :func:`oiio_msspl.colour.named_space`; None to read it from the headers,
+    and to take linear Rec. 709 if they do not say."""
 
 
 def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
@@ -58,13 +62,31 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
         LRHS and HRLS. The LRHS has albedo and normal only if its file does.
 
     Raises:
-        InputError: one of the files can't be used, or both are the same.
+        InputError: one of the files can't be used, both are the same, or their headers declare two colour spaces.
     """
     lr_path, hr_path = Path(lr_path), Path(hr_path)
     if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
         raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
-    return _map_lrhs(lr_file, inputs), map_render(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+    lr, hr = _map_lrhs(lr_file, inputs), map_render(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+    lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
+    return lr, hr
+
+
+def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:
+    """The linear RGB space of a pair. ``name``: see :attr:`InputOptions.colourspace`."""
+    if name is not None:
+        space = named_space(name)
+        if space is None:
+            raise InputError(f"--colorspace {name!r}: use one of {', '.join(space.name for space in SPACES)}")
+        return space
+    low, high = space_of(lr.metadata), space_of(hr.metadata)
+    if low is not None and high is not None and low != high:
+        raise InputError(
+            f"by their headers {lr.name} is in {low.name} and {hr.name} in {high.name}; write both in the same colour "
+            "space (or name it with --colorspace if a header is wrong)"
+        )
+    return high or low or REC709
 
 
 def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
@@ -223,7 +245,7 @@ def write_frame_preview(report: FrameReport, fused: FusedFrame, view: str | None
         return
     windows = (report.hr.data_window, report.hr.display_window)
     try:
-        write_preview(report.preview, fused.rgb, *windows, view, overwrite=overwrite)
+        write_preview(report.preview, fused.rgb, *windows, view, report.hr.space, overwrite=overwrite)
     except MssplError as error:
         report.warnings.append(f"no preview: {error}")
         report.preview = None

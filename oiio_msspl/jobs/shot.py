@@ -23,7 +23,7 @@ from oiio_msspl.jobs.dask_cluster import fuse_frames
 from oiio_msspl.jobs.frame import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.sequence import Frame, find_shot
-from oiio_msspl.jobs.shot_checks import known_result, model_of_shot, prepare_output
+from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of_shot, prepare_output
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
 
@@ -138,6 +138,8 @@ def fuse_shot(
         if client is None:
             run_pipeline(stages, to_fuse, record, save)
         else:
+            for doubt in check_first_pair(to_fuse, inputs):
+                log.warning("%s", doubt)
             for frame, outcome in fuse_frames(client, stages, to_fuse):
                 record(frame, outcome)
                 save()

@@ -5,10 +5,12 @@ from __future__ import annotations
 
 import logging
 import os
+from collections.abc import Sequence
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_target
 from oiio_msspl.jobs.frame import InputOptions, map_pair, resolve_auto
+from oiio_msspl.jobs.pair import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import is_left_over
@@ -57,6 +59,21 @@ def check_no_input(shot: Shot) -> None:
         for source in (frame.lr, frame.hr):
             if source is not None and source.exists() and frame.output.exists() and frame.output.samefile(source):
                 raise InputError(f"{frame.output}: is one of the inputs; write the results elsewhere")
+
+
+def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]:
+    """Check the first frame that has both renders, before a farm or cluster is asked to fuse all of them.
+
+    Returns:
+        Doubts about it, one sentence each. A pair that can't be read here is one of them, and no error, because files
+        that an option names may exist on the workers only.
+    """
+    for frame in frames:
+        if frame.lr is not None and frame.hr is not None:
+            check = check_files(frame.lr, frame.hr, inputs)
+            problems = [] if check.problem is None else [f"can't be checked here: {check.problem}"]
+            return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings]]
+    return []
 
 
 def known_result(frame: Frame, shot: Shot, previews: bool, overwrite: bool, skip_existing: bool) -> FrameResult | None:

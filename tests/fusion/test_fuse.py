@@ -457,8 +457,10 @@ def test_a_firefly_of_the_lrhs_is_dimmed_to_what_the_hrls_allows(session, scale)
 
 def test_another_frames_albedo_is_noticed(session, scale):
     """Not the right one, though light and shadow have edges that it lacks."""
-    rng = np.random.default_rng(0)
-    albedo = np.repeat(rng.random((16, 16, 1), np.float32), 3, -1).repeat(4 * scale, 0).repeat(4 * scale, 1)
+    rng = np.random.default_rng(1)
+    albedo = np.full((64 * scale, 64 * scale, 3), 0.5, np.float32)
+    for y, x, height, width in rng.integers(1, 64, (100, 4)):
+        albedo[y * scale : (y + height // 4) * scale, x * scale : (x + width // 4) * scale] = rng.random()
     shadow = np.where(np.arange(64 * scale)[:, None] > 40 * scale, 0.2, 1.0)[..., None]
     clean = (albedo * shadow).astype(np.float32)
     low = Render.from_arrays("lr", rgb=noisy(downsample(clean, scale), 16))

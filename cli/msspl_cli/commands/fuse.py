@@ -85,6 +85,7 @@ def fuse(
             hidden=True,
         ),
     ] = None,
+    colorspace: options.Colourspace = None,
     # Model
     model: options.Model = "auto",
     device: options.Device = "cpu",
@@ -213,7 +214,7 @@ def fuse(
     from oiio_msspl.jobs.sequence import is_sequence
 
     common: dict[str, Any] = {
-        "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp),
+        "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace),
         "write": options.make_write_options(layout, compression, half, layers, error_layer),
         "model": model,
         "device": device,

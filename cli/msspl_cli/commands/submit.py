@@ -54,9 +54,11 @@ def submit(
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import format_frames
+    from oiio_msspl.jobs.shot_checks import check_first_pair
 
     # Options with a wrong value are refused here, and not by every task.
-    inputs = options.make_inputs(*(given[name] for name in ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp")))
+    names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace")
+    inputs = options.make_inputs(*(given[name] for name in names))
     options.make_write_options(*(given[name] for name in ("layout", "compression", "half", "layers", "error_layer")))
     options.parse_bytes(given["max_memory"])
     job = make_job(
@@ -73,7 +75,10 @@ def submit(
         chunk=chunk,
         timeout=timeout,
     )
+    doubts = check_first_pair(job.shot.frames, inputs)
     write_bundle(bundle, job)
+    for doubt in doubts:
+        print(f"warning: {doubt}", file=sys.stderr)
     for pattern, frames in job.missing:
         text = f"warning: {pattern} lacks {format_frames(frames)}: their tasks fail unless these files appear"
         print(text, file=sys.stderr)

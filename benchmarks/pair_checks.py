@@ -1,0 +1,254 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How many wrong pairs the checks notice, and how many right pairs they doubt.
+
+    python -m benchmarks.pair_checks RENDERS... [--half report] [--table FILE.csv]
+
+Each folder in RENDERS is a view, with ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``. All of its pairs are right, whole
+and cut to each quarter. Wrong pairs are made from the pairs of equal samples: the LRHS is framed, shifted, recoloured
+or made from the HRLS, or the HRLS gets layers of another scene. Nothing is said of the LRHS's own albedo and normal.
+
+Thresholds are chosen by the scenes of one half ("tune") and reported for the other one ("report"). Views of a scene,
+such as ``lamp`` and ``lamp-left``, are in the same half.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import re
+import zlib
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from benchmarks import results
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.arrays import Array, box_downsample, interpolate
+from oiio_msspl.colour import ACESCG, REC709, conversion
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.render import Render
+from oiio_msspl.fusion.pair_checks import BOTH_BLACK, check_renders
+
+HALVES = ("all", "tune", "report")
+RIGHT, RIGHT_QUARTER = "right, whole frame", "right, a quarter of the frame"
+Layers = dict[str, Array]
+
+
+@dataclass(frozen=True)
+class View:
+    """A folder of renders of one camera."""
+
+    folder: Path
+
+    @property
+    def name(self) -> str:
+        return f"{self.folder.parent.name}/{self.folder.name}"
+
+    @property
+    def scene(self) -> str:
+        """The scene's name: that of the folder without the name of the camera."""
+        return re.sub(r"-(left|right)$", "", self.folder.name)
+
+    def layers(self, file: str) -> Layers | None:
+        """The features of one render; None if there is no such file."""
+        path = self.folder / f"{file}.exr"
+        if not path.exists():
+            return None
+        read = map_render(open_exr(path)).load().layers
+        return {name: read[name] for name in (RGB, ALBEDO, NORMAL) if name in read}
+
+    def pairs(self) -> Iterator[Pair]:
+        """All pairs of the folder."""
+        for high in sorted(self.folder.glob("hr_*spp.exr")):
+            hrls = self.layers(high.stem)
+            assert hrls is not None
+            for low in sorted(self.folder.glob("lr_x*spp.exr")):
+                numbers = re.findall(r"\d+", f"{low.stem} {high.stem}")
+                lrhs, scale = self.layers(low.stem), int(numbers[0])
+                assert lrhs is not None
+                spp = int(numbers[2])
+                yield Pair(f"{self.name} {low.stem} {high.stem}", scale, spp, int(numbers[1]), lrhs, hrls).trimmed()
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Both renders as arrays."""
+
+    name: str
+    scale: int
+    hr_spp: int
+    lr_spp: int
+    lrhs: Layers
+    hrls: Layers
+
+    @property
+    def equal_samples(self) -> bool:
+        """Whether both renders have the same number of samples for an area, and 1 spp in the HRLS."""
+        return self.hr_spp == 1 and self.lr_spp == self.scale**2
+
+    def cut(self, y: int, x: int, height: int, width: int) -> Pair:
+        """A rectangle, in LRHS pixels."""
+        s = self.scale
+        low = {name: v[y : y + height, x : x + width] for name, v in self.lrhs.items()}
+        high = {name: v[s * y : s * (y + height), s * x : s * (x + width)] for name, v in self.hrls.items()}
+        return Pair(self.name, s, self.hr_spp, self.lr_spp, low, high)
+
+    def trimmed(self) -> Pair:
+        """Without the rows and columns that only one of the renders has, where an odd size was rounded."""
+        low, high = self.lrhs[RGB].shape, self.hrls[RGB].shape
+        return self.cut(0, 0, *(min(a, b // self.scale) for a, b in zip(low[:2], high[:2], strict=True)))
+
+    def quarters(self) -> Iterator[Pair]:
+        """The four quarters of the frame."""
+        height, width = (n // 2 for n in self.lrhs[RGB].shape[:2])
+        for y, x in ((0, 0), (0, width), (height, 0), (height, width)):
+            yield self.cut(y, x, height, width)
+
+    def warnings(self) -> list[str]:
+        """What the checks say, or why they refuse the pair."""
+        low = Render.from_arrays("lr", rgb=np.ascontiguousarray(self.lrhs[RGB]))
+        high = Render.from_arrays("hr", **{name: np.ascontiguousarray(v) for name, v in self.hrls.items()})
+        try:
+            return check_renders(low, high)
+        except InputError as error:
+            return [str(error)]
+
+
+def wrong_pairs(pair: Pair, other: View, following: Layers | None) -> Iterator[tuple[str, Pair]]:
+    """Kinds of wrong pairs, each with an example made from a right one.
+
+    Args:
+        other: a view of another scene.
+        following: the HRLS of the next frame of a moving camera; None if there is none.
+    """
+    rng = np.random.default_rng(zlib.crc32(pair.name.encode()))
+    lrhs, scale = pair.lrhs[RGB], pair.scale
+    foreign = other.layers("hr_1spp")
+    assert foreign is not None
+
+    def low(rgb: Array) -> Pair:
+        return Pair(pair.name, scale, pair.hr_spp, pair.lr_spp, {RGB: rgb}, pair.hrls)
+
+    def high(**layers: Array) -> Pair:
+        return Pair(pair.name, scale, pair.hr_spp, pair.lr_spp, pair.lrhs, pair.hrls | layers)
+
+    matrix = conversion(REC709, ACESCG).astype(np.float32).T
+    x, y = ((1, 0), (-1, 0), (0, 1), (0, -1))[rng.integers(4)]
+    yield "crop 3 % tighter", low(_zoomed(lrhs, 0.97))
+    yield "red and blue swapped", low(lrhs[..., ::-1])
+    for name, kind in ((NORMAL, "normals"), (ALBEDO, "albedo")):
+        if name in pair.hrls and name in foreign:
+            yield f"{kind} of another scene", high(**{name: _fitted(foreign[name], pair.hrls[name].shape)})
+    yield "an object of 1/64 of the frame moved", high(**_moved_object(pair.hrls, scale, rng))
+    yield "shift by 1 LRHS pixel", low(_shifted(lrhs, x, y))
+    yield "shift by 4 LRHS pixels", low(_shifted(lrhs, 4 * x, 4 * y))
+    if following is not None:
+        shape = pair.hrls[RGB].shape
+        yield "next frame of a moving camera", high(**{k: v[: shape[0], : shape[1]] for k, v in following.items()})
+    yield "LRHS scaled down: box", low(box_downsample(pair.hrls[RGB], scale))
+    for filter_name in ("lanczos3", "cubic"):
+        yield f"LRHS scaled down: {filter_name}", low(_resized(pair.hrls[RGB], scale, filter_name))
+    yield "LRHS scaled down: nearest", low(pair.hrls[RGB][scale // 2 :: scale, scale // 2 :: scale])
+    yield "LRHS in ACEScg", low(lrhs @ matrix)
+    yield "HRLS in ACEScg", high(rgb=pair.hrls[RGB] @ matrix)
+    yield "exposure one stop up", low(lrhs * np.float32(2))
+
+
+def _zoomed(image: Array, share: float) -> Array:
+    """The middle of an image, enlarged to its size."""
+    for axis in (0, 1):
+        middle = (image.shape[axis] - 1) / 2
+        image = interpolate(image, (np.arange(image.shape[axis]) - middle) * share + middle, axis)
+    return image
+
+
+def _fitted(image: Array, shape: tuple[int, ...]) -> Array:
+    """An image scaled to a height and width, by its nearest pixels."""
+    rows, columns = (np.arange(n) * old // n for n, old in zip(shape[:2], image.shape[:2], strict=True))
+    return image[rows][:, columns]
+
+
+def _shifted(image: Array, x: int, y: int) -> Array:
+    """An image moved to the right and down; the edge pixel is repeated."""
+    rows, columns = (np.clip(np.arange(n) - by, 0, n - 1) for n, by in zip(image.shape[:2], (y, x), strict=True))
+    return image[rows][:, columns]
+
+
+def _resized(image: Array, scale: int, filter_name: str) -> Array:
+    """An image scaled down by OpenImageIO, as `oiiotool --resize` does it."""
+    height, width, channels = image.shape
+    area = oiio.ROI(0, width // scale, 0, height // scale, 0, 1, 0, channels)
+    small = oiio.ImageBufAlgo.resize(oiio.ImageBuf(np.ascontiguousarray(image)), filter_name, 0, area)
+    return np.maximum(np.asarray(small.get_pixels(oiio.FLOAT)), 0)
+
+
+def _moved_object(layers: Layers, scale: int, rng: np.random.Generator) -> Layers:
+    """Layers in which a rectangle of an eighth of each side shows what another such rectangle showed."""
+    height, width = layers[RGB].shape[:2]
+    h, w = (n // 8 // scale * scale for n in (height, width))
+    while True:
+        y, v = rng.integers(0, (height - h) // scale + 1, 2) * scale
+        x, u = rng.integers(0, (width - w) // scale + 1, 2) * scale
+        if abs(y - v) >= h or abs(x - u) >= w:
+            break
+    moved = {name: values.copy() for name, values in layers.items()}
+    for name, values in layers.items():
+        moved[name][y : y + h, x : x + w] = values[v : v + h, u : u + w]
+    return moved
+
+
+def find_views(folders: list[Path], half: str) -> list[View]:
+    """The views of a half of the scenes."""
+    views = [View(file.parent) for folder in folders for file in sorted(folder.glob("*/hr_1spp.exr"))]
+    scenes = sorted({view.scene for view in views})
+    chosen = scenes if half == "all" else scenes[HALVES.index(half) - 1 :: 2]
+    return [view for view in views if view.scene in chosen]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folders", nargs="+", type=Path, metavar="RENDERS")
+    parser.add_argument("--half", choices=HALVES, default="all")
+    parser.add_argument("--verbose", action="store_true", help="print every false alarm and every miss")
+    results.add_option(parser)
+    args = parser.parse_args()
+    views = find_views(args.folders, args.half)
+    noticed: dict[str, list[bool]] = collections.defaultdict(list)
+
+    def measure(kind: str, pair: Pair) -> None:
+        warnings = pair.warnings()
+        warnings = [warning for warning in warnings if warning != BOTH_BLACK]
+        noticed[kind].append(bool(warnings))
+        if args.verbose and bool(warnings) == (kind in (RIGHT, RIGHT_QUARTER)):
+            print(f"{pair.name}: {kind}: {'; '.join(warnings) or 'not noticed'}", flush=True)
+
+    for view in views:
+        other = next((v for v in views[views.index(view) :] + views if v.scene != view.scene), None)
+        for pair in view.pairs():
+            if not pair.hrls[RGB].any():
+                continue  # the camera is inside a wall
+            measure(RIGHT, pair)
+            for quarter in pair.quarters():
+                measure(RIGHT_QUARTER, quarter)
+            if pair.equal_samples and other is not None:
+                for kind, wrong in wrong_pairs(pair, other, view.layers("next_1spp")):
+                    measure(kind, wrong)
+    scenes = {view.scene for view in views}
+    print(f"{len(views)} views of {len(scenes)} scenes: {', '.join(view.name for view in views)}\n")
+    rows: list[results.Row] = [
+        {"pairs": kind, "count": len(alarms), "alarms": sum(alarms), "percent": 100 * sum(alarms) / len(alarms)}
+        for kind, alarms in noticed.items()
+    ]
+    cells = [[str(row["pairs"]), str(row["count"]), str(row["alarms"]), f"{row['percent']:.1f}"] for row in rows]
+    print(results.markdown(["pairs", "count", "alarms", "percent"], cells))
+    if args.table:
+        results.write(args.table, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""``msspl check``."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from msspl_cli import options
+from oiio_msspl.errors import InputError
+
+if TYPE_CHECKING:
+    from oiio_msspl.jobs.pair import PairCheck
+
+EXAMPLES = """[bold]Examples[/bold]
+
+  msspl check lr.exr hr.exr
+
+  msspl check lr/ hr/ --frames 1001-1100x10
+
+[bold]Exit code[/bold]
+
+  0: every pair fits. 2: a pair does not fit, or a mistake in files or options.
+"""
+
+
+def check(
+    lr: Annotated[
+        Path,
+        typer.Argument(
+            metavar="LR",
+            help="Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr.",
+            show_default=False,
+        ),
+    ],
+    hr: Annotated[
+        Path,
+        typer.Argument(metavar="HR", help="High-resolution, low-spp render, in the same form.", show_default=False),
+    ],
+    mapping: options.Map = [],  # noqa: B006
+    map_file: options.MapFile = None,
+    view_layer: options.ViewLayer = None,
+    colorspace: options.Colourspace = None,
+    frames: Annotated[
+        str | None,
+        typer.Option(
+            metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=options.SHOT
+        ),
+    ] = None,
+    as_json: options.Json = False,
+    debug: options.Debug = False,
+    help_all: options.HelpAll = False,
+) -> None:
+    """Tell whether two renders fit, without fusing them.
+
+    A pair does not fit if it can't be fused, or if the two renders do not seem to
+    show the same frame: another camera, light, colour space, albedo or normal.
+    """
+    from oiio_msspl.jobs.pair import check_files
+    from oiio_msspl.jobs.sequence import find_shot, is_sequence
+
+    inputs = options.make_inputs(mapping, map_file, view_layer, None, None, colorspace)
+    found: list[tuple[int | None, PairCheck]] = []
+    if is_sequence(lr) or is_sequence(hr):
+        shot = find_shot(lr, hr, Path(), frames)
+        for frame in shot.frames:
+            low, high = frame.lr or shot.lr.pattern.path(frame.number), frame.hr or shot.hr.pattern.path(frame.number)
+            pair = check_files(low, high, inputs)
+            found.append((frame.number, pair))
+            _print(frame.number, pair, as_json)
+    elif frames:
+        raise InputError("--frames is for shots: give folders, or patterns such as lr.####.exr")
+    else:
+        found.append((None, check_files(lr, hr, inputs)))
+        _print(*found[0], as_json)
+    if as_json:
+        data: list[dict[str, Any]] = [
+            ({} if number is None else {"frame": number}) | pair.as_dict() for number, pair in found
+        ]
+        print(json.dumps(data[0] if found[0][0] is None else data, indent=2))
+    if not all(pair.fits for _, pair in found):
+        raise typer.Exit(2)
+
+
+def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
+    """Print what was found about a pair, unless JSON is printed in the end."""
+    if as_json:
+        return
+    name = f"{pair.lr} and {pair.hr}" if number is None else f"frame {number}"
+    if pair.problem is not None:
+        print(f"{name}: can't be fused: {pair.problem}")
+    else:
+        print(f"{name}: {'fits' if pair.fits else 'does not fit'}")
+    for warning in pair.warnings:
+        print(f"  {warning}")

@@ -1,0 +1,107 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do albedo and normals belong to the picture? Then their edges lie where the picture has edges.
+
+Nothing is known of how strong an AOV's edges are in the picture: a dark corner hides them, a mirror shows others. So
+the AOV is its own control. Its edges, shifted by some pixels, say how well edges fit by chance, and the AOV that is not
+shifted must fit better.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.arrays import Array
+from oiio_msspl.fusion.pair_framing import SMALLEST, central_area, smooth
+
+#: Shifts in LRHS pixels that the control consists of; smaller ones than the first still overlap the edges.
+CONTROL = (4, 16)
+#: How many standard deviations above the control edges fit that belong together.
+FITS = 2.0
+#: AOVs that fit each other this well are of one frame.
+SAME_FRAME = 4.0
+#: Both renders show the same edges if these fit this well. In a picture with fewer edges no AOV can be judged.
+VISIBLE = 3.0
+#: An AOV with edges at fewer pixels says nothing.
+MIN_EDGES = 200
+#: A step of log albedo, or the length of a difference of normals, counts as an edge from here.
+EDGE = 0.2
+
+
+def foreign_aovs(low: Array, high: Array, albedo: Array | None, normal_edges: Array | None) -> list[str]:
+    """The AOVs, of "albedo" and "normal", that are of another frame than the picture.
+
+    Args:
+        low, high: luminance (h, w) of LRHS and HRLS.
+        albedo: luminance (h, w) of the albedo, averaged over LRHS pixels; None if there is none.
+        normal_edges: (h, w), length of the difference of the normals to the next pixels; None if there are none.
+    """
+    low, high = central_area(low), central_area(high)
+    if min(low.shape) < SMALLEST:
+        return []
+    found = {}
+    if albedo is not None:
+        surface = np.clip(central_area(albedo), 0, 1)
+        found["albedo"] = np.minimum(_length(_log_steps(surface, 0.05)), 1)
+    if normal_edges is not None:
+        found["normal"] = np.minimum(central_area(normal_edges), 0.5)
+    edges = {name: _local_contrast(v) for name, v in found.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
+    if not edges:
+        return []
+    both = low + high
+    lit = both[both > 0]
+    floor = 0.1 * float(np.median(lit)) if lit.size else 1.0
+    steps_low, steps_high, steps = (_log_steps(v, f) for v, f in ((low, floor / 2), (high, floor / 2), (both, floor)))
+    picture = _local_contrast(np.minimum(_length(steps), 1))
+    visible = _fit(*(_local_contrast(np.minimum(_length(v), 1)) for v in (steps_low, steps_high)))
+    if visible < VISIBLE:
+        return []
+    fits = {name: _fit(v, picture) for name, v in edges.items()}
+    if "albedo" in edges:
+        # Steps have a direction, too: what has the brighter albedo is brighter. A light may turn that around.
+        fits["albedo"] = max(fits["albedo"], abs(_fit_steps(_log_steps(surface, 0.05), steps)))
+    foreign = [name for name, fit in fits.items() if fit < FITS]
+    if len(edges) == 2 and len(foreign) == 1 and _fit(edges["albedo"], edges["normal"]) > SAME_FRAME:
+        return []  # one of the two fits the picture, and the other fits that one
+    return foreign
+
+
+def _log_steps(values: Array, floor: float) -> list[Array]:
+    """Differences of the logarithm to the next pixel, to the right and down: 2 x (h, w)."""
+    logs = np.log(values + np.float32(floor + 1e-20))
+    return [np.diff(logs, axis=axis, append=logs.take([-1], axis)) for axis in (1, 0)]
+
+
+def _length(steps: list[Array]) -> Array:
+    length: Array = np.hypot(*steps)
+    return length
+
+
+def _local_contrast(values: Array) -> Array:
+    """What stands out of its neighbourhood, in units of its local RMS: a noisy or bright corner does not dominate."""
+    fine = values - smooth(smooth(values))
+    power = np.square(fine)
+    for _ in range(6):
+        power = smooth(power)
+    return fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
+
+
+def _fit(a: Array, b: Array) -> float:
+    """By how many standard deviations two maps (h, w) fit better than when one is shifted."""
+    return _above_control(np.conj(np.fft.rfft2(a)) * np.fft.rfft2(b), a.shape)
+
+
+def _fit_steps(a: list[Array], b: list[Array]) -> float:
+    """The same for the directed steps of two pictures."""
+    first, second = ([np.fft.rfft2(np.clip(step, -1, 1)) for step in steps] for steps in (a, b))
+    products = [np.conj(u) * v for u, v in zip(first, second, strict=True)]
+    return _above_control(products[0] + products[1], a[0].shape)
+
+
+def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> float:
+    nearest, furthest = CONTROL
+    correlation = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
+    window = correlation[: 2 * furthest + 1, : 2 * furthest + 1]
+    y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
+    control = window[np.maximum(x, y) >= nearest]
+    return float((window[furthest, furthest] - control.mean()) / max(float(control.std()), 1e-30))

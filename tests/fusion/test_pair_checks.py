@@ -1,0 +1,159 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Right pairs fit, wrong ones are noticed: on pictures of rectangles with albedo, normals, light and noise of 4 spp."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.arrays import interpolate
+from oiio_msspl.colour import ACES2065, ACESCG, REC709, conversion
+from oiio_msspl.exr.render import Render
+from oiio_msspl.fusion.pair_checks import check_renders
+from tests.conftest import downsample, noisy
+
+#: Height and width of the LRHS.
+LOW = (64, 96)
+
+
+@pytest.fixture(params=[2, 4, 8])
+def scale(request):
+    return request.param
+
+
+def scene(scale, seed=0, size=LOW):
+    """Colour, albedo and normal, (h, w, 3) each, of coloured rectangles in the light of a window."""
+    rng = np.random.default_rng(seed)
+    height, width = (n * scale for n in size)
+    albedo, normal = np.full((height, width, 3), 0.5), np.zeros((height, width, 3))
+    normal[..., 2] = 1
+    for _ in range(60):
+        y, x = rng.integers(0, height), rng.integers(0, width)
+        rows, columns = slice(y, y + rng.integers(4, 20) * scale), slice(x, x + rng.integers(4, 20) * scale)
+        albedo[rows, columns] = rng.uniform(0.05, 0.95, 3)
+        direction = rng.normal(size=3)
+        normal[rows, columns] = direction / np.linalg.norm(direction)
+    light = 0.3 + np.maximum(normal @ (0.5, 0.5, 0.7), 0) * np.linspace(1, 2, width)[:, None].T
+    return tuple(v.astype(np.float32) for v in (albedo * light[..., None], albedo, normal))
+
+
+def pair(scale, seed=0, **changed):
+    """A right pair with 4 spp in the HRLS and as many samples in the LRHS; ``changed`` replaces layers, ``lr`` the
+    LRHS."""
+    colour, albedo, normal = scene(scale, seed)
+    low = noisy(downsample(colour, scale), 4 * scale**2, seed + 100)
+    layers = {"rgb": noisy(colour, 4, seed + 200), "albedo": albedo, "normal": normal}
+    lr = changed.pop("lr", low)
+    high = Render.from_arrays("hr", **{k: np.ascontiguousarray(v, np.float32) for k, v in (layers | changed).items()})
+    return Render.from_arrays("lr", rgb=np.ascontiguousarray(lr, np.float32)), high
+
+
+def warnings(scale, seed=0, **changed):
+    return check_renders(*pair(scale, seed, **changed))
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_right_pair_fits(scale, seed):
+    assert warnings(scale, seed) == []
+
+
+def test_a_right_pair_fits_whatever_tiles_it_is_read_in(scale, monkeypatch):
+    monkeypatch.setattr("oiio_msspl.fusion.pair_checks.PIXELS_PER_READ", 30 * 30 * scale**2)
+    assert warnings(scale) == []
+
+
+@pytest.mark.parametrize("how", ["box", "nearest"])
+def test_an_lrhs_made_from_the_hrls_is_noticed(scale, how):
+    """It has the HRLS's noise, so the result would keep it."""
+    high = pair(scale)[1].layers["rgb"]
+    made = downsample(high, scale) if how == "box" else high[scale // 2 :: scale, scale // 2 :: scale]
+    assert any("the LRHS has the noise of the HRLS" in w for w in warnings(scale, lr=made))
+
+
+def test_two_renders_without_noise_share_none(scale):
+    colour, *_ = scene(scale)
+    assert warnings(scale, lr=downsample(colour, scale), rgb=colour) == []
+
+
+def test_a_tighter_crop_is_noticed(scale):
+    """By 3 %, and which of the two renders has it."""
+    image = pair(scale)[0].layers["rgb"]
+    for axis in (0, 1):
+        middle = (image.shape[axis] - 1) / 2
+        image = interpolate(image, (np.arange(image.shape[axis]) - middle) * 0.97 + middle, axis)
+    (warning,) = [w for w in warnings(scale, lr=image) if "tighter" in w]
+    assert warning.startswith("the LRHS is framed")
+    assert 2.5 < float(warning.split(" %")[0].split()[-1]) < 3.5
+
+
+def test_swapped_channels_are_noticed(scale):
+    assert warnings(scale, lr=pair(scale)[0].layers["rgb"][..., ::-1]) == [
+        "red and blue are swapped in one of the two renders: write both in the same colour space"
+    ]
+
+
+@pytest.mark.parametrize(("space", "name"), [(ACESCG, "ACEScg"), (ACES2065, "ACES2065-1")])
+def test_another_colour_space_is_noticed(scale, space, name):
+    matrix = conversion(REC709, space).T
+    low, high = (render.layers["rgb"] for render in pair(scale))
+    assert any(f"the LRHS looks like {name} and" in w for w in warnings(scale, lr=low @ matrix))
+    assert any(f"and the HRLS like {name}" in w for w in warnings(scale, rgb=high @ matrix))
+
+
+def test_grey_pictures_have_no_colour_space(scale):
+    low, high = (render.layers["rgb"].mean(axis=-1, keepdims=True).repeat(3, -1) for render in pair(scale))
+    assert warnings(scale, lr=low, rgb=high) == []
+
+
+@pytest.mark.parametrize("aov", ["albedo", "normal"])
+def test_an_aov_of_another_frame_is_noticed(scale, aov):
+    other = dict(zip(("rgb", "albedo", "normal"), scene(scale, seed=50), strict=True))[aov]
+    assert [w for w in warnings(scale, **{aov: other}) if f"the {aov}'s edges are not in the picture" in w]
+
+
+def test_an_aov_is_not_judged_by_a_picture_without_edges(scale):
+    """Fog or darkness hides the edges of the right albedo."""
+    grey = np.full((*(n * scale for n in LOW), 3), 0.2, np.float32)
+    assert warnings(scale, lr=noisy(downsample(grey, scale), scale**2), rgb=noisy(grey, 1, seed=1)) == []
+
+
+def test_something_small_that_moved_is_noticed(scale):
+    """A 1/64 of the frame, which is no brighter than the rest."""
+    high = pair(scale)[1].layers["rgb"].copy()
+    h, w = LOW[0] // 8 * scale, LOW[1] // 8 * scale
+    high[3 * h : 4 * h, 5 * w : 6 * w] = high[6 * h : 7 * h, w : 2 * w].copy()
+    (warning,) = warnings(scale, rgb=high)
+    x, y = map(int, warning.split("(")[1].split(")")[0].split(","))
+    assert 5 * w - 8 * scale <= x < 6 * w + 8 * scale
+    assert 3 * h - 8 * scale <= y < 4 * h + 8 * scale
+
+
+def test_flat_frames_full_of_noise_look_alike(scale):
+    """Their blocks correlate by nothing, because there is nothing but noise."""
+    grey = np.full((*(n * scale for n in LOW), 3), 0.2, np.float32)
+    low, high = noisy(downsample(grey, scale), 1), noisy(grey, 0.05, seed=1)
+    assert warnings(scale, lr=low, rgb=high) == []
+
+
+def test_a_wider_pixel_filter_is_no_difference(scale):
+    """An LRHS that spreads its samples over its neighbours, beside lights 300 times as bright as the room."""
+    colour, *_ = scene(scale)
+    colour[20 * scale : 24 * scale, 30 * scale : 34 * scale] = 300
+    low = downsample(colour, scale)
+    for axis in (0, 1):
+        low = 0.25 * np.roll(low, 1, axis) + 0.5 * low + 0.25 * np.roll(low, -1, axis)
+    assert warnings(scale, lr=noisy(low, 64), rgb=noisy(colour, 4, seed=1)) == []
+
+
+@pytest.mark.parametrize("side", [44, 48, 50])
+@pytest.mark.parametrize("kind", ["black but for a pixel", "flat", "stripes", "huge"])
+def test_pictures_without_a_framing_are_no_error(side, kind):
+    """Stripes say nothing of the shift along them, so the equations have no single solution."""
+    image = np.full((2 * side, 2 * side, 3), 0.3, np.float32)
+    if kind == "black but for a pixel":
+        image[:] = 0
+        image[10:12, 10:12] = 1
+    elif kind == "stripes":
+        image[:, ::16] = 2
+    elif kind == "huge":
+        image[20:40, 20:40] = 3e38
+    low = Render.from_arrays("lr", rgb=image[::2, ::2].copy())
+    assert not [w for w in check_renders(low, Render.from_arrays("hr", rgb=image)) if "shifted" in w or "tighter" in w]

@@ -8,7 +8,7 @@ import sys
 
 import typer
 
-from oiio_msspl.errors import explain
+from oiio_msspl.errors import explain, printable
 
 
 def run(app: typer.Typer) -> None:
@@ -21,5 +21,5 @@ def run(app: typer.Typer) -> None:
         if "--debug" in sys.argv:
             raise
         message, code = explain(error)
-        print(f"error: {message}", file=sys.stderr)
+        print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(code)

@@ -23,12 +23,21 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
         InputError: it exists and may not be overwritten, it is a folder, or its folder is missing or read-only.
     """
     path = Path(path)
+    check_encodable(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists; pass --overwrite to replace it")
     check_folder(path)
     return path
+
+
+def check_encodable(path: Path) -> None:
+    """Raise InputError if a path is not UTF-8: OpenImageIO could not open it."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: the path is not UTF-8, which OpenImageIO can't open; rename it") from error
 
 
 def check_folder(path: Path) -> None:

@@ -114,6 +114,7 @@ def _has_one_type(part: Part) -> bool:
 
 def _whole_part(part: Part, taken: set[str]) -> PassedOnPart:
     spec = oiio.ImageSpec(part.spec)
+    spec.channelnames = tuple(channel.name for channel in part.channels)
     _name_and_compress(spec, _unique(part.name or f"part{part.index}", taken), lossless(part))
     if not _has_one_type(part):
         return PassedOnPart(spec, part, None)
@@ -140,10 +141,10 @@ def _layer_part(
         _drop_repeated_attributes(spec)
     if nuke and view:
         spec.attribute("view", view)
-    return PassedOnPart(spec, part, tuple(_runs(channels)))
+    return PassedOnPart(spec, part, tuple(runs(channels)))
 
 
-def _runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
+def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
     """Cut channels of one pixel type where their indices are not neighbours: a run can be decoded in one call."""
     run: list[Channel] = []
     for channel in channels:
@@ -183,7 +184,8 @@ def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
 def _drop_repeated_attributes(spec: Any) -> None:
     """Drop the metadata that one part holds for the whole file: a Cryptomatte manifest can take megabytes."""
     for name in [attribute.name for attribute in spec.extra_attribs]:
-        if name not in _KEPT_IN_EVERY_PART:
+        # OpenImageIO can't erase an attribute whose name is not UTF-8. Such a name holds surrogates.
+        if name not in _KEPT_IN_EVERY_PART and name.isprintable():
             spec.erase_attribute(name)
 
 

@@ -20,8 +20,14 @@ from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import check_encodable
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, StripCache, StripKey, strip_rows
+
+# OpenImageIO's own limits protect programs that read whole files: 1024 channels, and an image as large as the memory.
+# Files with thousands of light groups are larger. This module reads by rectangle, so it needs no limit to the image.
+oiio.attribute("limits:channels", 1 << 16)
+oiio.attribute("limits:imagesize_MB", 0)
 
 
 @dataclass(frozen=True)
@@ -230,6 +236,7 @@ def open_exr(path: str | Path) -> ExrFile:
         InputError: there is no such file, it is not an EXR, or its headers are corrupt.
     """
     path = Path(path)
+    check_encodable(path)
     handle = _open(path)
     parts: list[Part] = []
     metadata: dict[str, Any] = {}
@@ -237,7 +244,7 @@ def open_exr(path: str | Path) -> ExrFile:
         spec = handle.spec()
         parts.append(_part(path, len(parts), spec))
         for attribute in spec.extra_attribs:
-            metadata.setdefault(attribute.name, attribute.value)
+            metadata.setdefault(_text(attribute.name), _text(attribute.value))
     if not parts:
         raise InputError(f"{path}: holds no image ({handle.geterror() or 'empty'})")
     first = parts[0].spec
@@ -274,10 +281,10 @@ def _part(path: Path, index: int, spec: Any) -> Part:
     types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
     return Part(
         index=index,
-        name=str(spec.getattribute("oiio:subimagename") or ""),
-        view=str(spec.getattribute("view") or ""),
+        name=_text(str(spec.getattribute("oiio:subimagename") or "")),
+        view=_text(str(spec.getattribute("view") or "")),
         channels=tuple(
-            Channel(path, index, i, name, kind)
+            Channel(path, index, i, _text(name), kind)
             for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
         ),
         data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
@@ -288,9 +295,27 @@ def _part(path: Path, index: int, spec: Any) -> Part:
     )
 
 
+def _text(value: Any) -> Any:
+    """A header's text, or a sequence of texts. Bytes that are not UTF-8 are read as Latin-1; old exporters write that.
+
+    OpenImageIO gives such bytes as lone surrogates, which it refuses to write. So they are written as UTF-8.
+    """
+    if isinstance(value, tuple | list):
+        return tuple(_text(each) for each in value)
+    if not isinstance(value, str) or value.isascii():
+        return value
+    raw = value.encode("utf-8", "surrogateescape")
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
 def _last_error() -> str:
     """OpenImageIO's last error on one line: its messages repeat the path and break lines."""
     try:
-        return " ".join(str(oiio.geterror()).split()) or "no reason given"
+        # What follows is advice for programmers: to raise a limit of the library.
+        reason = str(oiio.geterror()).partition("Possible corrupt input?")[0]
+        return " ".join(reason.split()) or "no reason given"
     except UnicodeDecodeError:  # the message quotes bytes of the file, and OpenImageIO's binding expects UTF-8
         return "its header is damaged"

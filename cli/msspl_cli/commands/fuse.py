@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -300,7 +299,7 @@ def fuse(
         _print(report, time.perf_counter() - start)
     if not quiet:
         for warning in report.warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+            console.say(f"warning: {warning}", error=True)
 
 
 def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
@@ -316,17 +315,17 @@ def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each step."""
     spp = report.spp_avg
     renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
-    print(f"{renderer} at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
+    console.say(f"{renderer} at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
     console.aov_table(report.aovs(), report.hr.notes)
     if lrhs_aovs := report.found_lrhs_aovs():
-        print("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
+        console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     if report.repaired:
         counts = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())
-        print(f"Repaired values that were NaN, infinite or negative: {counts}")
+        console.say(f"Repaired values that were NaN, infinite or negative: {counts}")
     provider = report.provider.removesuffix("ExecutionProvider")
     where = "on the CPU" if provider == "CPU" else f"on {provider}"
     tiles = f" in {report.tiles} tiles" if report.tiles > 1 else ""
     steps = {"read": "loading", "fuse": "fusing", "write": "writing"}
     times = ", ".join(f"{report.seconds[key]:.1f} s {step}" for key, step in steps.items())
-    print(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
-    print(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))
+    console.say(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
+    console.say(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))

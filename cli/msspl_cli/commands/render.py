@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -215,7 +214,7 @@ def render(
             reports.append(event["report"])
             bar.hide()
             for warning in [] if quiet else event["report"]["warnings"]:
-                print(f"warning: frame {event['report']['frame']}: {warning}", file=sys.stderr)
+                console.say(f"warning: frame {event['report']['frame']}: {warning}", error=True)
             return
         if "step" in event:
             number = event.get("frame")

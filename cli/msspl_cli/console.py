@@ -56,7 +56,9 @@ def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 
         grid.add_column(overflow="fold")
     for index, row in enumerate(rows):
         style = "bold" if header and index == 0 else ""
-        grid.add_row(*(Text(printable(row[column]), style=_STYLES.get(row[column], "")) for column in filled), style=style)
+        grid.add_row(
+            *(Text(printable(row[column]), style=_STYLES.get(row[column], "")) for column in filled), style=style
+        )
     with console.capture() as captured:
         console.print(Padding.indent(grid, indent))
     for line in captured.get().splitlines():

@@ -103,7 +103,7 @@ def make_inputs(
     from oiio_msspl.jobs.frame import InputOptions
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
-    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp)
+    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp, map_file)
 
 
 def make_write_options(

@@ -7,7 +7,7 @@ it becomes a formula.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -88,7 +88,7 @@ class LayerFinder:
     def _layer_of_sibling(self, name: str) -> Layer | None:
         """The first layer with three channels of another EXR: its path, or the stem of a file in the same folder."""
         file = self._file
-        path = Path(name) if name.lower().endswith(".exr") else file.path.with_name(name + ".exr")
+        path = _path_of_sibling(file.path, name)
         if path == file.path or not path.is_file():
             return None
         if path not in file.siblings:
@@ -101,6 +101,23 @@ class LayerFinder:
             )
         layers = [replace(layer, name=path.name) for layer in layers_of(other)]
         return next((layer for layer in layers if layer.triple()), layers[0] if layers else None)
+
+
+def _path_of_sibling(path: Path, name: str) -> Path:
+    """The EXR that ``file:NAME`` means in a mapping of the file ``path``."""
+    return Path(name) if name.lower().endswith(".exr") else path.with_name(name + ".exr")
+
+
+def mapped_files(mapping: Mapping[str, Any], path: Path) -> set[Path]:
+    """The other EXRs that a user's mapping of the file ``path`` names, whether they exist or not."""
+    files = set()
+    for candidate in mapping.values():
+        values = candidate.values() if isinstance(candidate, dict) else [candidate]
+        for names in values:
+            for name in names if isinstance(names, list) else [names]:
+                if isinstance(name, str) and name.startswith("file:"):
+                    files.add(_path_of_sibling(path, name.removeprefix("file:")))
+    return files
 
 
 def missing(feature: str, candidate: Any) -> str:

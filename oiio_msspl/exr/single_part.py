@@ -73,9 +73,7 @@ def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[
                         plane[y0 - part.data_window.y0 : y1 - part.data_window.y0] = strip[..., position]
 
 
-def _planes(
-    contents: FileContents, run: Sequence[Channel], channels: dict[str, NDArray[Any]]
-) -> list[NDArray[Any]]:
+def _planes(contents: FileContents, run: Sequence[Channel], channels: dict[str, NDArray[Any]]) -> list[NDArray[Any]]:
     """Empty planes for some channels of one pixel type, which are added to ``channels``."""
     window = contents.home.data_window
     planes = []

@@ -38,6 +38,7 @@ def write_fused(
     error: Array | None = None,
     overwrite: bool = False,
     cache_bytes: int = 0,
+    stale: Path | None = None,
 ) -> list[str]:
     """Write the fused frame to ``path``, atomically.
 
@@ -53,6 +54,7 @@ def write_fused(
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
             each layer.
+        stale: a file that is deleted just before the EXR gets its name: the preview of the EXR that it replaces.
 
     Returns:
         Warnings, one sentence each.
@@ -64,7 +66,7 @@ def write_fused(
     pixels = FusedPixels(rgb, alpha, error, options.pixel_type or widest_type(beauty))
     dropped = dropped_channels(source, beauty, options.layers)
     contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options)
-    with replacing(path, overwrite=overwrite) as temporary:
+    with replacing(path, overwrite=overwrite, stale=stale) as temporary:
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
         else:

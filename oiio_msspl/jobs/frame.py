@@ -10,13 +10,14 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
 from oiio_msspl.exr.contents import dropped_channels
-from oiio_msspl.exr.preview import check_view, write_preview
+from oiio_msspl.exr.preview import check_view, old_preview, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import write_fused
@@ -42,6 +43,13 @@ class InputOptions:
     """Samples per pixel of the LRHS; None to read them from its header."""
     hr_spp: float | None = None
     """Samples per pixel of the HRLS; None to read them from its header."""
+    map_file: Path | None = None
+    """The file that ``mapping`` was read from, if any."""
+
+    def files(self, hr_path: Path, model: str | None) -> set[Path]:
+        """The files that a frame is made from beside the pair: of the mapping, and a model that is no shipped one."""
+        named = [self.map_file, None if model is None else Path(model)]
+        return mapped_files(self.mapping, hr_path) | {path for path in named if path is not None}
 
 
 def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
@@ -91,6 +99,12 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     return SPREAD_NOISE_FAMILY
 
 
+def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
+    """All files that a frame is made from: the pair, what lies beside it, the mapping's files and the model."""
+    siblings = {*lr.file.siblings, *hr.file.siblings}
+    return {lr.file.path, hr.file.path} | siblings | inputs.files(hr.file.path, model)
+
+
 def fuse_files(
     lr_path: str | Path,
     hr_path: str | Path,
@@ -135,13 +149,14 @@ def fuse_files(
     output = check_target(output, overwrite=overwrite)
     if output.suffix.lower() != ".exr":
         raise InputError(f"{output}: the result is an EXR; name it .exr")
-    if any(Path(p).exists() and output.exists() and output.samefile(p) for p in (lr_path, hr_path)):
-        raise InputError(f"{output}: is one of the inputs; write the result elsewhere")
     if preview_path is not None:
         check_target(preview_path, overwrite=overwrite)
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
+    targets = [output] if preview_path is None else [output, preview_path]
+    check_separate(files_read(lr, hr, inputs, model), targets)
+    remove_leftovers(targets)
     dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
     session = Session(find_model(align(lr, hr).scale, resolve_auto(lr, hr, model)), device, threads)
     opened = time.perf_counter()
@@ -169,6 +184,8 @@ def write_frame(
 ) -> None:
     """Write the EXR that the report names, and add the writer's warnings to the report.
 
+    A preview that shows the EXR that is replaced is deleted, because the new one may fail or may not be wanted.
+
     Args:
         cache_bytes: see :func:`oiio_msspl.exr.writer.write_fused`.
     """
@@ -183,6 +200,7 @@ def write_frame(
         error=fused.error,
         overwrite=overwrite,
         cache_bytes=cache_bytes,
+        stale=old_preview(report.output) if overwrite else None,
     )
 
 

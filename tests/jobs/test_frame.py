@@ -1,13 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main job on one pair: what is refused before any work, and what does not stop it."""
 
+import numpy as np
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
+from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs import frame
 from oiio_msspl.jobs.frame import map_pair
 from tests.conftest import picture, rgb, write_exr
+from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
 
 
@@ -64,3 +67,103 @@ def test_the_mapping_is_the_hrls_s_and_only_its_beauty_applies_to_the_lrhs(tmp_p
     assert (set(low.features), set(high.features)) == ({"rgb"}, {"rgb", "albedo"})
     assert (low.features["rgb"].text, high.features["albedo"].text) == ("key", "colours")
     assert (low.spp, high.spp) == (64, 2)
+
+
+# ------------------------------------------------------------------------------------------------ inputs stay
+
+
+def protected(folder):
+    """{name: bytes} of all files in a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def luxcore_pair(folder):
+    """LuxCore writes one file for each AOV; the beauty's reads the others."""
+    write_exr(folder / "lr.exr", low_layers(1))
+    for name in ("ALBEDO", "AVG_SHADING_NORMAL"):
+        write_exr(folder / f"{name}.exr", rgb(picture(HEIGHT, WIDTH)))
+    return folder / "lr.exr", write_exr(folder / "RGB.exr", rgb(picture(HEIGHT, WIDTH)))
+
+
+@pytest.mark.parametrize("target", ["other.exr", "map.toml", "model.onnx", "ALBEDO.exr", "AVG_SHADING_NORMAL.exr"])
+@pytest.mark.parametrize("kind", ["output", "preview"])
+def test_no_file_that_is_read_is_written_even_with_overwrite(tmp_path, monkeypatch, target, kind):
+    """A file of --map, the mapping's file, the model, and the sibling files of a LuxCore beauty, by name or by link."""
+    monkeypatch.setattr(frame, "Session", pytest.fail)
+    pair = luxcore_pair(tmp_path)
+    write_exr(tmp_path / "other.exr", rgb(picture(HEIGHT, WIDTH)))
+    for name in ("map.toml", "model.onnx"):
+        (tmp_path / name).write_text("text")
+    (tmp_path / "out.exr").symlink_to(target)
+    (tmp_path / "out.png").symlink_to(target)
+    before = protected(tmp_path)
+    mapping = {"diffuse": f"file:{tmp_path / 'other.exr'}"}
+    inputs = InputOptions(mapping, map_file=tmp_path / "map.toml")
+    more = {"inputs": inputs, "model": str(tmp_path / "model.onnx"), "overwrite": True}
+    output, preview = ("out.exr", None) if kind == "output" else ("new.exr", tmp_path / "out.png")
+    with pytest.raises(InputError, match="is one of the inputs"):
+        fuse_files(*pair, tmp_path / output, preview_path=preview, **more)
+    assert protected(tmp_path) == before
+
+
+def test_a_preview_that_is_a_link_to_the_result_is_refused(pair, tmp_path, bilinear_models):
+    (tmp_path / "out.png").symlink_to("out.exr")
+    with pytest.raises(InputError, match="is the same file as"):
+        fuse_files(
+            *pair,
+            tmp_path / "out.exr",
+            model=str(bilinear_models[4]),
+            preview_path=tmp_path / "out.png",
+            overwrite=True,
+        )
+
+
+# ------------------------------------------------------------------------------------------------ what is left behind
+
+
+def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bilinear_models, monkeypatch):
+    """Neither if no preview is asked for, nor if it can't be written, nor if the run dies before it."""
+    out, png, model = tmp_path / "out.exr", tmp_path / "out.png", str(bilinear_models[4])
+
+    def full_disk(*arguments, **more):
+        raise MssplError("disk full")
+
+    for preview, writes in ((None, frame.write_preview), (png, full_disk)):
+        out.write_text("old")
+        write_png(png, np.zeros((2, 2, 3)), overwrite=True)
+        monkeypatch.setattr(frame, "write_preview", writes)
+        fuse_files(*pair, out, model=model, preview_path=preview, overwrite=True)
+        assert not png.exists()
+    png.write_text("somebody's picture")
+    fuse_files(*pair, out, model=model, overwrite=True)
+    assert png.read_text() == "somebody's picture"
+
+
+def test_an_old_frame_that_can_not_be_replaced_keeps_its_preview(pair, tmp_path, bilinear_models, monkeypatch):
+    out, png = tmp_path / "out.exr", tmp_path / "out.png"
+    out.write_text("old")
+    write_png(png, np.zeros((2, 2, 3)))
+    monkeypatch.setattr("oiio_msspl.exr.writer._write_parts", lambda *_: (_ for _ in ()).throw(MssplError("full")))
+    with pytest.raises(MssplError, match="full"):
+        fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png, overwrite=True)
+    assert out.read_text() == "old" and is_our_preview(png)
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(pair, tmp_path, bilinear_models):
+    out, png = tmp_path / "out.exr", tmp_path / "out.png"
+    left = [leave_temporary(out), leave_temporary(png)]
+    assert all(path.exists() for path in left)
+    fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr", "out.exr", "out.png"]
+
+
+def test_a_result_may_be_a_link_to_a_name_without_extension(pair, tmp_path, bilinear_models):
+    (tmp_path / "out.exr").symlink_to("stored")
+    fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), overwrite=True)
+    assert open_exr(tmp_path / "stored").parts[0].data_window.width == WIDTH
+
+
+def test_a_result_may_have_the_longest_name(pair, tmp_path, bilinear_models):
+    out = tmp_path / ("x" * 250 + ".exr")
+    fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=out.with_suffix(".png"))
+    assert out.is_file() and out.with_suffix(".png").is_file()

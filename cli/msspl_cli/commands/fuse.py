@@ -189,6 +189,15 @@ def fuse(
             "--skip-existing", help="Skip frames that exist. This resumes a run.", rich_help_panel=options.SHOT
         ),
     ] = False,
+    update: Annotated[
+        bool,
+        typer.Option(
+            "--update",
+            help="Skip frames that exist and are newer than their inputs.",
+            rich_help_panel=options.SHOT,
+            hidden=True,
+        ),
+    ] = False,
     report_file: Annotated[
         Path | None,
         typer.Option(
@@ -260,6 +269,7 @@ def fuse(
                     frames=frames,
                     previews=preview,
                     skip_existing=skip_existing,
+                    update=update,
                     report_path=report_file,
                     progress=printer,
                     client=client,
@@ -272,6 +282,7 @@ def fuse(
     for option, value in (
         ("--frames", frames),
         ("--skip-existing", skip_existing),
+        ("--update", update),
         ("--report", report_file),
         ("--progress", progress),
         ("--scheduler", scheduler),

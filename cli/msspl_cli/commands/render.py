@@ -13,7 +13,7 @@ from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
 from msspl_cli.installed import find_msspl_fuse
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, check_target
+from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -186,6 +186,7 @@ def render(
     for _, target in [] if makes_folder else targets:
         for suffix in suffixes:
             check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
+    check_separate([scene], [target for _, target in targets])
     job = {
         "scene": str(scene.absolute()),
         "frames": [(number, str(target.absolute())) for number, target in targets],

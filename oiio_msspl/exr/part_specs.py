@@ -33,6 +33,10 @@ _KEPT_IN_EVERY_PART = (
 )
 
 
+#: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
+LARGEST_MIXED_PART = 256 << 20
+
+
 @dataclass(frozen=True)
 class PassedOnPart:
     """A part to be written, with pixels of the HRLS."""
@@ -104,8 +108,8 @@ def _stays_whole(part: Part, contents: FileContents) -> bool:
     if any(c in contents.beauty or c in contents.dropped for c in part.channels):
         return False
     # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. A part of a single pixel type
-    # is rewritten as scan lines; OpenImageIO can't do so with mixed types.
-    return _has_one_type(part) or part.tile == (0, 0)
+    # is rewritten as scan lines; OpenImageIO can't do so with mixed types. It copies those whole, in memory.
+    return _has_one_type(part) or (part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART)
 
 
 def _has_one_type(part: Part) -> bool:

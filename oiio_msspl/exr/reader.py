@@ -66,6 +66,15 @@ class Part:
     """OpenImageIO's ``ImageSpec``, from which a copy of the part can be written."""
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of all pixels in their stored types."""
+        return sum(self.plane_bytes(channel) for channel in self.channels)
+
+    def plane_bytes(self, channel: Channel) -> int:
+        """Bytes of the pixels of one channel in its stored type."""
+        return self.data_window.width * self.data_window.height * (2 if channel.type == "half" else 4)
+
+    @property
     def strip_height(self) -> int:
         """Rows that are decoded together: whole tiles, or whole chunks of scan lines."""
         unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)

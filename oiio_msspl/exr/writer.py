@@ -19,7 +19,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
-from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, error_spec, passed_on_parts
+from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, error_spec, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, unreadable
 from oiio_msspl.exr.single_part import write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
@@ -76,6 +76,18 @@ def write_fused(
         for part in source.parts
         if part.deep
     ]
+
+
+def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:
+    """Memory of the pixels that :func:`write_fused` holds at once, beside the fused frame; from the headers alone."""
+    if options.layout == "multilayer":
+        dropped = dropped_channels(source, beauty, options.layers)
+        flat = [part for part in source.parts if not part.deep]
+        return sum(part.plane_bytes(c) for part in flat for c in part.channels if c not in dropped)
+    if options.layout == "nuke":
+        return 0  # splits all parts
+    mixed = [part.nbytes for part in source.parts if len({channel.type for channel in part.channels}) > 1]
+    return max((size for size in mixed if size <= LARGEST_MIXED_PART), default=0)
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:

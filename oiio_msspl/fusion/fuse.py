@@ -17,7 +17,16 @@ from oiio_msspl.fusion.alpha import fuse_alpha
 from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, largest_tile, plan_tiles
+from oiio_msspl.fusion.tiling import (
+    MAX_MEMORY,
+    STRIPS_SHARE,
+    Tile,
+    aligned_grid,
+    check_memory,
+    largest_tile,
+    plan_tiles,
+    smallest_memory,
+)
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
@@ -59,6 +68,7 @@ def fuse(
     *,
     error: bool = False,
     max_memory: int = MAX_MEMORY,
+    reserved: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedFrame:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
@@ -68,18 +78,21 @@ def fuse(
         session: a model for the scale of the pair.
         error: also predict the error of the result.
         max_memory: bytes that the whole process should stay below.
+        reserved: bytes of these that the caller needs for other frames.
         progress: called with (tiles done, tiles in all).
 
     Raises:
-        InputError: the pair does not fit together, or the model is for another scale or does not predict its error.
+        InputError: the pair does not fit together, the model is for another scale or does not predict its error, or the
+            frame does not fit into memory. No pixel was read.
     """
     alignment = align(lr, hr)
     _check_model(session, alignment.scale, error)
+    check_memory(memory_to_fuse(lr, alignment, session, error=error) + reserved, max_memory)
     seconds = session.seconds
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
         frame = _blank_frame(alignment, pair.exposure, error=error)
-        largest = largest_tile(session.contract, frame.nbytes + pair.nbytes, max_memory)
+        largest = largest_tile(session.contract, frame.nbytes + pair.nbytes + reserved, max_memory)
         tiles = plan_tiles(pair.grid, largest, session.contract.overlap, session.contract.alignment)
         with hr.cache_strips(int(max_memory * STRIPS_SHARE)):
             # The next tile is read and encoded while the network works on this one.
@@ -92,6 +105,19 @@ def fuse(
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     return frame
+
+
+def memory_to_fuse(lr: ReadableRender, alignment: Alignment, session: Session, *, error: bool) -> int:
+    """The smallest ``max_memory`` with which a pair can be fused, from its headers."""
+    grid = aligned_grid(alignment.grid, session.contract.alignment)
+    # Of the features that the LRHS may have; it is not read yet. Alpha counts 1 channel, every other one 3.
+    lrhs_bytes = grid.width * grid.height * (3 * (1 + len(session.lrhs_aovs)) + 1) * 4
+    return smallest_memory(grid, session.contract, result_bytes(alignment, error=error) + lrhs_bytes)
+
+
+def result_bytes(alignment: Alignment, *, error: bool) -> int:
+    """Memory of a result: colour, alpha (whether there is one or not) and, if asked for, error."""
+    return alignment.hr_data_window.width * alignment.hr_data_window.height * (5 if error else 4) * 4
 
 
 def _check_model(session: Session, scale: int, error: bool) -> None:

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from oiio_msspl.errors import InputError
@@ -44,15 +45,30 @@ def largest_tile(contract: Contract, frame_bytes: int, max_memory: int) -> int:
         frame_bytes: memory for the whole frame: the result and the LRHS.
         max_memory: memory for the whole process.
 
-    Raises:
-        InputError: not even the frame fits.
+    Returns:
+        0 or less if not even the frame fits.
     """
     left = max_memory - FIXED_MEMORY - frame_bytes
     pixels = min(left // contract.bytes_per_pixel, LARGEST_TILE)
-    if pixels <= 0:
-        needed = (FIXED_MEMORY + frame_bytes) / 2**30
-        raise InputError(f"--max-memory: this frame alone takes {needed:.1f} GiB; allow at least {needed + 0.5:.1f}G")
     return int(pixels) // contract.scale**2
+
+
+def smallest_memory(grid: Window, contract: Contract, frame_bytes: int) -> int:
+    """Memory with which a frame can be fused: in the smallest tiles that :func:`plan_tiles` makes.
+
+    Args:
+        grid: LRHS pixels to cover.
+        frame_bytes: as for :func:`largest_tile`.
+    """
+    smallest = min(width * height for _, _, width, height in _cuts(grid, contract.overlap, contract.alignment))
+    return FIXED_MEMORY + frame_bytes + smallest * contract.scale**2 * contract.bytes_per_pixel
+
+
+def check_memory(needed: int, max_memory: int, hint: str = "") -> None:
+    """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else would help."""
+    if needed > max_memory:
+        tenths = -(-needed * 10 // 2**30)
+        raise InputError(f"--max-memory is too small for this frame; allow at least {tenths / 10:.1f}G{hint}")
 
 
 def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> list[Tile]:
@@ -65,7 +81,11 @@ def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> 
     Raises:
         InputError: ``largest`` is too small for a core.
     """
-    columns, rows = _split(grid, largest, overlap, alignment)
+    fitting = (cut for cut in _cuts(grid, overlap, alignment) if cut[2] * cut[3] <= largest)
+    width, height, _, _ = next(fitting, (0, 0, 0, 0))
+    if not width:
+        raise InputError(f"--max-memory is too small: no tile of {grid.size} low-resolution pixels fits; raise it")
+    columns, rows = _ranges(grid.x0, grid.x1, width), _ranges(grid.y0, grid.y1, height)
     return [
         Tile(Window(x0, y0, x1, y1), Window(x0 - overlap, y0 - overlap, x1 + overlap, y1 + overlap).intersect(grid))
         for y0, y1 in rows
@@ -73,28 +93,21 @@ def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> 
     ]
 
 
-def _split(
-    grid: Window, largest: int, overlap: int, alignment: int
-) -> tuple[list[tuple[int, int]], list[tuple[int, int]]]:
-    """Ranges of the columns and rows of tiles: the fewest that fit. The longer side is cut first, so tiles are nearly
-    square."""
+def _cuts(grid: Window, overlap: int, alignment: int) -> Iterator[tuple[int, int, int, int]]:
+    """Ways to cut a grid into more and more tiles: width and height of a core, and of a tile's area.
+
+    The longer side is cut first, so tiles are nearly square.
+    """
     nx = ny = 1
     while True:
         width, height = _step(grid.width, nx, alignment), _step(grid.height, ny, alignment)
-        area_width = width + (2 * overlap if nx > 1 else 0)
-        area_height = height + (2 * overlap if ny > 1 else 0)
-        if area_width * area_height <= largest:
-            break
+        yield width, height, width + (2 * overlap if nx > 1 else 0), height + (2 * overlap if ny > 1 else 0)
         if min(width, height) < max(SMALLEST_CORE, alignment + 1):
-            raise InputError(
-                f"not enough memory: even a tile of {width}x{height} low-resolution pixels needs more; "
-                "raise --max-memory"
-            )
+            return
         if width >= height:
             nx += 1
         else:
             ny += 1
-    return _ranges(grid.x0, grid.x1, width), _ranges(grid.y0, grid.y1, height)
 
 
 def _step(side: int, count: int, alignment: int) -> int:

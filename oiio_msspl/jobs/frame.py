@@ -20,11 +20,11 @@ from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.preview import check_view, old_preview, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import write_fused
-from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.exr.writer import bytes_held, write_fused
+from oiio_msspl.fusion.alignment import Alignment, align
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
 from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, check_memory
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY, find_model
 from oiio_msspl.model.session import Session
@@ -105,6 +105,33 @@ def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: 
     return {lr.file.path, hr.file.path} | siblings | inputs.files(hr.file.path, model)
 
 
+def memory_to_write(alignment: Alignment, hr: MappedRender, write: WriteOptions) -> int:
+    """The smallest ``max_memory`` with which the result can be written, from the headers."""
+    held = bytes_held(hr.file, hr.beauty_channels, write)
+    return FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + held
+
+
+def check_frame_memory(
+    lr: MappedRender, hr: MappedRender, session: Session, write: WriteOptions, max_memory: int, reserved: int = 0
+) -> None:
+    """Refuse a pair that does not fit into memory, before its pixels are read.
+
+    Args:
+        lr, hr, session, write: what is fused and how it is written.
+        max_memory: bytes that the process should stay below.
+        reserved: bytes of these that other frames need.
+
+    Raises:
+        InputError: it does not fit. The message says how much does.
+    """
+    alignment = align(lr, hr)
+    to_fuse = memory_to_fuse(lr, alignment, session, error=write.error_layer)
+    to_write = memory_to_write(alignment, hr, write)
+    only_layout = write.layout == "multilayer" and to_fuse + reserved <= max_memory
+    hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""
+    check_memory(max(to_fuse, to_write) + reserved, max_memory, hint)
+
+
 def fuse_files(
     lr_path: str | Path,
     hr_path: str | Path,
@@ -158,7 +185,11 @@ def fuse_files(
     check_separate(files_read(lr, hr, inputs, model), targets)
     remove_leftovers(targets)
     dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
-    session = Session(find_model(align(lr, hr).scale, resolve_auto(lr, hr, model)), device, threads)
+    # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
+    fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
+    family = resolve_auto(lr, hr, model) if fits else model or DEFAULT_FAMILY
+    session = Session(find_model(align(lr, hr).scale, family), device, threads)
+    check_frame_memory(lr, hr, session, write, max_memory)
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)

@@ -19,7 +19,14 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
-from oiio_msspl.jobs.frame import InputOptions, files_read, map_pair, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import (
+    InputOptions,
+    check_frame_memory,
+    files_read,
+    map_pair,
+    write_frame,
+    write_frame_preview,
+)
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.model.catalogue import find_model
@@ -121,12 +128,14 @@ class Stages:
         others = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
         if loaded.in_memory:
             others += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+        check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, others)
         fused = fuse(
             loaded.lr_pixels,
             loaded.hr_pixels,
             session,
             error=self.write_options.error_layer,
-            max_memory=self.max_memory - others,
+            max_memory=self.max_memory,
+            reserved=others,
         )
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)

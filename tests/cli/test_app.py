@@ -40,7 +40,7 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --model --device --max-memory --output --layout --layers --error-layer --overwrite --json "
         "--frames --skip-existing --help --help-all",
-        14,
+        15,
     ),
     "msspl_render": (
         "--blender --scale --lr-spp --hr-spp --output --compare --overwrite --json --frames --skip-existing --help "

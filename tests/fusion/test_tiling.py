@@ -4,7 +4,8 @@ import pytest
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.tiling import aligned_grid, plan_tiles
+from oiio_msspl.fusion.tiling import aligned_grid, largest_tile, plan_tiles, smallest_memory
+from oiio_msspl.model.contract import Contract
 
 
 @pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
@@ -41,5 +42,17 @@ def test_aligned_tiles_lie_on_the_blocks_of_the_whole_frame(grid):
 
 
 def test_too_little_memory_is_said():
-    with pytest.raises(InputError, match="raise --max-memory"):
+    with pytest.raises(InputError, match="--max-memory is too small"):
         list(plan_tiles(Window(0, 0, 500, 300), 100, overlap=16))
+
+
+@pytest.mark.parametrize(("alignment", "overlap"), [(1, 16), (8, 32), (16, 48)])
+@pytest.mark.parametrize("size", [(40, 30), (500, 300), (1921, 1081)])
+def test_the_smallest_memory_is_the_one_threshold(size, alignment, overlap):
+    """With it there is a plan, with a byte less there is none."""
+    contract = Contract(name="any", scale=4, alignment=alignment, overlap=overlap, bytes_per_pixel=1000)
+    grid = aligned_grid(Window(0, 0, *size), alignment)
+    needed = smallest_memory(grid, contract, 10**6)
+    assert plan_tiles(grid, largest_tile(contract, 10**6, needed), overlap, alignment)
+    with pytest.raises(InputError, match="--max-memory is too small"):
+        plan_tiles(grid, largest_tile(contract, 10**6, needed - 1), overlap, alignment)

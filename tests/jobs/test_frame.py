@@ -1,12 +1,17 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main job on one pair: what is refused before any work, and what does not stop it."""
 
+import re
+import subprocess
+import sys
+
 import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
 from oiio_msspl.exr.preview import is_our_preview, write_png
-from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.jobs import frame
 from oiio_msspl.jobs.frame import map_pair
 from tests.conftest import picture, rgb, write_exr
@@ -167,3 +172,75 @@ def test_a_result_may_have_the_longest_name(pair, tmp_path, bilinear_models):
     out = tmp_path / ("x" * 250 + ".exr")
     fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=out.with_suffix(".png"))
     assert out.is_file() and out.with_suffix(".png").is_file()
+
+
+# ------------------------------------------------------------------------------------------------ memory
+
+
+@pytest.mark.parametrize("layout", ["spec", "multilayer"])
+def test_a_frame_that_can_not_fit_is_refused_from_its_headers_by_one_sentence(
+    tmp_path, bilinear_models, monkeypatch, layout
+):
+    """At any limit below the one that it names; at that one the frame is fused."""
+    clean = picture(1024, 1024)
+    lr = write_exr(tmp_path / "lr.exr", rgb(clean[::4, ::4]))
+    channels = rgb(clean) | {f"l.{i:02d}": clean[..., 0] for i in range(40)}
+    hr = write_exr(tmp_path / "hr.exr", channels, compression=OpenEXR.NO_COMPRESSION)
+    more = {"model": str(bilinear_models[4]), "write": WriteOptions(layout=layout)}
+
+    def refusal(megabytes):
+        with monkeypatch.context() as patched, pytest.raises(InputError) as caught:
+            patched.setattr(ExrFile, "read", pytest.fail)
+            fuse_files(lr, hr, tmp_path / "out.exr", max_memory=megabytes << 20, **more)
+        return str(caught.value)
+
+    said = refusal(1)
+    needed = re.fullmatch(r"--max-memory is too small for this frame; allow at least (\d\.\d)G", said)
+    assert needed, said
+    sentences = {
+        refusal(megabytes).partition(", or use")[0] for megabytes in (300, 350, int(float(needed[1]) * 1024) - 103)
+    }
+    assert sentences == {said}
+    fuse_files(lr, hr, tmp_path / "out.exr", max_memory=int(float(needed[1]) * 2**30), **more)
+    if layout == "multilayer":
+        assert "use --layout spec" in refusal(500)
+    else:
+        assert float(needed[1]) < 0.5
+
+
+#: Writes zeros over a file and prints by how many MiB that raised the peak of the process's memory.
+WRITE = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr import part_specs, writer
+from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.exr.write_options import WriteOptions
+hr = map_render(open_exr(sys.argv[1]))
+window = hr.data_window
+rgb = np.zeros((window.height, window.width, 3), np.float32)
+options = WriteOptions(sys.argv[3])
+part_specs.LARGEST_MIXED_PART = writer.LARGEST_MIXED_PART = int(sys.argv[4])
+held = writer.bytes_held(hr.file, hr.beauty_channels, options)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+writer.write_fused(Path(sys.argv[2]), hr.file, hr.beauty_channels, rgb, None, {}, options)
+print(held >> 20, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) >> 10)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has other units elsewhere")
+@pytest.mark.parametrize(
+    ("layout", "largest", "holds"),
+    [("spec", 1 << 20, False), ("spec", 1 << 30, True), ("nuke", 1 << 30, False), ("multilayer", 0, True)],
+)
+def test_writing_holds_no_more_than_is_planned_for(tmp_path, layout, largest, holds):
+    """A part of mixed types is copied whole if it is small, and the single-part layout holds the file."""
+    plane = np.zeros((1024, 1024), np.float32)
+    mixed = {f"a{i:02d}.Y": plane for i in range(20)} | {f"b{i:02d}.Y": plane.astype(np.float16) for i in range(20)}
+    parts = [("rgba", rgb(np.zeros((1024, 1024, 3), np.float16)), (0, 0)), ("extra", mixed, (0, 0))]
+    hr = write_exr(tmp_path / "hr.exr", parts, compression=OpenEXR.NO_COMPRESSION)
+    command = [sys.executable, "-c", WRITE, str(hr), str(tmp_path / "out.exr"), layout, str(largest)]
+    held, grown = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert grown < (held if holds else 0) + 64, (held, grown)
+    assert (held > 100) == holds

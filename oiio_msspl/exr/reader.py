@@ -100,7 +100,7 @@ class ExrFile:
     def _input(self) -> Any:
         handle = oiio.ImageInput.open(str(self.path))
         if handle is None:
-            raise InputError(f"{self.path}: can't be opened ({_last_error()})")
+            raise InputError(f"{self.path}: can't be opened ({reason_of(oiio)})")
         return handle
 
     def read(self, channels: Sequence[Channel], window: Window) -> Array:
@@ -226,15 +226,15 @@ class ExrFile:
         else:
             strip = self._input.read_scanlines(part.index, 0, y0, y1, 0, first, last, kind)
         if strip is None:
-            raise unreadable(self.path, part, self._input.geterror(), f", rows {y0} to {y1 - 1}")
+            raise unreadable(self.path, part, reason_of(self._input), f", rows {y0} to {y1 - 1}")
         return np.asarray(strip)
 
 
 def unreadable(path: Path, part: Part, reason: str, where: str = "") -> InputError:
     """The error for pixels that can't be decoded; ``where`` follows the part's name."""
     return InputError(
-        f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read "
-        f"({' '.join(reason.split()) or 'no reason given'}); the file is damaged or still being written"
+        f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read ({reason}); "
+        "the file is damaged or still being written"
     )
 
 
@@ -255,7 +255,7 @@ def open_exr(path: str | Path) -> ExrFile:
         for attribute in spec.extra_attribs:
             metadata.setdefault(_text(attribute.name), _text(attribute.value))
     if not parts:
-        raise InputError(f"{path}: holds no image ({handle.geterror() or 'empty'})")
+        raise InputError(f"{path}: holds no image ({reason_of(handle)})")
     first = parts[0].spec
     x, y = first.full_x, first.full_y
     return ExrFile(
@@ -275,7 +275,7 @@ def _open(path: Path) -> Any:
         raise InputError(f"{path}: no such file")
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
-        reason = _last_error()
+        reason = reason_of(oiio)
         hint = "; if its channels are subsampled (luminance and chroma), convert it to RGB" if "twice" in reason else ""
         raise InputError(f"{path}: can't be opened as an EXR ({reason}){hint}")
     if handle.format_name() != "openexr":
@@ -320,11 +320,11 @@ def _text(value: Any) -> Any:
         return raw.decode("latin-1")
 
 
-def _last_error() -> str:
-    """OpenImageIO's last error on one line: its messages repeat the path and break lines."""
+def reason_of(source: Any) -> str:
+    """The last error of OpenImageIO, or of one of its files, on one line."""
     try:
         # What follows is advice for programmers: to raise a limit of the library.
-        reason = str(oiio.geterror()).partition("Possible corrupt input?")[0]
+        reason = str(source.geterror()).partition("Possible corrupt input?")[0]
         return " ".join(reason.split()) or "no reason given"
     except UnicodeDecodeError:  # the message quotes bytes of the file, and OpenImageIO's binding expects UTF-8
-        return "its header is damaged"
+        return "its header or its pixels are damaged"

@@ -20,7 +20,7 @@ from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
 from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, error_spec, passed_on_parts
-from oiio_msspl.exr.reader import Channel, ExrFile, unreadable
+from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.single_part import write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.exr.write_options import WriteOptions
@@ -113,7 +113,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
-        reason = " ".join(writer.geterror().split()) or "disk full?"
+        reason = reason_of(writer) if writer.has_error else "disk full?"
         raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
 
 
@@ -137,7 +137,7 @@ def _copy(file: ExrFile, part: PassedOnPart, writer: Any) -> bool:
         source = oiio.ImageInput.open(str(file.path))
         copied = source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source)
         if not copied and source is not None and source.has_error:
-            raise unreadable(file.path, part.source, source.geterror())
+            raise unreadable(file.path, part.source, reason_of(source))
         return bool(copied)
     runs = [file.native_strips(part.source, run[0].index, run[-1].index + 1) for run in part.runs]
     for strips in zip(*runs, strict=True):

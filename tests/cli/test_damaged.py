@@ -185,8 +185,23 @@ def test_what_a_file_claims_to_be_is_refused_in_words_that_help(tmp_path):
     assert "raise the" not in str(caught.value)
 
 
-def test_a_signal_of_nobody_is_no_process(tmp_path):
-    """The tool that runs the mutants reports exit codes and signals as they are."""
+def test_an_error_that_quotes_bytes_of_the_file_is_reported(tmp_path, monkeypatch):
+    """OpenImageIO's binding can't decode such a message."""
+
+    class Source:
+        def geterror(self):
+            return b"Corrupt channel \xdf".decode("utf-8")
+
+        def read_scanlines(self, *arguments):
+            return None
+
+    file = open_exr(write_exr(tmp_path / "hr.exr", layers(1)))
+    monkeypatch.setitem(file.__dict__, "_input", Source())
+    with pytest.raises(InputError, match=r"hr\.exr: part 0 .* can't be read \(its header or its pixels are damaged\)"):
+        file.read(file.parts[0].channels, file.parts[0].data_window)
+
+
+def test_the_tool_reports_exit_codes_and_signals_as_they_are():
     assert mutants.run([sys.executable, "-c", "print('on'); raise SystemExit(2)"])[:2] == (2, "on\n")
     if sys.platform != "win32":
         assert mutants.run([sys.executable, "-c", "import os; os.kill(os.getpid(), 9)"])[0] == -9

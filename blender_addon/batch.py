@@ -17,12 +17,14 @@ from .overrides import override
 from .render import escape_path, render
 
 
-def run_job(job, send):
-    """Render and fuse every frame of a job.
+def run_job(job, send, receive):
+    """Render every frame of a job, and let msspl-render fuse it.
 
     Args:
         job: the dictionary that :mod:`.headless` describes.
-        send: called with the progress and with the report of each frame, as keyword arguments.
+        send: called with the progress, with what is to be fused, and with the report of each frame, as keyword
+            arguments.
+        receive: called for the answer to what is to be fused.
 
     Raises:
         Failure: a frame failed. The frames before it are complete.
@@ -38,17 +40,22 @@ def run_job(job, send):
     for number, output in job["frames"]:
         if number is not None:
             scene.frame_set(number)
-        send(report=_run_frame(scene, options, job, Path(output), send))
+        send(report=_run_frame(scene, options, job, Path(output), send, receive))
 
 
-def _run_frame(scene, options, job, output, send):
+def _run_frame(scene, options, job, output, send, receive):
     number = scene.frame_current
 
     def on_step(step, fraction):
         send(frame=number, step=step, fraction=fraction)
 
+    def fuse(lrhs, hrls, output):
+        yield "fuse", 2 / 3
+        send(fuse={"lrhs": lrhs, "hrls": hrls, "output": output})  # msspl-render keeps its model loaded
+        return receive()
+
     on_step("start", 0.0)
-    steps = render_and_fuse(scene, options, output, job["work"], job["program"], overwrite=job["overwrite"])
+    steps = render_and_fuse(scene, options, output, job["work"], fuse, overwrite=job["overwrite"])
     report = run_to_end(steps, on_step)
     result = {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
     for each, suffix in ((report.lrhs, "lr"), (report.hrls, "hr")):

@@ -9,7 +9,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from . import fuse, render_settings
+from . import render_settings
 from .checks import check_animation, check_output, check_scene
 from .errors import Failure
 from .options import hrls_size, lrhs_size
@@ -70,13 +70,14 @@ class Report:
         )
 
 
-def render_and_fuse(scene, options, output, work, program, *, overwrite=False, window=False):
+def render_and_fuse(scene, options, output, work, fuse, *, overwrite=False, window=False):
     """Render and fuse a frame. This is a generator that yields ``(current step, fraction done)``.
 
     Args:
         output: the EXR to write.
         work: a folder for ``lr.exr`` and ``hr.exr``, which stay there.
-        program: the path of msspl-fuse.
+        fuse: called with the files of the LRHS, the HRLS and the output. It is a generator like this function, and
+            returns a dictionary with ``warnings``.
         window: let Blender go on while it renders. The caller must then return to Blender's event loop between steps.
 
     Returns:
@@ -107,7 +108,7 @@ def render_and_fuse(scene, options, output, work, program, *, overwrite=False, w
                     yield str(each), part / 3
             each.seconds = time.perf_counter() - start
     start = time.perf_counter()
-    fused = yield from fuse.run(program, lrhs.file, hrls.file, output, work, overwrite, options.threads)
+    fused = yield from fuse(lrhs.file, hrls.file, str(output))
     return Report(str(output), lrhs, hrls, time.perf_counter() - start, fused["warnings"])
 
 

@@ -8,14 +8,15 @@ The job is a JSON object:
 
     scene      the .blend to open
     frames     list of [frame number or null for the current frame, EXR to write]
-    program    path of msspl-fuse
     work       folder for temporary files, on the same file system as the results
     options    fields of :class:`.options.Options`
     overwrite  replace results that exist
     keep       keep both renders beside each result
     compare    also write an ordinary render, denoised with OIDN, that takes the same time
 
-Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON object.
+Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON object. After the line
+``MSSPL {"fuse": {"lrhs": file, "hrls": file, "output": file}}``, msspl-render fuses these files and writes a line to
+standard input, ``{"warnings": [...]}``. A frame that it can't fuse ends the input.
 """
 
 import importlib
@@ -40,6 +41,14 @@ def send(**message):
     print("MSSPL", json.dumps(message), flush=True)
 
 
+def receive():
+    """Wait for the answer of msspl-render."""
+    line = sys.stdin.readline()
+    if not line:
+        raise Failure("the frame was not fused", 1)
+    return json.loads(line)
+
+
 def leave(code):
     """End the process with an exit code."""
     sys.stdout.flush()
@@ -52,7 +61,7 @@ def leave(code):
 
 if __name__ == "__main__":
     try:
-        run_job(json.loads(Path(sys.argv[-1]).read_text(encoding="utf-8")), send)
+        run_job(json.loads(Path(sys.argv[-1]).read_text(encoding="utf-8")), send, receive)
     except Failure as error:
         send(error=str(error), code=error.code)
         leave(error.code)

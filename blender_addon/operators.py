@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
 """The button "Render and Fuse". It runs step by step in a window and blocks in a script."""
 
+import functools
 import re
 import tempfile
 import time
@@ -111,8 +112,9 @@ class MSSPL_OT_fuse(bpy.types.Operator):
             raise Failure(f"{path}: save the .blend first, or give a full path")
         with tempfile.TemporaryDirectory(prefix="msspl-") as work:
             output = bpy.path.abspath(path)
+            run = functools.partial(fuse.run, program, work=work, overwrite=overwrite, threads=options.threads)
             report = yield from frame.render_and_fuse(
-                scene, options, output, work, program, overwrite=overwrite, window=window
+                scene, options, output, work, run, overwrite=overwrite, window=window
             )
         scene = overrides.find_scene(*identity)
         compositor.show(scene, path, scene.msspl.connect)

@@ -22,12 +22,15 @@ class Options:
     view_layer: str = ""
     """Empty: the only one that is enabled."""
     threads: int = 0
-    """0: Blender uses the number that the scene sets, and msspl-fuse uses one thread per core."""
+    """0: Blender uses the number that the scene sets, and fusing uses one thread per core."""
 
     @property
     def lrhs_spp(self):
-        """By default the LRHS takes a third of the HRLS's total samples, but at least scale² per pixel."""
-        return self.lr_spp or self.scale**2 * max(1, round(self.hr_spp / 3))
+        """By default the LRHS takes a third of the HRLS's total samples, rounded up, but at least scale² per pixel.
+
+        That is always more than the HRLS has.
+        """
+        return self.lr_spp or -(-(self.scale**2) * max(3, self.hr_spp) // 3)
 
 
 def hrls_size(scene):
@@ -50,7 +53,7 @@ def find_view_layer(scene, options):
     names = [options.view_layer] if options.view_layer else [each.name for each in scene.view_layers if each.use]
     if len(names) != 1:
         seen = f"{len(names)} view layers are on ({', '.join(names)})" if names else "no view layer is on"
-        raise Failure(f"scene '{scene.name}': {seen}; name the one to render")
+        raise Failure(f"scene '{scene.name}': {seen}; choose one with --view-layer NAME")
     found = scene.view_layers.get(names[0])
     if found is None:
         known = ", ".join(each.name for each in scene.view_layers)

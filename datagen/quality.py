@@ -9,10 +9,10 @@ from oiio_msspl.colour import luminance, srgb
 from oiio_msspl.model.encoding import KEY
 
 
-def shows_something(probe: np.ndarray) -> bool:
+def shows_something(probe: np.ndarray, lit_share: float = 0.6) -> bool:
     """Whether a small render (n, n, 15) is neither black nor mostly background nor a bare wall.
 
-    The channels are those of ``hr`` in :mod:`datagen.views`.
+    The channels are those of ``hr`` in :mod:`datagen.views`. At least ``lit_share`` of the pixels must have light.
     """
     light = luminance(probe[..., :3])
     albedo, normal = probe[..., 3:6], probe[..., 6:9]
@@ -21,7 +21,7 @@ def shows_something(probe: np.ndarray) -> bool:
         return float((np.abs(np.diff(x, axis=0)).max(-1) > threshold).mean())
 
     # Dark regions are wanted. A view that is dark everywhere is not.
-    lit = (light > 3e-3 * max(np.percentile(light, 90), 1e-9)).mean() >= 0.6
+    lit = (light > 3e-3 * max(np.percentile(light, 90), 1e-9)).mean() >= lit_share
     background = (np.abs(normal).max(-1) == 0).mean() > 0.6
     return bool(
         lit and not background and edges(normal, 0.3) >= 0.06 and edges(normal, 0.3) + edges(albedo, 0.08) >= 0.15

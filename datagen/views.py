@@ -49,6 +49,8 @@ log = logging.getLogger(__name__)
 SIZE = 256
 #: 1-spp passes in ``hr``, and samples per pixel of the passes in ``lr``.
 HR_PASSES, LR_SPP = 8, (1, 1, 2, 4, 8)
+#: End of the names of views that keep single samples, and cells of their reference per pixel, along each side.
+SAMPLES_SUFFIX, REF_CELLS = ".samples.npz", 2
 SPLITS = ("train", "validation", "test")
 #: Pixel filters that a view's ``meta`` may name.
 FILTERS = ("box", "blackman-harris")
@@ -185,26 +187,56 @@ class View:
             raise ValueError(f"{path}: hr is {self.hr.shape}, lr {shapes}, lr_spp {self.lr_spp.shape}")
 
 
+class SampleView:
+    """One view with single samples, see :mod:`datagen.samples`; its arrays stay on disk.
+
+    Raises:
+        ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile: the file is incomplete or no view.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.arrays = map_npz(path)
+        self.path = path
+        self.meta: dict[str, Any] = json.loads(str(self.arrays["meta"]))
+        self.split: str = self.meta["split"]
+        self.scene: str = str(self.meta["seed"])
+        self.source: str = f"{self.meta['renderer']}, generator {self.meta['generator']}"
+        """Renderer and generator version, for the provenance of a model."""
+        samples, height, width = self.arrays["color"].shape
+        self.hr = self.arrays["color"]  # as of :class:`View`, one sample a pass
+        self.lr_spp = np.ones(len(self.arrays["lr_color"]), np.int64)
+        if self.arrays["ref"].shape != (REF_CELLS * height, REF_CELLS * width):
+            raise ValueError(f"{path}: ref is {self.arrays['ref'].shape}, color {(samples, height, width)}")
+
+
 class Folder:
     """The views of a folder. :meth:`scan` finds those that a renderer has added since."""
 
     def __init__(self, root: Path) -> None:
         self.root = root
         self._views: dict[Path, View] = {}
+        self._sample_views: dict[Path, SampleView] = {}
         self.scan()
 
     def scan(self) -> None:
         """Pick up new views. Hidden files are still being written. The next scan retries unreadable files."""
         for path in sorted(self.root.glob("[!.]*.npz")):
-            if path not in self._views:
+            if path not in self._views and path not in self._sample_views:
                 try:
-                    self._views[path] = View(path)
+                    if path.name.endswith(SAMPLES_SUFFIX):
+                        self._sample_views[path] = SampleView(path)
+                    else:
+                        self._views[path] = View(path)
                 except (ValueError, KeyError, OSError, struct.error, zipfile.BadZipFile) as error:
                     log.warning("skipped %s: %s", path.name, error)
 
     def split(self, name: str) -> list[View]:
         """The views of one split, sorted by file name."""
         return [view for _, view in sorted(self._views.items()) if view.split == name]
+
+    def sample_views(self, split: str) -> list[SampleView]:
+        """The views of one split that keep single samples, sorted by file name."""
+        return [view for _, view in sorted(self._sample_views.items()) if view.split == split]
 
 
 def split_features(passes: Array) -> dict[str, Array]:

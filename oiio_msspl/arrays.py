@@ -14,8 +14,8 @@ from oiio_msspl.parallel import for_row_blocks
 
 Array = NDArray[np.float32]
 
-#: Largest finite half-float value.
-HALF_MAX = 65504.0
+#: Largest finite values of half and of float.
+HALF_MAX, FLOAT_MAX = 65504.0, float(np.finfo(np.float32).max)
 
 
 def map_rows(function: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:
@@ -72,15 +72,17 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
 
 
 def box_downsample(image: Array, scale: int) -> Array:
-    """Mean over ``scale`` x ``scale`` pixels: (H, W, ...) to (H/s, W/s, ...)."""
+    """Mean over ``scale`` x ``scale`` pixels: (H, W, ...) to (H/s, W/s, ...). It is finite if the pixels are."""
     height, width, *channels = image.shape
     result = np.empty((height // scale, width // scale, *channels), np.float32)
 
     def work(rows: slice) -> None:
         # Sums of strided views are ten times as fast as np.mean over short axes.
         block = image[rows]
-        row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
-        sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))
+        with np.errstate(over="ignore"):
+            row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
+            sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))
+        np.clip(sums, -FLOAT_MAX, FLOAT_MAX, out=sums)
         np.multiply(sums, np.float32(1 / scale**2), out=result[rows.start // scale : rows.stop // scale])
 
     for_row_blocks(work, height, image[0].size, multiple=scale)

@@ -15,7 +15,10 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
 from oiio_msspl.jobs.frame import InputOptions
+from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.contract import SCALES, Contract
 
 #: Rows whose pixels are read at a time.
 ROWS_PER_READ = 256
@@ -30,12 +33,24 @@ class Inspection:
     """None if the headers can't be read."""
     render: MappedRender | None = None
     """None if the layers can't be mapped."""
+    contract: Contract | None = None
+    """Of the model that would read the file."""
     facts: list[str] = field(default_factory=list)
     """What was found, one line each."""
     passed_through: list[str] = field(default_factory=list)
-    """Names of the layers and channels that the network does not read."""
+    """Names of the layers and channels that no feature is read from."""
     problems: list[str] = field(default_factory=list)
     """Why the file can't be used, one sentence each; empty if it can."""
+
+    @property
+    def model(self) -> str:
+        """Family of the model that would read the file, such as ``joint``."""
+        return self.contract.name.removesuffix(f"-x{self.contract.scale}") if self.contract else ""
+
+    def aovs(self) -> list[dict[str, str]]:
+        """What the model would read, as :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` describes it."""
+        assert self.render is not None and self.contract is not None
+        return self.render.table(self.contract.features)
 
     def as_dict(self) -> dict[str, Any]:
         """The inspection as it is written to JSON."""
@@ -63,24 +78,30 @@ class Inspection:
                 "view": self.render.view or None,
                 "other_views": self.render.other_views,
                 "spp": self.render.spp,
-                "aovs": self.render.table(),
+                "model": self.model,
+                "aovs": self.aovs(),
                 "notes": self.render.notes,
                 "passed_through": self.passed_through,
             }
         return result
 
 
-def inspect_file(path: Path, inputs: InputOptions) -> Inspection:
+def inspect_file(path: Path, inputs: InputOptions, model: str | None = None) -> Inspection:
     """Open a file, map its layers and read all pixels of its features once.
 
     Args:
         path: an EXR.
         inputs: how its layers are to be understood; ``hr_spp`` says the samples per pixel.
+        model: the model that would read it, see :func:`oiio_msspl.model.catalogue.find_model`. The models of a family
+            read the same features at every scale.
 
     Returns:
         What was found. A file that can't be used is described in ``problems``; nothing is raised for it.
+
+    Raises:
+        InputError: there is no such model.
     """
-    result = Inspection(path)
+    result = Inspection(path, contract=Contract.of_file(find_model(SCALES[0], model)))
     try:
         file = result.file = open_exr(path)
         result.facts = _facts(file)
@@ -120,7 +141,7 @@ def _facts(file: ExrFile) -> list[str]:
 
 
 def _pixel_facts(render: MappedRender) -> list[str]:
-    """Read every feature once: count what is not finite, and name what is all zero.
+    """Read every feature once: count what is not finite and what is negative, and name what is all zero.
 
     Raises:
         InputError: the beauty is black everywhere.
@@ -128,19 +149,27 @@ def _pixel_facts(render: MappedRender) -> list[str]:
     window = render.data_window
     brightest: dict[str, float] = {}
     not_finite: dict[str, int] = {}
+    negative: dict[str, int] = {}
     for y in range(window.y0, window.y1, ROWS_PER_READ):
         rows = Window(window.x0, y, window.x1, min(y + ROWS_PER_READ, window.y1))
         for name, values in render.read(rows).items():
             finite = np.isfinite(values)
             not_finite[name] = not_finite.get(name, 0) + int(values.size - np.count_nonzero(finite))
+            if name not in SIGNED_FEATURES:
+                negative[name] = negative.get(name, 0) + int(np.count_nonzero(finite & (values < 0)))
             brightest[name] = max(brightest.get(name, 0.0), float(np.abs(values[finite]).max(initial=0.0)))
     if brightest[RGB] == 0:
         others = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
         hint = f", though {others} are not; check which layer it is (--map rgb=LAYER)" if others else ""
         raise InputError(f"the beauty is black everywhere{hint}")
-    repaired = [
+    counts = [
         f"{name}: {count} values are NaN or infinite; fusing repairs them"
         for name, count in not_finite.items()
         if count
     ]
-    return repaired + [f"{name}: all zero" for name, value in brightest.items() if value == 0]
+    counts += [
+        f"{name}: {count} values are negative (colours out of gamut); fusing sets them to 0"
+        for name, count in negative.items()
+        if count
+    ]
+    return counts + [f"{name}: all zero" for name, value in brightest.items() if value == 0]

@@ -322,6 +322,15 @@ def test_the_messages_of_the_troubleshooting_page_are_those_of_the_code() -> Non
     assert not missing, missing
 
 
+def test_messages_tell_to_install_what_the_project_asks_for() -> None:
+    """Whoever installed from this folder can't install extras by the project's name, so messages name the packages."""
+    wanted = {line for extra in PROJECT["optional-dependencies"].values() for line in extra}
+    wanted |= {line.partition(">=")[0] for line in wanted}
+    named = {name for text in texts() for name in re.findall(r"pip install '?([^\s',]+)", text)}
+    assert named
+    assert named <= {name for name in wanted if not name.startswith(PROJECT["name"])}, named
+
+
 def test_the_readme_has_two_set_up_commands() -> None:
     """One for the main job, one for the tests."""
     page = PAGES[0]

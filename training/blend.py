@@ -18,6 +18,7 @@ from collections.abc import Sequence
 
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from training.encoding import log_decode, log_encode
 from training.ops import highest_around, log2_scale, pyramid, upsample
@@ -29,6 +30,8 @@ COARSEST = (2.0, 0.0, -2.0, -2.0)
 #: Initial logits at finer levels: the denoised HRLS at the coarser level's brightness, the denoised HRLS, light times
 #: albedo, the HRLS.
 FINER = (2.0, 0.0, 0.0, -2.0)
+#: LRHS pixels over which the renders' brightest samples allow a bright result.
+FAR = 16
 #: Bounds of the ratio of a level's light to the denoised HRLS: 1 / MAX_RATIO and MAX_RATIO.
 MAX_RATIO = 8.0
 #: Added to both sides of that ratio, in exposed radiance, so that black pixels give a ratio of 1.
@@ -86,7 +89,27 @@ def blend(lrhs: Tensor, hrls: Tensor, denoised: Tensor, logits: Sequence[Tensor]
                 log_encode(means[level]) if level else samples,
             ],
         )
-    lowest, highest = (
-        upsample(sign * highest_around(sign * lrhs[:, :LRHS_CHANNELS], sign * samples), 2) for sign in (-1.0, 1.0)
-    )
+    low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
+    lowest, highest = (sign * highest_allowed(sign * low, sign * mean, sign * samples) for sign in (-1.0, 1.0))
     return torch.clamp(fused, lowest, highest)
+
+
+def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
+    """The largest value that a pixel may have.
+
+    It is the highest sample of either render close around. Where light is rare, all of these may be too dark. So the
+    denoised mean of both renders counts, too, as far as some sample within ``FAR`` LRHS pixels is as bright.
+
+    Args:
+        lrhs, mean: (N, 3, h, w), the LRHS and the denoised mean of both renders.
+        samples: (N, 3, s*h, s*w), the HRLS.
+
+    Returns:
+        (N, 3, s*h, s*w)
+    """
+    scale = 2 ** log2_scale(lrhs, samples)
+    brightest = torch.maximum(lrhs, F.max_pool2d(samples.contiguous(), scale))
+    for _ in range(FAR // 4):
+        brightest = F.max_pool2d(brightest, 9, stride=1, padding=4)
+    expected = F.max_pool2d(torch.minimum(mean, brightest), 3, stride=1, padding=1)
+    return torch.maximum(upsample(highest_around(lrhs, samples), 2), upsample(expected, scale))

@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
-from datagen.views import PASS_FEATURES, Array, Folder, View
+from datagen.samples import MANTISSA, STEP
+from datagen.views import PASS_FEATURES, REF_CELLS, Array, Folder, SampleView, View
 from oiio_msspl.aovs.features import (
     ALBEDO,
     DEFAULTS,
@@ -36,6 +37,7 @@ from oiio_msspl.aovs.features import (
 from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from training.encoding import compress, exposure_of, luminance, pack, repair
 from training.ops import box_downsample
+from training.splat import apply, draw_filter, filter_reference
 
 #: A batch by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w), all encoded, in
 #: channels-last memory. Some networks read further channels of the first two.
@@ -97,7 +99,7 @@ PAPER_SAMPLING = Sampling(
 )
 
 
-def spp_range(view: View, sampling: Sampling, scale: int) -> dict[str, list[int]]:
+def spp_range(view: View | SampleView, sampling: Sampling, scale: int) -> dict[str, list[int]]:
     """Lowest and highest spp of the pairs that :func:`draw` makes of a view, for the model's contract."""
     samples = scale**2 if sampling.nearest < 1 else 1
     return {
@@ -107,6 +109,36 @@ def spp_range(view: View, sampling: Sampling, scale: int) -> dict[str, list[int]
 
 
 # One batch
+
+
+#: Rows and columns of a crop, in HRLS pixels.
+Area = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A pair that was drawn from a view: linear, without negative radiance."""
+
+    features: dict[str, Tensor]
+    """(patch, patch, channels) by name, of the HRLS"""
+    variance: Tensor | None
+    """(patch, patch), of the luminance of the HRLS; None if it has one sample a pixel"""
+    lrhs: Tensor
+    """(H/s, W/s, 3), of the whole view"""
+    target: Tensor
+    """(patch, patch, 3)"""
+
+
+def _draw_spp(spp: np.ndarray, sampling: Sampling, nearest: bool, rng: np.random.Generator) -> tuple[int, np.ndarray]:
+    """Samples per pixel of the HRLS, and the passes of the LRHS, whose spp are given."""
+    while True:
+        n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
+        k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
+        # Passes of few samples are more likely, because the LRHS should get the smaller part of all samples
+        passes = rng.choice(len(spp), min(k, len(spp)), replace=False, p=_normalised(tuple(1 / spp)))
+        # A nearest-neighbour LRHS needs more spp than the HRLS, as in the paper
+        if not nearest or spp[passes].sum() > n:
+            return n, passes
 
 
 @dataclass(frozen=True)
@@ -141,9 +173,131 @@ class ViewTensors:
             return mean[scale // 2 :: scale, scale // 2 :: scale]
         return box_downsample(mean.permute(2, 0, 1)[None], scale)[0].permute(1, 2, 0)
 
+    @property
+    def device(self) -> torch.device:
+        return self.ref.device
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in HRLS pixels."""
+        return self.ref.shape[0], self.ref.shape[1]
+
+    def draw(self, scale: int, area: Area, light: Tensor, sampling: Sampling, rng: np.random.Generator) -> Rendered:
+        """Draw the samples of a pair; its radiance is multiplied by ``light``, (3, 3)."""
+        nearest = rng.random() < sampling.nearest
+        n, lr_passes = _draw_spp(self.lr_spp, sampling, nearest, rng)
+        lrhs = self.lrhs(lr_passes, scale, sampling.clip, nearest=nearest)
+        passes = [self.hr[p, *area] for p in rng.permutation(len(self.hr))[:n]]
+        features = _split(repair(torch.stack(passes), signed=True))
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name].clamp(0.0, sampling.clip)
+        variance = luminance(features[RGB] @ light).var(dim=0) / n if n > 1 else None
+        features = {name: values.mean(dim=0) for name, values in features.items()}
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name] @ light
+        target = repair(self.ref[area]).clamp_max(sampling.clip)
+        return Rendered(features, variance, lrhs @ light, target @ light)
+
+
+@dataclass(frozen=True)
+class SampleTensors:
+    """The arrays of a view with single samples as tensors, see :mod:`datagen.samples`."""
+
+    arrays: dict[str, Tensor]
+
+    @classmethod
+    def of(cls, view: SampleView, device: torch.device) -> SampleTensors:
+        """On a CPU the tensors share the file's mapped memory."""
+        arrays = {name: array for name, array in view.arrays.items() if name != "meta"}
+        signed = {name: a.view(np.int32) if a.dtype == np.uint32 else a for name, a in arrays.items()}
+        return cls({name: torch.from_numpy(array).to(device) for name, array in signed.items()})
+
+    @property
+    def device(self) -> torch.device:
+        return self.arrays["ref"].device
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in HRLS pixels."""
+        return self.arrays["color"].shape[1], self.arrays["color"].shape[2]
+
+    def read(self, name: str, samples: Tensor, rows: slice, columns: slice) -> Tensor:
+        """Some samples of an array in a crop: (k, C, h, w); places are (k, h, w, 2)."""
+        stored = self.arrays[name][samples, rows, columns]
+        layer = name.removeprefix("lr_")
+        if layer == "place":
+            return (stored.float() + 0.5) / 256
+        if layer == ALBEDO:
+            return stored.float().movedim(-1, 1) / 255
+        if layer == NORMAL:
+            return stored.float().movedim(-1, 1) / 127
+        return _decode_radiance(stored)
+
+    def draw(self, scale: int, area: Area, light: Tensor, sampling: Sampling, rng: np.random.Generator) -> Rendered:
+        """Draw a filter and the samples of a pair; its radiance is multiplied by ``light``, (3, 3).
+
+        Both renders and the reference have the same filter, the LRHS in its own pixels.
+        """
+        pixel_filter = draw_filter(rng)
+        lr_count = len(self.arrays["lr_color"])
+        n, lr_samples = _draw_spp(np.ones(lr_count), sampling, False, rng)
+        # Importance sampling leaves pixels without enough samples, unless there are more to choose from
+        device = light.device
+        drawn = torch.from_numpy(rng.permutation(len(self.arrays["color"]))).to(device)
+        drawn = drawn[: n if pixel_filter.spread else 2 * n + 4]
+        generator = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
+
+        # The crop with as much around it as the filter reaches
+        height, width = self.size
+        wide = [
+            slice(max(side.start - pixel_filter.reach, 0), min(side.stop + pixel_filter.reach, size))
+            for side, size in zip(area, (height, width), strict=True)
+        ]
+        inner = (
+            slice(None),
+            *(slice(side.start - w.start, side.stop - w.start) for side, w in zip(area, wide, strict=True)),
+        )
+        names = {RGB: "color"} | {name: name for name in PASS_FEATURES if name != RGB}
+        layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
+        for name in RADIANCE_FEATURES:
+            layers[name] = _lit(layers[name], light)
+        place = self.read("place", drawn, *wide)
+        measure = luminance(layers[RGB].movedim(1, -1))
+        filtered = apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, n, generator)
+        features = _split(filtered.mean[inner].movedim(0, -1))
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name].clamp(0.0, sampling.clip)
+        has_variance = n > 1 or (pixel_filter.spread and pixel_filter.reach > 0)
+
+        whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
+        chosen = torch.from_numpy(lr_samples).to(device)
+        color = _lit(self.read("lr_color", chosen, *whole), light)
+        lrhs = apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator)
+
+        cells = [slice(w.start * REF_CELLS, w.stop * REF_CELLS) for w in wide]
+        ref = _lit(_decode_radiance(self.arrays["ref"][None, *cells]), light)[0]
+        target = filter_reference(pixel_filter, ref, REF_CELLS)[inner].movedim(0, -1)
+        return Rendered(
+            features,
+            filtered.variance[inner[1:]] if has_variance and filtered.variance is not None else None,
+            lrhs.mean.movedim(0, -1).clamp(0.0, sampling.clip),
+            target.clamp(0.0, sampling.clip),
+        )
+
+
+def _decode_radiance(stored: Tensor) -> Tensor:
+    """As :func:`datagen.samples.decode`, with the channels second: (k, h, w) to (k, 3, h, w)."""
+    mantissas = torch.stack([stored >> shift & MANTISSA for shift in (0, 9, 18)], dim=1).float()
+    return mantissas * torch.exp2((stored >> 27 & 31).float() + math.log2(STEP))[:, None]
+
+
+def _lit(radiance: Tensor, light: Tensor) -> Tensor:
+    """Radiance (k, 3, h, w) @ light."""
+    return torch.einsum("kihw,ij->kjhw", radiance, light)
+
 
 def draw(
-    views: Sequence[ViewTensors],
+    views: Sequence[ViewTensors | SampleTensors],
     scale: int,
     patch: int,
     count: int,
@@ -153,53 +307,33 @@ def draw(
 ) -> Batch:
     """Draw a batch of ``count`` pairs of ``patch`` x ``patch`` HRLS pixels.
 
-    Views, crops, light, exposure and missing features differ within a batch. Spp, pixel filter, mirroring and rotation
+    Views, crops, spp, pixel filter, light, exposure and missing features differ within a batch. Mirroring and rotation
     are those of the batch. ``prepare`` appends further channels to the renders' own.
     """
-    # Views, samples and crops
+    # Views and crops
     chosen = [views[i] for i in rng.choice(len(views), count)]
-    nearest = rng.random() < sampling.nearest
-    spp = chosen[0].lr_spp
-    while True:
-        n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
-        k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
-        # Passes of few samples are more likely, because the LRHS should get the smaller part of all samples
-        lr_passes = rng.choice(len(spp), k, replace=False, p=_normalised(tuple(1 / spp)))
-        # A nearest-neighbour LRHS needs more spp than the HRLS, as in the paper
-        if not nearest or spp[lr_passes].sum() > n:
-            break
-    height, width = chosen[0].ref.shape[:2]
-    tops = scale * rng.integers((height - patch) // scale + 1, size=count)
-    lefts = scale * rng.integers((width - patch) // scale + 1, size=count)
-    areas = [(slice(top, top + patch), slice(left, left + patch)) for top, left in zip(tops, lefts, strict=True)]
-
-    device = chosen[0].ref.device
+    areas: list[Area] = []
+    for view in chosen:
+        top, left = (scale * int(rng.integers((size - patch) // scale + 1)) for size in view.size)
+        areas.append((slice(top, top + patch), slice(left, left + patch)))
+    device = chosen[0].device
 
     def on_device(array: np.ndarray) -> Tensor:
         return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(device, non_blocking=True)
 
-    lrhs = torch.stack([view.lrhs(lr_passes, scale, sampling.clip, nearest=nearest) for view in chosen])
-    passes = [
-        [view.hr[p, *area] for p in rng.permutation(len(view.hr))[:n]] for view, area in zip(chosen, areas, strict=True)
-    ]
-    features = _split(repair(torch.stack([torch.stack(of_view) for of_view in passes]), signed=True))
-    target = repair(torch.stack([view.ref[area] for view, area in zip(chosen, areas, strict=True)]))
-    target = target.clamp_max(sampling.clip)
-
-    # Colour of the light, in linear radiance; the variance is computed afterwards, so that it has the same colour
+    # Colour of the light, in linear radiance. The variance is computed afterwards, so that it has the same colour.
     permutation = np.stack(
         [np.eye(3)[rng.permutation(3) if rng.random() < sampling.permute else range(3)] for _ in chosen]
     )
-    light = on_device(np.stack([_random_light(rng, sampling) for _ in chosen]) @ permutation)[:, None]
-    for name in RADIANCE_FEATURES:
-        features[name] = features[name].clamp(0.0, sampling.clip)
-    variance = luminance(features[RGB] @ light[:, None]).var(dim=1) / n if n > 1 else None
-    features = {name: values.mean(dim=1) for name, values in features.items()}
-    for name in RADIANCE_FEATURES:
-        features[name] = features[name] @ light
+    light = on_device(np.stack([_random_light(rng, sampling) for _ in chosen]) @ permutation)
+    renders = [
+        view.draw(scale, area, of_view, sampling, rng) for view, area, of_view in zip(chosen, areas, light, strict=True)
+    ]
+    features = {name: torch.stack([pair.features[name] for pair in renders]) for name in PASS_FEATURES}
     features[ALBEDO] = features[ALBEDO].clamp_min(0.0) @ on_device(permutation)[:, None]
-    lrhs, target = lrhs @ light, target @ light
-    features[VARIANCE] = torch.zeros_like(target[..., :1]) if variance is None else variance[..., None]
+    target = torch.stack([pair.target for pair in renders])
+    black = torch.zeros_like(target[0, ..., 0])
+    features[VARIANCE] = torch.stack([black if pair.variance is None else pair.variance for pair in renders])[..., None]
 
     # Mirroring and rotation by quarter turns. Normals may be in any space, so each view gets a random rotation of them;
     # it mirrors if the image is mirrored.
@@ -209,15 +343,16 @@ def draw(
 
     # Exposure, estimated from the whole LRHS as at inference
     jitter = on_device(2.0 ** rng.uniform(-sampling.exposure_stops, sampling.exposure_stops, count))
-    exposure = exposure_of(lrhs) * jitter
+    exposure = torch.cat([exposure_of(pair.lrhs[None]) for pair in renders]) * jitter
     hrls = pack(features, exposure)
 
     # Missing features get their defaults
-    present = on_device(np.stack([_present(rng, sampling, has_variance=variance is not None) for _ in chosen]))
+    present = on_device(np.stack([_present(rng, sampling, has_variance=pair.variance is not None) for pair in renders]))
     hrls = torch.lerp(on_device(_DEFAULTS), hrls, present[:, None, None])
 
     low_areas = [tuple(slice(side.start // scale, side.stop // scale) for side in area) for area in areas]
-    lrhs = compress(torch.stack([image[area] for image, area in zip(lrhs, low_areas, strict=True)]), exposure)
+    crops = [pair.lrhs[area] for pair, area in zip(renders, low_areas, strict=True)]
+    lrhs = compress(torch.stack(crops), exposure)
     if prepare is not None:
         prepared = [prepare(*images) for images in zip(lrhs.cpu().numpy(), hrls.cpu().numpy(), strict=True)]
         lrhs, hrls = (on_device(np.stack(images)) for images in zip(*prepared, strict=True))
@@ -334,9 +469,10 @@ def _ignore_interrupts(_: int) -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewTensors]:
-    """The views of a split as tensors on a device."""
-    return [ViewTensors.of(view, device) for view in folder.split(split)]
+def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewTensors | SampleTensors]:
+    """The views of a split as tensors on a device, those with single samples too."""
+    passes = [ViewTensors.of(view, device) for view in folder.split(split)]
+    return [*passes, *(SampleTensors.of(view, device) for view in folder.sample_views(split))]
 
 
 def fixed_batches(

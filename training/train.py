@@ -28,7 +28,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
-from datagen.views import Folder
+from datagen.views import Folder, SampleView, View
 from training import checkpoints, losses
 from training.data import PAPER_PATCH, PAPER_SAMPLING, Batches, Sampling, spp_range
 from training.joint import JointFusion
@@ -171,7 +171,7 @@ class Run:
 
         # Data
         self.folder = Folder(args.data)
-        if not self.folder.split("train"):
+        if not self.train_views():
             raise SystemExit(f"{args.data}: no training views (*.npz with split 'train'); render some first")
         self.validation: dict[tuple[Path, int], ValidationPair] = {}
 
@@ -295,6 +295,10 @@ class Run:
                     self.validation[view.path, scale] = pair
         return evaluate(self.average.module, self.validation.values(), self.device)
 
+    def train_views(self) -> list[View | SampleView]:
+        """The training views that there are so far, of both kinds."""
+        return [*self.folder.split("train"), *self.folder.sample_views("train")]
+
     def log_row(self, scores: dict[str, float]) -> None:
         """Append a line to ``log.csv``."""
         self.folder.scan()
@@ -307,7 +311,7 @@ class Run:
             "skipped_steps": since["skipped"],
             "samples_per_s": since["steps"] * self.batch / interval,
             "wait_share": since["waited"] / interval,
-            "train_views": len(self.folder.split("train")),
+            "train_views": len(self.train_views()),
             "val_pairs": len(self.validation),
             **scores,
         }
@@ -316,7 +320,7 @@ class Run:
 
     def state(self, scores: dict[str, float]) -> checkpoints.State:
         """The checkpoint, see :mod:`training.checkpoints`."""
-        views = self.folder.split("train")
+        views = self.train_views()
         return {
             "network": self.network.state_dict(),
             "ema": self.average.module.state_dict(),

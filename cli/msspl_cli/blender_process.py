@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import re
@@ -21,7 +22,7 @@ from oiio_msspl.errors import InputError, MssplError
 
 #: What Blender prints while it renders.
 _SAMPLES = re.compile(r"Sample (\d+)/(\d+)")
-#: Seconds that Blender, and the msspl-fuse that it runs, get to end.
+#: Seconds that Blender gets to end.
 _GRACE = 15
 
 
@@ -52,10 +53,11 @@ def render_frames(
     job: dict[str, Any],
     folder: Path,
     on_event: Callable[[dict[str, Any]], None],
+    fuse: Callable[[Path, Path, Path], list[str]],
     *,
     verbose: bool = False,
 ) -> None:
-    """Render and fuse the frames of a job.
+    """Let Blender render the frames of a job, and fuse each in this process, where the model stays loaded.
 
     Args:
         program: Blender, or a Python that has bpy.
@@ -64,6 +66,7 @@ def render_frames(
         folder: of the results. Temporary files lie in it, so that a render that is kept is only renamed.
         on_event: called with each event: a step that begins, the share of samples that is done, or the report of a
             frame that ended.
+        fuse: called with the files of the LRHS, of the HRLS and of the result; returns warnings.
         verbose: print what Blender prints.
 
     Raises:
@@ -74,7 +77,7 @@ def render_frames(
         path = Path(work, "job.json")
         path.write_text(json.dumps({**job, "work": work}), encoding="utf-8")
         try:
-            for event in run_blender(command(program, scene, path), verbose=verbose):
+            for event in run_blender(command(program, scene, path), fuse, verbose=verbose):
                 number = event.get("frame", number)
                 if "report" in event:
                     reports += 1
@@ -96,24 +99,28 @@ def command(program: str, scene: Path, job: Path) -> list[str]:
     return [program, "--background", str(scene.absolute()), "--python", script, "--", str(job)]
 
 
-def run_blender(arguments: Sequence[str], *, verbose: bool = False) -> Iterator[dict[str, Any]]:
+def run_blender(
+    arguments: Sequence[str], fuse: Callable[[Path, Path, Path], list[str]], *, verbose: bool = False
+) -> Iterator[dict[str, Any]]:
     """Run the add-on's headless.py. Leaving the loop ends Blender and every process that it started.
 
     Args:
         arguments: of :func:`command`.
+        fuse: see :func:`render_frames`.
         verbose: print what Blender prints.
 
     Yields:
         The events that headless.py prints, and ``{"samples": share}`` for each line about samples.
 
     Raises:
-        InputError, MssplError: the job failed. The message is that of headless.py or msspl-fuse.
+        InputError, MssplError: the job failed. The message is that of headless.py.
+        Exception: what ``fuse`` raised, once Blender has ended.
     """
     posix = os.name == "posix"
     try:
         started = subprocess.Popen(
             arguments,
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=subprocess.STDOUT,
             text=True,
@@ -126,15 +133,24 @@ def run_blender(arguments: Sequence[str], *, verbose: bool = False) -> Iterator[
             "--blender or MSSPL_BLENDER"
         ) from refused
     with started as process:
-        assert process.stdout is not None
+        assert process.stdin is not None and process.stdout is not None
         last: deque[str] = deque(maxlen=5)
-        error = None
+        error, failure = None, None
         try:
             for line in process.stdout:
                 if line.startswith("MSSPL "):
                     event = json.loads(line.removeprefix("MSSPL "))
                     if "error" in event:
                         error = event
+                    elif "fuse" in event:
+                        try:
+                            warnings = fuse(*(Path(event["fuse"][key]) for key in ("lrhs", "hrls", "output")))
+                        except Exception as raised:
+                            failure = raised
+                            process.stdin.close()  # Blender ends by itself
+                        else:
+                            with contextlib.suppress(BrokenPipeError):  # Blender has ended; its exit code says why
+                                print(json.dumps({"warnings": warnings}), file=process.stdin, flush=True)
                     else:
                         yield event
                     continue
@@ -148,6 +164,8 @@ def run_blender(arguments: Sequence[str], *, verbose: bool = False) -> Iterator[
         finally:
             if process.poll() is None:
                 _end(process, group=posix)
+    if failure is not None:
+        raise failure
     if error is not None:
         raise (InputError if error["code"] == 2 else MssplError)(error["error"])
     if process.returncode:

@@ -22,9 +22,6 @@ _UNLIMITED = 100_000
 #: Colours of the words that say how a frame ended.
 _STYLES = {"fused": "green", "failed": "red", "missing": "red", "not done": "yellow", "warning": "yellow"}
 
-#: Printed for a feature that the render lacks. All other features are optional.
-_NONE_FOUND = {"albedo": "none found: expect blur; render an albedo, or name it with --map albedo=LAYER"}
-
 
 def say(text: str, *, error: bool = False) -> None:
     """Print a line that may contain names out of a file, see :func:`oiio_msspl.errors.printable`.
@@ -73,19 +70,11 @@ def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
             :meth:`oiio_msspl.jobs.report.FrameReport.aovs`.
         notes: sentences printed below.
     """
-    table([(row["feature"], _origin(row)) for row in rows])
+    from oiio_msspl.aovs.mapped_render import origin
+
+    table([(row["feature"], origin(row)) for row in rows])
     for note in notes:
         say(f"  note: {note}")
-
-
-def _origin(row: Mapping[str, str]) -> str:
-    """Where a feature comes from, in words."""
-    status, source = row["status"], row["source"] + (f" ({row['note']})" if row["note"] else "")
-    if status == "default":
-        return _NONE_FOUND.get(row["feature"], "none found (optional)")
-    if status == "unused":
-        return f"found: {source}; this model does not read it" if source else "none found; this model does not read it"
-    return "none" if status == "absent" else f"{status}: {source}"
 
 
 class ProgressBar:

@@ -61,6 +61,35 @@ ViewLayer = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
+Model = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="auto, a family (paper), a shipped model (see msspl models) or an ONNX file.",
+        rich_help_panel=MODEL,
+    ),
+]
+Device = Annotated[
+    str,
+    typer.Option(
+        metavar="NAME",
+        help="cpu, cuda, tensorrt, openvino, coreml or directml.",
+        rich_help_panel=MODEL,
+    ),
+]
+Layout = Annotated[str, typer.Option(metavar="NAME", help="spec, nuke or multilayer.", rich_help_panel=OUTPUT)]
+ErrorLayer = Annotated[
+    bool,
+    typer.Option(
+        "--error-layer",
+        help="Add a layer 'error': the error that the model expects.",
+        rich_help_panel=OUTPUT,
+    ),
+]
+SkipExisting = Annotated[
+    bool,
+    typer.Option("--skip-existing", help="Skip frames that exist. This resumes a run.", rich_help_panel=SHOT),
+]
 Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, metavar="", help="Print more; -vv prints all.", hidden=True)
 ]

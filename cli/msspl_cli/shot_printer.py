@@ -90,7 +90,8 @@ def print_table(report: ShotReport) -> None:
     from oiio_msspl.jobs.sequence import format_frames
 
     if first := report.first:
-        console.say(f"{first['renderer']} pairs at x{first['scale']}; layers of frame {first['frame']}:")
+        view = f", view {first['view']}" if first.get("other_views") else ""
+        console.say(f"{first['renderer']} pairs at x{first['scale']}{view}; layers of frame {first['frame']}:")
         console.aov_table(first["aovs"], first["notes"])
     # Sentences that differ only in their numbers share a row, which shows the first of them.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}

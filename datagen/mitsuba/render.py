@@ -26,13 +26,16 @@ _WIDTHS = (
 )  # width of the Blackman-Harris filter in pixels; Blender's default is 1.5, other renderers use up to 3
 
 
-def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int) -> Iterator[Camera]:
-    """Yield random cameras that are not inside an object, in front of a bare wall or in the dark."""
+def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int, lit_share: float = 0.6) -> Iterator[Camera]:
+    """Yield random cameras that are not inside an object, in front of a bare wall or in the dark.
+
+    At 16 spp and 32 x 32 pixels, at least `lit_share` of the pixels must have light.
+    """
     for attempt in range(_ATTEMPTS):
         rng = np.random.default_rng([seed, view, attempt, scenes.VERSION])
         camera = scenes.camera(plan, rng)
         probe = render_passes(scene, camera, 32, 16, seed=int(rng.integers(2**31)))
-        if quality.shows_something(probe.mean(0)) and _distance(scene, camera) > 0.15:
+        if quality.shows_something(probe.mean(0), lit_share) and _distance(scene, camera) > 0.15:
             yield camera
 
 

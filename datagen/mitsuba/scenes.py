@@ -22,7 +22,7 @@ from . import materials as mat
 from .assets import Assets, read_gltf, read_image, read_obj
 from .trace import Camera
 
-VERSION = 3  # of the generator: raise it when a seed would give another scene
+VERSION = 4  # of the generator: raise it when a seed would give another scene
 Rng = np.random.Generator
 
 _WINDOW = (0.35, 1.2)  # metres, a side
@@ -68,6 +68,10 @@ class Scene:
         if n is not None:
             params["vertex_normals"] = np.ascontiguousarray(n, np.float32).ravel()
         params.update()
+        self._parts[name] = shape
+
+    def add_shape(self, name: str, shape: mi.Shape) -> None:
+        """Add a shape that was loaded elsewhere."""
         self._parts[name] = shape
 
     def light(self, mesh: Mesh, radiance: np.ndarray, weight: float = 1.0) -> None:
@@ -240,10 +244,11 @@ class Scene:
 
     # -- rooms -------------------------------------------------------------------------------------
 
-    def shell(self, openings: int, size: tuple[float, float] = (3, 7), daylight: float = 0.0) -> None:
+    def shell(self, openings: int, size: tuple[float, float] = (3, 7), daylight: float = 0.0, gap: float = 0.0) -> None:
         """Floor, four walls, ceiling; `openings` windows, door gaps or skylights cut out of them.
 
-        With `daylight` a panel of that radiance hangs outside each opening: an artist's trick.
+        With `daylight` a panel of that radiance hangs outside each opening: an artist's trick. With a `gap`, in metres,
+        a door stands that far ajar, and behind it is a small lit hall.
         """
         rng, t = self.rng, 0.15
         w, d = rng.uniform(*size, 2)
@@ -264,6 +269,9 @@ class Scene:
                 z = rng.uniform(0.3 * heights[side], max(heights[side] - b - 0.1, 0.31 * heights[side]))
                 hole = (x, z, min(x + a, lengths[side] - 0.2), min(z + b, heights[side] - 0.05))
             holes[side].append(hole)
+        if gap:
+            door = rng.uniform(0.4, w - 1.4)
+            holes[0].append((door, 0.01, door + gap, 2.0))
         up = geo.rotation((1, 0, 0), -np.pi / 2)
 
         def place(mesh: Mesh, side: int) -> Mesh:
@@ -296,6 +304,9 @@ class Scene:
                 def in_window(m: Mesh, x: float = x0, z: float = z0, side: int = side) -> Mesh:
                     return place(m.moved(x, t / 2, z), side)
 
+                if gap and side == 0:
+                    self._hall(x0, x1, lambda m: place(m, 0))
+                    continue
                 self._dress_window(x1 - x0, z1 - z0, in_window, dressing)
                 if daylight:
                     low, high, y = x0 - 0.1, x1 + 0.1, t + 0.1
@@ -308,6 +319,20 @@ class Scene:
             floor.tiled(rng.choice([0.4, 0.7, 1.2, 2.0])),
             mat.structure(rng, tex.pattern(rng, 0.12) ** rng.choice([0.6, 1.0])),
         )
+
+    def _hall(self, x0: float, x1: float, place: Callable[[Mesh], Mesh]) -> None:
+        """A closed space outside the gap from x0 to x1 of the front wall; its lamp is seldom seen from the room."""
+        rng = self.rng
+        low, high = np.array([x0 - rng.uniform(0.5, 1.5), -rng.uniform(1.0, 2.0), 0]), np.array([x1 + 1.0, 0, 2.3])
+        (a, b, c), (d, e, f) = low, high
+        sides = [
+            [[a, b, c], [d, b, c], [d, b, f], [a, b, f]], [[a, b, c], [a, e, c], [a, e, f], [a, b, f]],
+            [[d, b, c], [d, e, c], [d, e, f], [d, b, f]], [[a, b, f], [d, b, f], [d, e, f], [a, e, f]],
+        ]  # fmt: skip
+        self.add(place(geo.quads(np.array(sides))), mat.diffuse(np.full((2, 2, 3), rng.uniform(0.5, 0.85))))
+        r = rng.uniform(0.03, 0.15)
+        lamp = low + np.array([0.2, 0.2, 0.2]) + rng.random(3) * (0.6, 0.5, 0.8) * (high - low - 0.4)
+        self.light(place(geo.sphere(r, 16).moved(*lamp)), self.tinted_light(5 / r**2, 0.1))
 
     def _dress_window(self, w: float, h: float, place: Callable[[Mesh], Mesh], bsdf: mat.Bsdf) -> None:
         rng = self.rng
@@ -508,6 +533,15 @@ def lamp_room(s: Scene) -> None:
         lamps[s.rng.integers(len(lamps))]()
 
 
+def ajar_room(s: Scene) -> None:
+    """A room where light is rare: it comes through a door ajar, and perhaps from a weak small lamp."""
+    s.shell(0, (2.5, 5.0), gap=float(10 ** s.rng.uniform(-1.2, -0.4)))
+    s.furnish(int(s.rng.integers(2, 7)))
+    s.clutter((1, 5), clear=0.3)
+    if s.rng.random() < 0.3:
+        s.lamp_hidden()
+
+
 def many_lights(s: Scene) -> None:
     """Dozens of small lights, of which a sample picks one."""
     s.shell(int(s.rng.random() < 0.3))
@@ -597,7 +631,7 @@ def lit_room(s: Scene) -> None:
 
 
 KINDS: dict[Callable[[Scene], None], float] = {
-    window_room: 0.30, lamp_room: 0.18, many_lights: 0.08, caustics: 0.08,
+    window_room: 0.27, lamp_room: 0.18, ajar_room: 0.12, many_lights: 0.08, caustics: 0.08,
     outdoors: 0.12, studio: 0.10, lit_room: 0.14,
 }  # fmt: skip
 
@@ -622,7 +656,7 @@ def camera(plan: Scene, rng: Rng) -> Camera:
             away = origin - target
             origin = target + away / np.linalg.norm(away) * min(rng.uniform(0.4, 1.4), np.linalg.norm(away))
             origin = np.clip(origin, (-0.47 * w, -0.47 * d, 0.1), (0.47 * w, 0.47 * d, h - 0.1))
-        fov = rng.uniform(35, 85)
+        fov = rng.uniform(*((18, 35), (35, 85), (35, 85), (85, 110))[rng.integers(4)])
     else:
         a, distance = rng.uniform(0, 6.3), 10 ** rng.uniform(-0.2, 0.6)
         origin = target + (distance * np.cos(a), distance * np.sin(a), 0)

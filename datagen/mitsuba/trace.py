@@ -92,7 +92,7 @@ def _share(part: mi.Spectrum, whole: mi.Spectrum) -> mi.Spectrum:
 
 @dr.syntax
 def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f):
-    """Trace one path a lane; return colour, albedo, normal, diffuse, specular (five 3-vectors).
+    """Trace one path a lane; return colour, albedo, normal, diffuse, specular (five 3-vectors), and the depth.
 
     The estimator is that of Mitsuba's `path` (next-event estimation and BSDF sampling, power heuristic).
     A path's light is split by the lobe of its *first* scattering event. A direction belongs to several lobes
@@ -108,6 +108,7 @@ def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f):
     hit = first_hit.is_valid()
     albedo = first_hit.bsdf().eval_diffuse_reflectance(first_hit, hit) & hit
     normal = first_hit.sh_frame.n & hit
+    distance = dr.select(hit, first_hit.t, 0)
 
     ray = mi.Ray3f(ray)
     color, diffuse, specular = mi.Spectrum(0), mi.Spectrum(0), mi.Spectrum(0)
@@ -175,7 +176,55 @@ def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f):
         depth += 1
         active = active_next
 
-    return color, albedo, normal, diffuse, specular
+    return color, albedo, normal, diffuse, specular, distance
+
+
+#: What a sample may hold: its position in the pixel (0 to 1), radiance, first hit, lobes (3 channels each), and the
+#: distance of the first hit (1 channel, 0 for the background).
+LAYERS = ("color", "albedo", "normal", "diffuse", "specular", "depth")
+
+
+def render_samples(
+    scene: mi.Scene,
+    camera: Camera,
+    size: int | tuple[int, int],
+    spp: int,
+    seed: int,
+    layers: tuple[str, ...] = LAYERS,
+    integrator=None,
+    pixel_filter: PixelFilter = box,
+) -> dict[str, np.ndarray]:
+    """Render `spp` samples for every pixel, each with its place: float32 (spp, height, width, C) by name.
+
+    The names are `place` (x and y in the pixel, 0 to 1 for a box) and those of `layers`, see `LAYERS`. A `size` is that
+    of a square, or width and height. An `integrator` of Mitsuba replaces the one here (colour only), for comparisons.
+    Samples with a non-finite value are zero.
+    """
+    columns, rows = (size, size) if isinstance(size, int) else size
+    n = columns * rows
+    sampler = mi.load_dict({"type": "independent"})
+    sampler.seed(seed, n * spp)
+    index = dr.arange(mi.UInt32, n * spp)
+    width, height, pixels = (dr.opaque(mi.UInt32, v) for v in (columns, rows, n))
+    pixel = index % pixels
+    row = pixel // width
+    jitter, lens = sampler.next_2d(), sampler.next_2d()
+    place = [pixel_filter(jitter.x), pixel_filter(jitter.y)]
+    x = (mi.Float(pixel - row * width) + place[0]) / mi.Float(width)
+    y = (mi.Float(row) + place[1]) / mi.Float(height)
+    ray = camera.rays(x, y, lens)
+    if integrator is not None:
+        traced = {"color": list(integrator.sample(scene, sampler, ray)[0])}
+    else:
+        *vectors, distance = sample_layers(scene, sampler, ray)
+        traced = dict(zip(LAYERS, [*map(list, vectors), [distance]], strict=True))
+    wanted = {"place": place} | {name: traced[name] for name in layers}
+    dr.eval([channel for channels in wanted.values() for channel in channels])
+    out = {name: np.stack([c.numpy() for c in channels], axis=-1) for name, channels in wanted.items()}
+    finite = np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in out.values()])
+    for name in layers:
+        out[name][~finite] = 0
+    return {name: values.reshape(spp, rows, columns, -1) for name, values in out.items()}
 
 
 def render_passes(
@@ -188,30 +237,10 @@ def render_passes(
     integrator=None,
     pixel_filter: PixelFilter = box,
 ) -> np.ndarray:
-    """Render `spp` independent 1-spp passes: float32 (spp, height, width, C).
+    """Render `spp` independent 1-spp passes: float32 (spp, height, width, C), as `render_samples` without places.
 
-    C is 15 with `layers` (colour, albedo, normal, diffuse, specular), 3 without. A `size` is that of a square, or width
-    and height. An `integrator` of Mitsuba replaces the one here (colour only), for comparisons. Samples with a
-    non-finite value are zero.
+    C is 15 with `layers` (colour, albedo, normal, diffuse, specular), 3 without.
     """
-    columns, rows = (size, size) if isinstance(size, int) else size
-    n = columns * rows
-    sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n * spp)
-    index = dr.arange(mi.UInt32, n * spp)
-    width, height, pixels = (dr.opaque(mi.UInt32, v) for v in (columns, rows, n))
-    pixel = index % pixels
-    row = pixel // width
-    jitter, lens = sampler.next_2d(), sampler.next_2d()
-    x = (mi.Float(pixel - row * width) + pixel_filter(jitter.x)) / mi.Float(width)
-    y = (mi.Float(row) + pixel_filter(jitter.y)) / mi.Float(height)
-    ray = camera.rays(x, y, lens)
-    if integrator is not None:
-        channels = [integrator.sample(scene, sampler, ray)[0]]
-    else:
-        channels = list(sample_layers(scene, sampler, ray))
-    flat = [c for vector in (channels if layers else channels[:1]) for c in vector]
-    dr.eval(flat)
-    out = np.stack([c.numpy() for c in flat], axis=-1)
-    out[~np.isfinite(out).all(axis=-1)] = 0
-    return out.reshape(spp, rows, columns, len(flat))
+    names = LAYERS[:5] if layers and integrator is None else LAYERS[:1]
+    samples = render_samples(scene, camera, size, spp, seed, names, integrator, pixel_filter)
+    return np.concatenate([samples[name] for name in names], axis=-1)

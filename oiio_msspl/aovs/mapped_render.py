@@ -3,14 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import FEATURES, RGB, VARIANCE
+from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.arrays import Array
 from oiio_msspl.exr.layers import layers_of
@@ -66,39 +66,42 @@ class MappedRender:
         """The channels R, G, B and, if there is one, A: those that a fused frame replaces."""
         return (*self.features[RGB].terms[0], *([self.alpha] if self.alpha else []))
 
-    def table(self) -> list[dict[str, str]]:
-        """What each feature and the alpha are read from, for the user.
+    def table(self, read: Collection[str] = FEATURES) -> list[dict[str, str]]:
+        """What each feature and the alpha are read from, for the user. :func:`origin` puts a row into words.
+
+        Args:
+            read: the features that the model reads.
 
         Returns:
-            Rows with the keys ``feature``, ``status``, ``source`` (the layers) and ``note``. The status is ``found``,
-            ``computed``, ``default`` (a missing feature) or, for alpha, ``absent``.
+            Rows with the keys ``feature``, ``status``, ``source`` (the layers; empty if there is none) and ``note``.
+            The status is ``found``, ``computed``, ``default`` (a missing feature), ``unused`` (the model does not read
+            it) or, for alpha, ``absent``.
         """
         rows = []
         for feature in FEATURES:
             formula = self.features.get(feature)
-            if formula is None:
-                rows.append(_row(feature, "default", "none found (optional)"))
-            else:
-                status = "computed" if formula.is_computed else "found"
-                rows.append(_row(feature, status, formula.text, formula.note))
+            status = "default" if formula is None else "computed" if formula.is_computed else "found"
+            text, note = (formula.text, formula.note) if formula else ("", "")
+            rows.append(_row(feature, status if feature in read else "unused", text, note))
         rows.append(_row("alpha", "found", self.alpha.name) if self.alpha else _row("alpha", "absent"))
         return rows
 
     def unread_layers(self) -> list[str]:
-        """Names of the layers, or of single channels, that no feature is read from."""
+        """Names of the layers, or of single channels, that no feature is read from. Those of another view than the
+        chosen one are followed by the view in brackets."""
         used = {c for formula in self.features.values() for c in formula.channels} | {self.alpha}
         names = []
         for layer in layers_of(self.file):
             rest = [c for c in layer.channels.values() if c not in used]
-            if len(rest) == len(layer.channels) and layer.name:
-                names.append(layer.name)
-            else:
-                names += [c.name for c in rest]
+            whole = len(rest) == len(layer.channels) and layer.name
+            view = f" ({layer.view})" if layer.view and layer.view not in self.view.split("/") else ""
+            names += [name + view for name in ([layer.name] if whole else [c.name for c in rest])]
         return names
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
         """Features over a rectangle: float32 (height, width, channels), in the units of the features.
 
+        Each channel is contiguous in memory. Features that are read from one file may share the memory of all of them.
         Values are as the renderer wrote them: NaN and infinities may be among them.
 
         Args:
@@ -114,7 +117,9 @@ class MappedRender:
         place = {channel: i for i, channel in enumerate(channels)}
 
         def take(group: Sequence[Channel]) -> Array:
-            return pixels[..., [place[c] for c in group]]
+            places = [place[c] for c in group]
+            adjacent = places == list(range(places[0], places[-1] + 1))
+            return pixels[..., places[0] : places[-1] + 1] if adjacent else pixels[..., places]
 
         result: dict[str, Array] = {}
         with np.errstate(all="ignore"):  # the caller repairs and counts NaN and infinities
@@ -160,3 +165,22 @@ class MappedRender:
 
 def _row(feature: str, status: str, source: str = "", note: str = "") -> dict[str, str]:
     return {"feature": feature, "status": status, "source": source, "note": note}
+
+
+def origin(row: Mapping[str, str]) -> str:
+    """Where a feature comes from, in words.
+
+    Args:
+        row: of :meth:`MappedRender.table`.
+    """
+    status, source = row["status"], row["source"] + (f" ({row['note']})" if row["note"] else "")
+    if status == "default":
+        # All features but the beauty are optional, but without an albedo textures are lost.
+        return (
+            "none: expect blur, render an albedo (or name it with --map albedo=LAYER)"
+            if row["feature"] == ALBEDO
+            else "none (optional)"
+        )
+    if status == "unused":
+        return f"found: {source}; this model does not read it" if source else "none; this model does not read it"
+    return "none" if status == "absent" else f"{status}: {source}"

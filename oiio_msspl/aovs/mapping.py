@@ -6,6 +6,7 @@ A mapping gives one candidate for each feature, written as in ``renderers.toml``
 
 from __future__ import annotations
 
+import re
 import tomllib
 from collections.abc import Iterable
 from pathlib import Path
@@ -59,7 +60,8 @@ def _read_text(path: Path) -> str:
 
 
 def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
-    """Parse ``--map feature=layer`` options. ``layer`` may also be a sum (``lighting+GI``) or an EXR file.
+    """Parse ``--map feature=layer`` options. ``layer`` may also be a sum (``lighting+GI``), an EXR file
+    (``other.exr``) or a layer of one (``other.exr:albedo``).
 
     Returns:
         Candidates by feature, with full paths: a farm's worker reads them in another folder.
@@ -72,11 +74,25 @@ def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
         feature, equals, layer = option.partition("=")
         if not equals or not layer:
             raise InputError(f"--map {option!r}: write it as feature=layer, e.g. --map albedo=my_albedo")
-        if layer.lower().endswith(".exr"):
+        if is_exr(layer):
             mapping[feature] = f"file:{Path(layer).absolute()}"
         else:
             mapping[feature] = {"sum": layer.split("+")} if "+" in layer else layer
     return check_mapping(mapping, "--map")
+
+
+def split_exr(text: str) -> tuple[str, str]:
+    """The file and the layer of ``other.exr:albedo``; the layer is empty if none is named.
+
+    The file is empty if ``text`` names no EXR.
+    """
+    match = re.fullmatch(r"(.*?\.exr)(?::(.*))?", text, re.IGNORECASE | re.DOTALL)
+    return (match[1], match[2] or "") if match else ("", text)
+
+
+def is_exr(text: str) -> bool:
+    """Whether ``text`` names an EXR, perhaps with a layer of it."""
+    return bool(split_exr(text)[0])
 
 
 def check_mapping(mapping: dict[str, Any], where: str) -> dict[str, Any]:
@@ -107,8 +123,9 @@ def _full_paths(candidate: Any, folder: Path) -> Any:
         return {key: _full_paths(value, folder) for key, value in candidate.items()}
     if isinstance(candidate, list):
         return [_full_paths(each, folder) for each in candidate]
-    is_exr = isinstance(candidate, str) and candidate.startswith("file:") and candidate.lower().endswith(".exr")
-    return f"file:{folder / candidate.removeprefix('file:')}" if is_exr else candidate
+    if isinstance(candidate, str) and candidate.startswith("file:") and is_exr(candidate):
+        return f"file:{folder / candidate.removeprefix('file:')}"
+    return candidate
 
 
 def _problem(feature: str, candidate: Any) -> str | None:

@@ -60,7 +60,7 @@ def map_render(
     beauty = choose_beauty(file, beauties, view)
     notes: list[str] = []
     found = {RGB: _beauty_formula(beauty)}
-    finder = LayerFinder(file, layers, beauty.view, beauty.view_layer)
+    finder = LayerFinder(file, layers, renderer, beauty.view, beauty.view_layer)
     for feature in features:
         if feature in mapping:
             formula: FeatureFormula | None = _user_formula(finder, feature, mapping[feature], file)

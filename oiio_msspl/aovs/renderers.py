@@ -10,7 +10,7 @@ from functools import lru_cache
 from importlib import resources
 from typing import Any
 
-from oiio_msspl.exr.layers import Layer
+from oiio_msspl.exr.layers import Layer, same_spelling
 from oiio_msspl.exr.reader import ExrFile
 
 
@@ -47,6 +47,20 @@ def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) 
     return None
 
 
+def layer_of_source(renderer: dict[str, Any], file: ExrFile, aov: str) -> str | None:
+    """The layer that holds an AOV under another name, as the header says; None if it names none or several.
+
+    Several layers hold the same AOV where lights are split into groups: none of them is the whole.
+    """
+    rule = re.compile(renderer["source"]) if "source" in renderer else None
+    found = {
+        match[1]
+        for key, value in file.metadata.items()
+        if rule and (match := rule.search(key)) and same_spelling(str(value)) == same_spelling(aov)
+    }
+    return found.pop() if len(found) == 1 else None
+
+
 def view_layer_of(layer: str, alias: str) -> str | None:
     """The view layer in front of ``alias`` in a layer's name.
 
@@ -56,17 +70,13 @@ def view_layer_of(layer: str, alias: str) -> str | None:
         ``ViewLayer`` for ``ViewLayer.Combined`` and the alias ``combined``; empty if the layer has just the alias as
         its name; None if it is another layer.
     """
-    name, wanted = _without_spelling(layer), _without_spelling(alias)
+    name, wanted = same_spelling(layer), same_spelling(alias)
     if name == wanted or ("*" in wanted and fnmatchcase(name, wanted)):
         return ""
     if wanted and name.endswith("." + wanted):
         # Cut the stored name as many dots from its end as the alias takes.
         return layer.rsplit(".", wanted.count(".") + 1)[0]
     return None
-
-
-def _without_spelling(name: str) -> str:
-    return re.sub(r"[ _-]", "", name).lower()
 
 
 def _holds(condition: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:

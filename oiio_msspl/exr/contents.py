@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from typing import Any
 
 import numpy as np
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.layers import Layer, layers_of, matches_layer
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOptions
 
@@ -97,20 +96,31 @@ def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequenc
     Args:
         file: the HRLS.
         beauty: its channels that the fused beauty replaces.
-        patterns: ``WriteOptions.layers``. A pattern matches the name of a layer or of a channel.
+        patterns: ``WriteOptions.layers``. A pattern matches the name of a layer or of a channel, see
+            :func:`oiio_msspl.exr.layers.matches_layer`.
 
     Raises:
         InputError: a pattern matches nothing.
     """
     if not patterns:
         return frozenset()
-    layers = {c: layer.name or c.name for layer in layers_of(file) for c in layer.channels.values()}
-    others = {c: layers.get(c, c.name) for part in file.parts for c in part.channels if c not in beauty}
+    layer_of = {c: layer for layer in layers_of(file) for c in layer.channels.values()}
+    others = [c for part in file.parts for c in part.channels if c not in beauty]
     kept: set[Channel] = set()
     for pattern in patterns:
-        found = {c for c, layer in others.items() if fnmatchcase(layer, pattern) or fnmatchcase(c.name, pattern)}
+        found = {c for c in others if _is_meant(pattern, c, layer_of.get(c), file.parts[c.part])}
         if not found and pattern != "none":
-            names = ", ".join(sorted(set(others.values()))) or "no other layer"
-            raise InputError(f"--layers {pattern!r}: {file.path} has no such layer; it has: {names}")
+            names = {layer_of[c].name or c.name if c in layer_of else c.name for c in others}
+            known = ", ".join(sorted(names)) or "no other layer"
+            raise InputError(f"--layers {pattern!r}: {file.path} has no such layer; it has: {known}")
         kept |= found
-    return frozenset(others.keys() - kept)
+    return frozenset(set(others) - kept)
+
+
+def _is_meant(pattern: str, channel: Channel, layer: Layer | None, part: Part) -> bool:
+    """Whether a pattern means a channel. ``depth`` also means a plain Z, as in Nuke."""
+    prefix, _, component = channel.name.rpartition(".")
+    name = layer.name if layer else prefix
+    if not name:
+        return matches_layer(pattern, channel.name) or (channel.name == "Z" and matches_layer(pattern, "depth"))
+    return matches_layer(pattern, name if name == part.name else f"{part.name}.{name}", component)

@@ -5,11 +5,12 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
+from fnmatch import fnmatchcase
 
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
 
 #: Part names that do not name a layer: channels without a prefix in such a part are plain R, G, B.
-_PLAIN_PART = re.compile(r"(rgba?|main|default|image|part ?\d+|subimage ?\d+)?", re.IGNORECASE)
+_PLAIN_PART = re.compile(r"((rgba?|default|image|part ?\d+|subimage ?\d+)([._ -]main)?|main)?", re.IGNORECASE)
 _COMPONENTS = {"r": "R", "red": "R", "g": "G", "green": "G", "b": "B", "blue": "B", "a": "A", "alpha": "A"}
 _COMPONENTS |= {c: c.upper() for c in "xyz"}
 _TRIPLES = (("R", "G", "B"), ("X", "Y", "Z"))
@@ -43,7 +44,7 @@ def layers_of(file: ExrFile) -> list[Layer]:
 
     Renderers name layers in three ways. OpenEXR's rule puts the layer in front of the channel's name
     (``diffuse.R``). Karma and Nuke put it in the part's name only. Blender 5 does both. So the prefix of the channel
-    names the layer, or else the part's name does.
+    names the layer, or else the part's name does. In a file of one part, the part's name says nothing about layers.
 
     If two channels have the same view, layer and component (``foo.R`` and ``foo.red``), the layer holds the first.
     """
@@ -51,10 +52,31 @@ def layers_of(file: ExrFile) -> list[Layer]:
     layers: dict[tuple[str, str], Layer] = {}
     for part in file.parts:
         for channel in part.channels:
-            view, name, component = _split_name(channel.name, part, views)
+            view, name, component = _split_name(channel.name, part, views, several=len(file.parts) > 1)
             layer = layers.setdefault((view, name), Layer(name, view))
             layer.channels.setdefault(component, channel)
     return list(layers.values())
+
+
+def same_spelling(name: str) -> str:
+    """A name without what programs spell differently: case, spaces, ``_`` and ``-``."""
+    return re.sub(r"[ _-]", "", name).lower()
+
+
+def matches_layer(pattern: str, name: str, component: str = "") -> bool:
+    """Whether a pattern such as ``crypto*`` means a layer, or a channel of it.
+
+    Case, spaces, ``_`` and ``-`` make no difference. The pattern may leave out the view layer or part in front of the
+    name: ``crypto*`` means ``ViewLayer.CryptoObject00``.
+
+    Args:
+        pattern: text with ``*`` for any text, ``?`` for any character.
+        name: the layer's name, perhaps with a part's or a view layer's in front.
+        component: the channel's own name, such as ``R``; the pattern may name it behind the layer.
+    """
+    wanted, words = same_spelling(pattern), same_spelling(name).split(".")
+    ends = [".".join(words[start:]) for start in range(len(words))]
+    return any(fnmatchcase(end, wanted) or fnmatchcase(f"{end}.{same_spelling(component)}", wanted) for end in ends)
 
 
 def _views(file: ExrFile) -> list[str]:
@@ -63,8 +85,8 @@ def _views(file: ExrFile) -> list[str]:
     return [views] if isinstance(views, str) else [str(view) for view in views]
 
 
-def _split_name(name: str, part: Part, views: list[str]) -> tuple[str, str, str]:
-    """View, layer and component of a channel.
+def _split_name(name: str, part: Part, views: list[str], *, several: bool) -> tuple[str, str, str]:
+    """View, layer and component of a channel, in a file of one part or of several.
 
     In a ``multiView`` file the view stands between the layer and the component (``diffuse.left.R``); channels without
     one belong to the default view.
@@ -73,7 +95,7 @@ def _split_name(name: str, part: Part, views: list[str]) -> tuple[str, str, str]
     view = part.view or (views[0] if views else "")
     if views and prefix.rpartition(".")[2] in views:
         prefix, _, view = prefix.rpartition(".")
-    return view, prefix or _part_layer(part), _COMPONENTS.get(component.lower(), component)
+    return view, prefix or (_part_layer(part) if several else ""), _COMPONENTS.get(component.lower(), component)
 
 
 def _part_layer(part: Part) -> str:

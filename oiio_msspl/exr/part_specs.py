@@ -21,6 +21,8 @@ from oiio_msspl.exr.write_options import ERROR_LAYER
 _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
 #: ST 2065-4 forbids compression and AOVs in a file that carries this flag.
 _ACES_FLAG = "acesImageContainerFlag"
+#: Effort of ZIP, 1 to 9. OpenEXR's own is 4, which takes a third longer and makes files of renders 1 to 2 % smaller.
+ZIP_LEVEL = 1
 #: Attributes that must be the same in all parts of a file, and attributes that describe a single part.
 _KEPT_IN_EVERY_PART = (
     "PixelAspectRatio",
@@ -54,9 +56,11 @@ def beauty_spec(contents: FileContents) -> Any:
     if contents.options.layout == "nuke":
         name, channels = _nuke_name("rgba", home.view), ["R", "G", "B", "A"][: len(contents.beauty)]
     else:
-        name, channels = home.name or "rgba", [channel.name for channel in contents.beauty]
+        # In a file of one part, its name says nothing; in the result, it would name a layer of plain channels.
+        named = home.name and (len(contents.source.parts) > 1 or "." in contents.beauty[0].name)
+        name, channels = home.name if named else "rgba", [channel.name for channel in contents.beauty]
     spec = _spec(home, name, channels, contents.pixels.kind)
-    spec.attribute("compression", contents.compression)
+    _compress(spec, contents.compression)
     for key, value in contents.attributes.items():
         spec.attribute(key, value)
     return spec
@@ -67,7 +71,7 @@ def error_spec(contents: FileContents, taken: set[str]) -> Any:
     channel = "Y" if contents.options.layout == "nuke" else f"{ERROR_LAYER}.Y"
     spec = _spec(contents.home, _unique(ERROR_LAYER, taken), [channel], contents.pixels.kind)
     _drop_repeated_attributes(spec)
-    spec.attribute("compression", contents.compression)
+    _compress(spec, contents.compression)
     return spec
 
 
@@ -198,4 +202,8 @@ def _name_and_compress(spec: Any, name: str, compression: str) -> None:
         spec.erase_attribute(attribute)
     spec.attribute("oiio:subimagename", name)
     spec.attribute("name", name)
-    spec.attribute("compression", compression)
+    _compress(spec, compression)
+
+
+def _compress(spec: Any, compression: str) -> None:
+    spec.attribute("compression", f"{compression}:{ZIP_LEVEL}" if compression in ("zip", "zips") else compression)

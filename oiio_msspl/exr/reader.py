@@ -104,7 +104,7 @@ class ExrFile:
         return handle
 
     def read(self, channels: Sequence[Channel], window: Window) -> Array:
-        """Channels over a rectangle, as float32 (height, width, len(channels)).
+        """Channels over a rectangle, as float32 (height, width, len(channels)); each channel is contiguous in memory.
 
         Pixels outside a part's data window are 0, as OpenEXR defines them. All channels of a part are decoded
         together, whatever layers they belong to.
@@ -117,7 +117,7 @@ class ExrFile:
             InputError: pixels can't be decoded, because the file is truncated or corrupt.
         """
         self._cache.drop_outside(window.y0, window.y1)
-        result = np.zeros((window.height, window.width, len(channels)), dtype=np.float32)
+        result = np.zeros((len(channels), window.height, window.width), dtype=np.float32).transpose(1, 2, 0)
         groups: dict[tuple[Path, int], list[int]] = {}
         for position, channel in enumerate(channels):
             groups.setdefault((channel.path, channel.part), []).append(position)
@@ -145,14 +145,15 @@ class ExrFile:
             self._cache.max_bytes = 0
             self._cache.clear()
 
-    def native_strips(self, part: Part, first: int, last: int) -> Iterator[tuple[int, int, NDArray[Any]]]:
+    def native_strips(
+        self, part: Part, first: int, last: int, later: Sequence[tuple[int, int]] = ()
+    ) -> Iterator[tuple[int, int, NDArray[Any]]]:
         """All rows of neighbouring channels in their stored pixel type, for copying them bit for bit.
-
-        Inside :meth:`cache_strips`, all channels of that pixel type are decoded together and kept, because a part that
-        is split into layers is read once for each layer.
 
         Args:
             first, last: indices of the first channel and of the one after the last. All have one pixel type.
+            later: more such ranges, which are read by later calls. Inside :meth:`cache_strips`, those of the same pixel
+                type are decoded together with this one, and kept until they are read.
 
         Yields:
             First row, last row (exclusive), and the strip (rows, width, channels).
@@ -160,26 +161,19 @@ class ExrFile:
         Raises:
             InputError: pixels can't be decoded.
         """
-        window = part.data_window
+        window, kind = part.data_window, part.channels[first].type
+        later = [(a, b) for a, b in later if self._cache.max_bytes and part.channels[a].type == kind]
+        start = min(first, *(a for a, _ in later)) if later else first
+        stop = max(last, *(b for _, b in later)) if later else last
         for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
-            if self._cache.max_bytes:
-                yield y0, y1, self._cached_native_strip(part, y0, y1, first, last)
-            else:
-                yield y0, y1, self._decode(part, y0, y1, first, last, part.channels[first].type)
-
-    def _cached_native_strip(self, part: Part, y0: int, y1: int, first: int, last: int) -> NDArray[Any]:
-        kind = part.channels[first].type
-        indices = tuple(channel.index for channel in part.channels if channel.type == kind)
-        key = StripKey(self.path, part.index, indices, y0, y1)
-        strip = self._cache.get(key)
-        if strip is None:
-            start, stop = indices[0], indices[-1] + 1
-            strip = self._decode(part, y0, y1, start, stop, kind)
-            if len(indices) < stop - start:  # channels of other types are among them
-                strip = strip[..., [i - start for i in indices]]
-            self._cache.keep(key, strip)
-        position = indices.index(first)
-        return strip[..., position : position + last - first]
+            strip = self._cache.pop(StripKey(self.path, part.index, tuple(range(first, last)), y0, y1))
+            if strip is None:
+                decoded = self._decode(part, y0, y1, start, stop, kind)
+                strip = decoded[..., first - start : last - start]
+                for a, b in later:
+                    key = StripKey(self.path, part.index, tuple(range(a, b)), y0, y1)
+                    self._cache.keep(key, decoded[..., a - start : b - start].copy())
+            yield y0, y1, strip
 
     def _read_part(
         self,
@@ -209,14 +203,17 @@ class ExrFile:
             result[(*shared.slices(window), planes)] = strip[rows, columns]
 
     def _decode_channels(self, part: Part, y0: int, y1: int, indices: tuple[int, ...]) -> NDArray[Any]:
-        """A strip of some channels: half if all of them are stored as half, otherwise float."""
+        """A strip of some channels, each contiguous in memory: half if all are stored as half, otherwise float."""
         first, last = min(indices), max(indices) + 1
         decoded = part.channels[first:last]
         strip = self._decode(part, y0, y1, first, last, "half" if all(c.type == "half" for c in decoded) else "float")
-        if indices == tuple(range(first, last)):
-            return strip
         dtype = np.float16 if all(part.channels[i].type == "half" for i in indices) else np.float32
-        return strip[..., [i - first for i in indices]].astype(dtype, copy=False)
+        planes = np.empty((len(indices), *strip.shape[:2]), dtype)
+        columns = [i - first for i in indices]
+        wanted = slice(None) if columns == list(range(last - first)) else columns
+        for row, pixels in enumerate(strip):  # a row fits into the processor's cache, which makes this twice as fast
+            planes[:, row] = pixels.T[wanted]
+        return planes.transpose(1, 2, 0)
 
     def _decode(self, part: Part, y0: int, y1: int, first: int, last: int, kind: str) -> NDArray[Any]:
         """Rows of neighbouring channels over the full width, in pixel type ``kind``: (rows, width, channels)."""

@@ -53,6 +53,10 @@ class StripCache:
         """The strip, if it is kept."""
         return self._strips.get(key)
 
+    def pop(self, key: StripKey) -> NDArray[Any] | None:
+        """The strip, if it is kept, and forget it."""
+        return self._strips.pop(key, None)
+
     def keep(self, key: StripKey, strip: NDArray[Any]) -> None:
         """Keep a strip if there is room."""
         if self.bytes + strip.nbytes <= self.max_bytes:

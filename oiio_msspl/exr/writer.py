@@ -106,20 +106,15 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     if error is not None:
         ok = ok and writer.open(str(path), error, "AppendSubimage")
         ok = ok and _write_rows(writer, error, contents.pixels.error_rows)
-    with contents.source.cache_strips(cache_bytes if _is_split(passed_on) else 0):
-        for part in passed_on:
+    with contents.source.cache_strips(cache_bytes):
+        for position, part in enumerate(passed_on, start=1):
             ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
-            ok = ok and _copy(contents.source, part, writer)
+            ok = ok and _copy(contents.source, part, passed_on[position:], writer)
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
         reason = reason_of(writer) if writer.has_error else "disk full?"
         raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
-
-
-def _is_split(parts: Sequence[PassedOnPart]) -> bool:
-    """Whether several parts are made of one part of the source."""
-    return len({part.source.index for part in parts}) < len(parts)
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:
@@ -131,15 +126,21 @@ def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]
     return True
 
 
-def _copy(file: ExrFile, part: PassedOnPart, writer: Any) -> bool:
-    """Copy pixels of the HRLS into the part that is open, in their own pixel types."""
+def _copy(file: ExrFile, part: PassedOnPart, later: Sequence[PassedOnPart], writer: Any) -> bool:
+    """Copy pixels of the HRLS into the part that is open, in their own pixel types; ``later`` parts follow."""
     if part.runs is None:
         source = oiio.ImageInput.open(str(file.path))
         copied = source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source)
         if not copied and source is not None and source.has_error:
             raise unreadable(file.path, part.source, reason_of(source))
         return bool(copied)
-    runs = [file.native_strips(part.source, run[0].index, run[-1].index + 1) for run in part.runs]
+    ranges = [
+        (run[0].index, run[-1].index + 1)
+        for other in (part, *later)
+        if other.source.index == part.source.index and other.runs
+        for run in other.runs
+    ]
+    runs = [file.native_strips(part.source, *ranges[i], ranges[i + 1 :]) for i in range(len(part.runs))]
     for strips in zip(*runs, strict=True):
         y0, y1, pixels = strips[0]
         if len(strips) > 1:

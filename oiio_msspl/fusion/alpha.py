@@ -7,7 +7,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.guards import holds_around
+from oiio_msspl.fusion.guards import check_finite, holds_around
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import decode_radiance, encode_features
 from oiio_msspl.model.render_mean import Images
@@ -37,5 +37,6 @@ def fuse_alpha(pair: TilePair, session: Session, lrhs_aovs: Images) -> Array:
     lrhs = encode_features({RGB: np.repeat(lrhs_alpha, 3, axis=-1)}, LRHS_FEATURES, 1.0, len(contract.lrhs))
     hrls = encode_features(grey, contract.features, 1.0, len(contract.hrls))
     encoded, _ = session.run(lrhs, hrls, lrhs_aovs=lrhs_aovs)
+    check_finite(session, encoded)
     fused = np.clip(decode_radiance(encoded, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))

@@ -14,18 +14,24 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import fuse_alpha
-from oiio_msspl.fusion.guards import EmptyRegions, Mask, dim_fireflies, is_noise_free
+from oiio_msspl.fusion.guards import (
+    EmptyRegions,
+    Mask,
+    check_finite,
+    dim_fireflies,
+    is_noise_free,
+    lights_above_ceiling,
+)
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
-from oiio_msspl.fusion.tile_features import TilePair, read_lrhs, read_tile
+from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
     MAX_MEMORY,
     STRIPS_SHARE,
     Tile,
     aligned_grid,
-    check_memory,
-    largest_tile,
+    memory_for_tiles,
     plan_tiles,
-    smallest_memory,
+    require_memory,
 )
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
@@ -48,7 +54,9 @@ class FusedFrame:
     exposure: float
     """Factor that the scene was multiplied by for the network."""
     repaired: dict[str, int]
-    """Numbers of values that were NaN, infinite or (except in normals) negative, by layer, as ``lrhs.rgb``."""
+    """Numbers of values that were NaN or infinite, by layer, as ``lrhs.rgb``."""
+    negative: dict[str, int] = field(default_factory=dict)
+    """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
     """One sentence each."""
     tiles: int = 1
@@ -68,7 +76,7 @@ def fuse(
     *,
     error: bool = False,
     max_memory: int = MAX_MEMORY,
-    reserved: int = 0,
+    held: int = 0,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedFrame:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
@@ -77,42 +85,44 @@ def fuse(
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
-        max_memory: bytes that the whole process should stay below.
-        reserved: bytes of these that the caller needs for other frames.
+        max_memory: bytes that the whole process should stay below. The result does not depend on it.
+        held: bytes that the caller holds beside this frame.
         progress: called with (tiles done, tiles in all).
 
     Raises:
-        InputError: the pair does not fit together, the model is for another scale or does not predict its error, or the
-            frame does not fit into memory. No pixel was read.
+        InputError: the pair does not fit together or into memory, or the model is for another scale or does not
+            predict its error. No pixel was read.
+        MssplError: the network failed, or returned NaN or infinite values.
     """
     alignment = align(lr, hr)
     _check_model(session, alignment.scale, error)
-    check_memory(memory_to_fuse(lr, alignment, session, error=error) + reserved, max_memory)
+    require_memory(memory_to_fuse(alignment, session, error=error) + held, session.contract, max_memory)
     seconds = session.seconds
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
         frame = _blank_frame(alignment, pair.exposure, error=error)
-        largest = largest_tile(session.contract, frame.nbytes + pair.nbytes + reserved, max_memory)
-        tiles = plan_tiles(pair.grid, largest, session.contract.overlap, session.contract.alignment)
-        with hr.cache_strips(int(max_memory * STRIPS_SHARE)):
+        tiles = plan_tiles(pair.grid, session.contract)
+        with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             # The next tile is read and encoded while the network works on this one.
             for done, tile in enumerate(one_ahead(pair.prepare, tiles), start=1):
                 _fuse_tile(tile, session, frame)
                 if progress is not None:
                     progress(done, len(tiles))
         frame.warnings += pair.check()
-    frame.repaired, frame.tiles, frame.seconds = pair.repaired, len(tiles), session.seconds - seconds
+    frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
+    frame.tiles, frame.seconds = len(tiles), session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     return frame
 
 
-def memory_to_fuse(lr: ReadableRender, alignment: Alignment, session: Session, *, error: bool) -> int:
+def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> int:
     """The smallest ``max_memory`` with which a pair can be fused, from its headers."""
     grid = aligned_grid(alignment.grid, session.contract.alignment)
-    # Of the features that the LRHS may have; it is not read yet. Alpha counts 1 channel, every other one 3.
+    # Of the features that the LRHS may have; it is not read yet. Alpha has 1 channel, every other one 3.
     lrhs_bytes = grid.width * grid.height * (3 * (1 + len(session.lrhs_aovs)) + 1) * 4
-    return smallest_memory(grid, session.contract, result_bytes(alignment, error=error) + lrhs_bytes)
+    frame_bytes = result_bytes(alignment, error=error) + lrhs_bytes
+    return memory_for_tiles(session.contract, plan_tiles(grid, session.contract), frame_bytes)
 
 
 def result_bytes(alignment: Alignment, *, error: bool) -> int:
@@ -145,6 +155,8 @@ class _PreparedTile:
     lrhs: Array | None = None
     """Network input, encoded; None for a tile that is empty everywhere."""
     hrls: Array | None = None
+    lights: Array | None = None
+    """See :func:`oiio_msspl.fusion.guards.lights_above_ceiling`."""
     noise_free: bool = False
     """There is no noise to remove: the HRLS is the result."""
 
@@ -155,10 +167,9 @@ class _Pair:
     def __init__(self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session) -> None:
         self._lr, self._hr, self._alignment, self._session = lr, hr, alignment, session
         self.grid = aligned_grid(alignment.grid, session.contract.alignment)
-        self._lrhs_repaired: dict[str, int] = {}
-        self._hrls_repaired: dict[str, int] = {}
+        self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         features = [RGB, *session.lrhs_aovs, "alpha"]
-        self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_repaired)
+        self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_counts)
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         self.exposure = find_exposure(self._lrhs_rgb)
         self._empty_regions, self._averages = EmptyRegions(self._lrhs[RGB]), HrlsAverages(alignment)
@@ -172,27 +183,29 @@ class _Pair:
     def lrhs_has_alpha(self) -> bool:
         return "alpha" in self._lrhs
 
-    @property
-    def repaired(self) -> dict[str, int]:
-        """See :attr:`FusedFrame.repaired`."""
-        lrhs = {f"lrhs.{name}": count for name, count in self._lrhs_repaired.items()}
-        return lrhs | {f"hrls.{name}": count for name, count in self._hrls_repaired.items()}
+    def counts(self, kind: str) -> dict[str, int]:
+        """What :attr:`FusedFrame.repaired` (``repaired``) or :attr:`FusedFrame.negative` (``negative``) holds."""
+        renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
+        return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
 
     def prepare(self, tile: Tile) -> _PreparedTile:
         """Read a tile, dim fireflies and encode its features."""
         contract, grid = self._session.contract, self.grid
         features = [*contract.features, "alpha"]
-        pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_repaired)
+        pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
         self._averages.add(pair)
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
         lrhs_aovs = {
             name: encode_feature(name, pair.lrhs[name], 1.0) for name in self._session.lrhs_aovs if name in pair.lrhs
         }
         hrls = pair.hrls
-        needed_for_alpha = {name: hrls[name] for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls}
+        # Copies, because views would keep the memory of all features.
+        for_alpha = [name for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls]
+        needed_for_alpha = {name: hrls[name].copy("K") for name in for_alpha}
         prepared = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
         if empty is None or not empty.all():
             lrhs_rgb, hrls = dim_fireflies(pair)
+            prepared.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
             prepared.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
             prepared.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
             prepared.noise_free = is_noise_free(pair, prepared.lrhs, hrls[RGB], self.exposure)
@@ -216,8 +229,11 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None
             encoded, encoded_error = session.run(
                 tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, error=frame.error is not None
             )
+        check_finite(session, encoded, encoded_error)
         rgb = frame.rgb[target]
         decode_radiance(encoded[core], frame.exposure, rgb)
+        if tile.lights is not None:
+            np.maximum(rgb, tile.lights[core], out=rgb)
         if empty is not None:
             rgb *= ~empty[core]
         if frame.error is not None and encoded_error is not None:

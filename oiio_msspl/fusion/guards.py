@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guards around the network: fireflies are dimmed, empty regions stay empty, noise-free tiles pass through."""
+"""Guards around the network: fireflies are dimmed, lights stay whole, empty regions stay empty, noise-free tiles pass
+through."""
 
 from __future__ import annotations
 
@@ -11,10 +12,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import NORMAL, RADIANCE_FEATURES, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.errors import MssplError
 from oiio_msspl.fusion.tile_features import TilePair
-from oiio_msspl.model.encoding import encode_radiance
+from oiio_msspl.model.encoding import MAX_RADIANCE, encode_radiance
+from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import for_row_blocks
 
 Mask = NDArray[np.bool_]
@@ -36,34 +39,78 @@ def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
     """
     lrhs_rgb, hrls = pair.lrhs[RGB], pair.hrls
     lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale))
-    hrls_limit = _brightness_limit(lrhs_rgb).repeat(pair.scale, axis=1)[:, None]
+    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb), pair.scale)
     dimmed = {name: _limit(hrls[name], hrls_limit, pair.scale) for name in RADIANCE_FEATURES if name in hrls}
     return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
 
 
+def _as_wide_as_hrls(limit: Array, scale: int) -> Array:
+    """(h, w, c) to (h, s*w, c). Each channel is contiguous, as in the HRLS: NumPy then compares them three times as
+    fast."""
+    return limit.transpose(2, 0, 1).repeat(scale, axis=2).transpose(1, 2, 0)
+
+
 def _limit(hrls: Array, limit: Array, scale: int) -> Array:
-    """HRLS values (s*h, s*w, c), at most the limit (h, 1, s*w, c) of their LRHS pixel."""
+    """HRLS values (s*h, s*w, c), at most the limit (h, s*w, c) of their LRHS pixel."""
     result = np.empty_like(hrls)
 
     def work(rows: slice) -> None:
-        by_lrhs_row = hrls[rows].reshape(-1, scale, *hrls.shape[1:])
         limits = limit[rows.start // scale : rows.stop // scale]
-        result[rows] = np.minimum(by_lrhs_row, limits).reshape(-1, *hrls.shape[1:])
+        for y in range(scale):
+            np.minimum(hrls[rows][y::scale], limits, out=result[rows][y::scale])
 
     for_row_blocks(work, len(hrls), hrls[0].size, multiple=scale)
     return result
 
 
+def lights_above_ceiling(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
+    """Radiance above the ceiling of the networks, where both renders have it.
+
+    Networks read radiance up to ``MAX_RADIANCE`` divided by the exposure, so they cannot tell how bright a light is.
+    It is as bright as in the HRLS, and at most as bright as the brightest of the 3 x 3 LRHS pixels around. A light that
+    is smaller than an LRHS pixel may be brighter than that: as bright as what the LRHS exceeds the clipped HRLS by,
+    spread over the clipped pixels. Pixel filters move light between neighbours, so both are counted over 3 x 3 LRHS
+    pixels.
+
+    Args:
+        lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
+
+    Returns:
+        (s*h, s*w, 3), scene linear; 0 below the ceiling. None if no pixel is above it.
+    """
+    ceiling = np.float32(MAX_RADIANCE / exposure)
+    if hrls_rgb.max() <= ceiling:
+        return None
+    scale = len(hrls_rgb) // len(lrhs_rgb)
+    clipped_share = box_downsample((hrls_rgb > ceiling).astype(np.float32), scale)
+    excess = np.maximum(lrhs_rgb - box_downsample(np.minimum(hrls_rgb, ceiling), scale), 0)
+    with np.errstate(over="ignore"):  # a limit that overflows is no limit
+        light, share = (reduce(np.add, _neighbours(values)) for values in (excess, clipped_share))
+        small_light = ceiling + light / np.maximum(share, np.float32(1 / scale**2))
+        limit = np.maximum(_max_3x3(lrhs_rgb), small_light)
+        # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
+        limit = np.minimum(limit, lrhs_rgb * np.float32(FIREFLY_FACTOR))
+    agreed = _limit(hrls_rgb, _as_wide_as_hrls(limit, scale), scale)
+    agreed[agreed <= ceiling] = 0
+    return agreed
+
+
 def _brightness_limit(rgb: Array) -> Array:
     """The largest values that the other render may have, (h, w, 3): none where this render is black."""
-    brightest = rgb.copy()
+    brightest = _max_3x3(rgb)
+    with np.errstate(over="ignore"):  # a limit that overflows is no limit
+        return np.where(brightest > 0, brightest * np.float32(FIREFLY_FACTOR), np.float32(np.inf))
+
+
+def _max_3x3(values: Array) -> Array:
+    """The largest of the 3 x 3 pixels around each, (h, w, c)."""
+    largest = values.copy()
     for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns
-        lines = brightest.swapaxes(0, axis)
+        lines = largest.swapaxes(0, axis)
         before = lines.copy(order="K")
         np.maximum(lines[1:], before[:-1], out=lines[1:])
         np.maximum(lines[:-1], before[1:], out=lines[:-1])
-    with np.errstate(over="ignore"):  # a limit that overflows is no limit
-        return np.where(brightest > 0, brightest * np.float32(FIREFLY_FACTOR), np.float32(np.inf))
+    return largest
 
 
 def is_noise_free(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: float) -> bool:
@@ -83,6 +130,18 @@ def _largest_difference(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: 
     means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), pair.scale)
     difference = encode_radiance(means, exposure)[:, pair.inside[1]] - lrhs[pair.inside][::step, :, :3]
     return float(np.abs(difference).max())
+
+
+def check_finite(session: Session, *images: Array | None) -> None:
+    """Raise MssplError if the output of a network, whose input is always finite, is not.
+
+    A frame with repaired holes would look finished.
+    """
+    if not all(np.isfinite(image).all() for image in images if image is not None):
+        raise MssplError(
+            f"{session.contract.name} on {session.provider} returned NaN or infinite values, so this frame is not "
+            "fused; try --device cpu or another --model"
+        )
 
 
 class EmptyRegions:
@@ -131,8 +190,9 @@ def _all_in_15x15(mask: Mask) -> Mask:
 
 
 def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
-    """Where alpha or normal is zero, (h, w, 1); everywhere if the HRLS has neither."""
-    signs = [np.all(hrls[name] == 0, axis=-1, keepdims=True) for name in ("alpha", NORMAL) if name in hrls]
+    """Where alpha or normal is zero, or the albedo if there are neither, (h, w, 1); everywhere without any of these."""
+    names = [name for name in ("alpha", NORMAL) if name in hrls] or [name for name in (ALBEDO,) if name in hrls]
+    signs = [np.all(hrls[name] == 0, axis=-1, keepdims=True) for name in names]
     return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)
 
 

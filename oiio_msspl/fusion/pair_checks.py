@@ -38,6 +38,8 @@ MIN_ALBEDO_EDGES = 200
 ALBEDO_CORRELATION = 0.05
 #: A difference of exposure, or a shift, must be this many standard errors from none.
 CERTAIN = 6.0
+#: Brighter pixels count as this bright, because sums over a frame would overflow float32.
+BRIGHTEST = 1e30
 #: Side of a block in LRHS pixels -> how many standard errors the block's means must differ by to show different things.
 #: Of 77 matching views none has such a block.
 BLOCK_CERTAINTY = {8: 6.0, 4: 8.0}
@@ -91,7 +93,8 @@ def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) 
     Raises:
         InputError: one render is black, most likely a wrong layer, and the other is not.
     """
-    low, high, alignment = luminance(lrhs_rgb), hrls.rgb, hrls.alignment
+    low, high = (np.minimum(values, BRIGHTEST) for values in (luminance(lrhs_rgb), hrls.rgb))
+    alignment = hrls.alignment
     if not low.any() and not high.any():
         return ["both renders are black (or NaN) everywhere: the result is black"]
     for name, values, other in ((lr_name, low, hr_name), (hr_name, high, lr_name)):

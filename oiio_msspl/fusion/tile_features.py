@@ -1,12 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The features of a tile: read from both renders, repaired, and continued beyond the data window."""
+"""The features of a tile: read from both renders, repaired, and mirrored where the tile reaches beyond the frame."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.arrays import Array, interpolate, repair
@@ -14,8 +15,27 @@ from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.tiling import Tile
 
+Indices = NDArray[np.int64]
+
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
+
+
+@dataclass
+class RepairCounts:
+    """How many values of a render were changed, by feature."""
+
+    repaired: dict[str, int] = field(default_factory=dict)
+    """NaN or infinite."""
+    negative: dict[str, int] = field(default_factory=dict)
+    """Negative and set to 0: colours out of gamut, in files that are otherwise sound."""
+
+    def add(self, feature: str, values: Array, changed: NDArray[np.bool_]) -> None:
+        """Count values; ``changed`` is the mask of :func:`oiio_msspl.arrays.repair`."""
+        broken = int(np.count_nonzero(~np.isfinite(values)))
+        for counts, count in ((self.repaired, broken), (self.negative, int(np.count_nonzero(changed)) - broken)):
+            if count:
+                counts[feature] = counts.get(feature, 0) + count
 
 
 @dataclass
@@ -46,21 +66,29 @@ def read_tile(
     hr: ReadableRender,
     alignment: Alignment,
     features: Iterable[str],
-    repaired: dict[str, int],
+    counts: RepairCounts,
 ) -> TilePair:
     """Read both renders over a tile.
 
     Args:
         lrhs: features of the LRHS over ``grid``, see :func:`read_lrhs`.
         features: names of the HRLS's features to read.
-        repaired: numbers of repaired values of the HRLS by feature; those of the tile's core are added.
+        counts: repaired values of the HRLS; those of the tile's core are added.
     """
     scale = alignment.scale
     area, core = _in_hrls_pixels(tile.area, scale), _in_hrls_pixels(tile.core, scale)
     window = tile.area.slices(grid)
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},
-        hrls=read_features(hr, area, alignment.hr_data_window, features, counts=repaired, counted=core),
+        hrls=read_features(
+            hr,
+            area,
+            alignment.hr_data_window,
+            features,
+            mirrored_at=_in_hrls_pixels(alignment.grid, scale),
+            counts=counts,
+            counted=core,
+        ),
         scale=scale,
         lrhs_area=tile.area,
         hrls_area=area,
@@ -71,23 +99,22 @@ def read_tile(
 
 
 def read_lrhs(
-    lr: ReadableRender, alignment: Alignment, grid: Window, features: Iterable[str], repaired: dict[str, int]
+    lr: ReadableRender, alignment: Alignment, grid: Window, features: Iterable[str], counts: RepairCounts
 ) -> dict[str, Array]:
     """Read features of the LRHS over ``grid``, those that it has. Where an odd size was rounded, they are resampled.
 
     Args:
-        repaired: numbers of repaired values by feature are added here.
+        counts: repaired values are added here.
     """
     data = alignment.lr_data_window
     if alignment.stretch == (1.0, 1.0):
-        return read_features(lr, grid, data, features, counts=repaired, counted=grid)
-    layers = read_features(lr, data, data, features, counts=repaired, counted=data)
+        return read_features(lr, grid, data, features, mirrored_at=alignment.grid, counts=counts, counted=grid)
+    layers = read_features(lr, data, data, features, counts=counts, counted=data)
     stretch_x, stretch_y = alignment.stretch
-    for axis, first, last, stretch, origin in (
-        (0, grid.y0, grid.y1, stretch_y, data.y0),
-        (1, grid.x0, grid.x1, stretch_x, data.x0),
+    for axis, pixels, stretch, origin in zip(
+        (0, 1), _mirrored_pixels(grid, alignment.grid), (stretch_y, stretch_x), (data.y0, data.x0), strict=True
     ):
-        positions = (np.arange(first, last, dtype=np.float64) + 0.5) * stretch - 0.5 - origin
+        positions = (pixels.astype(np.float64) + 0.5) * stretch - 0.5 - origin
         layers = {name: interpolate(values, positions, axis) for name, values in layers.items()}
     return layers
 
@@ -98,30 +125,51 @@ def read_features(
     data_window: Window,
     features: Iterable[str] | None = None,
     *,
-    counts: dict[str, int] | None = None,
+    mirrored_at: Window | None = None,
+    counts: RepairCounts | None = None,
     counted: Window | None = None,
 ) -> dict[str, Array]:
-    """Read and repair features over a window. Outside the data window the nearest pixel is repeated.
+    """Read and repair features over a window. Beyond its end the picture is mirrored.
+
+    Repeating the last pixel would turn its noise into lines, which networks take for texture.
 
     Args:
-        window, data_window: both relative to the top left of the display window.
+        window, data_window: both relative to the top left of the display window, as all windows here.
         features: names of features; all if None. Those that the render lacks are left out.
-        counts: numbers of repaired values by feature; those inside ``counted`` are added, because overlaps are read
-            twice.
+        mirrored_at: where the picture ends, even if the render has more pixels; the data window if None. If the data
+            window ends before, the picture is mirrored there first. Both renders of a pair end at the border of the
+            same LRHS pixel, so that they show the same picture beyond it, too.
+        counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
     """
-    rows = np.clip(np.arange(window.y0, window.y1), data_window.y0, data_window.y1 - 1)
-    columns = np.clip(np.arange(window.x0, window.x1), data_window.x0, data_window.x1 - 1)
-    stored = Window(int(columns[0]), int(rows[0]), int(columns[-1]) + 1, int(rows[-1]) + 1)
+    rows, columns = _mirrored_pixels(window, mirrored_at or data_window)
+    rows = _mirrored(rows, data_window.y0, data_window.y1)
+    columns = _mirrored(columns, data_window.x0, data_window.x1)
+    stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
     layers = render.read(stored.shift(render.display_window.x0, render.display_window.y0), features)
     result = {}
     for name, values in layers.items():
         repaired, bad = repair(values, signed=name in SIGNED_FEATURES)
         if bad is not None and counts is not None and counted is not None:
-            changed = int(np.count_nonzero(bad[counted.intersect(stored).slices(stored)]))
-            counts[name] = counts.get(name, 0) + changed
-        repeated = (rows[:, None] - stored.y0, columns[None, :] - stored.x0)
-        result[name] = repaired if stored == window else repaired[repeated]
+            inside = counted.intersect(stored).slices(stored)
+            counts.add(name, values[inside], bad[inside])
+        result[name] = repaired if stored == window else repaired[rows - stored.y0].take(columns - stored.x0, axis=1)
     return result
+
+
+def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
+    """The rows and the columns of ``inside`` that a window shows if the picture is mirrored at the sides of
+    ``inside``."""
+    return (
+        _mirrored(np.arange(window.y0, window.y1), inside.y0, inside.y1),
+        _mirrored(np.arange(window.x0, window.x1), inside.x0, inside.x1),
+    )
+
+
+def _mirrored(pixels: Indices, start: int, stop: int) -> Indices:
+    """The pixels from ``start`` to ``stop`` that these indices show if the line is mirrored at both ends."""
+    length = stop - start
+    offsets = (pixels - start) % (2 * length)
+    return start + np.minimum(offsets, 2 * length - 1 - offsets)
 
 
 def _in_hrls_pixels(window: Window, scale: int) -> Window:

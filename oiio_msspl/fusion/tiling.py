@@ -1,9 +1,16 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Cuts a frame into overlapping tiles, so that memory depends on the tile and not on the frame."""
+"""Cuts a frame into overlapping tiles, so that memory depends on the tile and not on the frame.
+
+The tiles depend on the model and on the size of the frame alone. A network sees only a part of the frame in each tile,
+so other tiles would give slightly other pixels. Frames of one shot must not differ because machines have more or less
+memory.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+import itertools
+import math
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 from oiio_msspl.errors import InputError
@@ -16,10 +23,9 @@ MAX_MEMORY = 3 << 30
 FIXED_MEMORY = 350 << 20
 #: Share of the memory for decoded rows that neighbouring tiles read. ``bytes_per_pixel`` of a model leaves room for it.
 STRIPS_SHARE = 1 / 6
-#: HRLS pixels of the largest tile; larger ones are no faster.
-LARGEST_TILE = 2048 * 2048
-#: Shortest side of a tile's core, in LRHS pixels; smaller ones would spend nearly all work on the overlap.
-SMALLEST_CORE = 16
+#: Memory of a tile. It is as large as ``MAX_MEMORY`` allows beside an 8K frame. Other tiles give other pixels, so this
+#: does not depend on what the user allows.
+TILE_MEMORY = 1872 << 20
 
 
 @dataclass(frozen=True)
@@ -38,82 +44,75 @@ def aligned_grid(grid: Window, alignment: int) -> Window:
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
 
-def largest_tile(contract: Contract, frame_bytes: int, max_memory: int) -> int:
-    """LRHS pixels of the largest tile that fits into memory.
-
-    Args:
-        frame_bytes: memory for the whole frame: the result and the LRHS.
-        max_memory: memory for the whole process.
-
-    Returns:
-        0 or less if not even the frame fits.
-    """
-    left = max_memory - FIXED_MEMORY - frame_bytes
-    pixels = min(left // contract.bytes_per_pixel, LARGEST_TILE)
-    return int(pixels) // contract.scale**2
-
-
-def smallest_memory(grid: Window, contract: Contract, frame_bytes: int) -> int:
-    """Memory with which a frame can be fused: in the smallest tiles that :func:`plan_tiles` makes.
-
-    Args:
-        grid: LRHS pixels to cover.
-        frame_bytes: as for :func:`largest_tile`.
-    """
-    smallest = min(width * height for _, _, width, height in _cuts(grid, contract.overlap, contract.alignment))
-    return FIXED_MEMORY + frame_bytes + smallest * contract.scale**2 * contract.bytes_per_pixel
-
-
-def check_memory(needed: int, max_memory: int, hint: str = "") -> None:
-    """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else would help."""
-    if needed > max_memory:
-        tenths = -(-needed * 10 // 2**30)
-        raise InputError(f"--max-memory is too small for this frame; allow at least {tenths / 10:.1f}G{hint}")
-
-
-def plan_tiles(grid: Window, largest: int, overlap: int, alignment: int = 1) -> list[Tile]:
-    """Cover ``grid`` by tiles, row by row, whose area has at most ``largest`` LRHS pixels.
+def plan_tiles(grid: Window, contract: Contract) -> list[Tile]:
+    """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
     There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
-    ``overlap`` and the sides of the grid are multiples of ``alignment``. So are the sides and offsets of all tiles, so
-    that a network that works on blocks of pixels divides a tile as it divides the frame.
-
-    Raises:
-        InputError: ``largest`` is too small for a core.
+    The offsets of all tiles are multiples of the model's tile alignment, so that a network that works on blocks of
+    pixels divides a tile as it divides the frame.
     """
-    fitting = (cut for cut in _cuts(grid, overlap, alignment) if cut[2] * cut[3] <= largest)
-    width, height, _, _ = next(fitting, (0, 0, 0, 0))
-    if not width:
-        raise InputError(f"--max-memory is too small: no tile of {grid.size} low-resolution pixels fits; raise it")
-    columns, rows = _ranges(grid.x0, grid.x1, width), _ranges(grid.y0, grid.y1, height)
+    alignment = contract.tile_alignment
+    overlap = -(-contract.overlap // alignment) * alignment
+    largest = TILE_MEMORY // (contract.bytes_per_pixel * contract.scale**2)
+    # The fewest pixels that are computed, in the fewest tiles; where even the smallest tile is too large, that one.
+    columns, rows = min(
+        itertools.product(_splits(grid.x0, grid.x1, overlap, alignment), _splits(grid.y0, grid.y1, overlap, alignment)),
+        key=lambda split: (
+            max(1.0, split[0].largest * split[1].largest / largest),
+            split[0].computed * split[1].computed,
+            len(split[0].cores) * len(split[1].cores),
+        ),
+    )
     return [
         Tile(Window(x0, y0, x1, y1), Window(x0 - overlap, y0 - overlap, x1 + overlap, y1 + overlap).intersect(grid))
-        for y0, y1 in rows
-        for x0, x1 in columns
+        for y0, y1 in rows.cores
+        for x0, x1 in columns.cores
     ]
 
 
-def _cuts(grid: Window, overlap: int, alignment: int) -> Iterator[tuple[int, int, int, int]]:
-    """Ways to cut a grid into more and more tiles: width and height of a core, and of a tile's area.
+def check_memory(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, max_memory: int) -> None:
+    """Check that the largest of the tiles fits into memory.
 
-    The longer side is cut first, so tiles are nearly square.
+    Args:
+        frame_bytes: memory for the whole frame: the result, the LRHS, and what the caller holds.
+        max_memory: memory for the whole process.
+
+    Raises:
+        InputError: it does not fit.
     """
-    nx = ny = 1
-    while True:
-        width, height = _step(grid.width, nx, alignment), _step(grid.height, ny, alignment)
-        yield width, height, width + (2 * overlap if nx > 1 else 0), height + (2 * overlap if ny > 1 else 0)
-        if min(width, height) < max(SMALLEST_CORE, alignment + 1):
-            return
-        if width >= height:
-            nx += 1
-        else:
-            ny += 1
+    require_memory(memory_for_tiles(contract, tiles, frame_bytes), contract, max_memory)
 
 
-def _step(side: int, count: int, alignment: int) -> int:
-    """The smallest multiple of ``alignment`` with which ``count`` steps cover a side."""
-    return -(-side // (count * alignment)) * alignment
+def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int) -> int:
+    """Memory with which a frame can be fused in these tiles; ``frame_bytes`` as for :func:`check_memory`."""
+    pixels = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
+    return FIXED_MEMORY + frame_bytes + pixels * contract.bytes_per_pixel
 
 
-def _ranges(start: int, end: int, step: int) -> list[tuple[int, int]]:
-    return [(a, min(a + step, end)) for a in range(start, end, step)]
+def require_memory(needed: int, contract: Contract, max_memory: int, hint: str = "") -> None:
+    """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else would help."""
+    if needed > max_memory:
+        raise InputError(
+            f"--max-memory: this frame needs more with model {contract.name}; allow at least "
+            f"{math.ceil(needed / 2**30 * 10) / 10:.1f}G{hint}"
+        )
+
+
+@dataclass(frozen=True)
+class _Split:
+    """A side of the grid, cut into ranges of pixels."""
+
+    cores: list[tuple[int, int]]
+    largest: int
+    """Length of the longest range with its overlap."""
+    computed: int
+    """Length of all ranges with their overlap."""
+
+
+def _splits(start: int, end: int, overlap: int, alignment: int) -> Iterator[_Split]:
+    """All ways to cut a side into equal steps that are multiples of ``alignment``; the last one may be shorter."""
+    units = -(-(end - start) // alignment)
+    for step in sorted({-(-units // count) * alignment for count in range(1, units + 1)}):
+        cores = [(a, min(a + step, end)) for a in range(start, end, step)]
+        lengths = [min(b + overlap, end) - max(a - overlap, start) for a, b in cores]
+        yield _Split(cores, max(lengths), sum(lengths))

@@ -47,7 +47,7 @@ def connect(scheduler: str) -> Client:
     try:
         from dask.distributed import Client
     except ImportError as error:
-        raise InputError("--scheduler needs Dask: pip install 'oiio-msspl[farm]'") from error
+        raise InputError("--scheduler needs Dask: pip install 'dask[distributed]'") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks repeat our messages
     try:
         return Client(scheduler_file=scheduler) if Path(scheduler).is_file() else Client(scheduler)
@@ -159,9 +159,7 @@ def _fuse_frame(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict
     # skip_existing lets this frame replace the preview that a dead worker left without its EXR.
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
     try:
-        loaded = stages.read(frame)
-        report, fused = stages.fuse(loaded, stages.session(loaded))
-        stages.write(report, fused)
+        report = stages.run(frame)
     except InputError as error:
         # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
         replaces = stages.replaces(frame.lr, frame.hr, frame.output)

@@ -10,13 +10,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
-from oiio_msspl.exr.contents import dropped_channels
+from oiio_msspl.exr.contents import dropped_channels, widest_type
 from oiio_msspl.exr.preview import check_view, old_preview, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.write_options import WriteOptions
@@ -24,7 +27,7 @@ from oiio_msspl.exr.writer import bytes_held, write_fused
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
 from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, check_memory
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, require_memory
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY, find_model
 from oiio_msspl.model.session import Session
@@ -112,24 +115,24 @@ def memory_to_write(alignment: Alignment, hr: MappedRender, write: WriteOptions)
 
 
 def check_frame_memory(
-    lr: MappedRender, hr: MappedRender, session: Session, write: WriteOptions, max_memory: int, reserved: int = 0
+    lr: MappedRender, hr: MappedRender, session: Session, write: WriteOptions, max_memory: int, held: int = 0
 ) -> None:
     """Refuse a pair that does not fit into memory, before its pixels are read.
 
     Args:
         lr, hr, session, write: what is fused and how it is written.
         max_memory: bytes that the process should stay below.
-        reserved: bytes of these that other frames need.
+        held: bytes of these that other frames need.
 
     Raises:
         InputError: it does not fit. The message says how much does.
     """
     alignment = align(lr, hr)
-    to_fuse = memory_to_fuse(lr, alignment, session, error=write.error_layer)
+    to_fuse = memory_to_fuse(alignment, session, error=write.error_layer)
     to_write = memory_to_write(alignment, hr, write)
-    only_layout = write.layout == "multilayer" and to_fuse + reserved <= max_memory
+    only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
     hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""
-    check_memory(max(to_fuse, to_write) + reserved, max_memory, hint)
+    require_memory(max(to_fuse, to_write) + held, session.contract, max_memory, hint)
 
 
 def fuse_files(
@@ -159,7 +162,7 @@ def fuse_files(
             :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.session.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
-        max_memory: bytes that the process should stay below; tiles shrink to fit.
+        max_memory: bytes that the process should stay below. The result does not depend on it.
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
@@ -213,13 +216,20 @@ def fuse_files(
 def write_frame(
     report: FrameReport, fused: FusedFrame, options: WriteOptions, *, overwrite: bool, cache_bytes: int = 0
 ) -> None:
-    """Write the EXR that the report names, and add the writer's warnings to the report.
+    """Write the EXR that the report names. The number of clipped values and the writer's warnings are added to the
+    report.
 
     A preview that shows the EXR that is replaced is deleted, because the new one may fail or may not be wanted.
 
     Args:
         cache_bytes: see :func:`oiio_msspl.exr.writer.write_fused`.
     """
+    if (options.pixel_type or widest_type(report.hr.beauty_channels)) == "half":
+        report.clipped = int(np.count_nonzero(fused.rgb > HALF_MAX))
+    if report.clipped:
+        report.warnings.append(
+            f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
+        )
     report.warnings += write_fused(
         report.output,
         report.hr.file,

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from oiio_msspl._version import __version__
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
@@ -28,7 +28,9 @@ class FrameReport:
     preview: Path | None
     """The PNG beside the EXR; None if none was written."""
     repaired: dict[str, int]
-    """Number of repaired values by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
+    """Number of values that were NaN or infinite, by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
+    negative: dict[str, int]
+    """The same of values that were negative and set to 0."""
     warnings: list[str]
     tiles: int
     seconds: dict[str, float]
@@ -36,6 +38,8 @@ class FrameReport:
     ``network`` is the part of ``fuse`` that the model's network took, and ``write`` writes EXR and preview."""
     features: frozenset[str]
     """Features of the HRLS that the model reads."""
+    clipped: int = 0
+    """Number of fused values that half could not hold; 0 if the beauty is stored as float."""
     lrhs_aovs: tuple[str, ...] = ()
     """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
 
@@ -47,16 +51,8 @@ class FrameReport:
         return self.lr.spp / self.scale**2 + self.hr.spp
 
     def aovs(self) -> list[dict[str, str]]:
-        """The rows of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` for the HRLS.
-
-        A feature that the model does not read has the status ``unused``.
-        """
-        rows = self.hr.table()
-        for row in rows:
-            if row["feature"] not in {*self.features, "alpha"}:
-                row |= {"source": ""} if row["status"] == "default" else {}
-                row |= {"status": "unused"}
-        return rows
+        """The rows of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` for the HRLS."""
+        return self.hr.table(self.features)
 
     def found_lrhs_aovs(self) -> dict[str, str]:
         """The features of ``lrhs_aovs`` that the LRHS has, with the layer of each."""
@@ -71,6 +67,7 @@ class FrameReport:
             "preview": str(self.preview) if self.preview else None,
             "renderer": self.hr.renderer,
             "view": self.hr.view or None,
+            "other_views": self.hr.other_views,
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
@@ -79,6 +76,8 @@ class FrameReport:
             "lrhs_aovs": self.found_lrhs_aovs(),
             "notes": self.hr.notes,
             "repaired": self.repaired,
+            "negative": self.negative,
+            "clipped": self.clipped,
             "warnings": self.warnings,
             "tiles": self.tiles,
             "seconds": {k: round(v, 3) for k, v in self.seconds.items()},
@@ -99,6 +98,7 @@ def report_on(
         output=output,
         preview=preview_path,
         repaired=fused.repaired,
+        negative=fused.negative,
         warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings],
         tiles=fused.tiles,
         seconds={},
@@ -133,5 +133,5 @@ def provenance(report: FrameReport) -> dict[str, str]:
         "msspl/spp_lrhs": "unknown" if report.lr.spp is None else f"{report.lr.spp:g}",
         "msspl/spp_hrls": "unknown" if report.hr.spp is None else f"{report.hr.spp:g}",
         "msspl/spp_average": "unknown" if spp is None else f"{spp:g}",
-        "msspl/aovs": "; ".join(f"{row['feature']}: {row['status']} {row['source']}".strip() for row in report.aovs()),
+        "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
     }

@@ -30,7 +30,7 @@ class FrameResult:
     """0, 2 for the caller's mistake, or 1 for any other failure."""
     warnings: list[str] = field(default_factory=list)
     repaired: dict[str, int] = field(default_factory=dict)
-    """Number of repaired values by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
+    """Number of values that were NaN or infinite, by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
     seconds: dict[str, float] = field(default_factory=dict)
     """As in :class:`oiio_msspl.jobs.report.FrameReport`. Neighbouring frames overlap in time."""
     lrhs: str | None = None
@@ -108,7 +108,7 @@ def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport)
     first = report.first = report.first or {"frame": frame.number, **frame_report}
     warnings = list(frame_report["warnings"])
     if frame_report["repaired"]:
-        warnings.append(f"repaired values that were NaN, infinite or negative in {', '.join(frame_report['repaired'])}")
+        warnings.append(f"repaired values that were NaN or infinite in {', '.join(frame_report['repaired'])}")
     first_status = {row["feature"]: row["status"] for row in first["aovs"]}
     words = {"default": "not found", "absent": "not found"}
     for row in frame_report["aovs"]:

@@ -18,7 +18,7 @@ from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.jobs.frame import (
     InputOptions,
     check_frame_memory,
@@ -73,6 +73,17 @@ class Stages:
     sessions: dict[Path, Session] = field(default_factory=dict)
     """Models that are loaded, by file."""
 
+    def run(self, frame: Frame) -> FrameReport:
+        """Take a frame through all stages, one after the other.
+
+        Raises:
+            InputError, MssplError: see the stages.
+        """
+        loaded = self.read(frame)
+        report, fused = self.fuse(loaded, self.session(loaded))
+        self.write(report, fused)
+        return report
+
     def skips(self, frame: Frame) -> bool:
         """Whether a frame counts as done: its EXR exists, and with ``update`` none of its inputs is newer."""
         if not (self.skip_existing and frame.output.exists()):
@@ -92,7 +103,7 @@ class Stages:
         return [path for path in files if path.is_file() and path.stat().st_mtime > written]
 
     def read(self, frame: Frame) -> LoadedFrame:
-        """Open and map a pair, and read its pixels if two frames fit into half of the memory.
+        """Open and map a pair, and read its pixels if two frames fit into memory beside a tile.
 
         Raises:
             InputError: a file can't be used, or the two renders don't fit together.
@@ -103,7 +114,9 @@ class Stages:
         targets = [frame.output, frame.output.with_suffix(".png")] if self.previews else [frame.output]
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
-        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= (self.max_memory - FIXED_MEMORY) // 2:
+        result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
+        left = self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr)
+        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= left:
             return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start)
         return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start)
 
@@ -135,7 +148,7 @@ class Stages:
             session,
             error=self.write_options.error_layer,
             max_memory=self.max_memory,
-            reserved=others,
+            held=others,
         )
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)

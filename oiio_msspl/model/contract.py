@@ -8,6 +8,7 @@ refused, so training and inference cannot disagree on scale, channel order, enco
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -26,6 +27,8 @@ SCALES = (2, 4, 8)
 #: Values of ``Contract.denoiser``: none; the denoiser of both renders' mean
 #: (:class:`oiio_msspl.model.mean_denoiser.MeanDenoiser`).
 NO_DENOISER, MEAN_DENOISER = "", "mean"
+#: The network of ``MEAN_DENOISER`` works on blocks of this many LRHS pixels.
+MEAN_DENOISER_ALIGNMENT = 16
 #: Channels of the denoised mean, behind the LRHS's own.
 DENOISED_FEATURES: dict[str, int] = {"denoised": 3}
 
@@ -72,7 +75,8 @@ class Contract:
     """LRHS pixels that a tile adds to its core on each side, a multiple of ``alignment``. Measured by training: the
     part of the receptive field that changes results."""
     bytes_per_pixel: int = 1000
-    """Peak memory of a tile for each of its HRLS pixels, rounded up. It limits the size of tiles."""
+    """Peak memory of a tile for each of its HRLS pixels, rounded up. The size of tiles follows from it, so other values
+    change the result a little."""
     lrhs: list[str] = field(default_factory=lambda: channel_names(LRHS_FEATURES))
     """Channels of the ``lrhs`` input, in order."""
     hrls: list[str] = field(default_factory=lambda: channel_names(HRLS_FEATURES))
@@ -88,6 +92,11 @@ class Contract:
     provenance: dict[str, Any] = field(default_factory=dict)
     """How the weights were made: data, steps, loss, seed, date, code version."""
     format: int = FORMAT
+
+    @property
+    def tile_alignment(self) -> int:
+        """Tiles begin at multiples of this many LRHS pixels, so that all networks divide them as the whole frame."""
+        return math.lcm(self.alignment, MEAN_DENOISER_ALIGNMENT if self.denoiser == MEAN_DENOISER else 1)
 
     @property
     def features(self) -> dict[str, int]:

@@ -23,6 +23,8 @@ MU = 16.0
 MAX_RADIANCE = HALF_MAX
 #: Largest albedo; glass and wrong materials exceed 1.
 MAX_ALBEDO = 2.0
+#: Bounds of the exposure: with these, it is a finite float32, and so is ``MAX_RADIANCE`` divided by it.
+EXPOSURE_BOUNDS = (2e-34, 1e38)
 #: Pixels darker than this share of a frame's bright pixels (33 stops below) do not count for its exposure.
 NO_LIGHT = 1e-10
 
@@ -41,7 +43,7 @@ def find_exposure(rgb: Array) -> float:
         rgb: (height, width, 3), scene linear, repaired.
 
     Returns:
-        The factor; 1.0 for a black render.
+        The factor, within ``EXPOSURE_BOUNDS``; 1.0 for a black render.
     """
     y = luminance(rgb).astype(np.float64)
     lit = y[y > 0]
@@ -49,7 +51,7 @@ def find_exposure(rgb: Array) -> float:
         return 1.0
     lit = lit[lit >= NO_LIGHT * np.quantile(lit, 0.99)]
     offset = 1e-4 * float(np.median(lit))
-    return float(KEY / np.exp(np.mean(np.log(lit + offset))))
+    return float(np.clip(KEY / np.exp(np.mean(np.log(lit + offset))), *EXPOSURE_BOUNDS))
 
 
 def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) -> Array:
@@ -61,7 +63,8 @@ def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) 
     """
 
     def encode(values: Array) -> None:
-        values *= np.float32(exposure)
+        with np.errstate(over="ignore"):  # what overflows is clipped
+            values *= np.float32(exposure)
         np.clip(values, 0.0, MAX_RADIANCE, out=values)
         values *= np.float32(MU)
         np.log1p(values, out=values)

@@ -6,8 +6,8 @@ from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
-from tests.aovs.renders import H, W, layer, mapped, plane
-from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
+from tests.aovs.renders import H, W, found, layer, mapped, plane
+from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
 
 
 @pytest.mark.parametrize(
@@ -53,16 +53,27 @@ def test_cycles_layers_add_up_to_the_beauty():
 def test_the_table_says_what_each_feature_is_read_from(tmp_path):
     channels = layer("", 1, "RGBA") | layer("denoise_albedo", 2) | layer("diffuse_direct", 3)
     render = mapped(tmp_path, channels | layer("diffuse_indirect", 4))
-    rows = {row["feature"]: (row["status"], row["source"]) for row in render.table()}
+    rows = {
+        row["feature"]: (row["status"], row["source"])
+        for row in render.table({"rgb", "albedo", "normal", "diffuse", "specular"})
+    }
     assert rows == {
         "rgb": ("found", "R G B"),
         "albedo": ("found", "denoise_albedo"),
-        "normal": ("default", "none found (optional)"),
+        "normal": ("default", ""),
         "diffuse": ("computed", "diffuse_direct + diffuse_indirect"),
-        "specular": ("default", "none found (optional)"),
-        "variance": ("default", "none found (optional)"),
+        "specular": ("default", ""),
+        "variance": ("unused", ""),
         "alpha": ("found", "A"),
     }
+
+
+def test_layers_of_another_view_are_told_apart(tmp_path):
+    """In a stereo file, the albedo of the left eye is read and that of the right eye is passed through."""
+    channels = layer("", 1) | layer("albedo", 2) | layer("right", 3) | layer("albedo.right", 4)
+    render = mapped(tmp_path, channels, attributes={"multiView": ["left", "right"]})
+    assert (render.view, found(render)["albedo"]) == ("left", "albedo")
+    assert render.unread_layers() == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
 
 
 def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):
@@ -91,6 +102,17 @@ def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):
     np.testing.assert_array_equal(loaded.layers["rgb"], values)
 
 
+def test_features_of_neighbouring_channels_are_not_copied(tmp_path):
+    """Each channel is contiguous, as the network wants it, whatever the order of the file."""
+    values = picture(H, W)
+    path = write_exr(tmp_path / "hr.exr", rgb(values) | rgb(values * 2, "albedo.") | {"Z": values[..., 0]})
+    features = map_render(open_exr(path)).read(Window(0, 0, W, H), ["albedo", "rgb"])
+    assert features["rgb"].base is features["albedo"].base is not None
+    for feature, factor in (("rgb", 1), ("albedo", 2)):
+        assert features[feature].transpose(2, 0, 1).flags.c_contiguous
+        np.testing.assert_array_equal(features[feature], values * factor)
+
+
 def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_path):
     """Whoever reads tiles asks both kinds of render in the same way."""
     render = mapped(tmp_path, layer("", 1))
@@ -98,3 +120,9 @@ def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_pat
         with readable.cache_strips(10**6):
             first, second = (readable.read(Window(x, 0, x + 4, H), ["rgb"])["rgb"] for x in (0, 4))
         np.testing.assert_array_equal(first, second)
+
+
+def test_the_users_spp_win_over_the_headers():
+    file = open_exr(EXAMPLES / "hr.exr")
+    assert map_render(file).spp == 1
+    assert map_render(file, spp=7).spp == 7

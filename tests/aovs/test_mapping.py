@@ -32,6 +32,7 @@ def test_mistakes_in_a_mapping_file_are_named(tmp_path, text, message):
 def test_files_that_a_mapping_names_do_not_depend_on_the_working_directory(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert parse_map_options(["albedo=a/b.exr"]) == {"albedo": f"file:{tmp_path}/a/b.exr"}
+    assert parse_map_options(["albedo=a/b.exr:Layer 1"]) == {"albedo": f"file:{tmp_path}/a/b.exr:Layer 1"}
     (tmp_path / "maps").mkdir()
     (tmp_path / "maps/map.toml").write_text('albedo = "file:b.exr"\ndiffuse = { sum = ["file:DIRECT", "file:/c.exr"] }')
     assert read_map_file("maps/map.toml") == {

@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from benchmarks import chart, paper, quality, results, scenes, tables
+from benchmarks import chart, paper, peers, quality, results, scenes, tables
 from datagen import views
 from oiio_msspl import Render
 from oiio_msspl.model.encoding import find_exposure
@@ -108,6 +108,22 @@ def test_quality_measures_only_the_methods_that_are_asked_for(tmp_path, bilinear
     assert quality.load_models([str(bilinear_models[4])], "OIDN*") == []
     (session,) = quality.load_models([str(bilinear_models[4])], "*, 3:1")
     assert session.contract.scale == 4
+
+
+def test_peers_get_all_layers_that_they_can_read(monkeypatch):
+    """Both calls of OIDN get the albedo and the normal; without an albedo it takes no normal."""
+    layers = {name: picture(32, 32) for name in ("rgb", "albedo", "normal", "diffuse")}
+    given = []
+    for call in ("denoise", "denoise_prefiltered"):
+        monkeypatch.setattr(peers, call, lambda **images: given.append(images))
+    for names in (layers, ("rgb", "normal"), ("rgb", "albedo")):
+        render = Render.from_arrays("hr", **{name: layers[name] for name in names})
+        peers.oidn(render)
+        peers.oidn_prefiltered(render)
+    for plain, prefiltered in zip(given[::2], given[1::2], strict=True):
+        assert plain.pop("quality") == "high"
+        assert plain.keys() == prefiltered.keys()
+    assert [set(images) for images in given[::2]] == [{"color", "albedo", "normal"}, {"color"}, {"color", "albedo"}]
 
 
 def test_prefiltering_helps_where_the_auxiliary_layers_are_noisy():

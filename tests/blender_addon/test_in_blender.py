@@ -100,19 +100,25 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
         "runpy.run_path(sys.argv[4], run_name='__main__')\n"
     )
     blender.chmod(0o755)
-    options = ["-s", "2", "--lr-spp", "8", "--view-layer", "ViewLayer", "--keep", "--compare", "--json"]
+    options = ["-s", "2", "--hr-spp", "4", "--view-layer", "ViewLayer", "--keep", "--compare", "--json"]
+    options += ["--model", "pyramid", "--error-layer"]
     frames = ["--frames", "3-4", "-o", out / "out.##.exr"]
     done = msspl_render(results / "scene.blend", "--blender", blender, *options, *frames)
     assert done.returncode == 0, done.stderr
     reports = json.loads(done.stdout)
     assert [report["frame"] for report in reports] == [3, 4]
     for report in reports:
-        assert (report["lrhs"]["size"], report["lrhs"]["spp"]) == ([51, 38], 8)
-        assert (report["hrls"]["size"], report["hrls"]["spp"]) == ([101, 75], 1)
+        # The LRHS gets a third of the HRLS's samples: 4/3 x 2 x 2 per pixel, rounded up. Nothing warns of it.
+        assert (report["lrhs"]["size"], report["lrhs"]["spp"]) == ([51, 38], 6)
+        assert (report["hrls"]["size"], report["hrls"]["spp"]) == ([101, 75], 4)
+        assert not [warning for warning in report["warnings"] if "spp" in warning]
         stages = report["lrhs"]["seconds"], report["hrls"]["seconds"], report["fuse_seconds"]
         assert report["seconds"] == pytest.approx(sum(stages))
         assert report["plain_spp"] > 3
         assert report["oidn"]["spp"] >= 1
+    written = open_exr(out / "out.03.exr")
+    assert written.metadata["msspl/model"] == "pyramid-x2"
+    assert "error.Y" in [channel.name for channel in written.parts[0].channels]
     names = [f"out.{n}{suffix}.exr" for n in ("03", "04") for suffix in ("", "_hr", "_lr", "_oidn")]
     assert sorted(p.name for p in out.iterdir()) == sorted(names)
     for name, components in (("CryptoObject00", "rgba"), ("Mist", "Z"), ("Combined_key", "RGB"), ("Matte", "RGB")):
@@ -125,7 +131,7 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["-s", "2"], "2 view layers are on (ViewLayer, Other.1); name the one to render"),
+        (["-s", "2"], "2 view layers are on (ViewLayer, Other.1); choose one with --view-layer NAME"),
         (["--view-layer", "Third"], "has no view layer 'Third'; it has ViewLayer, Other.1"),
     ],
 )

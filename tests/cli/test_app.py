@@ -43,9 +43,9 @@ SHOWN = {
         15,
     ),
     "msspl_render": (
-        "--blender --scale --lr-spp --hr-spp --output --compare --overwrite --json --frames --skip-existing --help "
-        "--help-all",
-        7,
+        "--view-layer --blender --scale --lr-spp --hr-spp --model --device --output --layout --error-layer --compare "
+        "--overwrite --json --frames --skip-existing --help --help-all",
+        6,
     ),
 }
 
@@ -68,7 +68,7 @@ def test_help_shows_everyday_options_in_groups_and_help_all_shows_all(program):
         "Arguments",
         "Options",
         "Input",
-        *(["Model"] if program == "msspl_fuse" else []),
+        "Model",
         "Output",
         "Shot",
     ]

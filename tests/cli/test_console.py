@@ -25,12 +25,12 @@ def test_a_piped_table_is_plain_text(capsys):
 @pytest.mark.parametrize(
     ("row", "text"),
     [
-        (("albedo", "default", ""), "none found: expect blur; render an albedo, or name it with --map albedo=LAYER"),
-        (("variance", "default", ""), "none found (optional)"),
+        (("albedo", "default", ""), "none: expect blur, render an albedo (or name it with --map albedo=LAYER)"),
+        (("variance", "default", ""), "none (optional)"),
         (("normal", "found", "N"), "found: N"),
         (("diffuse", "computed", "a + b"), "computed: a + b (scaled)"),
         (("variance", "unused", "v"), "found: v; this model does not read it"),
-        (("variance", "unused", ""), "none found; this model does not read it"),
+        (("variance", "unused", ""), "none; this model does not read it"),
         (("alpha", "absent", ""), "none"),
     ],
 )

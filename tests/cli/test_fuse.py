@@ -14,7 +14,7 @@ import pytest
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
-from tests.conftest import EXAMPLES
+from tests.conftest import EXAMPLES, picture, rgb, write_exr
 from tests.programs import fuse
 
 
@@ -22,7 +22,7 @@ def test_the_main_job(files, bilinear_models):
     done = fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4])
     assert done.returncode == 0, done.stderr
     assert "albedo    found: albedo\n" in done.stdout
-    assert "variance  none found (optional)\n" in done.stdout
+    assert "variance  none (optional)\n" in done.stdout
     timing = r"Fused with bilinear-x4 on the CPU in \d+\.\d s \(\d\.\d s loading, \d\.\d s fusing, \d\.\d s writing\)\."
     assert re.search(timing, done.stdout), done.stdout
     assert done.stderr == ""
@@ -146,6 +146,30 @@ def test_opencolorio_views_of_the_preview(files, bilinear_models):
         pictures.append(np.asarray(oiio.ImageBuf(str(files / "out.png")).get_pixels(oiio.UINT8)).astype(int))
     assert np.abs(pictures[0] - pictures[1]).max() <= 2  # the paper's curve is sRGB, clipped at white
     assert np.abs(pictures[0] - pictures[2]).mean() > 5
+
+
+def test_a_stereo_pair_says_whose_layers_are_read(tmp_path, bilinear_models):
+    """The view that is fused, the others, and negative values apart from broken ones."""
+    for name, size in (("lr", (24, 32)), ("hr", (96, 128))):
+        left, right = picture(*size), picture(*size) * 2
+        left[0, 0], left[0, 1, 0] = -0.1, np.nan
+        write_exr(tmp_path / f"{name}.exr", rgb(left) | rgb(right, "right."), multiView=["left", "right"])
+    options = ("--model", bilinear_models[4], "--no-preview", "-o", tmp_path / "out.exr")
+    done = fuse(tmp_path / "lr.exr", tmp_path / "hr.exr", *options)
+    assert done.stdout.startswith("Pair at x4, view left (also there: right; --view-layer)\n"), done.stderr
+    assert "Repaired values that were NaN or infinite: 1 in lrhs.rgb, 1 in hrls.rgb\n" in done.stdout
+    assert "Set negative values to 0 (colours out of gamut): 3 in lrhs.rgb, 3 in hrls.rgb\n" in done.stdout
+    assert open_exr(tmp_path / "out.exr").metadata["msspl/aovs"].endswith("variance: none (optional); alpha: none")
+
+
+@pytest.mark.parametrize("pattern", ["crypto*", "CRYPTO*", "viewlayer.crypto*", "*Crypto*"])
+def test_layers_of_the_example_are_chosen_by_any_spelling(tmp_path, bilinear_models, pattern):
+    """The example's layers are called ViewLayer.CryptoObject00 and so on."""
+    options = ("--model", bilinear_models[4], "--no-preview", "--layers", pattern)
+    done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr", *options)
+    assert done.returncode == 0, done.stderr
+    names = {channel.name.split(".")[1] for part in open_exr(tmp_path / "out.exr").parts for channel in part.channels}
+    assert names == {"Combined", "CryptoObject00"}
 
 
 def test_the_readmes_first_command_shows_a_result(tmp_path):

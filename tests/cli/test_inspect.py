@@ -20,6 +20,30 @@ def test_inspect_tells_a_person_and_a_machine(files):
     assert data["parts"][0]["channels"]["mask.X"] == "half"
 
 
+def test_inspect_says_what_the_model_does_not_read(files):
+    """joint reads colour, albedo and normal; paper reads diffuse, specular and variance, too."""
+    channels = rgb(picture(8, 8)) | rgb(picture(8, 8), "diffuse.") | {"variance.Y": picture(8, 8)[..., 0]}
+    write_exr(files / "more.exr", channels)
+    said = {model: run("msspl", "inspect", files / "more.exr", "--model", model).stdout for model in ("joint", "paper")}
+    assert "  what joint would read:\n" in said["joint"]
+    assert "diffuse   found: diffuse; this model does not read it\n" in said["joint"]
+    assert "variance  found: variance; this model does not read it\n" in said["joint"]
+    assert "diffuse   found: diffuse\n" in said["paper"]
+    assert "specular  none (optional)\n" in said["paper"]
+    for text in said.values():
+        assert "albedo    none: expect blur, render an albedo (or name it with --map albedo=LAYER)\n" in text
+
+
+def test_inspect_counts_negatives_apart(files):
+    values = picture(8, 8)
+    values[0, :3, 0], values[1, 0, 1], values[1, 1, 1] = -0.01, np.nan, -np.inf
+    write_exr(files / "odd.exr", rgb(values) | rgb(-np.ones((8, 8, 3), np.float32), "N."))
+    done = run("msspl", "inspect", files / "odd.exr")
+    assert "rgb: 2 values are NaN or infinite; fusing repairs them\n" in done.stdout
+    assert "rgb: 3 values are negative (colours out of gamut); fusing sets them to 0\n" in done.stdout
+    assert "normal: " not in done.stdout
+
+
 def test_inspect_explains_what_cannot_be_used(files):
     write_exr(files / "black.exr", rgb(np.zeros((8, 8, 3), np.float32)) | rgb(picture(8, 8), "albedo."))
     done = run("msspl", "inspect", files / "black.exr")

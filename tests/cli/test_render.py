@@ -4,6 +4,7 @@
 import json
 import os
 import re
+import shutil
 import signal
 import subprocess
 import sys
@@ -16,6 +17,8 @@ from msspl_cli.commands.render import name_targets
 from msspl_cli.installed import shipped_folder
 
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import open_exr
+from tests.conftest import EXAMPLES
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
 
@@ -114,7 +117,47 @@ def test_options_reach_blender_and_times_are_printed(farm):
         **{"scale": 8, "hr_spp": 2, "lr_spp": 0, "filter": "SCENE", "view_layer": "", "threads": 3}
     }
     assert job["frames"] == [[7, str(folder / "out.exr")]]
-    assert Path(job["program"]).stem == "msspl-fuse"
+
+
+#: In place of rendering: has the example pair fused, then spoils the model's file.
+ASKS = (
+    f"tell(fuse=dict(lrhs={str(EXAMPLES / 'lr.exr')!r}, hrls=os.environ.get('HR', {str(EXAMPLES / 'hr.exr')!r}), "
+    "output=output)); "
+    "answer = json.loads(sys.stdin.readline() or sys.exit(1)); "
+    "Path(os.environ['MODEL']).write_text('spoilt'); "
+    "take = dict(name='LRHS', size=[16, 9], spp=16, seconds=1.0, file=None); "
+    "tell(report=dict(frame=number, output=output, lrhs=take, hrls=take, fuse_seconds=0.5, seconds=2.5, "
+    "plain_spp=2.25, warnings=answer['warnings'])); continue"
+)
+
+
+@pytest.fixture
+def model(bilinear_models, tmp_path, monkeypatch):
+    """A copy of a model, which ASKS spoils."""
+    path = tmp_path.parent / f"{tmp_path.name}.onnx"
+    shutil.copy(bilinear_models[4], path)
+    monkeypatch.setenv("MODEL", str(path))
+    return str(path)
+
+
+@posix
+def test_frames_are_fused_here_with_the_options_of_msspl_fuse_and_a_model_that_stays_loaded(farm, model):
+    _, run, folder = farm
+    options = ["--model", model, "--device", "cpu", "--layout", "nuke", "--error-layer"]
+    code, _, err, left = run("-o", "out.##.exr", "--frames", "1-2", *options, code=ASKS)
+    assert (code, err, left) == (0, "", ["out.01.exr", "out.02.exr"])
+    for name in left:
+        parts = open_exr(folder / name).parts
+        assert [part.name for part in parts[:2]] == ["rgba", "error"]
+        assert parts[0].spec.getattribute("msspl/model") == "bilinear-x4"
+
+
+@posix
+def test_a_frame_that_cannot_be_fused_ends_the_shot_with_its_sentence(farm, model, monkeypatch):
+    monkeypatch.setenv("HR", "/nothing/hr.exr")
+    _, run, _ = farm
+    code, _, err, left = run("-o", "out.##.exr", "--frames", "1-2", "--model", model, code=ASKS)
+    assert (code, err, left) == (2, "error: frame 1: /nothing/hr.exr: no such file\n", [])
 
 
 @posix
@@ -141,6 +184,10 @@ def test_a_shot_and_a_report_for_machines(farm):
         (["-o", "no/where/x.##.exr", "--frames", "1"], "", 2, "the folder no does not exist"),
         (["--overwrite", "--skip-existing"], "", 2, "exclude each other"),
         (["--blender", "nothing"], "", 2, "--blender nothing: no such program"),
+        (["--model", "nothing"], "", 2, "no model 'nothing'"),
+        (["--device", "abacus"], "", 2, "--device 'abacus': use one of cpu"),
+        (["--layout", "x"], "", 2, "--layout 'x': use one of spec"),
+        (["--model", "paper", "--error-layer"], "", 2, "paper-x4 does not predict its error"),
     ],
 )
 def test_what_goes_wrong_is_one_sentence_and_a_code(farm, arguments, code, status, message):

@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.layers import layers_of, matches_layer
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import write_exr
 
@@ -72,3 +72,36 @@ def test_colours_and_vectors_are_triples_and_a_single_channel_is_a_scalar(tmp_pa
     assert [c.name for c in layers["v"].triple()] == ["v.X", "v.Y", "v.Z"]
     assert [c.name for c in layers["d"].scalar()] == ["d.Y"]
     assert layers["two"].triple() is layers["two"].scalar() is None
+
+
+@pytest.mark.parametrize("name", ["rgba_main", "rgba.main", "rgb_main", "main", "RGBA_MAIN", "part1.main"])
+def test_plain_parts_are_known_by_name(tmp_path, name):
+    plane = np.zeros((2, 2), np.float32)
+    parts = [(name, dict.fromkeys("RGB", plane), (0, 0)), ("albedo", dict.fromkeys("RGB", plane), (0, 0))]
+    assert [layer.name for layer in layers_of(open_exr(write_exr(tmp_path / "a.exr", parts)))] == ["", "albedo"]
+
+
+def test_the_only_part_names_no_layer(tmp_path):
+    plane = np.zeros((2, 2), np.float32)
+    channels = dict.fromkeys([*"RGB", "albedo.R"], plane)
+    file = open_exr(write_exr(tmp_path / "a.exr", [("shot_010 beauty v3", channels, (0, 0))]))
+    assert [layer.name for layer in layers_of(file)] == ["", "albedo"]
+
+
+@pytest.mark.parametrize(
+    ("pattern", "matches"),
+    [
+        ("crypto*", True),
+        ("CryptoObject00", True),
+        ("crypto object 00", True),
+        ("ViewLayer.crypto*", True),
+        ("crypto*.R", True),
+        ("*Layer.crypto*", True),
+        ("R", False),
+        ("object*", False),
+        ("Other.crypto*", False),
+        ("crypto*.G", False),
+    ],
+)
+def test_a_pattern_means_a_layer_whatever_the_case_and_without_the_view_layer(pattern, matches):
+    assert matches_layer(pattern, "ViewLayer.CryptoObject00", "R") == matches

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The preview shows the frame in display values."""
 
+import zlib
+
 import numpy as np
 import OpenImageIO as oiio
 import pytest
@@ -36,6 +38,15 @@ def test_display_values_are_written_as_they_are_and_clipped(tmp_path):
     values = np.array([[[-1, 0, 0.5], [1, 2, 0.25]]], np.float32)
     write_png(tmp_path / "a.png", values)
     np.testing.assert_array_equal(png(tmp_path / "a.png"), [[[0, 0, 128], [255, 255, 64]]])
+
+
+def test_rows_are_stored_with_the_filter_that_is_fast(tmp_path):
+    write_png(tmp_path / "a.png", np.random.default_rng(0).random((5, 7, 3), np.float32))
+    data = (tmp_path / "a.png").read_bytes()
+    start = data.index(b"IDAT")
+    length = int.from_bytes(data[start - 4 : start], "big")
+    rows = zlib.decompress(data[start + 4 : start + 4 + length])
+    assert list(rows[:: 1 + 7 * 3]) == [1] * 5  # "Sub"
 
 
 def test_our_previews_are_told_from_other_pictures(tmp_path):

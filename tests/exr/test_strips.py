@@ -160,8 +160,38 @@ def test_split_parts_are_decoded_once_and_copied_bit_for_bit(tmp_path, decoded):
     bits |= {"d.x": random.integers(0, 1 << 32, (70, 9), dtype=np.uint32)}
     file = open_exr(write_exr(tmp_path / "mixed.exr", bits))
     (part,) = file.parts
+    ranges = [(channel.index, channel.index + 1) for channel in part.channels]
     with file.cache_strips(10**6):
-        for channel in part.channels:
-            rows = np.concatenate([s for _, _, s in file.native_strips(part, channel.index, channel.index + 1)])
+        for i, channel in enumerate(part.channels):
+            rows = np.concatenate([s for _, _, s in file.native_strips(part, *ranges[i], ranges[i + 1 :])])
             assert same_bits(np.ascontiguousarray(rows[..., 0]), bits[channel.name])
     assert len(decoded) == 2 * 3  # two strips, three pixel types
+
+
+def test_only_what_is_still_to_be_written_is_kept(tmp_path, decoded):
+    """The first layer is not kept, nor what nobody asked for; a layer is forgotten when it is read."""
+    values = picture(HEIGHT, WIDTH).astype(np.float16)
+    file = open_exr(write_exr(tmp_path / "a.exr", rgb(values, "a.") | rgb(values, "b.") | rgb(values, "c.")))
+    (part,) = file.parts
+    with file.cache_strips(10**6):
+        list(file.native_strips(part, 0, 3, [(3, 6)]))
+        assert file._cache.bytes == strip_bytes(HEIGHT)
+        list(file.native_strips(part, 3, 6))
+        assert file._cache.bytes == 0
+    assert len(decoded) == len(set(decoded))
+
+
+def test_layers_that_do_not_fit_are_decoded_again(tmp_path, decoded):
+    values = {name: picture(HEIGHT, WIDTH, seed).astype(np.float16) for seed, name in enumerate("abc")}
+    channels = {key: plane for name, image in values.items() for key, plane in rgb(image, f"{name}.").items()}
+    file = open_exr(write_exr(tmp_path / "a.exr", channels))
+    (part,) = file.parts
+    ranges = [(0, 3), (3, 6), (6, 9)]
+    with file.cache_strips(strip_bytes(ROWS_PER_STRIP)):
+        for i, name in enumerate("abc"):
+            rows = np.concatenate([s for _, _, s in file.native_strips(part, *ranges[i], ranges[i + 1 :])])
+            order = [part.channels[j].name[-1] for j in range(*ranges[i])]
+            assert same_bits(np.ascontiguousarray(rows), values[name][..., ["RGB".index(c) for c in order]])
+            assert file._cache.bytes <= strip_bytes(ROWS_PER_STRIP)
+    assert decoded.count((0, 64)) == 2
+    assert decoded.count((256, 300)) > 1

@@ -58,6 +58,13 @@ def test_only_the_chosen_layers_are_passed_on(tmp_path, layout, source):
     assert all(same_bits(result[key], plane) for key, plane in chosen.items())
 
 
+def test_a_file_of_one_part_with_any_name_is_read_again(tmp_path):
+    """The result has more parts than one, so the name of the source's only part would name a layer."""
+    parts = [("shot_010", rgb(picture(8, 8)) | rgb(picture(8, 8), "albedo."), (0, 0))]
+    written(tmp_path, parts, WriteOptions())
+    assert map_render(open_exr(tmp_path / "out.exr")).table()[1]["source"] == "albedo"
+
+
 def test_layers_none_leaves_the_beauty_alone_and_a_misspelt_layer_is_named(tmp_path):
     _, _, after = written(tmp_path, everything(), WriteOptions(layers=("none",)))
     assert [list(channels) for _, channels in after] == [["A", "B", "G", "R"]]
@@ -216,6 +223,16 @@ def test_pixel_type_and_compression_of_the_beauty(tmp_path, kind, compression):
     assert file.parts[0].compression == compression
     assert all(part.compression == "zip" for part in file.parts[1:])
     assert same_bits(flat(parts)[("id", "X")], source["id.X"])
+
+
+def test_zip_is_fast_rather_than_small(tmp_path):
+    """The zlib header of a chunk names the effort: here of the only chunk, in a file of 2 KB."""
+    values = picture(16, 16)
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", rgb(values.astype(np.float16)))))
+    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, values, None, {}, WriteOptions())
+    fastest, default = b"\x78\x01", b"\x78\x5e"
+    assert fastest in (tmp_path / "out.exr").read_bytes()
+    assert default in (tmp_path / "hr.exr").read_bytes()
 
 
 def test_lossy_sources_are_not_compressed_a_second_time(tmp_path):

@@ -4,55 +4,64 @@ import pytest
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.tiling import aligned_grid, largest_tile, plan_tiles, smallest_memory
-from oiio_msspl.model.contract import Contract
+from oiio_msspl.fusion import tiling
+from oiio_msspl.fusion.tiling import aligned_grid, check_memory, plan_tiles
+from oiio_msspl.model.catalogue import shipped_models
+from oiio_msspl.model.contract import MEAN_DENOISER, MEAN_DENOISER_ALIGNMENT, Contract
+
+GRIDS = [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)]
 
 
-@pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
+def contract_of(alignment, overlap, denoiser=""):
+    return Contract(name="test", scale=2, alignment=alignment, overlap=overlap, denoiser=denoiser, bytes_per_pixel=100)
+
+
+@pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("largest", [4096, 20000, 10**9])
-def test_cores_cover_the_grid_once_and_areas_fit(grid, largest):
+@pytest.mark.parametrize(("alignment", "overlap", "denoiser"), [(1, 8, ""), (8, 24, ""), (2, 16, MEAN_DENOISER)])
+def test_cores_cover_the_grid_once_and_areas_fit(monkeypatch, grid, largest, alignment, overlap, denoiser):
+    """All tiles begin on the blocks of pixels that the networks work on."""
+    monkeypatch.setattr(tiling, "TILE_MEMORY", largest * 2**2 * 100)
+    contract = contract_of(alignment, overlap, denoiser)
+    block = MEAN_DENOISER_ALIGNMENT if denoiser else alignment
+    grid = aligned_grid(grid, alignment)
     covered = np.zeros((grid.height, grid.width), int)
-    for tile in plan_tiles(grid, largest, overlap=8):
+    for tile in plan_tiles(grid, contract):
         covered[tile.core.slices(grid)] += 1
-        assert tile.area.width * tile.area.height <= largest
+        assert tile.area.width * tile.area.height <= max(largest, (2 * overlap + block) ** 2)
         assert tile.area.intersect(grid) == tile.area
         assert tile.area.intersect(tile.core) == tile.core
-        for inner, outer, border in (
-            (tile.core.x0, tile.area.x0, grid.x0),
-            (tile.core.y0, tile.area.y0, grid.y0),
-        ):
-            assert inner - outer == 8 or outer == border
+        for window in (tile.core, tile.area):
+            assert (window.x0 - grid.x0) % block == (window.y0 - grid.y0) % block == 0
+            assert window.width % alignment == window.height % alignment == 0
+        for inner, outer, border in ((tile.core.x0, tile.area.x0, grid.x0), (tile.core.y0, tile.area.y0, grid.y0)):
+            assert inner - outer == overlap or outer == border
     assert (covered == 1).all()
 
 
-@pytest.mark.parametrize("grid", [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)])
-def test_aligned_tiles_lie_on_the_blocks_of_the_whole_frame(grid):
+@pytest.mark.parametrize("grid", GRIDS)
+def test_the_grid_grows_to_the_right_and_to_the_bottom(grid):
     wider = aligned_grid(grid, 8)
     assert grid.intersect(wider) == grid
     assert (wider.x0, wider.y0) == (grid.x0, grid.y0)
     assert wider.width - grid.width < 8 > wider.height - grid.height
-    covered = np.zeros((wider.height, wider.width), int)
-    for tile in plan_tiles(wider, 20000, overlap=24, alignment=8):
-        covered[tile.core.slices(wider)] += 1
-        assert tile.area.width * tile.area.height <= 20000
-        for window in (tile.core, tile.area):
-            sides = window.x0 - grid.x0, window.y0 - grid.y0, window.width, window.height
-            assert not any(side % 8 for side in sides)
-    assert (covered == 1).all()
 
 
-def test_too_little_memory_is_said():
-    with pytest.raises(InputError, match="--max-memory is too small"):
-        list(plan_tiles(Window(0, 0, 500, 300), 100, overlap=16))
+@pytest.mark.parametrize("name", shipped_models())
+@pytest.mark.parametrize(("size", "cost"), [((1280, 720), 1.25), ((1920, 1080), 1.4), ((8192, 4320), 1.85)])
+def test_overlaps_cost_little_and_the_default_memory_suffices(name, size, cost):
+    """Computed pixels by pixels of the frame."""
+    contract = Contract.of_file(shipped_models()[name])
+    width, height = (-(-side // contract.scale) for side in size)
+    tiles = plan_tiles(aligned_grid(Window(0, 0, width, height), contract.alignment), contract)
+    assert sum(tile.area.width * tile.area.height for tile in tiles) <= cost * width * height
+    frame_bytes = 4 * (4 * size[0] * size[1] + 9 * width * height)  # result, and LRHS with albedo and normal
+    check_memory(contract, tiles, frame_bytes, tiling.MAX_MEMORY)
 
 
-@pytest.mark.parametrize(("alignment", "overlap"), [(1, 16), (8, 32), (16, 48)])
-@pytest.mark.parametrize("size", [(40, 30), (500, 300), (1921, 1081)])
-def test_the_smallest_memory_is_the_one_threshold(size, alignment, overlap):
-    """With it there is a plan, with a byte less there is none."""
-    contract = Contract(name="any", scale=4, alignment=alignment, overlap=overlap, bytes_per_pixel=1000)
-    grid = aligned_grid(Window(0, 0, *size), alignment)
-    needed = smallest_memory(grid, contract, 10**6)
-    assert plan_tiles(grid, largest_tile(contract, 10**6, needed), overlap, alignment)
-    with pytest.raises(InputError, match="--max-memory is too small"):
-        plan_tiles(grid, largest_tile(contract, 10**6, needed - 1), overlap, alignment)
+def test_too_little_memory_is_said_with_what_suffices():
+    contract = contract_of(1, 8)
+    tiles = plan_tiles(Window(0, 0, 1000, 500), contract)
+    with pytest.raises(InputError, match=r"this frame needs more with model test; allow at least 1\.1G"):
+        check_memory(contract, tiles, 500 << 20, 1 << 30)
+    check_memory(contract, tiles, 500 << 20, int(1.1 * 2**30))

@@ -14,7 +14,7 @@ from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.jobs import frame
 from oiio_msspl.jobs.frame import map_pair
-from tests.conftest import picture, rgb, write_exr
+from tests.conftest import downsample, picture, read_bits, rgb, write_exr
 from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
 
@@ -72,6 +72,19 @@ def test_the_mapping_is_the_hrls_s_and_only_its_beauty_applies_to_the_lrhs(tmp_p
     assert (set(low.features), set(high.features)) == ({"rgb"}, {"rgb", "albedo"})
     assert (low.features["rgb"].text, high.features["albedo"].text) == ("key", "colours")
     assert (low.spp, high.spp) == (64, 2)
+
+
+@pytest.mark.parametrize(("pixel_type", "lamp", "clipped"), [("half", 65504.0, 3 * 64), ("float", 1e6, 0)])
+def test_values_that_half_cannot_hold_are_clipped_and_counted(tmp_path, bilinear_models, pixel_type, lamp, clipped):
+    clean = np.full((64, 64, 3), 0.5, np.float32)
+    clean[16:24, 40:48] = 1e6
+    lr, hr = write_exr(tmp_path / "lr.exr", rgb(downsample(clean, 4))), write_exr(tmp_path / "hr.exr", rgb(clean))
+    write = WriteOptions(pixel_type=pixel_type)
+    report = fuse_files(lr, hr, tmp_path / "out.exr", write=write, model=str(bilinear_models[4]))
+    assert report.clipped == report.as_dict()["clipped"] == clipped
+    assert any(f"{clipped} values are too bright for half" in warning for warning in report.warnings) == bool(clipped)
+    [(_, channels)] = read_bits(tmp_path / "out.exr")
+    assert (channels["R"][16:24, 40:48] == lamp).all()
 
 
 # ------------------------------------------------------------------------------------------------ inputs stay
@@ -195,7 +208,7 @@ def test_a_frame_that_can_not_fit_is_refused_from_its_headers_by_one_sentence(
         return str(caught.value)
 
     said = refusal(1)
-    needed = re.fullmatch(r"--max-memory is too small for this frame; allow at least (\d\.\d)G", said)
+    needed = re.fullmatch(r"--max-memory: this frame needs more with model bilinear-x4; allow at least (\d\.\d)G", said)
     assert needed, said
     sentences = {
         refusal(megabytes).partition(", or use")[0] for megabytes in (300, 350, int(float(needed[1]) * 1024) - 103)

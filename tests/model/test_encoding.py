@@ -36,6 +36,12 @@ def test_traces_of_light_do_not_decide_the_exposure():
     assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
 
 
+@pytest.mark.parametrize("light", [1e-45, 1e-40, 1e-30, 1.0, 1e30, 3e38])
+def test_exposure_and_ceiling_are_finite(light):
+    exposure = np.float32(find_exposure(np.full((4, 4, 3), light, np.float32)))
+    assert np.isfinite([exposure, np.float32(65504) / exposure]).all()
+
+
 def test_exposure_of_black_is_one():
     assert find_exposure(np.zeros((4, 4, 3), np.float32)) == 1.0
 
@@ -51,6 +57,12 @@ def test_repaired_values_are_finite_after_the_transform(value, feature):
     assert (bad is not None) == needs_repair
     if bad is not None:
         assert bad.sum() == values.size
+
+
+def test_infinite_light_is_bright_and_nan_is_black():
+    values = np.array([[np.inf, -np.inf, np.nan]], np.float32)
+    assert repair(values)[0].tolist() == [[65504.0, 0.0, 0.0]]
+    assert repair(values, signed=True)[0].tolist() == [[65504.0, -65504.0, 0.0]]
 
 
 def test_repair_returns_sound_input_itself():

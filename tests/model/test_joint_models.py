@@ -63,6 +63,25 @@ def test_it_denoises_no_worse_than_open_image_denoise(scale, spp_of_albedo):
     assert (fused.error > 0).all()
 
 
+@pytest.mark.parametrize("scale", [2, 4])
+def test_rare_light_leaves_no_holes(scale):
+    """One sample of fifty finds the light, so most pixels around are black in both renders. No pixel of the result is
+    below a tenth of the truth, or below a quarter of what is around it."""
+    rng = np.random.default_rng(scale)
+    y, x = np.mgrid[:128, :192] / 192
+    clean = np.float32([1, 0.9, 0.8]) * (0.05 + 0.05 * np.sin(3 * x + 2 * y) + 0.05 * y)[..., None].astype(np.float32)
+
+    def rendered(image, spp):
+        return (image * rng.binomial(spp, 0.02, image.shape[:2])[..., None] / (spp * 0.02)).astype(np.float32)
+
+    lr = Render.from_arrays("lr", rgb=rendered(box_downsample(clean, scale), scale**2))
+    hr = Render.from_arrays("hr", rgb=rendered(clean, 1), albedo=np.full_like(clean, 0.8))
+    fused = fuse(lr, hr, Session(find_model(scale, "joint"), threads=1)).rgb.mean(axis=-1)
+    around = box_downsample(fused[..., None], 16).repeat(16, 0).repeat(16, 1)[..., 0]
+    assert (fused > 0.1 * clean.mean(axis=-1)).all()
+    assert (fused > 0.25 * around).all()
+
+
 def test_layers_that_it_does_not_read_are_not_read():
     model = Session(find_model(2, "joint"), threads=1)
     assert list(model.contract.features) == [RGB, ALBEDO, NORMAL]

@@ -39,6 +39,7 @@ def test_a_contract_survives_its_json():
         ({"format": 99}, "contract format 99, this version reads 1"),
         ({"hrls": ["rgb.R"]}, "made for hrls"),
         ({"transforms": {"curve": "linear"}}, "made for transforms"),
+        ({"defaults": {"albedo": 0.4}}, "made for defaults"),
         ({"scale": 3}, "scale 3 is none of"),
         ({"surprise": 1}, "can't be read"),
     ],

@@ -76,11 +76,23 @@ def test_every_coarse_candidate_can_be_chosen(scale: int) -> None:
 
 
 def test_it_never_leaves_the_range_of_its_inputs() -> None:
-    """Even with random weights and a wrong denoised HRLS, the result stays in the range of the renders around it."""
+    """Even with random weights and a wrong denoised HRLS. A denoised mean that is in the range does not widen it."""
     lrhs, hrls, denoised = images(4)
     denoised, lrhs[:, 3:] = 4.0 * denoised, 4.0 * lrhs[:, 3:]
-    lrhs[:, :3, :8], hrls[:, :3, :32] = 0.1, 0.2
+    lrhs[:, :3, :8], hrls[:, :3, :32], lrhs[:, 3:, :8] = 0.1, 0.2, 0.15
     logits = [5 * torch.randn(1, 8 if level else 5, HEIGHT >> level, WIDTH >> level) for level in range(4)]
     fused = blend(lrhs, hrls, denoised, logits)
     assert fused[:, :, :20].min() >= 0.1 and fused[:, :, :20].max() <= 0.2
     assert fused.max() <= 1.0
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_where_all_samples_around_are_black_the_denoised_mean_counts(scale: int) -> None:
+    """As far as a sample nearby is as bright; without any light nearby the result is black."""
+    lrhs, hrls, denoised = (torch.zeros_like(image) for image in images(scale))
+    lrhs[:, 3:] = denoised[:] = 0.3
+    assert blend(lrhs, hrls, denoised, preferring(DENOISED)).max() == 0
+    lrhs[:, :3, 2, 2] = 0.2
+    fused = blend(lrhs, hrls, denoised, preferring(DENOISED))
+    row = 6 * scale  # beyond the LRHS pixels beside the lit one
+    torch.testing.assert_close(fused[:, :, row, : 4 * scale], torch.full((1, 3, 4 * scale), 0.2))

@@ -29,7 +29,7 @@ EXAMPLES = """[bold]Examples[/bold]
 
   msspl-fuse lr.exr hr.exr -o out.exr --map albedo=my_albedo --layout nuke --half
 
-  msspl-fuse lr.exr hr.exr -o out.exr --overwrite --no-preview --max-memory 2G --json > report.json
+  msspl-fuse lr.exr hr.exr -o out.exr --overwrite --no-preview --max-memory 4G --json > report.json
 
   msspl-fuse lr/ hr/ -o out/ --skip-existing --report shot.json
 
@@ -85,25 +85,15 @@ def fuse(
         ),
     ] = None,
     # Model
-    model: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="auto, a family (paper), a shipped model (see msspl models) or an ONNX file.",
-            rich_help_panel=options.MODEL,
-        ),
-    ] = "auto",
-    device: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="cpu, cuda, tensorrt, openvino, coreml or directml.",
-            rich_help_panel=options.MODEL,
-        ),
-    ] = "cpu",
+    model: options.Model = "auto",
+    device: options.Device = "cpu",
     max_memory: Annotated[
         str,
-        typer.Option(metavar="SIZE", help="Memory to stay below. Tiles shrink to fit.", rich_help_panel=options.MODEL),
+        typer.Option(
+            metavar="SIZE",
+            help="Memory to stay below; the result does not depend on it.",
+            rich_help_panel=options.MODEL,
+        ),
     ] = "3G",
     threads: Annotated[
         int,
@@ -128,9 +118,7 @@ def fuse(
             rich_help_panel=options.OUTPUT,
         ),
     ],
-    layout: Annotated[
-        str, typer.Option(metavar="NAME", help="spec, nuke or multilayer.", rich_help_panel=options.OUTPUT)
-    ] = "spec",
+    layout: options.Layout = "spec",
     layers: Annotated[
         list[str],
         typer.Option(
@@ -139,14 +127,7 @@ def fuse(
             rich_help_panel=options.OUTPUT,
         ),
     ] = [],  # noqa: B006
-    error_layer: Annotated[
-        bool,
-        typer.Option(
-            "--error-layer",
-            help="Add a layer 'error': the error that the model expects.",
-            rich_help_panel=options.OUTPUT,
-        ),
-    ] = False,
+    error_layer: options.ErrorLayer = False,
     compression: Annotated[
         str | None,
         typer.Option(
@@ -183,12 +164,7 @@ def fuse(
             metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=options.SHOT
         ),
     ] = None,
-    skip_existing: Annotated[
-        bool,
-        typer.Option(
-            "--skip-existing", help="Skip frames that exist. This resumes a run.", rich_help_panel=options.SHOT
-        ),
-    ] = False,
+    skip_existing: options.SkipExisting = False,
     update: Annotated[
         bool,
         typer.Option(
@@ -326,13 +302,19 @@ def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each step."""
     spp = report.spp_avg
     renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
-    console.say(f"{renderer} at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else ""))
+    view = f", view {report.hr.view}" if report.hr.view and report.hr.other_views else ""
+    others = f" (also there: {', '.join(report.hr.other_views)}; --view-layer)" if view else ""
+    average = f", {spp:g} spp on average" if spp is not None else ""
+    console.say(f"{renderer} at x{report.scale}{average}{view}{others}")
     console.aov_table(report.aovs(), report.hr.notes)
     if lrhs_aovs := report.found_lrhs_aovs():
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
-    if report.repaired:
-        counts = ", ".join(f"{count} in {name}" for name, count in report.repaired.items())
-        console.say(f"Repaired values that were NaN, infinite or negative: {counts}")
+    for text, counts in (
+        ("Repaired values that were NaN or infinite", report.repaired),
+        ("Set negative values to 0 (colours out of gamut)", report.negative),
+    ):
+        if counts:
+            console.say(f"{text}: {', '.join(f'{count} in {name}' for name, count in counts.items())}")
     provider = report.provider.removesuffix("ExecutionProvider")
     where = "on the CPU" if provider == "CPU" else f"on {provider}"
     tiles = f" in {report.tiles} tiles" if report.tiles > 1 else ""

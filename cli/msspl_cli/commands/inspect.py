@@ -24,18 +24,19 @@ def inspect(
     mapping: options.Map = [],  # noqa: B006
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
+    model: options.Model = "auto",
     as_json: options.Json = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
 ) -> None:
-    """Print what a render contains, and which of its layers the model would read.
+    """Print what a render contains, and which of its layers a model would read.
 
     If a file can't be used, the reason is printed and the exit code is 2.
     """
     from oiio_msspl.inspection import inspect_file
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
-    found = [inspect_file(path, inputs) for path in files]
+    found = [inspect_file(path, inputs, model) for path in files]
     if as_json:
         data = [inspection.as_dict() for inspection in found]
         print(json.dumps(data if len(data) > 1 else data[0], indent=2))
@@ -45,7 +46,8 @@ def inspect(
             for line in inspection.facts:
                 console.say(f"  {line}")
             if inspection.render is not None:
-                console.aov_table(inspection.render.table(), inspection.render.notes)
+                console.say(f"  what {inspection.model} would read:")
+                console.aov_table(inspection.aovs(), inspection.render.notes)
                 if inspection.passed_through:
                     console.say(f"  passed through: {', '.join(inspection.passed_through)}")
             for problem in inspection.problems:

@@ -4,16 +4,20 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
 from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
-from msspl_cli.installed import find_msspl_fuse
-from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
+
+if TYPE_CHECKING:
+    from oiio_msspl.exr.write_options import WriteOptions
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -38,10 +42,9 @@ def render(
         str,
         typer.Option(
             metavar="NAME",
-            help="View layer, if several are enabled.",
+            help="View layer to render, if several are on.",
             show_default=False,
             rich_help_panel=options.INPUT,
-            hidden=True,
         ),
     ] = "",
     blender: Annotated[
@@ -68,7 +71,8 @@ def render(
         typer.Option(
             min=1,
             metavar="N",
-            help="Samples per pixel of the low-resolution render. Without it: a third of the other's samples in total.",
+            help="Samples per pixel of the low-resolution render. Without it: a third of the other's samples in total, "
+            "but at least N x N of --scale.",
             show_default=False,
             rich_help_panel=RENDER,
         ),
@@ -100,6 +104,9 @@ def render(
             hidden=True,
         ),
     ] = 0,
+    # Model
+    model: options.Model = "auto",
+    device: options.Device = "cpu",
     # Output
     output: Annotated[
         Path,
@@ -112,6 +119,8 @@ def render(
             rich_help_panel=options.OUTPUT,
         ),
     ],
+    layout: options.Layout = "multilayer",
+    error_layer: options.ErrorLayer = False,
     keep: Annotated[
         bool,
         typer.Option(
@@ -142,12 +151,7 @@ def render(
             rich_help_panel=options.SHOT,
         ),
     ] = None,
-    skip_existing: Annotated[
-        bool,
-        typer.Option(
-            "--skip-existing", help="Skip frames whose OUT exists. This resumes a shot.", rich_help_panel=options.SHOT
-        ),
-    ] = False,
+    skip_existing: options.SkipExisting = False,
     verbose: options.Verbose = 0,
     quiet: options.Quiet = False,
     debug: options.Debug = False,
@@ -167,9 +171,6 @@ def render(
     if pixel_filter not in ("box", "scene"):
         raise InputError(f"--filter {pixel_filter!r}: use one of box, scene")
     program = find_blender(blender)
-    fuse = find_msspl_fuse()
-    if fuse is None:
-        raise MssplError("msspl-fuse is not installed beside this program; install oiio-msspl again")
     if overwrite and skip_existing:
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
     targets = name_targets(output, frames)
@@ -190,7 +191,6 @@ def render(
     job = {
         "scene": str(scene.absolute()),
         "frames": [(number, str(target.absolute())) for number, target in targets],
-        "program": fuse,
         "options": {
             "scale": scale,
             "hr_spp": hr_spp,
@@ -203,6 +203,9 @@ def render(
         "keep": keep,
         "compare": compare,
     }
+    fuse = _fuser(
+        scale, model, device, threads, options.make_write_options(layout, None, None, [], error_layer), overwrite
+    )
     if makes_folder:
         folder.mkdir(exist_ok=True)
     reports: list[dict[str, Any]] = []
@@ -224,7 +227,7 @@ def render(
 
     try:
         if targets:
-            render_frames(program, scene, job, folder, show, verbose=bool(verbose))
+            render_frames(program, scene, job, folder, show, fuse, verbose=bool(verbose))
     finally:
         # Frames that ended are reported even if a later one failed.
         bar.hide()
@@ -234,6 +237,40 @@ def render(
             _print(reports)
     if not (targets or as_json or quiet):
         print(f"{output}: every frame exists")
+
+
+def _fuser(
+    scale: int, model: str, device: str, threads: int, write: WriteOptions, overwrite: bool
+) -> Callable[[Path, Path, Path], list[str]]:
+    """What fuses the frames: a function of LRHS, HRLS and result that returns warnings. Its model is loaded once.
+
+    Raises:
+        InputError: the model or the device can't be used. No frame was rendered for nothing.
+    """
+    from oiio_msspl.jobs.frame import map_pair, resolve_auto
+    from oiio_msspl.jobs.sequence import Frame
+    from oiio_msspl.jobs.stages import Stages
+    from oiio_msspl.model.catalogue import AUTO, find_model
+    from oiio_msspl.model.session import Session
+    from oiio_msspl.parallel import limit_threads
+
+    path = find_model(scale, model)
+    session = Session(path, device, threads)
+    if write.error_layer:
+        session.require_error()
+    sessions = {path: session}
+    stages = Stages(
+        write_options=write, model=model, device=device, threads=threads, overwrite=overwrite, sessions=sessions
+    )
+
+    def fuse(lr: Path, hr: Path, output: Path) -> list[str]:
+        nonlocal stages
+        with limit_threads(threads):
+            if stages.model == AUTO:  # all frames get the model that suits the first pair
+                stages = replace(stages, model=resolve_auto(*map_pair(lr, hr, stages.inputs), AUTO))
+            return stages.run(Frame(0, lr, hr, output)).warnings
+
+    return fuse
 
 
 def is_pattern(output: Path) -> bool:

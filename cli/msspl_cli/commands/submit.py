@@ -123,5 +123,7 @@ def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
 
 def _full_path(mapping: str) -> str:
     """A ``--map`` with an absolute path if it names an EXR, because tasks run in other folders."""
+    from oiio_msspl.aovs.mapping import is_exr
+
     feature, equals, layer = mapping.partition("=")
-    return f"{feature}{equals}{Path(layer).absolute()}" if layer.lower().endswith(".exr") else mapping
+    return f"{feature}{equals}{Path(layer).absolute()}" if is_exr(layer) else mapping

@@ -15,7 +15,7 @@ from pathlib import Path
 
 import bpy
 from check_button import check_button, check_cancel, check_modes, check_panel
-from check_scene import check_animated, check_changes, check_sentences, render_ramps
+from check_scene import check_animated, check_changes, check_samples, check_sentences, render_ramps
 from support import MODULE, WORK, build_scene
 
 ADDON = Path(__file__).resolve().parents[3] / "blender_addon"
@@ -38,6 +38,7 @@ if __name__ == "__main__":
     check_button(scene)
     scene = build_scene()
     check_sentences(scene)
+    check_samples()
     check_animated(scene)
     check_changes(scene)
     check_modes(scene)

@@ -25,7 +25,7 @@ def check_sentences(scene):
         options.find_view_layer(scene, options.Options())
         raise AssertionError("no error with two view layers on")
     except module("errors").Failure as error:
-        assert "2 view layers are on (ViewLayer, Other.1); name the one" in str(error)
+        assert "2 view layers are on (ViewLayer, Other.1); choose one with --view-layer NAME" in str(error)
     program = os.environ["MSSPL_FUSE"]
     os.environ["MSSPL_FUSE"] = "/nothing/msspl-fuse"
     assert "/nothing/msspl-fuse: no such program; correct the path in MSSPL_FUSE" in sentence()
@@ -41,6 +41,15 @@ def check_sentences(scene):
     (WORK / "fake-fuse").write_text("no program")
     assert "can't be started" in sentence()
     os.environ["MSSPL_FUSE"] = program
+
+
+def check_samples():
+    """The LRHS gets the samples of the table in docs/guide/render.md, always more than the HRLS has."""
+    options = module("options").Options
+    table = {1: (4, 16, 64), 3: (4, 16, 64), 4: (6, 22, 86), 6: (8, 32, 128), 8: (11, 43, 171)}
+    for hr_spp, expected in table.items():
+        assert tuple(options(scale=scale, hr_spp=hr_spp).lrhs_spp for scale in (2, 4, 8)) == expected, hr_spp
+    assert all(options(scale=2, hr_spp=spp).lrhs_spp > spp for spp in range(1, 65))
 
 
 def check_animated(scene):
@@ -64,7 +73,7 @@ def check_changes(scene):
     options = module("options").Options(view_layer="ViewLayer")
 
     def said(scene, meanwhile):
-        steps = frame.render_and_fuse(scene, options, WORK / "new.exr", WORK, "msspl-fuse")
+        steps = frame.render_and_fuse(scene, options, WORK / "new.exr", WORK, fuse=None)
         next(steps)
         meanwhile()
         try:

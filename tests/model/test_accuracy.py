@@ -1,0 +1,46 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Every shipped model removes noise from a real frame, as well as it did when it was shipped."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oiio_msspl import Render, Session, find_model, fuse
+from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.model.catalogue import shipped_models
+
+#: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``.
+SCORES = {
+    "joint-x2": (24.67, 0.0251),
+    "joint-x4": (24.35, 0.0246),
+    "joint-x8": (24.14, 0.0241),
+    "paper-x2": (23.39, 0.0357),
+    "paper-x4": (22.60, 0.0427),
+    "paper-x8": (21.74, 0.0555),
+    "pyramid-x2": (23.84, 0.0348),
+    "pyramid-x4": (23.64, 0.0356),
+    "pyramid-x8": (23.30, 0.0370),
+}
+
+
+def test_no_shipped_model_is_missing():
+    assert SCORES.keys() == shipped_models().keys()
+
+
+@pytest.mark.parametrize("name", SCORES)
+def test_a_real_frame_is_as_clean_as_it_was(name):
+    """Within 0.2 dB and a tenth of the RelMSE. Enlarging the LRHS is at least 1.5 dB worse."""
+    with np.load(Path(__file__).parents[1] / "data" / "pair.npz") as file:
+        images = {key: values.astype(np.float32) for key, values in file.items()}
+    model = Session(find_model(0, name), threads=1)
+    lr = Render.from_arrays("lr", rgb=images[f"lrhs_x{model.contract.scale}"])
+    hr = Render.from_arrays("hr", **{k.removeprefix("hrls_"): v for k, v in images.items() if k.startswith("hrls_")})
+    fused = fuse(lr, hr, model).rgb
+    floor, ceiling = SCORES[name]
+    assert psnr(fused, images["reference"]) > floor - 0.2
+    assert relmse(fused, images["reference"]) < 1.1 * ceiling
+    enlarged = lr.layers["rgb"].repeat(model.contract.scale, 0).repeat(model.contract.scale, 1)
+    assert psnr(enlarged, images["reference"]) < floor - 1.5

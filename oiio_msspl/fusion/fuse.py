@@ -11,7 +11,7 @@ import numpy as np
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import fuse_alpha
 from oiio_msspl.fusion.guards import (
@@ -122,7 +122,9 @@ def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> in
     # Of the features that the LRHS may have; it is not read yet. Alpha has 1 channel, every other one 3.
     lrhs_bytes = grid.width * grid.height * (3 * (1 + len(session.lrhs_aovs)) + 1) * 4
     frame_bytes = result_bytes(alignment, error=error) + lrhs_bytes
-    return memory_for_tiles(session.contract, plan_tiles(grid, session.contract), frame_bytes)
+    # The tiles of larger frames are as large. A damaged header may claim millions of tiles.
+    part = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + 16384, grid.y0 + 16384))
+    return memory_for_tiles(session.contract, plan_tiles(part, session.contract), frame_bytes)
 
 
 def result_bytes(alignment: Alignment, *, error: bool) -> int:

@@ -13,7 +13,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array, repair
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.exr.atomic import check_separate, check_target
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, relmse_map, ssim
@@ -57,15 +57,17 @@ def compare_files(images: Sequence[Path], reference: Path) -> list[dict[str, flo
     return [scores(_read_at_size_of(truth, path, reference), truth) for path in images]
 
 
-def check_error_map(path: Path, *, overwrite: bool) -> None:
-    """Check that an error map can be written at ``path``.
+def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
+    """Check that an error map of the files ``compared`` can be written at ``path``.
 
     Raises:
-        InputError: it is not named .png, it exists and may not be overwritten, or its folder is missing or read-only.
+        InputError: it is not named .png, it is one of the files compared, it exists and may not be overwritten, or its
+            folder is missing or read-only.
     """
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the error map is a PNG; name it .png")
     check_target(path, overwrite=overwrite)
+    check_separate(compared, [path])
 
 
 def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool) -> None:

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import unicodedata
+
 
 class MssplError(Exception):
     """Something failed that the caller could not have avoided (exit code 1)."""
@@ -14,6 +16,27 @@ class InputError(MssplError):
     """The caller's mistake: a file, an option or a pair that can't be used (exit code 2)."""
 
     exit_code = 2
+
+
+#: Unicode categories that do something to a terminal or can't be encoded: control characters, separators of lines and
+#: paragraphs, and lone surrogates, as which Python reads bytes that are not UTF-8.
+_UNSAFE = {"Cc", "Zl", "Zp", "Cs"}
+#: Characters that reverse the direction of the text behind them.
+_DIRECTIONS = frozenset("\u200e\u200f\u202a\u202b\u202c\u202d\u202e\u2066\u2067\u2068\u2069")
+
+
+def printable(text: str) -> str:
+    """Text on one line, with control characters as escapes such as ``\\x1b``.
+
+    Names out of a file may hold anything: line breaks that forge a line of the farm's protocol, or terminal commands.
+    Whatever prints a message passes it through here.
+    """
+    if text.isprintable():
+        return text
+    return "".join(
+        char.encode("unicode_escape").decode() if unicodedata.category(char) in _UNSAFE or char in _DIRECTIONS else char
+        for char in text
+    )
 
 
 def explain(error: Exception) -> tuple[str, int]:

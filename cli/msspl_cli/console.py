@@ -11,6 +11,8 @@ import sys
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+from oiio_msspl.errors import printable
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -19,6 +21,16 @@ _UNLIMITED = 100_000
 
 #: Colours of the words that say how a frame ended.
 _STYLES = {"fused": "green", "failed": "red", "missing": "red", "not done": "yellow", "warning": "yellow"}
+
+
+def say(text: str, *, error: bool = False) -> None:
+    """Print a line that may contain names out of a file, see :func:`oiio_msspl.errors.printable`.
+
+    Args:
+        text: one line.
+        error: print to standard error instead of standard output.
+    """
+    print(printable(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 2) -> None:
@@ -41,7 +53,9 @@ def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 
         grid.add_column(overflow="fold")
     for index, row in enumerate(rows):
         style = "bold" if header and index == 0 else ""
-        grid.add_row(*(Text(row[column], style=_STYLES.get(row[column], "")) for column in filled), style=style)
+        grid.add_row(
+            *(Text(printable(row[column]), style=_STYLES.get(row[column], "")) for column in filled), style=style
+        )
     with console.capture() as captured:
         console.print(Padding.indent(grid, indent))
     for line in captured.get().splitlines():
@@ -60,7 +74,7 @@ def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
 
     table([(row["feature"], origin(row)) for row in rows])
     for note in notes:
-        print(f"  note: {note}")
+        say(f"  note: {note}")
 
 
 class ProgressBar:
@@ -93,7 +107,7 @@ class ProgressBar:
             )
             self._task = self._progress.add_task(label)
             self._progress.start()
-        self._progress.update(self._task, description=label, completed=done, total=total)
+        self._progress.update(self._task, description=printable(label), completed=done, total=total)
 
     def hide(self) -> None:
         """Remove the bar from the terminal. The next update draws it again."""

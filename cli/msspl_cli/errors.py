@@ -8,18 +8,37 @@ import sys
 
 import typer
 
-from oiio_msspl.errors import explain
+from oiio_msspl.errors import explain, printable
 
 
 def run(app: typer.Typer) -> None:
     """Run a program and exit. Typer itself ends wrong usage with exit code 2. ``--debug`` shows the traceback."""
-    # A farm ends a job with SIGTERM. Exit as on an exception, so that temporary files are removed.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    _exit_on_signals()
     try:
         app()
     except Exception as error:
         if "--debug" in sys.argv:
             raise
         message, code = explain(error)
-        print(f"error: {message}", file=sys.stderr)
+        print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(code)
+
+
+def _exit_on_signals() -> None:
+    """Exit on a signal as on an exception, so that temporary files are removed and a shot's report is written.
+
+    A farm ends a job with SIGTERM, a terminal that closes sends SIGHUP. Further signals are ignored: they would
+    interrupt the clean-up.
+    """
+    ending = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
+
+    def leave(number: int, _frame: object) -> None:
+        for each in ending:
+            signal.signal(each, signal.SIG_IGN)
+        if number == signal.SIGINT:
+            raise KeyboardInterrupt
+        sys.exit(128 + number)
+
+    for each in ending:
+        if signal.getsignal(each) is not signal.SIG_IGN:  # nohup ignores SIGHUP
+            signal.signal(each, leave)

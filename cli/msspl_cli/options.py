@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, printable
 
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
@@ -116,10 +116,19 @@ HelpAll = Annotated[
 ]
 
 
+class _OneLine(logging.Formatter):
+    """Prints a message on one line: it may contain names out of a file. A traceback follows on lines of its own."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        return printable(super().formatMessage(record))
+
+
 def set_up_logging(verbose: int, quiet: bool) -> None:
     """Send the library's log to standard error: warnings, with -v information, with -vv all."""
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
-    logging.basicConfig(level=level, format="%(levelname)s: %(message)s", force=True)
+    handler = logging.StreamHandler()
+    handler.setFormatter(_OneLine("%(levelname)s: %(message)s"))
+    logging.basicConfig(level=level, handlers=[handler], force=True)
 
 
 def make_inputs(
@@ -139,7 +148,7 @@ def make_inputs(
     from oiio_msspl.jobs.frame import InputOptions
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
-    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp, colourspace)
+    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp, colourspace, map_file)
 
 
 def make_write_options(

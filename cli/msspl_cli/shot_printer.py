@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import re
-import sys
 from typing import TYPE_CHECKING
 
 from msspl_cli import console
@@ -50,7 +49,7 @@ class ShotPrinter:
             self._print_once("warning", result.frame, warning)
         if self._verbose:
             times = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.seconds.items())
-            print(f"frame {result.frame}: {result.status}" + (f" ({times})" if times else ""), file=sys.stderr)
+            console.say(f"frame {result.frame}: {result.status}" + (f" ({times})" if times else ""), error=True)
         done, count = len(report.results), len(report.shot.frames)
         bad = sum(bool(each.message) for each in report.results.values())
         self._bar.update(f"{done} of {count} frames" + (f", {bad} not fused" if bad else ""), done, count)
@@ -68,16 +67,16 @@ class ShotPrinter:
     def _print_once(self, kind: str, frame: int, text: str) -> None:
         if text not in self._printed:
             self._printed.add(text)
-            print(f"{kind}: frame {frame}: {text}", file=sys.stderr)
+            console.say(f"{kind}: frame {frame}: {text}", error=True)
 
 
 def _print_openjd(result: FrameResult, report: ShotReport) -> None:
     """Print lines that an Open Job Description worker understands."""
     done, count = len(report.results), len(report.shot.frames)
-    print(f"openjd_progress: {100 * done / count:.1f}")
-    print(f"openjd_status: frame {result.frame} {result.status}, {done} of {count} done", flush=True)
+    console.say(f"openjd_progress: {100 * done / count:.1f}")
+    console.say(f"openjd_status: frame {result.frame} {result.status}, {done} of {count} done")
     if result.message:
-        print(f"openjd_fail: frame {result.frame}: {' '.join(result.message.split())}", flush=True)
+        console.say(f"openjd_fail: frame {result.frame}: {' '.join(result.message.split())}")
 
 
 def _print_json(result: FrameResult, report: ShotReport) -> None:
@@ -92,7 +91,7 @@ def print_table(report: ShotReport) -> None:
 
     if first := report.first:
         view = f", view {first['view']}" if first.get("other_views") else ""
-        print(f"{first['renderer']} pairs at x{first['scale']}{view}; layers of frame {first['frame']}:")
+        console.say(f"{first['renderer']} pairs at x{first['scale']}{view}; layers of frame {first['frame']}:")
         console.aov_table(first["aovs"], first["notes"])
     # Sentences that differ only in their numbers share a row, which shows the first of them.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}
@@ -110,4 +109,4 @@ def print_table(report: ShotReport) -> None:
     stages = ", ".join(
         f"{verbs[name]} {seconds:.1f} s" for name, seconds in report.stage_seconds.items() if name in verbs
     )
-    print(f"{report.shot.output}: {report.seconds:.1f} s" + (f" ({stages}; stages overlap)" if stages else ""))
+    console.say(f"{report.shot.output}: {report.seconds:.1f} s" + (f" ({stages}; stages overlap)" if stages else ""))

@@ -8,7 +8,7 @@ it becomes a formula.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -191,6 +191,24 @@ def _views_and_view_layers(layers: list[Layer], first: tuple[str, str]) -> list[
         for count in range(len(words))
     }
     return [first, *sorted(prefixes - {first})]
+
+
+def _path_of_sibling(path: Path, name: str) -> Path:
+    """The EXR that ``file:NAME`` means in a mapping of the file ``path``."""
+    named, _ = split_exr(name)
+    return Path(named) if named else path.with_name(name + ".exr")
+
+
+def mapped_files(mapping: Mapping[str, Any], path: Path) -> set[Path]:
+    """The other EXRs that a user's mapping of the file ``path`` names, whether they exist or not."""
+    files = set()
+    for candidate in mapping.values():
+        values = candidate.values() if isinstance(candidate, dict) else [candidate]
+        for names in values:
+            for name in names if isinstance(names, list) else [names]:
+                if isinstance(name, str) and name.startswith("file:"):
+                    files.add(_path_of_sibling(path, name.removeprefix("file:")))
+    return files
 
 
 def missing(feature: str, candidate: Any) -> str:

@@ -20,6 +20,9 @@ VARIANCE_KINDS = ("mean", "per_sample", "relative", "second_moment", "deviation"
 #: How a normal layer may be stored; ``auto`` decides by the pixels.
 NORMAL_ENCODINGS = ("signed", "unsigned", "auto")
 
+#: Bytes of the largest file that is read as a mapping.
+LARGEST_MAP_FILE = 1 << 20
+
 #: Keys that say which layers a candidate reads, and whether their value is a list of names. A candidate has one.
 _FORMS = {"layer": False, "sum": True, "halves": True, "channels": True}
 #: Keys that a candidate may have beside one of these.
@@ -38,11 +41,22 @@ def read_map_file(path: str | Path) -> dict[str, Any]:
         InputError: the file can't be read, or an entry is not a candidate.
     """
     try:
-        mapping = tomllib.loads(Path(path).read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        mapping = tomllib.loads(_read_text(Path(path)))
+    except (OSError, ValueError) as error:  # text that is not UTF-8, a mistake in the TOML, a number of 5,000 digits
         raise InputError(f"{path}: can't be read as a mapping ({error})") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: can't be read as a mapping (its tables are nested too deeply)") from error
     folder = Path(path).absolute().parent
     return {name: _full_paths(each, folder) for name, each in check_mapping(mapping, str(path)).items()}
+
+
+def _read_text(path: Path) -> str:
+    """The text of a small file. Devices such as /dev/zero never end."""
+    if not path.is_file():
+        raise InputError(f"{path}: no such file")
+    if path.stat().st_size > LARGEST_MAP_FILE:
+        raise InputError(f"{path}: is too large for a mapping; name a TOML file with a line for each feature")
+    return path.read_text(encoding="utf-8")
 
 
 def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
@@ -120,7 +134,7 @@ def _problem(feature: str, candidate: Any) -> str | None:
         is_file = candidate.startswith("file:")
         return "the beauty must be a layer of the render itself" if feature == RGB and is_file else None
     if not isinstance(candidate, dict):
-        return f"{candidate!r} is neither a layer's name nor a table such as {{ sum = ['a', 'b'] }}"
+        return f"{str(candidate)[:80]} is neither a layer's name nor a table such as {{ sum = ['a', 'b'] }}"
     return _problem_of_form(candidate) or _problem_of_feature(feature, candidate)
 
 
@@ -140,6 +154,8 @@ def _problem_of_form(candidate: dict[str, Any]) -> str | None:
         return f"{form} must be {'a list of names' if _FORMS[form] else 'a name'}"
     if not isinstance(candidate.get("times", ""), str):
         return "times must be a name"
+    if not isinstance(candidate.get("note", ""), str):
+        return "note must be a text"
     return None
 
 

@@ -1,16 +1,32 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing files atomically: a file appears whole or not at all."""
+"""Writing files atomically: a file appears whole or not at all.
+
+It is written under a temporary name beside the target, ``.STEM.NAME-MACHINE-PROCESS-RANDOM.tmp.SUFFIX``. NAME is a hash
+of the target's name, MACHINE one of the machine on which the process PROCESS runs. So a later run can tell whose
+temporary file it finds, and whether that process still lives.
+"""
 
 from __future__ import annotations
 
 import os
 import re
 import secrets
+import socket
+import sys
+import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
+from functools import lru_cache
+from hashlib import sha256
 from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
+
+#: Bytes of the target's stem in the name of its temporary file. Names may have 143 bytes on encrypted file systems.
+_STEM_BYTES = 60
+#: Seconds after which the temporary file of a process that can't be looked up counts as left over. A file that is
+#: being written is touched every few seconds.
+_ABANDONED = 24 * 3600
 
 
 def check_target(path: str | Path, *, overwrite: bool) -> Path:
@@ -20,15 +36,56 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
         ``path`` as a ``Path``.
 
     Raises:
-        InputError: it exists and may not be overwritten, it is a folder, or its folder is missing or read-only.
+        InputError: it exists and may not be overwritten, it is write-protected or a folder, or its folder is missing or
+            read-only.
     """
     path = Path(path)
+    check_encodable(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists; pass --overwrite to replace it")
+    # Renaming would replace a write-protected file all the same. Somebody protected it on purpose.
+    if path.exists() and not (path.stat().st_mode & 0o222 and os.access(path, os.W_OK)):
+        raise InputError(f"{path}: is write-protected; make it writable or name another file")
     check_folder(path)
     return path
+
+
+def check_separate(reads: Iterable[Path], writes: Iterable[Path]) -> None:
+    """Check that no file that a run writes is one that it reads, or one that it also writes under another name.
+
+    Links and hard links are followed. ``--overwrite`` makes no difference: the caller wants both files.
+
+    Raises:
+        InputError: a file that is written is read, or is written twice.
+    """
+    read = {_identity(path) for path in reads}
+    written: dict[object, Path] = {}
+    for path in writes:
+        identity = _identity(path)
+        if identity in read:
+            raise InputError(f"{path}: is one of the inputs; write the result elsewhere")
+        if identity in written:
+            raise InputError(f"{path}: is the same file as {written[identity]}, which is also written; name another")
+        written[identity] = path
+
+
+def _identity(path: Path) -> object:
+    """What is equal for two names of one file: device and number of the file, or the full path if it does not exist."""
+    try:
+        status = path.stat()
+    except OSError:
+        return os.path.normcase(os.path.realpath(path))
+    return status.st_dev, status.st_ino
+
+
+def check_encodable(path: Path) -> None:
+    """Raise InputError if a path is not UTF-8: OpenImageIO could not open it."""
+    try:
+        str(path).encode("utf-8")
+    except UnicodeEncodeError as error:
+        raise InputError(f"{path}: the path is not UTF-8, which OpenImageIO can't open; rename it") from error
 
 
 def check_folder(path: Path) -> None:
@@ -45,7 +102,7 @@ def check_folder(path: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
+def replacing(path: Path, *, overwrite: bool = False, stale: Path | None = None) -> Iterator[Path]:
     """Give the ``with`` block a temporary file, and rename it to ``path`` when the block ends.
 
     If the block raises, the temporary file is deleted and ``path`` stays as it was. If ``path`` is a link, the file
@@ -54,6 +111,7 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     Args:
         path: the file to write.
         overwrite: replace an existing file.
+        stale: a file that is deleted just before the rename, such as the preview of the file that is replaced.
 
     Yields:
         The path of the temporary file, in the same folder.
@@ -63,14 +121,15 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         MssplError: the file system refused, e.g. because the disk is full; ``path`` is as it was.
     """
     target = Path(os.path.realpath(path))
-    # remove_leftovers finds the file by this form of its name. Processes on two machines may have the same id.
-    unique = f"{os.getpid()}{secrets.randbelow(10**9):09d}"
-    temporary = target.with_name(f".{target.stem}.{unique}.tmp{target.suffix}")
+    # The suffix of `path`, because a link may point to a name without one, and writers choose the format by it.
+    temporary = target.with_name(f"{_prefix(target)}{_machine()}-{os.getpid()}-{secrets.token_hex(4)}.tmp{path.suffix}")
     try:
         yield temporary
         # The pixels must be on the disk before the rename: a crash must not leave half a file under the final name.
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
+        if stale is not None:
+            stale.unlink(missing_ok=True)
         if overwrite:
             if target.exists():
                 os.chmod(temporary, target.stat().st_mode & 0o7777)
@@ -86,17 +145,60 @@ def replacing(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def remove_leftovers(targets: Iterable[Path]) -> None:
-    """Delete the temporary files that killed runs left beside these files.
+    """Delete the temporary files that killed processes left beside these files.
 
-    If another process is writing one of them at this moment, that process fails with a message.
+    Files of living processes stay. A process on another machine can't be looked up, so its file stays for a day.
     """
-    wanted = {Path(os.path.realpath(target)) if target.is_symlink() else target for target in targets}
-    for folder in {target.parent for target in wanted}:
-        for name in os.listdir(folder) if folder.is_dir() else ():
-            match = re.fullmatch(r"\.(.+)\.\d+\.tmp(\.\w+)", name)
-            if match and folder / (match[1] + match[2]) in wanted:
-                with suppress(OSError):
-                    (folder / name).unlink()
+    prefixes: dict[Path, set[str]] = {}
+    for target in targets:
+        real = Path(os.path.realpath(target))
+        prefixes.setdefault(real.parent, set()).add(_prefix(real))
+    for folder, wanted in prefixes.items():
+        with suppress(OSError):
+            for name in os.listdir(folder):
+                match = re.fullmatch(r"(\..*\.[0-9a-f]{8}-)([0-9a-f]{8})-(\d+)-[0-9a-f]{8}\.tmp(\..*)?", name)
+                if match and match[1] in wanted and _is_abandoned(folder / name, match[2], int(match[3])):
+                    with suppress(OSError):
+                        (folder / name).unlink()
+
+
+def _prefix(target: Path) -> str:
+    """The beginning of the names of a target's temporary files."""
+    stem = os.fsencode(target.stem)[:_STEM_BYTES].decode("utf-8", "ignore")
+    return f".{stem}.{_hash(target.name)}-"
+
+
+@lru_cache(maxsize=1)
+def _machine() -> str:
+    """A hash that says where the number of a process has a meaning: this machine, or this container, since its start.
+
+    Containers may share the name of a machine and not its processes.
+    """
+    names = [socket.gethostname()]
+    with suppress(OSError):
+        names += [Path("/proc/sys/kernel/random/boot_id").read_text(), os.readlink("/proc/self/ns/pid")]
+    return _hash(" ".join(names))
+
+
+def _hash(text: str) -> str:
+    return sha256(os.fsencode(text)).hexdigest()[:8]
+
+
+def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:
+    """Whether nobody writes a temporary file any more."""
+    # On Windows, os.kill would end the process.
+    if machine == _machine() and sys.platform != "win32":
+        try:
+            os.kill(process, 0)
+        except ProcessLookupError:
+            return True
+        except (OSError, OverflowError):
+            return False
+        return False
+    # The clocks of two machines may differ, but not by a day.
+    with suppress(OSError):
+        return time.time() - temporary.stat().st_mtime > _ABANDONED
+    return False
 
 
 def _name_if_free(temporary: Path, target: Path) -> None:

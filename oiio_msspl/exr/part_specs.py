@@ -35,6 +35,10 @@ _KEPT_IN_EVERY_PART = (
 )
 
 
+#: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
+LARGEST_MIXED_PART = 256 << 20
+
+
 @dataclass(frozen=True)
 class PassedOnPart:
     """A part to be written, with pixels of the HRLS."""
@@ -108,8 +112,8 @@ def _stays_whole(part: Part, contents: FileContents) -> bool:
     if any(c in contents.beauty or c in contents.dropped for c in part.channels):
         return False
     # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. A part of a single pixel type
-    # is rewritten as scan lines; OpenImageIO can't do so with mixed types.
-    return _has_one_type(part) or part.tile == (0, 0)
+    # is rewritten as scan lines; OpenImageIO can't do so with mixed types. It copies those whole, in memory.
+    return _has_one_type(part) or (part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART)
 
 
 def _has_one_type(part: Part) -> bool:
@@ -118,6 +122,7 @@ def _has_one_type(part: Part) -> bool:
 
 def _whole_part(part: Part, taken: set[str]) -> PassedOnPart:
     spec = oiio.ImageSpec(part.spec)
+    spec.channelnames = tuple(channel.name for channel in part.channels)
     _name_and_compress(spec, _unique(part.name or f"part{part.index}", taken), lossless(part))
     if not _has_one_type(part):
         return PassedOnPart(spec, part, None)
@@ -144,10 +149,10 @@ def _layer_part(
         _drop_repeated_attributes(spec)
     if nuke and view:
         spec.attribute("view", view)
-    return PassedOnPart(spec, part, tuple(_runs(channels)))
+    return PassedOnPart(spec, part, tuple(runs(channels)))
 
 
-def _runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
+def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
     """Cut channels of one pixel type where their indices are not neighbours: a run can be decoded in one call."""
     run: list[Channel] = []
     for channel in channels:
@@ -187,7 +192,8 @@ def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
 def _drop_repeated_attributes(spec: Any) -> None:
     """Drop the metadata that one part holds for the whole file: a Cryptomatte manifest can take megabytes."""
     for name in [attribute.name for attribute in spec.extra_attribs]:
-        if name not in _KEPT_IN_EVERY_PART:
+        # OpenImageIO can't erase an attribute whose name is not UTF-8. Such a name holds surrogates.
+        if name not in _KEPT_IN_EVERY_PART and name.isprintable():
             spec.erase_attribute(name)
 
 

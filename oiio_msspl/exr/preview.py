@@ -35,9 +35,15 @@ def is_our_preview(path: Path) -> bool:
     if file is None:
         oiio.geterror()  # OpenImageIO prints an error that nobody asked for when the process ends
         return False
-    ours: bool = file.spec().get_string_attribute("Software") == SOFTWARE
+    ours = file.format_name() == "png" and file.spec().get_string_attribute("Software") == SOFTWARE
     file.close()
-    return ours
+    return bool(ours)
+
+
+def old_preview(exr: Path) -> Path | None:
+    """The preview that this module wrote beside an EXR that exists, or None."""
+    png = exr.with_suffix(".png")
+    return png if exr.exists() and png.is_file() and not png.is_symlink() and is_our_preview(png) else None
 
 
 def check_view(view: str) -> None:

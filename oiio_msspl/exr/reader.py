@@ -20,8 +20,14 @@ from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import check_encodable
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, StripCache, StripKey, strip_rows
+
+# OpenImageIO's own limits protect programs that read whole files: 1024 channels, and an image as large as the memory.
+# Files with thousands of light groups are larger. This module reads by rectangle, so it needs no limit to the image.
+oiio.attribute("limits:channels", 1 << 16)
+oiio.attribute("limits:imagesize_MB", 0)
 
 
 @dataclass(frozen=True)
@@ -60,6 +66,15 @@ class Part:
     """OpenImageIO's ``ImageSpec``, from which a copy of the part can be written."""
 
     @property
+    def nbytes(self) -> int:
+        """Bytes of all pixels in their stored types."""
+        return sum(self.plane_bytes(channel) for channel in self.channels)
+
+    def plane_bytes(self, channel: Channel) -> int:
+        """Bytes of the pixels of one channel in its stored type."""
+        return self.data_window.width * self.data_window.height * (2 if channel.type == "half" else 4)
+
+    @property
     def strip_height(self) -> int:
         """Rows that are decoded together: whole tiles, or whole chunks of scan lines."""
         unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)
@@ -85,7 +100,7 @@ class ExrFile:
     def _input(self) -> Any:
         handle = oiio.ImageInput.open(str(self.path))
         if handle is None:
-            raise InputError(f"{self.path}: can't be opened ({_last_error()})")
+            raise InputError(f"{self.path}: can't be opened ({reason_of(oiio)})")
         return handle
 
     def read(self, channels: Sequence[Channel], window: Window) -> Array:
@@ -208,15 +223,15 @@ class ExrFile:
         else:
             strip = self._input.read_scanlines(part.index, 0, y0, y1, 0, first, last, kind)
         if strip is None:
-            raise unreadable(self.path, part, self._input.geterror(), f", rows {y0} to {y1 - 1}")
+            raise unreadable(self.path, part, reason_of(self._input), f", rows {y0} to {y1 - 1}")
         return np.asarray(strip)
 
 
 def unreadable(path: Path, part: Part, reason: str, where: str = "") -> InputError:
     """The error for pixels that can't be decoded; ``where`` follows the part's name."""
     return InputError(
-        f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read "
-        f"({' '.join(reason.split()) or 'no reason given'}); the file is damaged or still being written"
+        f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read ({reason}); "
+        "the file is damaged or still being written"
     )
 
 
@@ -227,6 +242,7 @@ def open_exr(path: str | Path) -> ExrFile:
         InputError: there is no such file, it is not an EXR, or its headers are corrupt.
     """
     path = Path(path)
+    check_encodable(path)
     handle = _open(path)
     parts: list[Part] = []
     metadata: dict[str, Any] = {}
@@ -234,9 +250,9 @@ def open_exr(path: str | Path) -> ExrFile:
         spec = handle.spec()
         parts.append(_part(path, len(parts), spec))
         for attribute in spec.extra_attribs:
-            metadata.setdefault(attribute.name, attribute.value)
+            metadata.setdefault(_text(attribute.name), _text(attribute.value))
     if not parts:
-        raise InputError(f"{path}: holds no image ({handle.geterror() or 'empty'})")
+        raise InputError(f"{path}: holds no image ({reason_of(handle)})")
     first = parts[0].spec
     x, y = first.full_x, first.full_y
     return ExrFile(
@@ -256,7 +272,7 @@ def _open(path: Path) -> Any:
         raise InputError(f"{path}: no such file")
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
-        reason = _last_error()
+        reason = reason_of(oiio)
         hint = "; if its channels are subsampled (luminance and chroma), convert it to RGB" if "twice" in reason else ""
         raise InputError(f"{path}: can't be opened as an EXR ({reason}){hint}")
     if handle.format_name() != "openexr":
@@ -271,10 +287,10 @@ def _part(path: Path, index: int, spec: Any) -> Part:
     types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
     return Part(
         index=index,
-        name=str(spec.getattribute("oiio:subimagename") or ""),
-        view=str(spec.getattribute("view") or ""),
+        name=_text(str(spec.getattribute("oiio:subimagename") or "")),
+        view=_text(str(spec.getattribute("view") or "")),
         channels=tuple(
-            Channel(path, index, i, name, kind)
+            Channel(path, index, i, _text(name), kind)
             for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
         ),
         data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
@@ -285,9 +301,27 @@ def _part(path: Path, index: int, spec: Any) -> Part:
     )
 
 
-def _last_error() -> str:
-    """OpenImageIO's last error on one line: its messages repeat the path and break lines."""
+def _text(value: Any) -> Any:
+    """A header's text, or a sequence of texts. Bytes that are not UTF-8 are read as Latin-1; old exporters write that.
+
+    OpenImageIO gives such bytes as lone surrogates, which it refuses to write. So they are written as UTF-8.
+    """
+    if isinstance(value, tuple | list):
+        return tuple(_text(each) for each in value)
+    if not isinstance(value, str) or value.isascii():
+        return value
+    raw = value.encode("utf-8", "surrogateescape")
     try:
-        return " ".join(str(oiio.geterror()).split()) or "no reason given"
+        return raw.decode("utf-8")
+    except UnicodeDecodeError:
+        return raw.decode("latin-1")
+
+
+def reason_of(source: Any) -> str:
+    """The last error of OpenImageIO, or of one of its files, on one line."""
+    try:
+        # What follows is advice for programmers: to raise a limit of the library.
+        reason = str(source.geterror()).partition("Possible corrupt input?")[0]
+        return " ".join(reason.split()) or "no reason given"
     except UnicodeDecodeError:  # the message quotes bytes of the file, and OpenImageIO's binding expects UTF-8
-        return "its header is damaged"
+        return "its header or its pixels are damaged"

@@ -7,6 +7,7 @@ needs the whole file in memory.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.contents import FileContents
+from oiio_msspl.exr.contents import DTYPES, FileContents
+from oiio_msspl.exr.part_specs import runs
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.write_options import ERROR_LAYER
 
@@ -62,16 +64,28 @@ def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[
                 f"--layout multilayer: part '{part.name}' of {file.path} has the data window {part.data_window}, "
                 f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
             )
-        for channel in part.channels:
-            if channel in contents.beauty or channel in contents.dropped:
-                continue
-            name = _name(contents, channel)
-            if name in channels:
-                raise InputError(
-                    f"--layout multilayer: two parts of {file.path} hold a channel '{name}'; use --layout spec"
-                )
-            strips = [strip for _, _, strip in file.native_strips(part, channel.index, channel.index + 1)]
-            channels[name] = np.concatenate(strips)[..., 0]
+        passed_on = [c for c in part.channels if c not in contents.beauty and c not in contents.dropped]
+        for kind in sorted({channel.type for channel in passed_on}):
+            for run in runs([channel for channel in passed_on if channel.type == kind]):
+                planes = _planes(contents, run, channels)
+                for y0, y1, strip in file.native_strips(part, run[0].index, run[-1].index + 1):
+                    for position, plane in enumerate(planes):
+                        plane[y0 - part.data_window.y0 : y1 - part.data_window.y0] = strip[..., position]
+
+
+def _planes(contents: FileContents, run: Sequence[Channel], channels: dict[str, NDArray[Any]]) -> list[NDArray[Any]]:
+    """Empty planes for some channels of one pixel type, which are added to ``channels``."""
+    window = contents.home.data_window
+    planes = []
+    for channel in run:
+        name = _name(contents, channel)
+        if name in channels:
+            raise InputError(
+                f"--layout multilayer: two parts of {contents.source.path} hold a channel '{name}'; use --layout spec"
+            )
+        channels[name] = np.empty((window.height, window.width), dtype=DTYPES[channel.type])
+        planes.append(channels[name])
+    return planes
 
 
 def _name(contents: FileContents, channel: Channel) -> str:
@@ -86,8 +100,14 @@ def _header(contents: FileContents) -> dict[str, Any]:
     """The header of the HRLS's beauty, with the compression and the attributes of the contents."""
     import OpenEXR
 
-    with OpenEXR.File(str(contents.source.path), header_only=True) as source:
-        header = dict(source.parts[contents.home.index].header)
+    path = contents.source.path
+    try:
+        with OpenEXR.File(str(path), header_only=True) as source:
+            header = dict(source.parts[contents.home.index].header)
+    except UnicodeDecodeError as error:
+        raise InputError(
+            f"--layout multilayer: the header of {path} has names or texts that are not UTF-8; use --layout spec"
+        ) from error
     for key in _STRUCTURE:
         header.pop(key, None)
     name = "NO" if contents.compression == "none" else contents.compression.upper()

@@ -19,8 +19,8 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
-from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, error_spec, passed_on_parts
-from oiio_msspl.exr.reader import Channel, ExrFile, unreadable
+from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, error_spec, passed_on_parts
+from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.single_part import write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.exr.write_options import WriteOptions
@@ -38,6 +38,7 @@ def write_fused(
     error: Array | None = None,
     overwrite: bool = False,
     cache_bytes: int = 0,
+    stale: Path | None = None,
 ) -> list[str]:
     """Write the fused frame to ``path``, atomically.
 
@@ -53,6 +54,7 @@ def write_fused(
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
             each layer.
+        stale: a file that is deleted just before the EXR gets its name: the preview of the EXR that it replaces.
 
     Returns:
         Warnings, one sentence each.
@@ -64,7 +66,7 @@ def write_fused(
     pixels = FusedPixels(rgb, alpha, error, options.pixel_type or widest_type(beauty))
     dropped = dropped_channels(source, beauty, options.layers)
     contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options)
-    with replacing(path, overwrite=overwrite) as temporary:
+    with replacing(path, overwrite=overwrite, stale=stale) as temporary:
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
         else:
@@ -74,6 +76,18 @@ def write_fused(
         for part in source.parts
         if part.deep
     ]
+
+
+def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:
+    """Memory of the pixels that :func:`write_fused` holds at once, beside the fused frame; from the headers alone."""
+    if options.layout == "multilayer":
+        dropped = dropped_channels(source, beauty, options.layers)
+        flat = [part for part in source.parts if not part.deep]
+        return sum(part.plane_bytes(c) for part in flat for c in part.channels if c not in dropped)
+    if options.layout == "nuke":
+        return 0  # splits all parts
+    mixed = [part.nbytes for part in source.parts if len({channel.type for channel in part.channels}) > 1]
+    return max((size for size in mixed if size <= LARGEST_MIXED_PART), default=0)
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
@@ -99,7 +113,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
-        reason = " ".join(writer.geterror().split()) or "disk full?"
+        reason = reason_of(writer) if writer.has_error else "disk full?"
         raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
 
 
@@ -118,7 +132,7 @@ def _copy(file: ExrFile, part: PassedOnPart, later: Sequence[PassedOnPart], writ
         source = oiio.ImageInput.open(str(file.path))
         copied = source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source)
         if not copied and source is not None and source.has_error:
-            raise unreadable(file.path, part.source, source.geterror())
+            raise unreadable(file.path, part.source, reason_of(source))
         return bool(copied)
     ranges = [
         (run[0].index, run[-1].index + 1)

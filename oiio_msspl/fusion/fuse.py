@@ -11,7 +11,7 @@ import numpy as np
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import fuse_alpha
 from oiio_msspl.fusion.guards import (
@@ -24,7 +24,15 @@ from oiio_msspl.fusion.guards import (
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE, Tile, aligned_grid, check_memory, plan_tiles
+from oiio_msspl.fusion.tiling import (
+    MAX_MEMORY,
+    STRIPS_SHARE,
+    Tile,
+    aligned_grid,
+    memory_for_tiles,
+    plan_tiles,
+    require_memory,
+)
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images
 from oiio_msspl.model.session import Session
@@ -83,17 +91,17 @@ def fuse(
 
     Raises:
         InputError: the pair does not fit together or into memory, or the model is for another scale or does not
-            predict its error.
+            predict its error. No pixel was read.
         MssplError: the network failed, or returned NaN or infinite values.
     """
     alignment = align(lr, hr)
     _check_model(session, alignment.scale, error)
+    require_memory(memory_to_fuse(alignment, session, error=error) + held, session.contract, max_memory)
     seconds = session.seconds
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
         frame = _blank_frame(alignment, pair.exposure, error=error)
         tiles = plan_tiles(pair.grid, session.contract)
-        check_memory(session.contract, tiles, frame.nbytes + pair.nbytes + held, max_memory)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             # The next tile is read and encoded while the network works on this one.
             for done, tile in enumerate(one_ahead(pair.prepare, tiles), start=1):
@@ -106,6 +114,22 @@ def fuse(
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     return frame
+
+
+def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> int:
+    """The smallest ``max_memory`` with which a pair can be fused, from its headers."""
+    grid = aligned_grid(alignment.grid, session.contract.alignment)
+    # Of the features that the LRHS may have; it is not read yet. Alpha has 1 channel, every other one 3.
+    lrhs_bytes = grid.width * grid.height * (3 * (1 + len(session.lrhs_aovs)) + 1) * 4
+    frame_bytes = result_bytes(alignment, error=error) + lrhs_bytes
+    # The tiles of larger frames are as large. A damaged header may claim millions of tiles.
+    part = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + 16384, grid.y0 + 16384))
+    return memory_for_tiles(session.contract, plan_tiles(part, session.contract), frame_bytes)
+
+
+def result_bytes(alignment: Alignment, *, error: bool) -> int:
+    """Memory of a result: colour, alpha (whether there is one or not) and, if asked for, error."""
+    return alignment.hr_data_window.width * alignment.hr_data_window.height * (5 if error else 4) * 4
 
 
 def _check_model(session: Session, scale: int, error: bool) -> None:

@@ -80,12 +80,21 @@ def check_memory(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, ma
     Raises:
         InputError: it does not fit.
     """
+    require_memory(memory_for_tiles(contract, tiles, frame_bytes), contract, max_memory)
+
+
+def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int) -> int:
+    """Memory with which a frame can be fused in these tiles; ``frame_bytes`` as for :func:`check_memory`."""
     pixels = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
-    needed = FIXED_MEMORY + frame_bytes + pixels * contract.bytes_per_pixel
+    return FIXED_MEMORY + frame_bytes + pixels * contract.bytes_per_pixel
+
+
+def require_memory(needed: int, contract: Contract, max_memory: int, hint: str = "") -> None:
+    """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else would help."""
     if needed > max_memory:
         raise InputError(
             f"--max-memory: this frame needs more with model {contract.name}; allow at least "
-            f"{math.ceil(needed / 2**30 * 10) / 10:.1f}G"
+            f"{math.ceil(needed / 2**30 * 10) / 10:.1f}G{hint}"
         )
 
 

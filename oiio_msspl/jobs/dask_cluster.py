@@ -153,7 +153,7 @@ def _fuse_frame(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict
     from dask.system import CPU_COUNT
 
     # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
-    if not stages.overwrite and frame.output.exists():
+    if not stages.replaces(frame.lr, frame.hr, frame.output) and frame.output.exists():
         return None
     threads = stages.threads or (max(1, CPU_COUNT // neighbours) if neighbours > 1 else 0)
     # skip_existing lets this frame replace the preview that a dead worker left without its EXR.
@@ -162,5 +162,6 @@ def _fuse_frame(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict
         report = stages.run(frame)
     except InputError as error:
         # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
-        return None if not stages.overwrite and frame.output.exists() else error
+        replaces = stages.replaces(frame.lr, frame.hr, frame.output)
+        return None if not replaces and frame.output.exists() else error
     return report.as_dict()

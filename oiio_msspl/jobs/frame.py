@@ -12,22 +12,23 @@ from typing import Any
 
 import numpy as np
 
+from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, space_of
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
 from oiio_msspl.exr.contents import dropped_channels, widest_type
-from oiio_msspl.exr.preview import check_view, write_preview
+from oiio_msspl.exr.preview import check_view, old_preview, write_preview
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import write_fused
-from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.exr.writer import bytes_held, write_fused
+from oiio_msspl.fusion.alignment import Alignment, align
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
 from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, require_memory
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY, find_model
 from oiio_msspl.model.session import Session
@@ -49,6 +50,13 @@ class InputOptions:
     colourspace: str | None = None
     """Linear RGB space of both renders, see :func:`oiio_msspl.colour.named_space`; None to read it from the headers,
     and to take linear Rec. 709 if they do not say."""
+    map_file: Path | None = None
+    """The file that ``mapping`` was read from, if any."""
+
+    def files(self, hr_path: Path, model: str | None) -> set[Path]:
+        """The files that a frame is made from beside the pair: of the mapping, and a model that is no shipped one."""
+        named = [self.map_file, None if model is None else Path(model)]
+        return mapped_files(self.mapping, hr_path) | {path for path in named if path is not None}
 
 
 def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
@@ -116,6 +124,39 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     return SPREAD_NOISE_FAMILY
 
 
+def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
+    """All files that a frame is made from: the pair, what lies beside it, the mapping's files and the model."""
+    siblings = {*lr.file.siblings, *hr.file.siblings}
+    return {lr.file.path, hr.file.path} | siblings | inputs.files(hr.file.path, model)
+
+
+def memory_to_write(alignment: Alignment, hr: MappedRender, write: WriteOptions) -> int:
+    """The smallest ``max_memory`` with which the result can be written, from the headers."""
+    held = bytes_held(hr.file, hr.beauty_channels, write)
+    return FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + held
+
+
+def check_frame_memory(
+    lr: MappedRender, hr: MappedRender, session: Session, write: WriteOptions, max_memory: int, held: int = 0
+) -> None:
+    """Refuse a pair that does not fit into memory, before its pixels are read.
+
+    Args:
+        lr, hr, session, write: what is fused and how it is written.
+        max_memory: bytes that the process should stay below.
+        held: bytes of these that other frames need.
+
+    Raises:
+        InputError: it does not fit. The message says how much does.
+    """
+    alignment = align(lr, hr)
+    to_fuse = memory_to_fuse(alignment, session, error=write.error_layer)
+    to_write = memory_to_write(alignment, hr, write)
+    only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
+    hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""
+    require_memory(max(to_fuse, to_write) + held, session.contract, max_memory, hint)
+
+
 def fuse_files(
     lr_path: str | Path,
     hr_path: str | Path,
@@ -160,15 +201,20 @@ def fuse_files(
     output = check_target(output, overwrite=overwrite)
     if output.suffix.lower() != ".exr":
         raise InputError(f"{output}: the result is an EXR; name it .exr")
-    if any(Path(p).exists() and output.exists() and output.samefile(p) for p in (lr_path, hr_path)):
-        raise InputError(f"{output}: is one of the inputs; write the result elsewhere")
     if preview_path is not None:
         check_target(preview_path, overwrite=overwrite)
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
+    targets = [output] if preview_path is None else [output, preview_path]
+    check_separate(files_read(lr, hr, inputs, model), targets)
+    remove_leftovers(targets)
     dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
-    session = Session(find_model(align(lr, hr).scale, resolve_auto(lr, hr, model)), device, threads)
+    # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
+    fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
+    family = resolve_auto(lr, hr, model) if fits else model or DEFAULT_FAMILY
+    session = Session(find_model(align(lr, hr).scale, family), device, threads)
+    check_frame_memory(lr, hr, session, write, max_memory)
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
@@ -195,6 +241,8 @@ def write_frame(
     """Write the EXR that the report names. The number of clipped values and the writer's warnings are added to the
     report.
 
+    A preview that shows the EXR that is replaced is deleted, because the new one may fail or may not be wanted.
+
     Args:
         cache_bytes: see :func:`oiio_msspl.exr.writer.write_fused`.
     """
@@ -215,6 +263,7 @@ def write_frame(
         error=fused.error,
         overwrite=overwrite,
         cache_bytes=cache_bytes,
+        stale=old_preview(report.output) if overwrite else None,
     )
 
 

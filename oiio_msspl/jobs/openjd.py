@@ -111,7 +111,7 @@ def make_job(
 
     if not any(frame.lr and frame.hr for frame in shot.frames):
         raise InputError(f"no frame is in both {shot.lr.pattern} and {shot.hr.pattern}; nothing to submit")
-    check_no_input(shot)
+    check_no_input(shot, InputOptions(map_file=map_file), model)
     folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
     if not folder.is_dir():
         raise InputError(f"{output}: the folder {folder} does not exist; create it first")

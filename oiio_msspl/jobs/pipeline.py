@@ -11,6 +11,7 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
 
+from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
@@ -20,7 +21,7 @@ from oiio_msspl.jobs.stages import Stages
 def run_pipeline(
     stages: Stages,
     frames: list[Frame],
-    record: Callable[[Frame, dict[str, Any] | Exception], None],
+    record: Callable[[Frame, dict[str, Any] | Exception | None], None],
     save: Callable[[], None],
 ) -> None:
     """Take frames through the stages. However this ends, the frame that is being written is finished and recorded.
@@ -28,7 +29,8 @@ def run_pipeline(
     Args:
         stages: the stages and their settings.
         frames: what to fuse, in this order.
-        record: called in the order of the frames, with a frame and its report as a dict, or the reason for its failure.
+        record: called in the order of the frames, with a frame and its report as a dict, the reason for its failure,
+            or None if another run has fused it in the meantime.
         save: called after each frame, when the frames before it are recorded.
 
     Raises:
@@ -39,7 +41,8 @@ def run_pipeline(
     def record_failure(frame: Frame, error: BaseException) -> None:
         if not isinstance(error, Exception):
             raise error
-        record(frame, error)
+        # The error says that the EXR appeared while it was computed.
+        record(frame, None if stages.skips(frame) else error)
 
     def finish_writing() -> None:
         """Wait until the frame that is being written is on the disk, and record it."""
@@ -62,7 +65,9 @@ def run_pipeline(
                 reading = reads.pop()
                 reads += [reader.submit(stages.read, following) for following in frames[index + 1 : index + 2]]
                 error = reading.exception()
-                if error is None:
+                if error is None and stages.skips(frame):
+                    error = InputError("another run has fused it")  # is recorded as skipped
+                elif error is None:
                     session = stages.session(reading.result())
                     try:
                         report, fused = stages.fuse(reading.result(), session)

@@ -50,6 +50,7 @@ def fuse_shot(
     view_transform: str | None = None,
     overwrite: bool = False,
     skip_existing: bool = False,
+    update: bool = False,
     report_path: str | Path | None = None,
     progress: Callable[[FrameResult, ShotReport], None] | None = None,
     client: Client | None = None,
@@ -64,6 +65,7 @@ def fuse_shot(
         previews: write a PNG beside each EXR.
         overwrite: replace existing files.
         skip_existing: skip frames whose EXR exists. This resumes a run that was ended.
+        update: the same, but fuse a frame again if one of its inputs is newer than its EXR, as ``make`` does.
         report_path: JSON file that is kept up to date frame by frame. With ``skip_existing``, skipped frames keep
             their entries of an earlier report.
         progress: called after each frame with its result and the report so far. Frames that are skipped, missing or
@@ -80,15 +82,17 @@ def fuse_shot(
         MssplError: the report can't be written.
     """
     start = time.perf_counter()
-    if overwrite and skip_existing:
-        raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
+    if overwrite and (skip_existing or update):
+        option = "--update" if update else "--skip-existing"
+        raise InputError(f"--overwrite and {option} exclude each other: replace all frames, or leave some")
     shot = find_shot(lr, hr, output, frames)
     if previews and view_transform is not None:
         check_view(view_transform)
-    prepare_output(shot)
-    report = ShotReport(shot)
     report_path = None if report_path is None else Path(report_path)
-    earlier = read_earlier(report, report_path, overwrite, skip_existing)
+    pngs = [frame.output.with_suffix(".png") for frame in shot.frames] if previews else []
+    prepare_output(shot, inputs, model, [*pngs, *([report_path] if report_path else [])])
+    report = ShotReport(shot)
+    earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
 
     def finish(result: FrameResult) -> None:
         report.results[result.frame] = result
@@ -113,15 +117,6 @@ def fuse_shot(
         except MssplError as error:
             log.warning("%s", error)
 
-    to_fuse = []
-    for frame in shot.frames:
-        result = known_result(frame, shot, previews, overwrite, skip_existing)
-        if result is None:
-            to_fuse.append(frame)
-        else:
-            finish(replace(result, **earlier.get(frame.number, {})) if result.status == SKIPPED else result)
-    targets = [path for frame in shot.frames for path in (frame.output, frame.output.with_suffix(".png"))]
-    remove_leftovers([*targets, report_path] if report_path else targets)
     stages = Stages(
         inputs=inputs,
         write_options=write,
@@ -132,8 +127,21 @@ def fuse_shot(
         previews=previews,
         view_transform=view_transform,
         overwrite=overwrite,
-        skip_existing=skip_existing,
+        skip_existing=skip_existing or update,
+        update=update,
     )
+    to_fuse = []
+    for frame in shot.frames:
+        result = known_result(frame, shot, stages)
+        if result is None:
+            to_fuse.append(frame)
+            continue
+        if result.status == SKIPPED and (entry := earlier.get(frame.number)):
+            warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
+            result = replace(result, **entry | {"warnings": warnings})
+        finish(result)
+    targets = [path for frame in shot.frames for path in (frame.output, frame.output.with_suffix(".png"))]
+    remove_leftovers([*targets, report_path] if report_path else targets)
     try:
         if client is None:
             run_pipeline(stages, to_fuse, record, save)

@@ -5,22 +5,28 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, check_target
+from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
 from oiio_msspl.jobs.frame import InputOptions, map_pair, resolve_auto
 from oiio_msspl.jobs.pair import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
-from oiio_msspl.jobs.stages import is_left_over
+from oiio_msspl.jobs.stages import Stages, is_left_over
 from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY
 
 log = logging.getLogger(__name__)
 
 
-def prepare_output(shot: Shot) -> None:
+def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_targets: Iterable[Path]) -> None:
     """Create the output folder if only the folder itself is missing.
+
+    Args:
+        shot: the shot.
+        inputs, model: what all frames are made from, beside their pairs.
+        more_targets: what is written beside the EXRs.
 
     Raises:
         InputError: the folder can't be created or written to, or a result would replace an input.
@@ -30,7 +36,7 @@ def prepare_output(shot: Shot) -> None:
         check_folder(folder)
         folder.mkdir(exist_ok=True)
     check_folder(shot.output.path(0))
-    check_no_input(shot)
+    check_no_input(shot, inputs, model, more_targets)
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
@@ -53,12 +59,14 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
     return DEFAULT_FAMILY
 
 
-def check_no_input(shot: Shot) -> None:
-    """Raise InputError if a result would replace one of its inputs."""
-    for frame in shot.frames:
-        for source in (frame.lr, frame.hr):
-            if source is not None and source.exists() and frame.output.exists() and frame.output.samefile(source):
-                raise InputError(f"{frame.output}: is one of the inputs; write the results elsewhere")
+def check_no_input(
+    shot: Shot, inputs: InputOptions, model: str | None = None, more_targets: Iterable[Path] = ()
+) -> None:
+    """Raise InputError if a file that is written is read for any frame, or is written twice."""
+    pairs = {path for frame in shot.frames for path in (frame.lr, frame.hr) if path is not None}
+    # Without its path an HRLS can't have siblings either.
+    others = [inputs.files(frame.hr, model) for frame in shot.frames if frame.hr is not None]
+    check_separate(pairs.union(*others), [*(frame.output for frame in shot.frames), *more_targets])
 
 
 def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]:
@@ -76,27 +84,30 @@ def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]
     return []
 
 
-def known_result(frame: Frame, shot: Shot, previews: bool, overwrite: bool, skip_existing: bool) -> FrameResult | None:
+def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None:
     """The result of a frame that need not or can't be fused; None for a frame to fuse.
 
     Args:
         frame: one of the shot's frames.
         shot: the shot.
-        previews, overwrite, skip_existing: as in :func:`oiio_msspl.jobs.shot.fuse_shot`.
+        stages: their settings.
     """
-    if skip_existing and frame.output.exists():
-        return result_of(frame, SKIPPED)
+    if stages.skips(frame):
+        newer = stages.newer_inputs(frame.lr, frame.hr, frame.output)
+        warnings = [f"is older than {newer[0]}; --update fuses such frames again"] if newer else []
+        return result_of(frame, SKIPPED, warnings=warnings)
     sources = (("LRHS", frame.lr, shot.lr), ("HRLS", frame.hr, shot.hr))
     lacking = [f"{name} ({sequence.pattern})" for name, path, sequence in sources if path is None]
     if lacking:
         return result_of(frame, MISSING, f"no {' and no '.join(lacking)} of this number", 2)
+    overwrite = stages.replaces(frame.lr, frame.hr, frame.output)
     if os.path.lexists(frame.output) and not frame.output.is_dir() and not overwrite:
         return result_of(frame, FAILED, "the output exists; pass --skip-existing or --overwrite", 2)
     try:
         check_target(frame.output, overwrite=overwrite)
-        if previews:
+        if stages.previews:
             png = frame.output.with_suffix(".png")
-            check_target(png, overwrite=overwrite or (skip_existing and is_left_over(png)))
+            check_target(png, overwrite=overwrite or (stages.skip_existing and is_left_over(png)))
     except InputError as error:
         return result_of(frame, FAILED, str(error), error.exit_code)
     return None

@@ -135,16 +135,21 @@ def read_earlier(
         ``warnings``, ``repaired`` and ``seconds`` of each frame in the earlier report.
 
     Raises:
-        InputError: the file exists and may not be replaced, or it is no report of a shot.
+        InputError: the file exists and may not be replaced, or it is no report of a shot. An option that names the
+            wrong file must not turn a render into a report, with ``--overwrite`` neither.
     """
     if path is None:
         return {}
     check_target(path, overwrite=overwrite or skip_existing)
-    if not skip_existing or not path.exists():
+    if not path.exists():
         return {}
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
-        report.first = data["first_fused"]
-        return {entry["frame"]: {k: entry[k] for k in ("warnings", "repaired", "seconds")} for entry in data["frames"]}
-    except (ValueError, KeyError, TypeError) as error:
+        entries = {
+            entry["frame"]: {k: entry[k] for k in ("warnings", "repaired", "seconds")} for entry in data["frames"]
+        }
+        if skip_existing:
+            report.first = data["first_fused"]
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise InputError(f"{path}: exists and is no report of a shot; name another file") from error
+    return entries if skip_existing else {}

@@ -12,13 +12,21 @@ from pathlib import Path
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import InputOptions, map_pair, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import (
+    InputOptions,
+    check_frame_memory,
+    files_read,
+    map_pair,
+    write_frame,
+    write_frame_preview,
+)
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.model.catalogue import find_model
@@ -61,6 +69,7 @@ class Stages:
     view_transform: str | None = None
     overwrite: bool = False
     skip_existing: bool = False
+    update: bool = False
     sessions: dict[Path, Session] = field(default_factory=dict)
     """Models that are loaded, by file."""
 
@@ -75,6 +84,24 @@ class Stages:
         self.write(report, fused)
         return report
 
+    def skips(self, frame: Frame) -> bool:
+        """Whether a frame counts as done: its EXR exists, and with ``update`` none of its inputs is newer."""
+        if not (self.skip_existing and frame.output.exists()):
+            return False
+        return not (self.update and self.newer_inputs(frame.lr, frame.hr, frame.output))
+
+    def replaces(self, lr: Path | None, hr: Path | None, output: Path) -> bool:
+        """Whether an EXR that exists is replaced."""
+        return self.overwrite or (self.update and bool(self.newer_inputs(lr, hr, output)))
+
+    def newer_inputs(self, lr: Path | None, hr: Path | None, output: Path) -> list[Path]:
+        """The files that a frame is made from and that were changed after ``output``, which exists."""
+        if lr is None or hr is None or not output.exists():
+            return []
+        written = output.stat().st_mtime
+        files = [lr, hr, *sorted(self.inputs.files(hr, self.model))]
+        return [path for path in files if path.is_file() and path.stat().st_mtime > written]
+
     def read(self, frame: Frame) -> LoadedFrame:
         """Open and map a pair, and read its pixels if two frames fit into memory beside a tile.
 
@@ -84,6 +111,8 @@ class Stages:
         start = time.perf_counter()
         assert frame.lr is not None and frame.hr is not None
         lr, hr = map_pair(frame.lr, frame.hr, self.inputs)
+        targets = [frame.output, frame.output.with_suffix(".png")] if self.previews else [frame.output]
+        check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
         left = self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr)
@@ -112,6 +141,7 @@ class Stages:
         others = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
         if loaded.in_memory:
             others += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+        check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, others)
         fused = fuse(
             loaded.lr_pixels,
             loaded.hr_pixels,
@@ -135,7 +165,7 @@ class Stages:
             MssplError: the file system refused. An old frame is as it was; of a new one nothing is left.
         """
         start = time.perf_counter()
-        if self.overwrite and report.output.exists():
+        if report.output.exists() and self.replaces(report.lr.file.path, report.hr.file.path, report.output):
             # The EXR goes first: if it can't be replaced, the old frame keeps its preview.
             write_frame(report, fused, self.write_options, overwrite=True)
             write_frame_preview(report, fused, self.view_transform, overwrite=True)

@@ -105,6 +105,32 @@ class Contract:
             name: count for name, count in HRLS_FEATURES.items() if any(c.startswith(f"{name}.") for c in self.hrls)
         }
 
+    def _wrong_field(self) -> str | None:
+        """The name of a field whose value has another type or is out of range; None if all can be used."""
+        numbers = {
+            "format": (0, 10**6),
+            "scale": (1, 64),
+            "alignment": (1, 1024),
+            "overlap": (0, 4096),
+            "bytes_per_pixel": (1, 10**6),
+        }
+        for name, (least, most) in numbers.items():
+            value = getattr(self, name)
+            if type(value) is not int or not least <= value <= most:
+                return name
+        if not isinstance(self.name, str) or not 0 < len(self.name) <= 100:
+            return "name"
+        if self.denoiser not in (NO_DENOISER, MEAN_DENOISER):
+            return "denoiser"
+        if not isinstance(self.provenance, dict):
+            return "provenance"
+        spans = self.training_spp
+        is_span = isinstance(spans, dict) and all(
+            isinstance(span, list) and len(span) == 2 and all(type(spp) in (int, float) for spp in span)
+            for span in spans.values()
+        )
+        return None if is_span else "training_spp"
+
     def to_json(self) -> str:
         return json.dumps(asdict(self), sort_keys=True)
 
@@ -144,10 +170,13 @@ class Contract:
         """
         try:
             contract = cls(**json.loads(text))
-        except (ValueError, TypeError) as error:
+        except (ValueError, TypeError, RecursionError) as error:
             raise InputError(
                 f"{source}: the '{METADATA_KEY}' metadata can't be read ({error}); export it again"
             ) from error
+        wrong = contract._wrong_field()
+        if wrong:
+            raise InputError(f"{source}: the field {wrong} of its contract has a value that can't be; export it again")
         if contract.format != FORMAT:
             raise InputError(
                 f"{source}: contract format {contract.format}, this version reads {FORMAT}; update one of them"
@@ -162,7 +191,8 @@ class Contract:
         for key, value in expected.items():
             if getattr(contract, key) != value:
                 raise InputError(
-                    f"{source}: made for {key} {getattr(contract, key)}, this version has {value}; export it again"
+                    f"{source}: made for {key} {str(getattr(contract, key))[:200]}, this version has {value}; "
+                    "export it again"
                 )
         if contract.overlap % contract.alignment:
             raise InputError(

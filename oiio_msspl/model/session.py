@@ -66,6 +66,12 @@ class Session:
         self.contract = Contract.of_network(self._session, path)
         self._denoiser = make_denoiser(self.contract.denoiser, threads)
         self._outputs = [output.name for output in self._session.get_outputs()]
+        inputs = sorted(each.name for each in self._session.get_inputs())
+        if inputs != ["hrls", "lrhs"] or "fused" not in self._outputs:
+            raise InputError(
+                f"{path}: its network has the inputs {', '.join(inputs)[:99]} and the outputs "
+                f"{', '.join(self._outputs)[:99]}, not lrhs, hrls and fused; export it again"
+            )
         self.path = Path(path)
         self.threads = threads
         self.seconds = 0.0

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import re
+from pathlib import Path
 
 import pytest
 
@@ -53,3 +54,31 @@ def test_files_that_a_mapping_names_do_not_depend_on_the_working_directory(tmp_p
 def test_a_wrong_mapping_option_is_explained(options, message):
     with pytest.raises(InputError, match=message):
         parse_map_options(options)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("albedo = " + "[" * 10**5 + "]" * 10**5, "nested too deeply"),
+        ("albedo = " + "1" * 5000, "can't be read as a mapping"),
+        ("albedo = " + "{ layer = " * 3000 + "'a'" + " }" * 3000, "."),
+        ("albedo = [" + "1, " * 10**5 + "]", "is neither a layer's name nor a table"),
+        ("normal = { layer = 'N', note = 1979-05-27 }", "note must be a text"),
+        ("albedo = 1979-05-27", "is neither a layer's name"),
+        ("x" * (2 << 20), "is too large for a mapping"),
+        ("albedo = 'a\x00b'", "can't be read as a mapping"),
+    ],
+)
+def test_a_forged_mapping_file_is_refused_by_a_short_sentence(tmp_path, text, message):
+    path = tmp_path / "map.toml"
+    path.write_text(text)
+    with pytest.raises(InputError, match=message) as caught:
+        read_map_file(path)
+    assert len(str(caught.value)) < 1000
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device that never ends")
+@pytest.mark.parametrize("path", ["/dev/zero", "/dev", "nothing.toml"])
+def test_what_is_no_file_is_no_mapping(path):
+    with pytest.raises(InputError, match="no such file"):
+        read_map_file(path)

@@ -188,7 +188,7 @@ def test_the_readmes_first_command_shows_a_result(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT"])
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
 def test_a_signal_leaves_nothing_half_written(files, bilinear_models, name):
     """Ended by a farm or by Ctrl-C at any moment: the old file stays and no temporary file is left."""
     (files / "out.exr").write_text("old")
@@ -203,3 +203,45 @@ def test_a_signal_leaves_nothing_half_written(files, bilinear_models, name):
         process.send_signal(getattr(signal, name))
         process.communicate()
         assert sorted(p.name for p in files.iterdir()) == before
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+@pytest.mark.parametrize("names", [["SIGHUP"], ["SIGTERM", "SIGTERM", "SIGINT"], ["SIGINT", "SIGINT", "SIGHUP"]])
+def test_signals_in_quick_succession_leave_no_temporary_file(files, names):
+    """The first one ends the program while it writes, the others come while it cleans up."""
+    code = """
+import sys, time, typer
+from pathlib import Path
+from msspl_cli.errors import run
+from oiio_msspl.exr.atomic import replacing
+app = typer.Typer()
+
+@app.command()
+def write(path: Path) -> None:
+    try:
+        with replacing(path) as temporary:
+            temporary.write_text("half")
+            print("on", flush=True)
+            time.sleep(60)
+    finally:
+        time.sleep(0.5)
+        path.with_suffix(".cleaned").touch()
+
+run(app)
+"""
+    out = files / "new.exr"
+    process = subprocess.Popen([sys.executable, "-c", code, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process.stdout.readline()
+    for name in names:
+        process.send_signal(getattr(signal, name))
+        time.sleep(0.1)
+    process.communicate(timeout=30)
+    assert process.returncode == (130 if names[0] == "SIGINT" else 128 + getattr(signal, names[0]))
+    assert [path.name for path in files.iterdir() if path.name.startswith((".", "new"))] == ["new.cleaned"]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
+def test_nohup_is_respected(files):
+    code = "import os, signal; from msspl_cli.errors import _exit_on_signals as on\n"
+    code += "signal.signal(signal.SIGHUP, signal.SIG_IGN); on(); os.kill(os.getpid(), signal.SIGHUP); print('lives')"
+    assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "lives\n"

@@ -14,7 +14,7 @@ import pytest
 
 from oiio_msspl.exr.preview import write_png
 from tests.conftest import read_bits, write_exr
-from tests.programs import fuse
+from tests.programs import fuse, leave_temporary
 from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
 
 
@@ -142,7 +142,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(tmp_path, bilinear_model
         if (folder / "r.json").exists():
             assert not json.loads((folder / "r.json").read_text())["finished"]
     # What a kill in the middle of writing leaves, should the three moments have missed it.
-    (folder / "out/.beauty.1100.99999.tmp.exr").write_bytes(b"half")
+    leave_temporary(folder / "out/beauty.1100.exr")
     write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
 
     last = start(folder, bilinear_models[4])

@@ -3,11 +3,14 @@
 
 import os
 import sys
+import time
 
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_target, remove_leftovers, replacing
+from oiio_msspl.exr import atomic
+from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers, replacing
+from tests.programs import leave_temporary
 
 
 def test_a_failing_block_leaves_the_old_file(tmp_path):
@@ -57,13 +60,77 @@ def test_targets_are_checked_before_any_work(tmp_path):
 
 
 def test_leftovers_of_killed_runs_are_removed_and_nothing_else(tmp_path):
-    """The temporary file of a run that never ended goes; files that only look like one stay."""
+    """The temporary file of a process that died goes. Those of other targets stay, and so do files of similar names."""
     target = tmp_path / "out.exr"
-    stack = replacing(target)
-    leftover = stack.__enter__()
-    leftover.write_text("half")
-    others = [tmp_path / name for name in (".other.12.tmp.exr", ".out.12.tmp.png", ".out.x.tmp.exr", "out.exr")]
-    for path in others:
-        path.write_text("kept")
+    gone = leave_temporary(target)
+    names = (".out.12.tmp.exr", ".out.x.tmp.exr", "out.exr", gone.name.replace(".out.", ".in."))
+    kept = [leave_temporary(tmp_path / "other.exr"), leave_temporary(tmp_path / "out.png")]
+    for name in names:
+        (tmp_path / name).write_text("kept")
     remove_leftovers([target])
-    assert sorted(tmp_path.iterdir()) == sorted(others)
+    assert sorted(tmp_path.iterdir()) == sorted([*kept, *(tmp_path / name for name in names)])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="on Windows only the age counts")
+def test_a_temporary_file_that_a_living_process_writes_stays(tmp_path):
+    """Even if it is old, because a process of this machine can be looked up."""
+    target = tmp_path / "out.exr"
+    with replacing(target) as temporary:
+        temporary.write_text("half")
+        os.utime(temporary, (0, 0))
+        remove_leftovers([target])
+        assert temporary.exists()
+    assert target.exists()
+
+
+def test_a_process_on_another_machine_is_taken_for_dead_after_a_day(tmp_path, monkeypatch):
+    target = tmp_path / "out.exr"
+    monkeypatch.setattr(atomic, "_machine", lambda: "0123abcd")
+    new, old = leave_temporary(target), leave_temporary(target)
+    os.utime(old, (time.time() - 25 * 3600,) * 2)
+    monkeypatch.undo()
+    remove_leftovers([target])
+    assert list(tmp_path.iterdir()) == [new]
+
+
+@pytest.mark.parametrize("name", ["x" * 251 + ".exr", "ä" * 125 + ".exr"])
+def test_a_name_as_long_as_the_file_system_allows_is_written(tmp_path, name):
+    with replacing(tmp_path / name) as temporary:
+        temporary.write_text("new")
+    assert os.listdir(tmp_path) == [name]
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX links")
+def test_the_format_follows_the_name_that_was_given_and_not_that_of_the_link_s_target(tmp_path):
+    (tmp_path / "out.exr").symlink_to("stored.data")
+    with replacing(tmp_path / "out.exr") as temporary:
+        assert temporary.suffix == ".exr"
+        temporary.write_text("new")
+    assert (tmp_path / "stored.data").read_text() == "new"
+
+
+def test_a_write_protected_file_is_not_replaced(tmp_path):
+    target = tmp_path / "out.exr"
+    target.write_text("published")
+    target.chmod(0o444)
+    with pytest.raises(InputError, match="is write-protected; make it writable or name another file"):
+        check_target(target, overwrite=True)
+
+
+def link(path, to):
+    path.symlink_to(to.name)
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX links")
+@pytest.mark.parametrize("named", [link, lambda path, to: os.link(to, path), lambda path, to: None])
+def test_what_is_read_is_not_written_under_any_name(tmp_path, named):
+    """The same name, a link, or a second name of one file; before it is written, and if it is written twice."""
+    source, other = tmp_path / "in.exr", tmp_path / "other.exr"
+    source.write_text("render")
+    named(other, source)
+    target = other if other.exists() else tmp_path / ".." / tmp_path.name / "in.exr"
+    with pytest.raises(InputError, match="is one of the inputs"):
+        check_separate([source], [tmp_path / "out.exr", target])
+    with pytest.raises(InputError, match="is the same file as"):
+        check_separate([], [source, target])
+    check_separate([source], [tmp_path / "out.exr", tmp_path / "out.png"])

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputError, fuse_shot
+from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs.dask_cluster import _sessions
 from oiio_msspl.jobs.stages import Stages
@@ -48,9 +49,10 @@ def hang_in_writing(marker):
 
     def write(self, report, fused):
         write_png(report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
-        report.output.with_name(f".{report.output.stem}.{os.getpid()}.tmp.exr").write_bytes(b"half")
-        marker.touch()
-        time.sleep(1000)
+        with replacing(report.output) as temporary:
+            temporary.write_bytes(b"half")
+            marker.touch()
+            time.sleep(1000)
 
     Stages.write = write
 

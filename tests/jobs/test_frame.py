@@ -1,14 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main job on one pair: what is refused before any work, and what does not stop it."""
 
+import re
+import subprocess
+import sys
+
 import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
-from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.preview import is_our_preview, write_png
+from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.jobs import frame
 from oiio_msspl.jobs.frame import map_pair
 from tests.conftest import downsample, picture, read_bits, rgb, write_exr
+from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
 
 
@@ -78,3 +85,175 @@ def test_values_that_half_cannot_hold_are_clipped_and_counted(tmp_path, bilinear
     assert any(f"{clipped} values are too bright for half" in warning for warning in report.warnings) == bool(clipped)
     [(_, channels)] = read_bits(tmp_path / "out.exr")
     assert (channels["R"][16:24, 40:48] == lamp).all()
+
+
+# ------------------------------------------------------------------------------------------------ inputs stay
+
+
+def protected(folder):
+    """{name: bytes} of all files in a folder."""
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+def luxcore_pair(folder):
+    """LuxCore writes one file for each AOV; the beauty's reads the others."""
+    write_exr(folder / "lr.exr", low_layers(1))
+    for name in ("ALBEDO", "AVG_SHADING_NORMAL"):
+        write_exr(folder / f"{name}.exr", rgb(picture(HEIGHT, WIDTH)))
+    return folder / "lr.exr", write_exr(folder / "RGB.exr", rgb(picture(HEIGHT, WIDTH)))
+
+
+@pytest.mark.parametrize("target", ["other.exr", "map.toml", "model.onnx", "ALBEDO.exr", "AVG_SHADING_NORMAL.exr"])
+@pytest.mark.parametrize("kind", ["output", "preview"])
+def test_no_file_that_is_read_is_written_even_with_overwrite(tmp_path, monkeypatch, target, kind):
+    """A file of --map, the mapping's file, the model, and the sibling files of a LuxCore beauty, by name or by link."""
+    monkeypatch.setattr(frame, "Session", pytest.fail)
+    pair = luxcore_pair(tmp_path)
+    write_exr(tmp_path / "other.exr", rgb(picture(HEIGHT, WIDTH)))
+    for name in ("map.toml", "model.onnx"):
+        (tmp_path / name).write_text("text")
+    (tmp_path / "out.exr").symlink_to(target)
+    (tmp_path / "out.png").symlink_to(target)
+    before = protected(tmp_path)
+    mapping = {"diffuse": f"file:{tmp_path / 'other.exr'}"}
+    inputs = InputOptions(mapping, map_file=tmp_path / "map.toml")
+    more = {"inputs": inputs, "model": str(tmp_path / "model.onnx"), "overwrite": True}
+    output, preview = ("out.exr", None) if kind == "output" else ("new.exr", tmp_path / "out.png")
+    with pytest.raises(InputError, match="is one of the inputs"):
+        fuse_files(*pair, tmp_path / output, preview_path=preview, **more)
+    assert protected(tmp_path) == before
+
+
+def test_a_preview_that_is_a_link_to_the_result_is_refused(pair, tmp_path, bilinear_models):
+    (tmp_path / "out.png").symlink_to("out.exr")
+    with pytest.raises(InputError, match="is the same file as"):
+        fuse_files(
+            *pair,
+            tmp_path / "out.exr",
+            model=str(bilinear_models[4]),
+            preview_path=tmp_path / "out.png",
+            overwrite=True,
+        )
+
+
+# ------------------------------------------------------------------------------------------------ what is left behind
+
+
+def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bilinear_models, monkeypatch):
+    """Neither if no preview is asked for, nor if it can't be written, nor if the run dies before it."""
+    out, png, model = tmp_path / "out.exr", tmp_path / "out.png", str(bilinear_models[4])
+
+    def full_disk(*arguments, **more):
+        raise MssplError("disk full")
+
+    for preview, writes in ((None, frame.write_preview), (png, full_disk)):
+        out.write_text("old")
+        write_png(png, np.zeros((2, 2, 3)), overwrite=True)
+        monkeypatch.setattr(frame, "write_preview", writes)
+        fuse_files(*pair, out, model=model, preview_path=preview, overwrite=True)
+        assert not png.exists()
+    png.write_text("somebody's picture")
+    fuse_files(*pair, out, model=model, overwrite=True)
+    assert png.read_text() == "somebody's picture"
+
+
+def test_an_old_frame_that_can_not_be_replaced_keeps_its_preview(pair, tmp_path, bilinear_models, monkeypatch):
+    out, png = tmp_path / "out.exr", tmp_path / "out.png"
+    out.write_text("old")
+    write_png(png, np.zeros((2, 2, 3)))
+    monkeypatch.setattr("oiio_msspl.exr.writer._write_parts", lambda *_: (_ for _ in ()).throw(MssplError("full")))
+    with pytest.raises(MssplError, match="full"):
+        fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png, overwrite=True)
+    assert out.read_text() == "old" and is_our_preview(png)
+
+
+def test_what_a_killed_run_left_is_removed_by_the_next(pair, tmp_path, bilinear_models):
+    out, png = tmp_path / "out.exr", tmp_path / "out.png"
+    left = [leave_temporary(out), leave_temporary(png)]
+    assert all(path.exists() for path in left)
+    fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=png)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr", "out.exr", "out.png"]
+
+
+def test_a_result_may_be_a_link_to_a_name_without_extension(pair, tmp_path, bilinear_models):
+    (tmp_path / "out.exr").symlink_to("stored")
+    fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), overwrite=True)
+    assert open_exr(tmp_path / "stored").parts[0].data_window.width == WIDTH
+
+
+def test_a_result_may_have_the_longest_name(pair, tmp_path, bilinear_models):
+    out = tmp_path / ("x" * 250 + ".exr")
+    fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=out.with_suffix(".png"))
+    assert out.is_file() and out.with_suffix(".png").is_file()
+
+
+# ------------------------------------------------------------------------------------------------ memory
+
+
+@pytest.mark.parametrize("layout", ["spec", "multilayer"])
+def test_a_frame_that_can_not_fit_is_refused_from_its_headers_by_one_sentence(
+    tmp_path, bilinear_models, monkeypatch, layout
+):
+    """At any limit below the one that it names; at that one the frame is fused."""
+    clean = picture(512, 512)
+    lr = write_exr(tmp_path / "lr.exr", rgb(clean[::4, ::4]))
+    channels = rgb(clean) | {f"l.{i:03d}": clean[..., 0] for i in range(300)}
+    hr = write_exr(tmp_path / "hr.exr", channels, compression=OpenEXR.NO_COMPRESSION)
+    more = {"model": str(bilinear_models[4]), "write": WriteOptions(layout=layout)}
+
+    def refusal(megabytes):
+        with monkeypatch.context() as patched, pytest.raises(InputError) as caught:
+            patched.setattr(ExrFile, "read", pytest.fail)
+            fuse_files(lr, hr, tmp_path / "out.exr", max_memory=megabytes << 20, **more)
+        return str(caught.value)
+
+    said = refusal(1)
+    needed = re.fullmatch(r"--max-memory: this frame needs more with model bilinear-x4; allow at least (\d\.\d)G", said)
+    assert needed, said
+    sentences = {
+        refusal(megabytes).partition(", or use")[0] for megabytes in (300, 350, int(float(needed[1]) * 1024) - 103)
+    }
+    assert sentences == {said}
+    if layout == "multilayer":
+        assert "use --layout spec" in refusal(500)
+    else:
+        assert float(needed[1]) < 0.6
+    fuse_files(lr, hr, tmp_path / "out.exr", max_memory=int(float(needed[1]) * 2**30), **more)
+
+
+#: Writes zeros over a file and prints by how many MiB that raised the peak of the process's memory.
+WRITE = """
+import resource, sys
+from pathlib import Path
+import numpy as np
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr import part_specs, writer
+from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.exr.write_options import WriteOptions
+hr = map_render(open_exr(sys.argv[1]))
+window = hr.data_window
+rgb = np.zeros((window.height, window.width, 3), np.float32)
+options = WriteOptions(sys.argv[3])
+part_specs.LARGEST_MIXED_PART = writer.LARGEST_MIXED_PART = int(sys.argv[4])
+held = writer.bytes_held(hr.file, hr.beauty_channels, options)
+before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+writer.write_fused(Path(sys.argv[2]), hr.file, hr.beauty_channels, rgb, None, {}, options)
+print(held >> 20, (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) >> 10)
+"""
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="ru_maxrss has other units elsewhere")
+@pytest.mark.parametrize(
+    ("layout", "largest", "holds"),
+    [("spec", 1 << 20, False), ("spec", 1 << 30, True), ("nuke", 1 << 30, False), ("multilayer", 0, True)],
+)
+def test_writing_holds_no_more_than_is_planned_for(tmp_path, layout, largest, holds):
+    """A part of mixed types is copied whole if it is small, and the single-part layout holds the file."""
+    plane = np.zeros((1024, 1024), np.float32)
+    mixed = {f"a{i:02d}.Y": plane for i in range(20)} | {f"b{i:02d}.Y": plane.astype(np.float16) for i in range(20)}
+    parts = [("rgba", rgb(np.zeros((1024, 1024, 3), np.float16)), (0, 0)), ("extra", mixed, (0, 0))]
+    hr = write_exr(tmp_path / "hr.exr", parts, compression=OpenEXR.NO_COMPRESSION)
+    command = [sys.executable, "-c", WRITE, str(hr), str(tmp_path / "out.exr"), layout, str(largest)]
+    held, grown = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    assert grown < (held if holds else 0) + 64, (held, grown)
+    assert (held > 100) == holds

@@ -11,8 +11,8 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl import InputError, MssplError, fuse_files, fuse_shot
-from oiio_msspl.exr.atomic import remove_leftovers, replacing
+from oiio_msspl import InputError, InputOptions, MssplError, fuse_files, fuse_shot
+from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs import shot, stages
 from oiio_msspl.jobs.frame import write_frame
@@ -386,14 +386,153 @@ def test_a_frame_that_is_handed_over_as_the_signal_comes_is_reported(tmp_path, b
 
 
 def test_temporary_files_of_two_machines_have_two_names(tmp_path, monkeypatch):
-    """Where both have a process of one number; either is known as a leftover."""
+    """Where both have a process of one number."""
     monkeypatch.setattr(os, "getpid", lambda: 7)
     target = tmp_path / "a.1001.exr"
-    with replacing(target, overwrite=True) as one, replacing(target) as other:
+    with replacing(target, overwrite=True) as one, replacing(target, overwrite=True) as other:
         for path in (one, other):
             path.touch()
         assert len(list(tmp_path.iterdir())) == 2
-        remove_leftovers([target])
-        assert list(tmp_path.iterdir()) == []
-        for path in (one, other):
-            path.touch()
+
+
+# ------------------------------------------------------------------------------------------------ inputs stay
+
+
+@pytest.mark.parametrize(
+    ("report", "message"),
+    [
+        ("lr/lr.1002.exr", "is one of the inputs"),
+        ("hr/beauty.1001.exr", "is one of the inputs"),
+        ("albedo.exr", "is one of the inputs"),
+        ("out/beauty.1002.exr", "is the same file as"),
+        ("out/beauty.1002.png", "is the same file as"),
+        ("link.json", "is one of the inputs"),
+        ("somebody.txt", "is no report of a shot"),
+    ],
+)
+@pytest.mark.parametrize("existing", [True, False])
+def test_a_report_replaces_nothing_but_a_report(tmp_path, bilinear_models, report, message, existing):
+    folder = make_shot(tmp_path, 2)
+    write_exr(folder / "albedo.exr", rgb(picture(HEIGHT, WIDTH)))
+    (folder / "link.json").symlink_to("hr/beauty.1001.exr")
+    (folder / "somebody.txt").write_text("mine")
+    if existing:
+        assert run(folder, bilinear_models[4], previews=True).exit_code == 0
+    before = everything(folder)
+    inputs = InputOptions({"albedo": f"file:{folder / 'albedo.exr'}"})
+    with pytest.raises(InputError, match=message):
+        run(
+            folder,
+            bilinear_models[4],
+            inputs=inputs,
+            previews=True,
+            overwrite=True,
+            report_path=folder / report,
+        )
+    assert everything(folder) == before
+
+
+def test_a_preview_of_one_frame_that_is_a_link_to_another_s_input_is_refused(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 2)
+    (folder / "out").mkdir()
+    (folder / "out/beauty.1001.png").symlink_to(folder / "hr/beauty.1002.exr")
+    before = everything(folder)
+    with pytest.raises(InputError, match=r"beauty\.1001\.png: is one of the inputs"):
+        run(folder, bilinear_models[4], previews=True, overwrite=True)
+    assert everything(folder) == before
+
+
+def test_a_sibling_file_that_a_frame_reads_is_not_written(tmp_path, bilinear_models):
+    """It is known only when the frame is opened. The frame fails and the file stays."""
+    folder = tmp_path
+    for name in ("lr", "hr", "out"):
+        (folder / name).mkdir()
+    write_exr(folder / "lr/RGB_IMAGEPIPELINE_1.exr", low_layers(1))
+    write_exr(folder / "hr/RGB_IMAGEPIPELINE_1.exr", rgb(picture(HEIGHT, WIDTH)))
+    write_exr(folder / "hr/ALBEDO.exr", rgb(picture(HEIGHT, WIDTH)))
+    (folder / "out/RGB_IMAGEPIPELINE_1.exr").symlink_to(folder / "hr/ALBEDO.exr")
+    before = everything(folder)
+    report = run(folder, bilinear_models[4], overwrite=True)
+    assert "is one of the inputs" in report.results[1].message
+    assert everything(folder) == before
+
+
+def everything(folder):
+    """{path: bytes} of all files below a folder."""
+    return {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+
+
+# ------------------------------------------------------------------------------------------------ what exists already
+
+
+def test_frames_of_two_runs_at_the_same_time_are_skipped(tmp_path, bilinear_models, monkeypatch):
+    """The other run has written a frame before this one fuses it, or while it was fused."""
+    folder, real = make_shot(tmp_path, 3), stages.fuse
+    assert run(folder, bilinear_models[4], previews=True).exit_code == 0
+    other = folder / "other"
+    (folder / "out").rename(other)
+    expected = contents(other)
+    (folder / "out").mkdir()
+
+    def meanwhile(lr, *arguments, **more):
+        if "1001" in lr.name:
+            for name in ("beauty.1001", "beauty.1002"):
+                for suffix in (".png", ".exr"):
+                    os.link(other / (name + suffix), folder / "out" / (name + suffix))
+        assert "1002" not in lr.name
+        return real(lr, *arguments, **more)
+
+    monkeypatch.setattr(stages, "fuse", meanwhile)
+    report = run(folder, bilinear_models[4], previews=True, skip_existing=True)
+    assert [result.status for result in report.results.values()] == ["skipped", "skipped", "fused"]
+    assert contents(folder / "out") == expected
+    assert report.exit_code == 0
+
+
+def test_two_runs_leave_each_other_s_temporary_files(tmp_path, bilinear_models):
+    """A shot that starts cleans up, and another one is writing a frame at this moment."""
+    folder = make_shot(tmp_path, 2)
+    (folder / "out").mkdir()
+    with replacing(folder / "out/beauty.1002.exr") as temporary:
+        temporary.write_text("half")
+        report = run(folder, bilinear_models[4], frames="1001", skip_existing=True)
+        assert report.exit_code == 0 and temporary.exists()
+        temporary.write_text("whole")
+    assert (folder / "out/beauty.1002.exr").read_text() == "whole"
+
+
+def test_frames_that_are_older_than_an_input_are_named_and_with_update_fused_again(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 4)
+    albedo = write_exr(folder / "albedo.exr", rgb(picture(HEIGHT, WIDTH)))
+    more = {"inputs": InputOptions({"albedo": f"file:{albedo}"}), "previews": True}
+    assert run(folder, bilinear_models[4], **more).exit_code == 0
+    outputs = {n: folder / f"out/beauty.{n}.exr" for n in range(1001, 1005)}
+    now = outputs[1004].stat().st_mtime
+    os.utime(folder / "lr/lr.1002.exr", (now + 9, now + 9))
+    os.utime(folder / "hr/beauty.1003.exr", (now + 9, now + 9))
+    outputs[1004].unlink()
+    kept = {n: path.stat().st_ino for n, path in outputs.items() if path.exists()}
+
+    report = run(folder, bilinear_models[4], frames="1001-1003", skip_existing=True, **more)
+    assert [result.status for result in report.results.values()] == ["skipped"] * 3
+    assert [len(result.warnings) for result in report.results.values()] == [0, 1, 1]
+    assert "is older than" in report.results[1002].warnings[0] and "lr.1002.exr" in report.results[1002].warnings[0]
+
+    report = run(folder, bilinear_models[4], update=True, **more)
+    assert [report.results[n].status for n in outputs] == ["skipped", "fused", "fused", "fused"]
+    changed = [n for n, path in outputs.items() if path.stat().st_ino != kept.get(n)]
+    assert changed == [1002, 1003, 1004]
+    os.utime(albedo, (now + 99, now + 99))
+    assert {r.status for r in run(folder, bilinear_models[4], update=True, **more).results.values()} == {"fused"}
+
+
+def test_write_protected_frames_are_not_replaced(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 2)
+    assert run(folder, bilinear_models[4]).exit_code == 0
+    published = folder / "out/beauty.1001.exr"
+    published.chmod(0o444)
+    before = published.stat().st_ino
+    report = run(folder, bilinear_models[4], overwrite=True)
+    assert [result.status for result in report.results.values()] == ["failed", "fused"]
+    assert "is write-protected" in report.results[1001].message
+    assert published.stat().st_ino == before

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+from dataclasses import fields
 
 import numpy as np
 import pytest
@@ -73,3 +74,60 @@ def test_devices_that_are_not_there_are_said(bilinear_models):
 
 def test_the_cpu_is_named_as_provider(bilinear_models):
     assert Session(bilinear_models[2]).provider == "CPUExecutionProvider"
+
+
+#: Values that a forged file may hold anywhere.
+FORGED = [
+    None,
+    True,
+    -1,
+    0,
+    1e308,
+    2**70,
+    "",
+    "x" * 10**4,
+    "\x1b[2J",
+    [],
+    [[]],
+    {},
+    {"hrls": 1},
+    {"hrls": [1]},
+    [None] * 9,
+]
+
+
+@pytest.mark.parametrize("name", [field.name for field in fields(Contract)])
+def test_a_forged_contract_is_refused_or_can_be_used(name):
+    """By a sentence that is no longer than a screen. What is accepted has the types that the rest relies on."""
+    honest = json.loads(Contract(name="x", scale=4, training_spp={"hrls": [1, 8]}).to_json())
+    for value in FORGED:
+        try:
+            contract = Contract.from_json(json.dumps(honest | {name: value}), "x.onnx")
+        except InputError as error:
+            assert len(str(error)) < 2000
+            continue
+        numbers = [contract.scale, contract.alignment, contract.overlap, contract.bytes_per_pixel]
+        assert all(type(number) is int for number in numbers)
+        assert contract.alignment > 0 <= contract.overlap and contract.bytes_per_pixel > 0
+        assert isinstance(contract.name, str) and isinstance(contract.provenance, dict)
+        assert all(low <= 0 or high for low, high in contract.training_spp.values())
+
+
+@pytest.mark.parametrize("text", ["[" * 10**5, "[]", "null", "{", '{"name": 1' + "0" * 5000 + "}", "", "\x00"])
+def test_text_that_is_no_contract_is_refused(text):
+    with pytest.raises(InputError, match=r"x\.onnx: the 'msspl' metadata can't be read"):
+        Contract.from_json(text, "x.onnx")
+
+
+@pytest.mark.parametrize("change", ["outputs", "inputs"])
+def test_a_network_with_other_inputs_or_outputs_is_refused(tmp_path, bilinear_models, change):
+    onnx = pytest.importorskip("onnx")
+    model = onnx.load(bilinear_models[2])
+    side = model.graph.output if change == "outputs" else model.graph.input
+    old, side[0].name = side[0].name, "other"
+    for node in model.graph.node:
+        for names in (node.input, node.output):
+            names[:] = ["other" if each == old else each for each in names]
+    onnx.save(model, tmp_path / "forged.onnx")
+    with pytest.raises(InputError, match=r"forged\.onnx: its network has the inputs"):
+        Session(tmp_path / "forged.onnx")

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from msspl_cli import options
+from msspl_cli import console, options
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
@@ -91,8 +91,8 @@ def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
         return
     name = f"{pair.lr} and {pair.hr}" if number is None else f"frame {number}"
     if pair.problem is not None:
-        print(f"{name}: can't be fused: {pair.problem}")
+        console.say(f"{name}: can't be fused: {pair.problem}")
     else:
-        print(f"{name}: {'fits' if pair.fits else 'does not fit'}")
+        console.say(f"{name}: {'fits' if pair.fits else 'does not fit'}")
     for warning in pair.warnings:
-        print(f"  {warning}")
+        console.say(f"  {warning}")

@@ -42,7 +42,7 @@ def compare(
     from oiio_msspl.compare import check_error_map, compare_files, write_error_map
 
     if error_map is not None:
-        check_error_map(error_map, overwrite=overwrite)
+        check_error_map(error_map, [*images, reference], overwrite=overwrite)
     results = compare_files(images, reference)
     if error_map is not None:
         write_error_map(error_map, images[0], reference, overwrite=overwrite)

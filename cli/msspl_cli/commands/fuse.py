@@ -5,7 +5,6 @@ from __future__ import annotations
 
 import json
 import logging
-import sys
 import time
 from contextlib import nullcontext
 from pathlib import Path
@@ -167,6 +166,15 @@ def fuse(
         ),
     ] = None,
     skip_existing: options.SkipExisting = False,
+    update: Annotated[
+        bool,
+        typer.Option(
+            "--update",
+            help="Skip frames that exist and are newer than their inputs.",
+            rich_help_panel=options.SHOT,
+            hidden=True,
+        ),
+    ] = False,
     report_file: Annotated[
         Path | None,
         typer.Option(
@@ -238,6 +246,7 @@ def fuse(
                     frames=frames,
                     previews=preview,
                     skip_existing=skip_existing,
+                    update=update,
                     report_path=report_file,
                     progress=printer,
                     client=client,
@@ -250,6 +259,7 @@ def fuse(
     for option, value in (
         ("--frames", frames),
         ("--skip-existing", skip_existing),
+        ("--update", update),
         ("--report", report_file),
         ("--progress", progress),
         ("--scheduler", scheduler),
@@ -277,7 +287,7 @@ def fuse(
         _print(report, time.perf_counter() - start)
     if not quiet:
         for warning in report.warnings:
-            print(f"warning: {warning}", file=sys.stderr)
+            console.say(f"warning: {warning}", error=True)
 
 
 def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
@@ -295,20 +305,21 @@ def _print(report: FrameReport, seconds: float) -> None:
     renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
     view = f", view {report.hr.view}" if report.hr.view and report.hr.other_views else ""
     others = f" (also there: {', '.join(report.hr.other_views)}; --view-layer)" if view else ""
-    print(f"{renderer} at x{report.scale}" + (f", {spp:g} spp on average" if spp is not None else "") + view + others)
+    average = f", {spp:g} spp on average" if spp is not None else ""
+    console.say(f"{renderer} at x{report.scale}{average}{view}{others}")
     console.aov_table(report.aovs(), report.hr.notes)
     if lrhs_aovs := report.found_lrhs_aovs():
-        print("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
+        console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     for text, counts in (
         ("Repaired values that were NaN or infinite", report.repaired),
         ("Set negative values to 0 (colours out of gamut)", report.negative),
     ):
         if counts:
-            print(f"{text}: {', '.join(f'{count} in {name}' for name, count in counts.items())}")
+            console.say(f"{text}: {', '.join(f'{count} in {name}' for name, count in counts.items())}")
     provider = report.provider.removesuffix("ExecutionProvider")
     where = "on the CPU" if provider == "CPU" else f"on {provider}"
     tiles = f" in {report.tiles} tiles" if report.tiles > 1 else ""
     steps = {"read": "loading", "fuse": "fusing", "write": "writing"}
     times = ", ".join(f"{report.seconds[key]:.1f} s {step}" for key, step in steps.items())
-    print(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
-    print(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))
+    console.say(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
+    console.say(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))

@@ -42,15 +42,15 @@ def inspect(
         print(json.dumps(data if len(data) > 1 else data[0], indent=2))
     else:
         for inspection in found:
-            print(inspection.path)
+            console.say(str(inspection.path))
             for line in inspection.facts:
-                print(f"  {line}")
+                console.say(f"  {line}")
             if inspection.render is not None:
-                print(f"  what {inspection.model} would read:")
+                console.say(f"  what {inspection.model} would read:")
                 console.aov_table(inspection.aovs(), inspection.render.notes)
                 if inspection.passed_through:
-                    print(f"  passed through: {', '.join(inspection.passed_through)}")
+                    console.say(f"  passed through: {', '.join(inspection.passed_through)}")
             for problem in inspection.problems:
-                print(f"  can't be used: {problem}")
+                console.say(f"  can't be used: {problem}")
     if any(inspection.problems for inspection in found):
         raise typer.Exit(2)

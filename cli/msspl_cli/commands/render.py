@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +14,7 @@ import typer
 from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_folder, check_target
+from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
 
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
@@ -188,6 +187,7 @@ def render(
     for _, target in [] if makes_folder else targets:
         for suffix in suffixes:
             check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
+    check_separate([scene], [target for _, target in targets])
     job = {
         "scene": str(scene.absolute()),
         "frames": [(number, str(target.absolute())) for number, target in targets],
@@ -218,7 +218,7 @@ def render(
             reports.append(event["report"])
             bar.hide()
             for warning in [] if quiet else event["report"]["warnings"]:
-                print(f"warning: frame {event['report']['frame']}: {warning}", file=sys.stderr)
+                console.say(f"warning: frame {event['report']['frame']}: {warning}", error=True)
             return
         if "step" in event:
             number = event.get("frame")

@@ -4,13 +4,12 @@
 from __future__ import annotations
 
 import shlex
-import sys
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from msspl_cli import options
+from msspl_cli import console, options
 from msspl_cli.commands import fuse
 from oiio_msspl.errors import InputError
 
@@ -78,17 +77,17 @@ def submit(
     doubts = check_first_pair(job.shot.frames, inputs)
     write_bundle(bundle, job)
     for doubt in doubts:
-        print(f"warning: {doubt}", file=sys.stderr)
+        console.say(f"warning: {doubt}", error=True)
     for pattern, frames in job.missing:
         text = f"warning: {pattern} lacks {format_frames(frames)}: their tasks fail unless these files appear"
-        print(text, file=sys.stderr)
+        console.say(text, error=True)
     if given["quiet"]:
         return
     skipped = f"; {job.existing} exist and will be skipped" if job.existing else ""
-    print(f"{len(job.shot.frames)} frames{skipped}. To run the job:")
+    console.say(f"{len(job.shot.frames)} frames{skipped}. To run the job:")
     values = f"file://{bundle / OPENJD_VALUES}"
-    print(f"  openjd run {shlex.quote(str(bundle / TEMPLATE))} --job-param {shlex.quote(values)}")
-    print(f"  deadline bundle submit {shlex.quote(str(bundle))}")
+    console.say(f"  openjd run {shlex.quote(str(bundle / TEMPLATE))} --job-param {shlex.quote(values)}")
+    console.say(f"  deadline bundle submit {shlex.quote(str(bundle))}")
 
 
 def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:

@@ -29,7 +29,8 @@ if TYPE_CHECKING:
     from oiio_msspl.exr.render import Render, Window
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
-    from oiio_msspl.jobs.frame import InputOptions, fuse_files
+    from oiio_msspl.jobs.frame import fuse_files
+    from oiio_msspl.jobs.inputs import InputOptions
     from oiio_msspl.jobs.report import FrameReport
     from oiio_msspl.jobs.shot import fuse_shot
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
@@ -43,7 +44,7 @@ _MODULES = {
     "FrameResult": "jobs.shot_report",
     "FusedFrame": "fusion.fuse",
     "InputError": "errors",
-    "InputOptions": "jobs.frame",
+    "InputOptions": "jobs.inputs",
     "MappedRender": "aovs.mapped_render",
     "MssplError": "errors",
     "Render": "exr.render",

@@ -16,7 +16,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
-from oiio_msspl.jobs.frame import InputOptions
+from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 

@@ -17,7 +17,7 @@ from oiio_msspl.errors import InputError, printable
 
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
-    from oiio_msspl.jobs.frame import InputOptions
+    from oiio_msspl.jobs.inputs import InputOptions
 
 #: Groups of options in the help text.
 INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
@@ -145,7 +145,7 @@ def make_inputs(
         InputError: a mapping can't be read.
     """
     from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
-    from oiio_msspl.jobs.frame import InputOptions
+    from oiio_msspl.jobs.inputs import InputOptions
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
     return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp, colourspace, map_file)

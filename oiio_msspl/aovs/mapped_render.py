@@ -40,7 +40,7 @@ class MappedRender:
     """Samples per pixel; None if neither the header nor the user says."""
     data_window: Window
     space: ColourSpace = REC709
-    """Linear RGB space of the beauty, for the preview. :func:`oiio_msspl.jobs.frame.map_pair` finds it."""
+    """Linear RGB space of the beauty, for the preview. :func:`oiio_msspl.jobs.inputs.map_pair` finds it."""
     notes: list[str] = field(default_factory=list)
     """What the user should know about the mapping, one sentence each."""
 

@@ -20,7 +20,7 @@ from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiling import MAX_MEMORY
 from oiio_msspl.jobs.dask_cluster import fuse_frames
-from oiio_msspl.jobs.frame import InputOptions
+from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.sequence import Frame, find_shot
 from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of_shot, prepare_output

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
-from oiio_msspl.jobs.frame import InputOptions, map_pair, resolve_auto
-from oiio_msspl.jobs.pair import check_files
+from oiio_msspl.jobs.inputs import InputOptions, map_pair, resolve_auto
+from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import Stages, is_left_over

@@ -19,14 +19,8 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import (
-    InputOptions,
-    check_frame_memory,
-    files_read,
-    map_pair,
-    write_frame,
-    write_frame_preview,
-)
+from oiio_msspl.jobs.frame import check_frame_memory, write_frame, write_frame_preview
+from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.model.catalogue import find_model

@@ -13,7 +13,7 @@ from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_
 from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.jobs import frame
-from oiio_msspl.jobs.frame import map_pair
+from oiio_msspl.jobs.inputs import map_pair
 from tests.conftest import downsample, picture, read_bits, rgb, write_exr
 from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers

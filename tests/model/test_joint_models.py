@@ -11,7 +11,7 @@ from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, NORMAL, RGB, SPECULAR
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.jobs.frame import InputOptions
+from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import WEIGHTS, shipped_models
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.encoding import encode_radiance

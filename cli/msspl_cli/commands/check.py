@@ -13,7 +13,7 @@ from msspl_cli import console, options
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from oiio_msspl.jobs.pair import PairCheck
+    from oiio_msspl.jobs.pair_check import PairCheck
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -59,7 +59,7 @@ def check(
     A pair does not fit if it can't be fused, or if the two renders do not seem to
     show the same frame: another camera, light, colour space, albedo or normal.
     """
-    from oiio_msspl.jobs.pair import check_files
+    from oiio_msspl.jobs.pair_check import check_files
     from oiio_msspl.jobs.sequence import find_shot, is_sequence
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None, colorspace)

@@ -247,7 +247,7 @@ def _fuser(
     Raises:
         InputError: the model or the device can't be used. No frame was rendered for nothing.
     """
-    from oiio_msspl.jobs.frame import map_pair, resolve_auto
+    from oiio_msspl.jobs.inputs import map_pair, resolve_auto
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
     from oiio_msspl.model.catalogue import AUTO, find_model

@@ -9,8 +9,9 @@ from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.preview import write_preview
 from oiio_msspl.exr.render import Window
-from oiio_msspl.jobs.frame import InputOptions, fuse_files, map_pair
-from oiio_msspl.jobs.pair import check_files
+from oiio_msspl.jobs.frame import fuse_files
+from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import find_shot
 from oiio_msspl.jobs.shot_checks import check_first_pair
 from tests.conftest import downsample, noisy, picture, rgb, write_exr

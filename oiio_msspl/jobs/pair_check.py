@@ -9,7 +9,7 @@ from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.pair_checks import BOTH_BLACK, check_renders
-from oiio_msspl.jobs.frame import InputOptions, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, map_pair
 
 
 @dataclass(frozen=True)

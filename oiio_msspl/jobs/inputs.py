@@ -1,0 +1,115 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Opens a pair of files, maps their layers, and finds out what else a run must know of them."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from oiio_msspl.aovs.candidates import mapped_files
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, space_of
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.noise import is_noise_spread
+from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY
+
+
+@dataclass(frozen=True)
+class InputOptions:
+    """What the caller knows of the two files that they do not say themselves."""
+
+    mapping: Mapping[str, Any] = field(default_factory=dict)
+    """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
+    view: str | None = None
+    """View or view layer; the first one of each file if None."""
+    lr_spp: float | None = None
+    """Samples per pixel of the LRHS; None to read them from its header."""
+    hr_spp: float | None = None
+    """Samples per pixel of the HRLS; None to read them from its header."""
+    colourspace: str | None = None
+    """Linear RGB space of both renders, see :func:`oiio_msspl.colour.named_space`; None to read it from the headers,
+    and to take linear Rec. 709 if they do not say."""
+    map_file: Path | None = None
+    """The file that ``mapping`` was read from, if any."""
+
+    def files(self, hr_path: Path, model: str | None) -> set[Path]:
+        """The files that a frame is made from beside the pair: of the mapping, and a model that is no shipped one."""
+        named = [self.map_file, None if model is None else Path(model)]
+        return mapped_files(self.mapping, hr_path) | {path for path in named if path is not None}
+
+
+def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
+    """Open both files and map their layers to features.
+
+    Args:
+        lr_path, hr_path: the low-resolution and the high-resolution render.
+        inputs: mapping, view and spp.
+
+    Returns:
+        LRHS and HRLS. The LRHS has albedo and normal only if its file does.
+
+    Raises:
+        InputError: one of the files can't be used, both are the same, or their headers declare two colour spaces.
+    """
+    lr_path, hr_path = Path(lr_path), Path(hr_path)
+    if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
+        raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
+    lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
+    lr, hr = _map_lrhs(lr_file, inputs), map_render(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+    lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
+    return lr, hr
+
+
+def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:
+    """The linear RGB space of a pair. ``name``: see :attr:`InputOptions.colourspace`."""
+    if name is not None:
+        space = named_space(name)
+        if space is None:
+            raise InputError(f"--colorspace {name!r}: use one of {', '.join(space.name for space in SPACES)}")
+        return space
+    low, high = space_of(lr.metadata), space_of(hr.metadata)
+    if low is not None and high is not None and low != high:
+        raise InputError(
+            f"by their headers {lr.name} is in {low.name} and {hr.name} in {high.name}; write both in the same colour "
+            "space (or name it with --colorspace if a header is wrong)"
+        )
+    return high or low or REC709
+
+
+def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
+    """Map the LRHS: its beauty, and albedo and normal where it has them.
+
+    The user's mapping is written for the HRLS. Of its entries only the beauty's applies here: the LRHS need not have
+    the other layers, and an entry may name an EXR of the HRLS's size.
+    """
+    features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
+    rgb_only = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
+    return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
+
+
+def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
+    """The model that is meant: ``auto`` and None are a family that suits the pair's noise.
+
+    Raises:
+        InputError: the pair does not fit together.
+    """
+    if model not in (None, AUTO):
+        return model
+    if not is_noise_spread(lr, hr, align(lr, hr)):
+        return DEFAULT_FAMILY
+    hr.notes.append(
+        f"the pixel filter has spread the noise over neighbouring pixels, so --model auto takes {SPREAD_NOISE_FAMILY}"
+    )
+    return SPREAD_NOISE_FAMILY
+
+
+def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
+    """All files that a frame is made from: the pair, what lies beside it, the mapping's files and the model."""
+    siblings = {*lr.file.siblings, *hr.file.siblings}
+    return {lr.file.path, hr.file.path} | siblings | inputs.files(hr.file.path, model)

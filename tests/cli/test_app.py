@@ -40,7 +40,7 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --model --device --max-memory --output --layout --layers --error-layer --overwrite --json "
         "--frames --skip-existing --help --help-all",
-        15,
+        16,
     ),
     "msspl_render": (
         "--view-layer --blender --scale --lr-spp --hr-spp --model --device --output --layout --error-layer --compare "

@@ -32,6 +32,17 @@ def _show_all(context: typer.Context, wanted: bool) -> None:
         raise typer.Exit
 
 
+LowRender = Annotated[
+    Path,
+    typer.Argument(
+        metavar="LR",
+        help="Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr.",
+        show_default=False,
+    ),
+]
+HighRender = Annotated[
+    Path, typer.Argument(metavar="HR", help="High-resolution, low-spp render, in the same form.", show_default=False)
+]
 Map = Annotated[
     list[str],
     typer.Option(
@@ -85,6 +96,10 @@ ErrorLayer = Annotated[
         help="Add a layer 'error': the error that the model expects.",
         rich_help_panel=OUTPUT,
     ),
+]
+Frames = Annotated[
+    str | None,
+    typer.Option(metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=SHOT),
 ]
 SkipExisting = Annotated[
     bool,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Any
 
 import typer
 
@@ -28,28 +28,13 @@ EXAMPLES = """[bold]Examples[/bold]
 
 
 def check(
-    lr: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LR",
-            help="Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr.",
-            show_default=False,
-        ),
-    ],
-    hr: Annotated[
-        Path,
-        typer.Argument(metavar="HR", help="High-resolution, low-spp render, in the same form.", show_default=False),
-    ],
+    lr: options.LowRender,
+    hr: options.HighRender,
     mapping: options.Map = [],  # noqa: B006
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
     colorspace: options.Colourspace = None,
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=options.SHOT
-        ),
-    ] = None,
+    frames: options.Frames = None,
     as_json: options.Json = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,

@@ -45,18 +45,8 @@ EXAMPLES = """[bold]Examples[/bold]
 
 
 def fuse(
-    lr: Annotated[
-        Path,
-        typer.Argument(
-            metavar="LR",
-            help="Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr.",
-            show_default=False,
-        ),
-    ],
-    hr: Annotated[
-        Path,
-        typer.Argument(metavar="HR", help="High-resolution, low-spp render, in the same form.", show_default=False),
-    ],
+    lr: options.LowRender,
+    hr: options.HighRender,
     *,
     # Input
     mapping: options.Map = [],  # noqa: B006
@@ -159,12 +149,7 @@ def fuse(
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=options.SHOT
-        ),
-    ] = None,
+    frames: options.Frames = None,
     skip_existing: options.SkipExisting = False,
     update: Annotated[
         bool,

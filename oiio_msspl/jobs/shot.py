@@ -120,7 +120,7 @@ def fuse_shot(
     stages = Stages(
         inputs=inputs,
         write_options=write,
-        model=model_of_shot(shot, inputs, model),
+        model=model,
         device=device,
         threads=threads,
         max_memory=max_memory,
@@ -140,6 +140,8 @@ def fuse_shot(
             warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
             result = replace(result, **entry | {"warnings": warnings})
         finish(result)
+    if to_fuse:
+        stages = replace(stages, model=model_of_shot(shot, inputs, model))
     targets = [path for frame in shot.frames for path in (frame.output, frame.output.with_suffix(".png"))]
     remove_leftovers([*targets, report_path] if report_path else targets)
     try:

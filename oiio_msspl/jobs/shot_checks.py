@@ -15,7 +15,7 @@ from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import Stages, is_left_over
-from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY
+from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY
 
 log = logging.getLogger(__name__)
 
@@ -52,7 +52,8 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
             try:
                 lr, hr = map_pair(frame.lr, frame.hr, inputs)
                 family = resolve_auto(lr, hr, model)
-                log.info("frame %d: %s", frame.number, "; ".join([*hr.notes, f"the model is {family}"]))
+                if family == SPREAD_NOISE_FAMILY:
+                    log.warning("frame %d: %s", frame.number, hr.notes[-1])
                 return family
             except MssplError as error:
                 log.debug("frame %d: %s", frame.number, error)

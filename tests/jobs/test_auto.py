@@ -28,8 +28,9 @@ def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, family):
     assert report.model == "pyramid-x4"
 
 
-def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path):
-    """Also in a second run that begins with another frame. A broken pair is passed over."""
+def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path, caplog, monkeypatch):
+    """Also in a second run that begins with another frame. A broken pair is passed over. The user is told, and a run
+    without a frame to fuse reads none."""
     for number, sigma in ((1, None), (2, 0.5), (3, None)):
         write_pair(tmp_path, f"a.{number:04}", sigma)
     (tmp_path / "hr/a.0001.exr").write_bytes(b"broken")
@@ -38,5 +39,9 @@ def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_pa
         report = fuse_shot(*pair, frames=frames, skip_existing=True)
     assert [result.status for _, result in sorted(report.results.items())] == ["failed", "skipped", "fused"]
     assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "paper-x4"
+    assert "so --model auto takes paper" in caplog.text
+    monkeypatch.setattr("oiio_msspl.jobs.shot.model_of_shot", lambda *arguments: pytest.fail("reads a pair"))
+    assert fuse_shot(*pair, frames=[2, 3], skip_existing=True).results[2].status == "skipped"
+    monkeypatch.undo()
     action = make_job(*pair).template["steps"][0]["script"]["actions"]["onRun"]
     assert action["args"][-2:] == ["--model", "paper"]

@@ -15,12 +15,11 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import ContextVar
 from functools import partial
-from typing import TypeVar
+from typing import TypeVar, cast
 
 #: Values of a block: 512 KiB of float32.
 BLOCK_VALUES = 1 << 17
 
-S = TypeVar("S")
 T = TypeVar("T")
 
 _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
@@ -72,19 +71,17 @@ def in_background(work: Callable[[], T]) -> Callable[[], T]:
     return _background_pool().submit(contextvars.copy_context().run, work).result
 
 
-def one_ahead(function: Callable[[S], T], items: Iterable[S]) -> Iterator[T]:
-    """Yield ``function(item)`` for each item; while the caller uses a result, the next one is computed.
+def one_ahead(items: Iterable[T]) -> Iterator[T]:
+    """Yield the items; while the caller uses one, the next one is computed in the background.
 
-    ``function`` never runs twice at the same time.
+    ``items`` never computes two at the same time.
     """
     remaining = iter(items)
-    for first in remaining:
-        pending = in_background(partial(function, first))
-        for item in remaining:
-            result = pending()
-            pending = in_background(partial(function, item))
-            yield result
-        yield pending()
+    end = object()
+    pending = in_background(partial(next, remaining, end))
+    while (item := pending()) is not end:
+        pending = in_background(partial(next, remaining, end))
+        yield cast(T, item)
 
 
 def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:

@@ -115,8 +115,8 @@ def test_one_ahead_computes_the_next_item_and_never_two_at_once(count):
         return item * item
 
     with limit_threads(count):
-        assert list(one_ahead(square, range(5))) == [0, 1, 4, 9, 16]
-        assert list(one_ahead(square, [])) == []
-        results = one_ahead(square, iter([7, 8, 9]))
+        assert list(one_ahead(map(square, range(5)))) == [0, 1, 4, 9, 16]
+        assert list(one_ahead(map(square, []))) == []
+        results = one_ahead(map(square, iter([7, 8, 9])))
         assert next(results) == 49
     assert 9 not in started[5:]

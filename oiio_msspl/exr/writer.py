@@ -24,6 +24,7 @@ from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.single_part import write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.parallel import one_ahead
 
 
 def write_fused(
@@ -119,9 +120,10 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:
     """Write the part that is open, a strip at a time; ``rows(start, stop)`` gives its pixels."""
-    for start in range(0, spec.height, ROWS_PER_STRIP):
-        stop = min(start + ROWS_PER_STRIP, spec.height)
-        if not writer.write_scanlines(spec.y + start, spec.y + stop, 0, rows(start, stop)):
+    ranges = ((start, min(start + ROWS_PER_STRIP, spec.height)) for start in range(0, spec.height, ROWS_PER_STRIP))
+    # The next rows are converted while OpenImageIO compresses these.
+    for start, stop, pixels in one_ahead((a, b, rows(a, b)) for a, b in ranges):
+        if not writer.write_scanlines(spec.y + start, spec.y + stop, 0, pixels):
             return False
     return True
 
@@ -141,7 +143,8 @@ def _copy(file: ExrFile, part: PassedOnPart, later: Sequence[PassedOnPart], writ
         for run in other.runs
     ]
     runs = [file.native_strips(part.source, *ranges[i], ranges[i + 1 :]) for i in range(len(part.runs))]
-    for strips in zip(*runs, strict=True):
+    # The next strips are decoded while OpenImageIO compresses these.
+    for strips in one_ahead(zip(*runs, strict=True)):
         y0, y1, pixels = strips[0]
         if len(strips) > 1:
             pixels = np.concatenate([strip for _, _, strip in strips], axis=-1)

@@ -104,7 +104,7 @@ def fuse(
         tiles = plan_tiles(pair.grid, session.contract)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             # The next tile is read and encoded while the network works on this one.
-            for done, tile in enumerate(one_ahead(pair.prepare, tiles), start=1):
+            for done, tile in enumerate(one_ahead(map(pair.prepare, tiles)), start=1):
                 _fuse_tile(tile, session, frame)
                 if progress is not None:
                     progress(done, len(tiles))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.arrays import Array
@@ -41,6 +42,8 @@ class MappedRender:
     data_window: Window
     space: ColourSpace = REC709
     """Linear RGB space of the beauty, for the preview. :func:`oiio_msspl.jobs.inputs.map_pair` finds it."""
+    additive_sets: list[AdditiveSet] = field(default_factory=list)
+    """Layers that may sum to the beauty."""
     notes: list[str] = field(default_factory=list)
     """What the user should know about the mapping, one sentence each."""
 

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from oiio_msspl.aovs.additive_sets import find_additive_sets
 from oiio_msspl.aovs.candidates import LayerFinder, missing
 from oiio_msspl.aovs.features import NORMAL, OPTIONAL_FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import NEEDS_SPP, FeatureFormula
@@ -37,6 +38,7 @@ def map_render(
     view: str | None = None,
     spp: float | None = None,
     features: Sequence[str] = OPTIONAL_FEATURES,
+    sums: Sequence[str] = (),
 ) -> MappedRender:
     """Find the features of :mod:`oiio_msspl.aovs.features` among a file's layers.
 
@@ -46,9 +48,10 @@ def map_render(
         view: view (``left``) or view layer (``ViewLayer``) to take; the file's first if None.
         spp: samples per pixel, if the header does not say or is wrong.
         features: which features to look for, beside the beauty.
+        sums: the user's own additive sets, see :func:`oiio_msspl.aovs.additive_sets.find_additive_sets`.
 
     Raises:
-        InputError: the mapping has a mistake; the file has only deep data, no beauty or no such view; a layer holds
+        InputError: the mapping or a sum has a mistake; the file has only deep data, no beauty or no such view; a layer holds
             integers; or a layer of the mapping is missing or has the wrong channels.
     """
     layers = _flat_layers(file)
@@ -79,6 +82,7 @@ def map_render(
         alpha=beauty.layer.channels.get("A"),
         spp=spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer),
         data_window=file.parts[found[RGB].terms[0][0].part].data_window,
+        additive_sets=find_additive_sets(renderer, layers, beauty, sums, str(file.path)),
         notes=notes,
     )
     _drop_unusable_variance(render)

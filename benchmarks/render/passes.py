@@ -1,0 +1,101 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Renders pairs and references whose layers sum to the beauty, for `benchmarks.passes`.
+
+    python -m benchmarks.render.passes SCENES OUT
+
+Of every ``NAME/scene.xml`` the crop of `benchmarks.render.pairs` is rendered with Mitsuba 3, once for each group of
+lamps with the same random numbers: a lamp's share of each path, as renderers write light groups. So the file has two
+additive sets: ``light_1`` to ``light_n``, and ``diffuse``, ``specular`` and ``other`` (seen directly, or through
+glass). There are HRLS of 1, 2 and 4 spp, LRHS with as many samples a HRLS pixel, and a reference. Files that exist are
+kept.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+import zlib
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.render.film import write_exr
+from benchmarks.render.pairs import LAUNCH, SensorCamera
+from datagen.mitsuba.start import start as start_mitsuba
+from oiio_msspl.model.contract import SCALES
+
+SPP = (1, 2, 4)
+#: Most light groups of a scene; lamps that follow each other in the scene share one.
+GROUPS = 4
+
+
+class Lamps:
+    """The lamps of a scene, in groups that can be switched."""
+
+    def __init__(self, mi: Any, scene: Any) -> None:
+        lamps = [mi.traverse(emitter) for emitter in scene.emitters()]
+        count = min(GROUPS, len(lamps))
+        self.groups = [lamps[len(lamps) * i // count : len(lamps) * (i + 1) // count] for i in range(count)]
+        #: A lamp's brightness is its radiance; an environment map has a scale instead.
+        self._keys = ["radiance.value" if "radiance.value" in lamp else "scale" for lamp in lamps]
+        self._lamps, self._values = lamps, [lamp[key] * 1 for lamp, key in zip(lamps, self._keys, strict=True)]
+
+    def switch_on(self, group: int) -> None:
+        """Switch on the lamps of this group alone."""
+        for lamp, key, value in zip(self._lamps, self._keys, self._values, strict=True):
+            lamp[key] = value * (1 if any(lamp is other for other in self.groups[group]) else 0)
+            lamp.update()
+
+
+def render(file: Path, folder: Path, reference: int) -> None:
+    """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
+    import mitsuba as mi
+
+    from datagen.mitsuba.trace import box, render_passes
+
+    scene = mi.load_file(str(file))
+    camera, lamps = SensorCamera(mi, scene.sensors()[0]), Lamps(mi, scene)
+    jobs = [(f"hr_{spp}spp", 1, spp) for spp in SPP]
+    jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES[:2] for spp in SPP]
+    for name, scale, spp in [*jobs, ("ref", 1, reference)]:
+        path = folder / f"{name}.exr"
+        if path.exists():
+            continue
+        size = camera.at(scale)
+        per_launch = max(1, LAUNCH // (size[0] * size[1]))
+        total = np.zeros((len(lamps.groups), size[1], size[0], 15))
+        for i, group in enumerate(total):
+            lamps.switch_on(i)
+            for done in range(0, spp, per_launch):
+                count = min(per_launch, spp - done)
+                seed = zlib.crc32(f"{folder.name} {name} {done}".encode())
+                group += render_passes(scene, camera, size, count, seed, True, pixel_filter=box).sum(
+                    0, dtype=np.float64
+                )  # type: ignore[arg-type]
+        total /= spp
+        beauty, diffuse, specular = (total[..., i : i + 3].sum(axis=0) for i in (0, 9, 12))
+        layers = {"": beauty, "albedo.": total[0, ..., 3:6], "nn.": total[0, ..., 6:9], "diffuse.": diffuse}
+        layers |= {"specular.": specular, "other.": beauty - diffuse - specular}
+        layers |= {f"light_{i}.": group[..., :3] for i, group in enumerate(total, start=1)}
+        path.parent.mkdir(parents=True, exist_ok=True)
+        channels = [layer + c for layer in layers for c in ("XYZ" if layer == "nn." else "RGB")]
+        write_exr(path, np.concatenate(list(layers.values()), axis=-1), channels)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path)
+    parser.add_argument("out", type=Path)
+    parser.add_argument("--reference", type=int, default=512, help="spp")
+    parser.add_argument("--threads", type=int, default=2)
+    args = parser.parse_args()
+    start_mitsuba(args.threads)
+    for file in sorted(args.scenes.glob("*/scene.xml")):
+        start = time.perf_counter()
+        render(file, args.out / file.parent.name, args.reference)
+        print(f"{file.parent.name}: {time.perf_counter() - start:.0f} s", flush=True)
+
+
+if __name__ == "__main__":
+    main()

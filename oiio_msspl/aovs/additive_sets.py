@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Additive sets: layers of a file that sum to its beauty, such as light groups.
+
+The table of renderers and the user's ``--sum`` name candidates. Whether a candidate really sums to the beauty is
+measured by :mod:`oiio_msspl.fusion.sums`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from typing import Any
+
+from oiio_msspl.aovs.formula import FeatureFormula
+from oiio_msspl.aovs.renderers import view_layer_of
+from oiio_msspl.aovs.views import Beauty
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.layers import Layer, matches_layer, same_spelling
+from oiio_msspl.exr.reader import Channel
+
+
+@dataclass(frozen=True)
+class AdditiveLayer:
+    """A layer, or a layer times another one, that is a share of the beauty."""
+
+    name: str
+    """As stored, without the view layer in front."""
+    channels: tuple[Channel, ...]
+    """R, G, B."""
+    factor: tuple[Channel, ...] | None = None
+    """R, G, B of the layer that it is multiplied by: Cycles' light passes leave the surface colour out."""
+
+    @property
+    def formula(self) -> FeatureFormula:
+        """The light of this layer."""
+        return FeatureFormula((self.channels,), self.factor, text=self.name)
+
+
+@dataclass(frozen=True)
+class AdditiveSet:
+    """Layers that may sum to the beauty."""
+
+    name: str
+    """Such as ``light groups``."""
+    layers: tuple[AdditiveLayer, ...]
+    by_user: bool = False
+    """The user has named it, so it must be usable."""
+
+    def matches(self, pattern: str) -> bool:
+        """Whether a pattern such as ``light*`` means this set or one of its layers."""
+        return fnmatchcase(same_spelling(self.name), same_spelling(pattern)) or any(
+            matches_layer(pattern, layer.name) for layer in self.layers
+        )
+
+
+def find_additive_sets(
+    renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, sums: Sequence[str] = (), path: str = ""
+) -> list[AdditiveSet]:
+    """The candidates of a file, those of the user first.
+
+    Args:
+        renderer: entry of the table.
+        layers: of the file.
+        beauty: the one that the sets should sum to; its view and view layer are searched.
+        sums: the user's, as ``NAME=a+b+c*d``.
+        path: of the file, for messages.
+
+    Raises:
+        InputError: a sum of the user can't be read, or names a layer that is not there.
+    """
+    finder = _Finder(layers, beauty)
+    sets = [_user_set(finder, text, path) for text in sums]
+    for entry in renderer.get("sets", ()):
+        found = tuple(dict.fromkeys(layer for candidate in entry["layers"] for layer in finder.find(candidate)))
+        if len(found) > 1 and all(set(found) != set(other.layers) for other in sets):
+            sets.append(AdditiveSet(entry["name"], found))
+    return sets
+
+
+class _Finder:
+    """Finds the layers of one view and view layer that hold light."""
+
+    def __init__(self, layers: Sequence[Layer], beauty: Beauty) -> None:
+        self._view_layer = beauty.view_layer
+        self._layers = [
+            layer
+            for layer in layers
+            if layer.view in (beauty.view, "") and layer.triple() and layer is not beauty.layer
+        ]
+
+    def find(self, candidate: str | Mapping[str, str]) -> Iterator[AdditiveLayer]:
+        """The layers that an entry of the table means; none if a factor is missing."""
+        entry = {"layer": candidate} if isinstance(candidate, str) else candidate
+        factor = next(self._named(entry["times"]), None) if "times" in entry else None
+        if "times" in entry and factor is None:
+            return
+        for layer in self._named(entry["layer"]):
+            channels = layer.triple()
+            assert channels is not None
+            if all(channel.type != "uint" for channel in channels):
+                yield AdditiveLayer(self._short(layer.name), channels, factor.triple() if factor else None)
+
+    def _named(self, alias: str) -> Iterator[Layer]:
+        """The layers of a name, or of a pattern with ``*``, where ``_`` matters: ``C_*`` does not mean ``coat``."""
+        for layer in self._layers:
+            if "*" in alias:
+                named = fnmatchcase(self._short(layer.name).lower(), alias.lower())
+            else:
+                named = view_layer_of(layer.name, alias) in (self._view_layer, "")
+            if named:
+                yield layer
+
+    def _short(self, name: str) -> str:
+        """A layer's name without the view layer."""
+        return name.removeprefix(self._view_layer + ".") if self._view_layer else name
+
+
+def _user_set(finder: _Finder, text: str, path: str) -> AdditiveSet:
+    """The set that ``NAME=a+b+c*d`` describes."""
+    name, equals, terms = text.partition("=")
+    if not equals or not name.strip() or "+" not in terms:
+        raise InputError(f"--sum {text!r}: write NAME=LAYER+LAYER, or LAYER*COLOUR for a product")
+    found: list[AdditiveLayer] = []
+    for term in terms.split("+"):
+        layer, times, factor = (part.strip() for part in term.partition("*"))
+        one = list(finder.find({"layer": layer, "times": factor} if times else layer))
+        if len(one) != 1:
+            raise InputError(f"--sum {text!r}: {path} has {'several layers' if one else 'no layer'} {term.strip()!r}")
+        found += one
+    return AdditiveSet(name.strip(), tuple(found), by_user=True)

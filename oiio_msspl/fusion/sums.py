@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Do layers sum to the beauty? Names only suggest it, so the pixels of the render decide."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.exr.render import Window
+
+#: Largest part of the beauty's light that may be wrong in a sum: what half floats round, and a few repaired pixels.
+TOLERANCE = 2e-3
+#: What a sum is compared on: so many strips of rows, evenly spaced. A quarter of a 1080p frame.
+STRIPS, ROWS = 17, 16
+
+
+@dataclass(frozen=True)
+class SumCheck:
+    """What :func:`check_sum` found."""
+
+    residual: float
+    """Sum of |beauty - layers| divided by the sum of |beauty|."""
+    remainder: bool = False
+    """The layers lack some of the light, such as lights in no group. The rest is nowhere negative."""
+    problem: str = ""
+    """Why the layers do not sum to the beauty; empty if they do."""
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        if self.problem:
+            return f"does not sum to the beauty: {self.problem}"
+        share = f"{self.residual:.1%} of the light" if self.remainder else f"{self.residual:.2g} of it"
+        return f"sums to the beauty but for {share}" + (" that is in no layer" if self.remainder else "")
+
+
+def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
+    """Compare the sum of a set's layers with the beauty of the same file, on some strips of rows.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window = render.data_window
+    other = [
+        layer.name for layer in additive_set.layers for c in layer.channels if _window_of(render, c.part) != window
+    ]
+    if other:
+        return SumCheck(1.0, problem=f"{other[0]} has another data window")
+    layers = with_layers(render, additive_set)
+    names = [RGB, *layer_keys(additive_set)]
+    light = wrong = missing = surplus = 0.0
+    for y in _strips(window):
+        pixels = layers.read(Window(window.x0, y, window.x1, min(y + ROWS, window.y1)), names)
+        beauty = pixels[RGB].astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            rest = beauty - sum(pixels[name] for name in names[1:])
+        rest, beauty = rest[np.isfinite(rest)], beauty[np.isfinite(rest)]
+        light, wrong = light + np.abs(beauty).sum(), wrong + np.abs(rest).sum()
+        missing, surplus = missing + np.maximum(rest, 0).sum(), surplus + np.maximum(-rest, 0).sum()
+    if light == 0:
+        return SumCheck(0.0, problem="the beauty is black")
+    residual = float(wrong / light)
+    if residual <= TOLERANCE:
+        return SumCheck(residual)
+    if surplus / light <= TOLERANCE:
+        return SumCheck(residual, remainder=True)
+    if abs(missing - surplus) < wrong / 4:
+        return SumCheck(
+            residual, problem=f"they differ by {residual:.1%} both ways; is the beauty denoised, or stored lossily?"
+        )
+    return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; some layers overlap")
+
+
+def with_layers(render: MappedRender, additive_set: AdditiveSet) -> MappedRender:
+    """The render with the light of each layer as a feature beside the beauty, see :func:`layer_keys`."""
+    formulas = dict(zip(layer_keys(additive_set), (layer.formula for layer in additive_set.layers), strict=True))
+    return replace(render, features={RGB: render.features[RGB], **formulas}, alpha=None)
+
+
+def layer_keys(additive_set: AdditiveSet) -> list[str]:
+    """Names of the layers' features."""
+    return [f"layer {i}" for i in range(len(additive_set.layers))]
+
+
+def _strips(window: Window) -> list[int]:
+    """First rows of the strips that are compared."""
+    if window.height <= STRIPS * ROWS:
+        return list(range(window.y0, window.y1, ROWS))
+    return [window.y0 + round(i * (window.height - ROWS) / (STRIPS - 1)) for i in range(STRIPS)]
+
+
+def _window_of(render: MappedRender, part: int) -> Window:
+    return render.file.parts[part].data_window

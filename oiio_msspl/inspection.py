@@ -15,6 +15,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import find_model
@@ -105,10 +106,13 @@ def inspect_file(path: Path, inputs: InputOptions, model: str | None = None) -> 
     try:
         file = result.file = open_exr(path)
         result.facts = _facts(file)
-        render = result.render = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+        render = result.render = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
         result.facts.append(_renderer_fact(render))
         result.passed_through = render.unread_layers()
         result.facts += _pixel_facts(render)
+        result.facts += [
+            f"{each.name} ({each.layer_names}): {check_sum(render, each).text}" for each in render.additive_sets
+        ]
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
     return result

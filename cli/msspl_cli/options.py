@@ -131,6 +131,26 @@ HelpAll = Annotated[
 ]
 
 
+Passes = Annotated[
+    list[str],
+    typer.Option(
+        metavar="PATTERN",
+        help="Which layers that sum to the beauty are fused, too: auto, none, or names of sets or layers (light*).",
+        rich_help_panel=OUTPUT,
+    ),
+]
+Sum = Annotated[
+    list[str],
+    typer.Option(
+        "--sum",
+        metavar="NAME=A+B+C*D",
+        help="Layers of HR that sum to the beauty, if their names are not known. May be repeated.",
+        rich_help_panel=INPUT,
+        hidden=True,
+    ),
+]
+
+
 class _OneLine(logging.Formatter):
     """Prints a message on one line: it may contain names out of a file. A traceback follows on lines of its own."""
 
@@ -153,6 +173,7 @@ def make_inputs(
     lr_spp: float | None,
     hr_spp: float | None,
     colourspace: str | None = None,
+    sums: list[str] | None = None,
 ) -> InputOptions:
     """The options that describe the input files. ``--map`` wins over ``--map-file``.
 
@@ -163,11 +184,17 @@ def make_inputs(
     from oiio_msspl.jobs.inputs import InputOptions
 
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
-    return InputOptions(layers | parse_map_options(mapping), view_layer, lr_spp, hr_spp, colourspace, map_file)
+    mapped = layers | parse_map_options(mapping)
+    return InputOptions(mapped, view_layer, lr_spp, hr_spp, colourspace, tuple(sums or ()), map_file)
 
 
 def make_write_options(
-    layout: str, compression: str | None, half: bool | None, layers: list[str], error_layer: bool
+    layout: str,
+    compression: str | None,
+    half: bool | None,
+    layers: list[str],
+    error_layer: bool,
+    passes: list[str] | None = None,
 ) -> WriteOptions:
     """The options that describe the result.
 
@@ -177,7 +204,8 @@ def make_write_options(
     from oiio_msspl.exr.write_options import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"
-    return WriteOptions(layout, compression, pixel_type, tuple(layers), error_layer)
+    patterns = tuple(passes) if passes and "auto" not in passes else ()
+    return WriteOptions(layout, compression, pixel_type, tuple(layers), patterns, error_layer)
 
 
 def parse_bytes(text: str) -> int:

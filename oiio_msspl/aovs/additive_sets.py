@@ -47,6 +47,11 @@ class AdditiveSet:
     by_user: bool = False
     """The user has named it, so it must be usable."""
 
+    @property
+    def layer_names(self) -> str:
+        """Its layers, for the user."""
+        return ", ".join(f"{layer.name} x colour" if layer.factor else layer.name for layer in self.layers)
+
     def matches(self, pattern: str) -> bool:
         """Whether a pattern such as ``light*`` means this set or one of its layers."""
         return fnmatchcase(same_spelling(self.name), same_spelling(pattern)) or any(

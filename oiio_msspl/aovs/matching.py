@@ -51,8 +51,8 @@ def map_render(
         sums: the user's own additive sets, see :func:`oiio_msspl.aovs.additive_sets.find_additive_sets`.
 
     Raises:
-        InputError: the mapping or a sum has a mistake; the file has only deep data, no beauty or no such view; a layer holds
-            integers; or a layer of the mapping is missing or has the wrong channels.
+        InputError: the mapping or a sum has a mistake; the file has only deep data, no beauty or no such view; a layer
+            holds integers; or a layer of the mapping is missing or has the wrong channels.
     """
     layers = _flat_layers(file)
     mapping = check_mapping(dict(mapping or {}), "mapping")

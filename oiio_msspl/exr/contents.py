@@ -14,10 +14,8 @@ from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
+from oiio_msspl.exr.replaced import DTYPES, ReplacedChannels
 from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOptions
-
-#: NumPy's type of each pixel type.
-DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}
 
 
 @dataclass(frozen=True)
@@ -68,6 +66,8 @@ class FileContents:
     attributes: dict[str, str]
     """Header attributes that are added to the part of the beauty."""
     options: WriteOptions
+    replaced: ReplacedChannels | None = None
+    """New pixels for channels that are passed on, with the beauty's data window."""
 
     @property
     def home(self) -> Part:

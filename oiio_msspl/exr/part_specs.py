@@ -111,6 +111,8 @@ def _stays_whole(part: Part, contents: FileContents) -> bool:
         return False
     if any(c in contents.beauty or c in contents.dropped for c in part.channels):
         return False
+    if contents.replaced is not None and not _has_one_type(part) and any(c in contents.replaced for c in part.channels):
+        return False
     # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. A part of a single pixel type
     # is rewritten as scan lines; OpenImageIO can't do so with mixed types. It copies those whole, in memory.
     return _has_one_type(part) or (part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART)

@@ -15,9 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.contents import DTYPES, FileContents
+from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.part_specs import runs
 from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.replaced import DTYPES
 from oiio_msspl.exr.write_options import ERROR_LAYER
 
 #: Header entries that say how the source was stored. The ACES flag is forbidden in a file with AOVs (ST 2065-4).
@@ -69,6 +70,8 @@ def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[
             for run in runs([channel for channel in passed_on if channel.type == kind]):
                 planes = _planes(contents, run, channels)
                 for y0, y1, strip in file.native_strips(part, run[0].index, run[-1].index + 1):
+                    if contents.replaced is not None:
+                        strip = contents.replaced.apply(run, y0 - part.data_window.y0, strip)
                     for position, plane in enumerate(planes):
                         plane[y0 - part.data_window.y0 : y1 - part.data_window.y0] = strip[..., position]
 

@@ -41,6 +41,9 @@ class WriteOptions:
     """``half`` or ``float``, for the fused beauty; None keeps the type of the HRLS's beauty."""
     layers: tuple[str, ...] = ()
     """Patterns such as ``crypto*`` of the HRLS's layers to pass on; ``("none",)`` passes on none, ``()`` all."""
+    passes: tuple[str, ...] = ()
+    """Patterns such as ``light*`` of the additive sets, or of layers in them, to fuse; ``("none",)`` fuses none, ``()``
+    all. Other layers are passed on."""
     error_layer: bool = False
     """Add a layer ``error``: the error that the model predicts for the fused beauty."""
 

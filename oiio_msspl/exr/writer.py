@@ -21,6 +21,7 @@ from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
 from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, error_spec, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
+from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.exr.write_options import WriteOptions
@@ -37,6 +38,7 @@ def write_fused(
     options: WriteOptions,
     *,
     error: Array | None = None,
+    replaced: ReplacedChannels | None = None,
     overwrite: bool = False,
     cache_bytes: int = 0,
     stale: Path | None = None,
@@ -52,6 +54,7 @@ def write_fused(
         attributes: header attributes that are added to the beauty's part.
         options: layout, compression, pixel type and layers.
         error: predicted error, (height, width, 1); becomes the layer ``error``.
+        replaced: new pixels for some of the other channels, over the beauty's data window.
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
             each layer.
@@ -66,7 +69,7 @@ def write_fused(
     """
     pixels = FusedPixels(rgb, alpha, error, options.pixel_type or widest_type(beauty))
     dropped = dropped_channels(source, beauty, options.layers)
-    contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options)
+    contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options, replaced)
     with replacing(path, overwrite=overwrite, stale=stale) as temporary:
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
@@ -110,7 +113,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     with contents.source.cache_strips(cache_bytes):
         for position, part in enumerate(passed_on, start=1):
             ok = ok and writer.open(str(path), part.spec, "AppendSubimage")
-            ok = ok and _copy(contents.source, part, passed_on[position:], writer)
+            ok = ok and _copy(contents, part, passed_on[position:], writer)
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
@@ -128,8 +131,9 @@ def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]
     return True
 
 
-def _copy(file: ExrFile, part: PassedOnPart, later: Sequence[PassedOnPart], writer: Any) -> bool:
+def _copy(contents: FileContents, part: PassedOnPart, later: Sequence[PassedOnPart], writer: Any) -> bool:
     """Copy pixels of the HRLS into the part that is open, in their own pixel types; ``later`` parts follow."""
+    file, replaced = contents.source, contents.replaced
     if part.runs is None:
         source = oiio.ImageInput.open(str(file.path))
         copied = source is not None and source.seek_subimage(part.source.index, 0) and writer.copy_image(source)
@@ -148,6 +152,9 @@ def _copy(file: ExrFile, part: PassedOnPart, later: Sequence[PassedOnPart], writ
         y0, y1, pixels = strips[0]
         if len(strips) > 1:
             pixels = np.concatenate([strip for _, _, strip in strips], axis=-1)
+        if replaced is not None:
+            channels = [channel for run in part.runs for channel in run]
+            pixels = replaced.apply(channels, y0 - contents.home.data_window.y0, pixels)
         if not writer.write_scanlines(y0, y1, 0, np.ascontiguousarray(pixels)):
             return False
     return True

@@ -23,6 +23,7 @@ from oiio_msspl.fusion.guards import (
     lights_above_ceiling,
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
+from oiio_msspl.fusion.passes import FusedPasses
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
     MAX_MEMORY,
@@ -61,6 +62,8 @@ class FusedFrame:
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
     """One sentence each."""
+    passes: FusedPasses | None = None
+    """The fused layers of additive sets; None if there are none."""
     tiles: int = 1
     seconds: float = 0.0
     """Time in the network alone."""

@@ -76,7 +76,7 @@ def read_tile(
         counts: repaired values of the HRLS; those of the tile's core are added.
     """
     scale = alignment.scale
-    area, core = _in_hrls_pixels(tile.area, scale), _in_hrls_pixels(tile.core, scale)
+    area, core = in_hrls_pixels(tile.area, scale), in_hrls_pixels(tile.core, scale)
     window = tile.area.slices(grid)
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},
@@ -102,7 +102,7 @@ def read_lrhs(
         counts: repaired values are added here.
     """
     data = alignment.lr_data_window
-    hrls_rows, hrls_columns = _mirrored_pixels(_in_hrls_pixels(grid, alignment.scale), alignment.hr_data_window)
+    hrls_rows, hrls_columns = mirrored_pixels(in_hrls_pixels(grid, alignment.scale), alignment.hr_data_window)
     rows = np.clip(_lrhs_positions(hrls_rows, alignment.scale, alignment.stretch[1]), data.y0, data.y1 - 1)
     columns = np.clip(_lrhs_positions(hrls_columns, alignment.scale, alignment.stretch[0]), data.x0, data.x1 - 1)
     y0, x0 = int(np.floor(rows.min())), int(np.floor(columns.min()))
@@ -134,7 +134,7 @@ def read_features(
         features: names of features; all if None. Those that the render lacks are left out.
         counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
     """
-    rows, columns = _mirrored_pixels(window, data_window)
+    rows, columns = mirrored_pixels(window, data_window)
     stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
     layers = render.read(stored.shift(render.display_window.x0, render.display_window.y0), features)
     result = {}
@@ -147,7 +147,7 @@ def read_features(
     return result
 
 
-def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
+def mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
     """The rows and the columns of ``inside`` that a window shows if the picture is mirrored at the sides of
     ``inside``."""
     return (
@@ -163,5 +163,5 @@ def _mirrored(pixels: Indices, start: int, stop: int) -> Indices:
     return start + np.minimum(offsets, 2 * length - 1 - offsets)
 
 
-def _in_hrls_pixels(window: Window, scale: int) -> Window:
+def in_hrls_pixels(window: Window, scale: int) -> Window:
     return Window(window.x0 * scale, window.y0 * scale, window.x1 * scale, window.y1 * scale)

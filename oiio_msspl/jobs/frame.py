@@ -20,7 +20,8 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, require_memory
+from oiio_msspl.fusion.passes import FusedPasses, fuse_passes
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, STRIPS_SHARE, require_memory
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair, resolve_auto
 from oiio_msspl.jobs.report import FrameReport, provenance, report_on
 from oiio_msspl.model.catalogue import DEFAULT_FAMILY, find_model
@@ -116,6 +117,7 @@ def fuse_files(
     opened = time.perf_counter()
 
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
+    fused.passes = fuse_frame_passes(lr, hr, fused, write, max_memory)
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
@@ -131,6 +133,30 @@ def fuse_files(
         "write": time.perf_counter() - computed,
     }
     return report
+
+
+def fuse_frame_passes(
+    lr: MappedRender, hr: MappedRender, fused: FusedFrame, write: WriteOptions, max_memory: int
+) -> FusedPasses | None:
+    """Fuse the additive sets that are asked for; None if there are none.
+
+    Args:
+        lr, hr: the pair, as files.
+        fused: its fused beauty.
+        write: ``passes`` says which.
+        max_memory: bytes that the process should stay below.
+
+    Raises:
+        InputError: a pattern matches no set, or pixels can't be decoded.
+    """
+    if write.passes == ("none",):
+        return None
+    cache_bytes = int((max_memory - fused.nbytes) * STRIPS_SHARE)
+    passes = fuse_passes(lr, hr, fused.rgb, fused.alignment, write.passes, max(0, cache_bytes))
+    if passes is None and write.passes:
+        known = ", ".join(f"'{each.name}'" for each in hr.additive_sets) or "none"
+        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
+    return passes
 
 
 def write_frame(
@@ -159,6 +185,7 @@ def write_frame(
         provenance(report),
         options,
         error=fused.error,
+        replaced=fused.passes.pixels if fused.passes else None,
         overwrite=overwrite,
         cache_bytes=cache_bytes,
         stale=old_preview(report.output) if overwrite else None,

@@ -35,6 +35,8 @@ class InputOptions:
     colourspace: str | None = None
     """Linear RGB space of both renders, see :func:`oiio_msspl.colour.named_space`; None to read it from the headers,
     and to take linear Rec. 709 if they do not say."""
+    sums: tuple[str, ...] = ()
+    """The user's additive sets, as ``NAME=a+b+c*d``."""
     map_file: Path | None = None
     """The file that ``mapping`` was read from, if any."""
 
@@ -61,7 +63,7 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
     if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
         raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
-    lr, hr = _map_lrhs(lr_file, inputs), map_render(hr_file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+    lr, hr = _map_lrhs(lr_file, inputs), _map_hrls(hr_file, inputs)
     lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
     return lr, hr
 
@@ -80,6 +82,11 @@ def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> Colou
             "space (or name it with --colorspace if a header is wrong)"
         )
     return high or low or REC709
+
+
+def _map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
+    """Map the HRLS: all that the user says applies to it."""
+    return map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
 
 
 def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +42,8 @@ class FrameReport:
     """Number of fused values that half could not hold; 0 if the beauty is stored as float."""
     lrhs_aovs: tuple[str, ...] = ()
     """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
+    passes: dict[str, str] = field(default_factory=dict)
+    """What was done with each additive set, by its name."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -74,6 +76,7 @@ class FrameReport:
             "provider": self.provider,
             "aovs": self.aovs(),
             "lrhs_aovs": self.found_lrhs_aovs(),
+            "passes": self.passes,
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "negative": self.negative,
@@ -99,12 +102,28 @@ def report_on(
         preview=preview_path,
         repaired=fused.repaired,
         negative=fused.negative,
-        warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings],
+        warnings=[*spp_warnings(lr, hr, session.contract), *fused.warnings, *_pass_warnings(hr, fused)],
         tiles=fused.tiles,
         seconds={},
         features=frozenset(session.contract.features),
         lrhs_aovs=session.lrhs_aovs,
+        passes=_passes(fused),
     )
+
+
+def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:
+    """Sentences for the sets that the user has named and that could not be fused."""
+    refused = fused.passes.refused if fused.passes else {}
+    named = [each.name for each in hr.additive_sets if each.by_user and each.name in refused]
+    return [f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are" for name in named]
+
+
+def _passes(fused: FusedFrame) -> dict[str, str]:
+    """What was done with each additive set."""
+    if fused.passes is None:
+        return {}
+    done = {each.name: f"fused: {each.layer_names}" for each in fused.passes.sets}
+    return done | {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in done}
 
 
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:

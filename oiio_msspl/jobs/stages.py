@@ -19,7 +19,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import check_frame_memory, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import check_frame_memory, fuse_frame_passes, write_frame, write_frame_preview
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame
@@ -144,6 +144,7 @@ class Stages:
             max_memory=self.max_memory,
             held=others,
         )
+        fused.passes = fuse_frame_passes(loaded.lr, loaded.hr, fused, self.write_options, self.max_memory - others)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
         report.seconds = {"read": loaded.seconds, "fuse": time.perf_counter() - start, "network": fused.seconds}

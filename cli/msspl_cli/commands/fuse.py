@@ -75,6 +75,7 @@ def fuse(
         ),
     ] = None,
     colorspace: options.Colourspace = None,
+    sums: options.Sum = [],  # noqa: B006
     # Model
     model: options.Model = "auto",
     device: options.Device = "cpu",
@@ -118,6 +119,7 @@ def fuse(
             rich_help_panel=options.OUTPUT,
         ),
     ] = [],  # noqa: B006
+    passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     compression: Annotated[
         str | None,
@@ -207,8 +209,8 @@ def fuse(
     from oiio_msspl.jobs.sequence import is_sequence
 
     common: dict[str, Any] = {
-        "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace),
-        "write": options.make_write_options(layout, compression, half, layers, error_layer),
+        "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
+        "write": options.make_write_options(layout, compression, half, layers, error_layer, passes),
         "model": model,
         "device": device,
         "threads": threads,
@@ -295,6 +297,8 @@ def _print(report: FrameReport, seconds: float) -> None:
     console.aov_table(report.aovs(), report.hr.notes)
     if lrhs_aovs := report.found_lrhs_aovs():
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
+    for name, done in report.passes.items():
+        console.say(f"  {name}: {done}")
     for text, counts in (
         ("Repaired values that were NaN or infinite", report.repaired),
         ("Set negative values to 0 (colours out of gamut)", report.negative),

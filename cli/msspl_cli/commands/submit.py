@@ -56,9 +56,11 @@ def submit(
     from oiio_msspl.jobs.shot_checks import check_first_pair
 
     # Options with a wrong value are refused here, and not by every task.
-    names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace")
+    names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
-    options.make_write_options(*(given[name] for name in ("layout", "compression", "half", "layers", "error_layer")))
+    options.make_write_options(
+        *(given[name] for name in ("layout", "compression", "half", "layers", "error_layer", "passes"))
+    )
     options.parse_bytes(given["max_memory"])
     job = make_job(
         given["lr"],

@@ -1,0 +1,66 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels that take the place of channels of the HRLS in the fused file."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.arrays import FLOAT_MAX, HALF_MAX, Array
+from oiio_msspl.exr.reader import Channel
+
+#: NumPy's type of each pixel type.
+DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}
+
+
+class ReplacedChannels:
+    """New pixels for some channels, in their stored types.
+
+    They are kept in a temporary file, because forty channels of an 8K frame take gigabytes. The system deletes it with
+    the process, even a killed one. The variable ``TMPDIR`` says where it is.
+    """
+
+    def __init__(self, channels: Sequence[Channel], width: int, height: int) -> None:
+        """Room for ``channels``, of ``width`` x ``height`` pixels each."""
+        self._width = width
+        self._offsets: dict[Channel, int] = {}
+        size = 0
+        for channel in dict.fromkeys(channels):
+            self._offsets[channel] = size
+            size += width * height * np.dtype(DTYPES[channel.type]).itemsize
+        self._file = tempfile.TemporaryFile(prefix="msspl-")  # noqa: SIM115 - it lives as long as this object
+        self._file.truncate(size)
+
+    def __contains__(self, channel: Channel) -> bool:
+        return channel in self._offsets
+
+    def put(self, channel: Channel, start: int, rows: Array) -> None:
+        """Store rows (n, width) of a channel from row ``start`` on; what is too bright for its type is clipped."""
+        largest = HALF_MAX if channel.type == "half" else FLOAT_MAX
+        stored = np.clip(rows, -largest, largest).astype(DTYPES[channel.type])
+        self._file.seek(self._place(channel, start))
+        self._file.write(stored.tobytes())
+
+    def get(self, channel: Channel, start: int, stop: int) -> NDArray[Any]:
+        """Rows of a channel, (stop - start, width)."""
+        dtype = np.dtype(DTYPES[channel.type])
+        self._file.seek(self._place(channel, start))
+        data = self._file.read((stop - start) * self._width * dtype.itemsize)
+        return np.frombuffer(data, dtype).reshape(stop - start, self._width)
+
+    def apply(self, channels: Sequence[Channel], start: int, pixels: NDArray[Any]) -> NDArray[Any]:
+        """Put the new pixels over rows (n, width, channels) from row ``start`` on, in a copy."""
+        if not any(channel in self for channel in channels):
+            return pixels
+        pixels = pixels.copy()
+        for i, channel in enumerate(channels):
+            if channel in self:
+                pixels[..., i] = self.get(channel, start, start + len(pixels))
+        return pixels
+
+    def _place(self, channel: Channel, row: int) -> int:
+        return self._offsets[channel] + row * self._width * np.dtype(DTYPES[channel.type]).itemsize

@@ -1,0 +1,340 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fuses the layers of an additive set, so that they still sum to the fused beauty.
+
+A layer is fitted, around every LRHS pixel, as a linear function of what is nearly free of noise: the fused beauty,
+albedo and normal (first-order regression: Bitterli et al. 2016; the fit at low resolution: fast guided filter, He and
+Sun 2015). The function is then applied at full resolution. A fit needs the averages of noisy layers only, so eight
+layers cost about as much as the beauty. What the fitted layers lack of the fused beauty is spread over them in
+proportion to their light, so their sum is the beauty to the last bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.formula import FeatureFormula
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.sums import check_sum, layer_keys, with_layers
+from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
+from oiio_msspl.parallel import for_row_blocks
+
+#: HRLS rows that are fused at a time.
+BAND_ROWS = 128
+#: A fit spans so many LRHS pixels to each side: at x2 a pixel has fewer samples, so more of them are needed.
+RADIUS = {2: 3, 4: 2, 8: 2}
+#: The coefficients of fits that overlap are averaged over so many LRHS pixels to each side.
+SMOOTHING = 1
+#: Keeps a fit from following noise: variance that is added to each guide, relative to its mean square.
+RIDGE = 0.03
+#: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
+FIREFLY = 8.0
+#: A colour below this can't carry light: a product of light and colour is written as product / colour.
+DARKEST_COLOUR = 1e-3
+
+
+@dataclass
+class FusedPasses:
+    """The fused layers of all sets."""
+
+    sets: list[AdditiveSet]
+    """The sets that were fused."""
+    pixels: ReplacedChannels
+    """Their new pixels, over the HRLS's data window."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Why other sets were not fused, by name."""
+
+
+def fuse_passes(
+    lr: MappedRender,
+    hr: MappedRender,
+    rgb: Array,
+    alignment: Alignment,
+    patterns: Sequence[str] = (),
+    cache_bytes: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> FusedPasses | None:
+    """Fuse the layers of the HRLS's additive sets.
+
+    Args:
+        lr, hr: the pair. Layers that the LRHS lacks are fused from the HRLS alone.
+        rgb: the fused beauty, (height, width, 3), over the HRLS's data window.
+        alignment: of the pair.
+        patterns: names of sets or layers; a set that none of them matches is left out. None: all.
+        cache_bytes: memory for decoded rows that two bands need.
+        progress: called with (bands done, bands in all).
+
+    Returns:
+        None if the HRLS has no set of these names.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    wanted = [each for each in hr.additive_sets if not patterns or any(each.matches(p) for p in patterns)]
+    if not wanted:
+        return None
+    jobs, refused = _checked(lr, hr, wanted)
+    window = alignment.hr_data_window
+    channels = [channel for job in jobs for layer in job.layers.layers for channel in layer.channels]
+    pixels = ReplacedChannels(channels, window.width, window.height)
+    fused = FusedPasses([job.layers for job in jobs], pixels, refused)
+    step = BAND_ROWS // alignment.scale
+    tops = range(alignment.grid.y0, alignment.grid.y1, step) if jobs else []
+    with hr.cache_strips(cache_bytes):
+        for done, top in enumerate(tops, start=1):
+            core = Window(alignment.grid.x0, top, alignment.grid.x1, min(top + step, alignment.grid.y1))
+            band = _Band(hr, rgb, alignment, core)
+            for job in jobs:
+                band.fuse(job, lr, hr, pixels)
+            if progress is not None:
+                progress(done, len(tops))
+    return fused
+
+
+@dataclass(frozen=True)
+class _Job:
+    """A set that sums to the beauty."""
+
+    layers: AdditiveSet
+    lrhs: AdditiveSet | None
+    """The same layers in the LRHS."""
+    remainder: bool
+    """Some light is in no layer."""
+
+
+def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[list[_Job], dict[str, str]]:
+    """The sets that sum to the beauty, and why each of the others does not, by name."""
+    jobs: list[_Job] = []
+    refused: dict[str, str] = {}
+    taken: set[object] = set()
+    for layers in sets:
+        check = check_sum(hr, layers)
+        shared = [layer.name for layer in layers.layers if not taken.isdisjoint(layer.channels)]
+        if check.problem or shared:
+            refused[layers.name] = check.text if check.problem else f"shares {shared[0]} with another set"
+            continue
+        taken.update(channel for layer in layers.layers for channel in layer.channels)
+        names = [layer.name for layer in layers.layers]
+        lrhs = next((each for each in lr.additive_sets if [layer.name for layer in each.layers] == names), None)
+        if lrhs is not None and check_sum(lr, lrhs).problem:
+            lrhs = None
+        jobs.append(_Job(layers, lrhs, check.remainder))
+    return jobs, refused
+
+
+class _Band:
+    """Some rows of the frame, with what their layers are fitted to."""
+
+    def __init__(self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window) -> None:
+        self._alignment, self._core, self._scale = alignment, core, alignment.scale
+        self._radius = RADIUS[alignment.scale]
+        reach = self._radius + SMOOTHING + 1
+        area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
+        self._area = area.intersect(alignment.grid)
+        self._hrls_area = in_hrls_pixels(self._area, alignment.scale)
+        window = alignment.hr_data_window
+        rows, columns = mirrored_pixels(self._hrls_area, window)
+        beauty = rgb[rows - window.y0].take(columns - window.x0, axis=1)
+        features = read_features(hr, self._hrls_area, window, [ALBEDO, NORMAL])
+        guides = [beauty, *([features[ALBEDO]] if ALBEDO in features else [])]
+        #: Guides by channel of colour: the same channel of beauty and albedo, and the normal. (3, guides, h, w).
+        normal = [features[NORMAL][..., i] for i in range(3)] if NORMAL in features else []
+        self._guides = np.stack([[*(guide[..., c] for guide in guides), *normal] for c in range(3)])
+        self._beauty = _planes(beauty)
+        self._low_beauty = _planes(box_downsample(beauty, self._scale))
+        low = np.stack([_planes(box_downsample(np.moveaxis(g, 0, -1), self._scale)) for g in self._guides])
+        self._fit = _Fit(low, self._radius)
+
+    def fuse(self, job: _Job, lr: MappedRender, hr: MappedRender, pixels: ReplacedChannels) -> None:
+        """Fuse the layers of one set and store them."""
+        noisy = self._average(job, lr, hr)
+        core_rows = slice(self._core.y0 - self._area.y0, self._core.y1 - self._area.y0)
+        scale = self._scale
+        rows = slice(core_rows.start * scale, core_rows.stop * scale)
+        beauty, guides = self._beauty[:, rows], self._guides[:, :, rows]
+        fitted = np.empty((len(noisy), *beauty.shape), np.float32)
+        flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *beauty.shape[1:])
+
+        def fit(planes: slice) -> None:
+            for i in range(planes.start, planes.stop):
+                coefficients = self._fit.coefficients(flat_noisy[i], i % 3)
+                high = [_upsample(plane, scale, core_rows) for plane in coefficients]
+                flat_fitted[i] = high[-1]
+                for guide, coefficient in zip(guides[i % 3], high[:-1], strict=True):
+                    flat_fitted[i] += guide * coefficient
+
+        for_row_blocks(fit, len(flat_noisy), beauty[0].size)
+        colours = self._colours(job, hr, rows)
+        np.maximum(fitted, 0, out=fitted)
+        # Where no layer is left, the beauty is divided as in the whole band.
+        dark = fitted.sum(axis=0) == 0
+        fitted[:, dark] = noisy.sum(axis=(1, 2, 3))[:, None]
+        for i, colour in colours.items():
+            fitted[i] *= colour >= DARKEST_COLOUR
+        _make_sum(fitted, beauty)
+        for i, colour in colours.items():
+            fitted[i] /= np.maximum(colour, DARKEST_COLOUR)
+        window = self._alignment.hr_data_window
+        core = in_hrls_pixels(self._core, scale)
+        inside = core.intersect(window)
+        for layer, values in zip(job.layers.layers, fitted, strict=False):
+            for channel, plane in zip(layer.channels, values, strict=True):
+                pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
+
+    def _average(self, job: _Job, lr: MappedRender, hr: MappedRender) -> Array:
+        """The mean of both renders' layers at low resolution, (layers, 3, h, w); the remainder is the last layer."""
+        window = self._alignment.hr_data_window
+        render = with_layers(hr, job.layers)
+        high = read_features(render, self._hrls_area, window, render.features)
+        renders = [{name: box_downsample(values, self._scale) for name, values in high.items()}]
+        if job.lrhs is not None:
+            low = with_layers(lr, job.lrhs)
+            renders.append(read_lrhs(low, self._alignment, self._area, low.features, RepairCounts()))
+        total = np.zeros((len(job.layers.layers) + job.remainder, *self._low_beauty.shape), np.float32)
+        for pixels in renders:
+            layers = np.stack([_planes(pixels[name]) for name in layer_keys(job.layers)])
+            if job.remainder:
+                rest = np.maximum(_planes(pixels[RGB]) - layers.sum(axis=0), 0)
+                layers = np.concatenate([layers, rest[None]])
+            light = layers.sum(axis=(0, 1))
+            allowed = FIREFLY * _largest_around(self._low_beauty.sum(axis=0))
+            total += layers * np.minimum(1, allowed / np.maximum(light, 1e-20))
+        total /= np.float32(len(renders))
+        return total
+
+    def _colours(self, job: _Job, hr: MappedRender, rows: slice) -> dict[int, Array]:
+        """The colour (3, h, w) that each product's light is multiplied by, by index of the layer."""
+        colours: dict[int, Array] = {}
+        by_channels: dict[object, Array] = {}
+        window = in_hrls_pixels(self._core, self._scale)
+        for i, layer in enumerate(job.layers.layers):
+            if layer.factor is not None:
+                if layer.factor not in by_channels:
+                    render = replace(hr, features={"colour": FeatureFormula((layer.factor,))})
+                    colour = read_features(render, window, self._alignment.hr_data_window, ["colour"])["colour"]
+                    by_channels[layer.factor] = _planes(colour)
+                colours[i] = by_channels[layer.factor]
+        return colours
+
+
+class _Fit:
+    """Linear fits around every low-resolution pixel: layer = sum over guides of a_k guide_k + b."""
+
+    def __init__(self, guides: Array, radius: int) -> None:
+        """``guides``: (3, guides, h, w)."""
+        self._guides, self._radius = guides, radius
+        self._means = np.stack([[_mean_around(g, radius) for g in channel] for channel in guides])
+        count = guides.shape[1]
+        self._factors = []
+        for c in range(3):
+            matrix = [
+                [
+                    _mean_around(guides[c, i] * guides[c, j], radius) - self._means[c, i] * self._means[c, j]
+                    for j in range(i + 1)
+                ]
+                for i in range(count)
+            ]
+            for i in range(count):
+                matrix[i][i] += RIDGE * (np.square(self._means[c, i]) + np.maximum(matrix[i][i], 0)) + 1e-7
+            self._factors.append(_cholesky(matrix))
+
+    def coefficients(self, layer: Array, channel: int) -> list[Array]:
+        """a_k of each guide, and b, averaged over overlapping fits: planes (h, w)."""
+        guides, means, factor = self._guides[channel], self._means[channel], self._factors[channel]
+        mean = _mean_around(layer, self._radius)
+        covariances = [_mean_around(layer * g, self._radius) - mean * m for g, m in zip(guides, means, strict=True)]
+        slopes = _solve(factor, covariances)
+        offset = _minus_products(mean, slopes, means)
+        return [_mean_around(plane, SMOOTHING) for plane in (*slopes, offset)]
+
+
+def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
+    """The Cholesky factor of a symmetric matrix of planes; the lower triangle of both is used."""
+    factor: list[list[Array]] = []
+    for i, row in enumerate(matrix):
+        new: list[Array] = []
+        for j in range(i):
+            new.append(_minus_products(row[j], new, factor[j]) / factor[j][j])
+        # Rounding can make a pivot negative where two guides are the same.
+        new.append(np.sqrt(np.maximum(_minus_products(row[i], new, new), np.float32(1e-8))))
+        factor.append(new)
+    return factor
+
+
+def _solve(factor: list[list[Array]], values: list[Array]) -> list[Array]:
+    """Solve ``L L^T x = values`` for planes."""
+    half: list[Array] = []
+    for row, value in zip(factor, values, strict=True):
+        half.append(_minus_products(value, row, half) / row[-1])
+    result: list[Array] = []
+    for i in reversed(range(len(factor))):
+        column = [row[i] for row in factor[i + 1 :]]
+        result.insert(0, _minus_products(half[i], column, result) / factor[i][i])
+    return result
+
+
+def _minus_products(value: Array, first: Sequence[Array], second: Sequence[Array]) -> Array:
+    """``value`` minus the products of the planes of two lists; the longer list's other planes are not used."""
+    for a, b in zip(first, second, strict=False):
+        value = value - a * b
+    return value
+
+
+def _make_sum(layers: Array, beauty: Array) -> None:
+    """Scale layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w)."""
+    total = layers.sum(axis=0)
+    lit = total > 0
+    layers *= np.where(lit, beauty / np.where(lit, total, 1), 0)
+
+
+def _mean_around(plane: Array, radius: int) -> Array:
+    """Mean over the pixels up to ``radius`` rows and columns away that exist."""
+    for axis in (0, 1):
+        size = plane.shape[axis]
+        total, count = plane.copy(), np.ones(size, np.float32)
+        for offset in range(1, min(radius, size - 1) + 1):
+            low, high = (slice(None, -offset), slice(offset, None))
+            take = (lambda s: (s, slice(None))) if axis == 0 else (lambda s: (slice(None), s))
+            total[take(low)] += plane[take(high)]
+            total[take(high)] += plane[take(low)]
+            count[low] += 1
+            count[high] += 1
+        total /= count[:, None] if axis == 0 else count
+        plane = total
+    return plane
+
+
+def _largest_around(plane: Array) -> Array:
+    """Maximum of 3 x 3 pixels."""
+    padded = np.pad(plane, 1, mode="edge")
+    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
+    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
+
+
+def _upsample(plane: Array, scale: int, rows: slice) -> Array:
+    """Interpolate a plane linearly at ``scale`` times its resolution; only these of its rows, in its own pixels."""
+    return _upsample_rows(_upsample_rows(plane, scale, rows).T, scale, slice(0, plane.shape[1])).T
+
+
+def _upsample_rows(plane: Array, scale: int, rows: slice) -> Array:
+    padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")
+    before, here, after = (padded[rows.start + i : rows.stop + i] for i in range(3))
+    result = np.empty((len(here) * scale, plane.shape[1]), np.float32)
+    for phase in range(scale):
+        position = (phase + 0.5) / scale - 0.5
+        other = before if position < 0 else after
+        result[phase::scale] = here + np.float32(abs(position)) * (other - here)
+    return result
+
+
+def _planes(image: Array) -> Array:
+    """(h, w, c) as (c, h, w), each plane contiguous."""
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0))

@@ -166,10 +166,14 @@ class _Band:
         def fit(planes: slice) -> None:
             for i in range(planes.start, planes.stop):
                 coefficients = self._fit.coefficients(flat_noisy[i], i % 3)
-                high = [_upsample(plane, scale, core_rows) for plane in coefficients]
-                flat_fitted[i] = high[-1]
-                for guide, coefficient in zip(guides[i % 3], high[:-1], strict=True):
-                    flat_fitted[i] += guide * coefficient
+                *slopes, offset = (_upsample(plane, scale, core_rows) for plane in coefficients)
+                flat_fitted[i] = offset
+                for guide, slope in zip(guides[i % 3], slopes, strict=True):
+                    flat_fitted[i] += guide * slope
+                # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
+                low, high = -_largest_around(-flat_noisy[i]), _largest_around(flat_noisy[i])
+                bounds = (_upsample(plane, scale, core_rows) for plane in (low, high))
+                np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
 
         for_row_blocks(fit, len(flat_noisy), beauty[0].size)
         colours = self._colours(job, hr, rows)

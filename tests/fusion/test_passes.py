@@ -1,0 +1,174 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layers that sum to the beauty are fused, and still sum to it."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
+from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
+
+HEIGHT, WIDTH = 90, 122  # no multiple of 4
+HALF_ROUNDING = 2**-11
+
+
+def lights():
+    """Clean light of two lamps: one from the left, one that lights a disk alone."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] / WIDTH
+    colour = picture(HEIGHT, WIDTH)
+    disk = ((x - 0.6) ** 2 + (y - 0.4) ** 2 < 0.03)[..., None]
+    return {"light_key": colour * (1 - 0.8 * x)[..., None], "light_spot": np.float32(2) * disk * (0.2, 0.5, 1.0)}
+
+
+def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=None):
+    """An LRHS of 16 spp at x4 and an HRLS of 1 spp whose ``layers`` (clean, by name) sum to the beauty."""
+    small = {name: downsample(np.pad(v, ((0, 2), (0, 2), (0, 0)), "edge"), 4) for name, v in layers.items()}
+    paths = []
+    for name, clean, spp in (("lr", small, 16), ("hr", layers, 1)):
+        samples = {n: noisy(v.astype(np.float32), spp, seed).astype(dtype) for seed, (n, v) in enumerate(clean.items())}
+        total = sum(v.astype(np.float64) for v in samples.values()) if beauty is None else beauty(samples)
+        channels = rgb(np.asarray(total).astype(dtype))
+        if name == "hr":
+            channels |= rgb((picture(HEIGHT, WIDTH) > 0.3).astype(dtype), "albedo.")
+            channels |= extra or {}
+        for layer, values in samples.items() if name == "hr" or low else ():
+            channels |= rgb(values, f"{layer}.")
+        paths.append(write_exr(folder / f"{name}.exr", channels))
+    return paths
+
+
+def fused(pair, out, models, passes=(), sums=(), layout="spec", **options):
+    """The report, and {channel: pixels} of the fused file."""
+    write, inputs = WriteOptions(passes=passes, layout=layout, **options), InputOptions(sums=sums)
+    report = fuse_files(*pair, out, model=str(models[4]), write=write, inputs=inputs, overwrite=True)
+    return report, {name: pixels for _, part in read_bits(out) for name, pixels in part.items()}
+
+
+def layer(channels, name=""):
+    prefix = f"{name}." if name else ""
+    return np.stack([channels[f"{prefix}{c}"] for c in "RGB"], axis=-1).astype(np.float64)
+
+
+@pytest.mark.parametrize("low", [True, False])
+@pytest.mark.parametrize(("dtype", "rounding"), [(np.float32, 1e-6), (np.float16, 3 * HALF_ROUNDING)])
+def test_fused_layers_sum_to_the_fused_beauty(tmp_path, bilinear_models, low, dtype, rounding):
+    clean = lights()
+    pair = write_pair(tmp_path, clean, dtype, low)
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    assert report.passes == {"light groups": "fused: light_key, light_spot"}
+    total = sum(layer(out, name) for name in clean)
+    assert np.abs(total - layer(out)).max() <= rounding * layer(out).max()
+    assert np.all(np.abs(total - layer(out)) <= 2 * rounding * layer(out) + 1e-5)
+    _, raw = fused(pair, tmp_path / "raw.exr", bilinear_models, ("none",))
+    for name, values in clean.items():
+        assert np.all(layer(out, name) >= 0)
+        assert out[f"{name}.R"].dtype == dtype
+        errors = [np.mean((layer(channels, name) - values) ** 2) for channels in (out, raw)]
+        assert errors[0] < errors[1] / 5
+
+
+def test_all_else_is_what_it_is_without_passes(tmp_path, bilinear_models):
+    pair = write_pair(
+        tmp_path, lights(), extra={"Z": picture(HEIGHT, WIDTH)[..., 0], "id.X": np.ones((HEIGHT, WIDTH), np.uint32)}
+    )
+    _, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    _, raw = fused(pair, tmp_path / "raw.exr", bilinear_models, ("none",))
+    assert out.keys() == raw.keys()
+    changed = {name for name in out if not same_bits(out[name], raw[name])}
+    assert changed == {f"{name}.{c}" for name in lights() for c in "RGB"}
+    assert same_bits(raw["light_key.R"], read_bits(pair[1])[0][1]["light_key.R"])
+
+
+@pytest.mark.parametrize("layout", ["nuke", "multilayer"])
+def test_every_layout_holds_the_same_layers(tmp_path, bilinear_models, layout):
+    pair = write_pair(tmp_path, lights())
+    _, expected = fused(pair, tmp_path / "out.exr", bilinear_models)
+    fused(pair, tmp_path / "other.exr", bilinear_models, layout=layout)
+    found = [pixels for _, part in read_bits(tmp_path / "other.exr") for pixels in part.values()]
+    for name in ("light_key.R", "light_spot.B"):
+        assert any(same_bits(expected[name], pixels) for pixels in found)
+
+
+def test_a_layer_stays_black_where_it_has_no_light(tmp_path, bilinear_models):
+    pair = write_pair(tmp_path, lights() | {"light_off": np.zeros((HEIGHT, WIDTH, 3))})
+    _, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    assert not layer(out, "light_off").any()
+    far = lights()["light_spot"].any(axis=-1)
+    for _ in range(24):  # a fit and its coefficients reach so many HRLS pixels
+        padded = np.pad(far, 1)
+        far = padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:] | far
+    assert not layer(out, "light_spot")[~far].any()
+    assert (~far).any()
+
+
+def test_light_in_no_layer_is_left_out(tmp_path, bilinear_models):
+    clean = lights() | {"light_rest": 0.2 * picture(HEIGHT, WIDTH)}
+    pair = write_pair(tmp_path, clean, beauty=lambda layers: sum(v.astype(np.float64) for v in layers.values()))
+    sums = ("some=light_key+light_spot",)
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, ("some",), sums)
+    assert report.passes == {"some": "fused: light_key, light_spot"}
+    rest = layer(out) - layer(out, "light_key") - layer(out, "light_spot")
+    assert rest.min() >= -1e-5 * layer(out).max()
+    assert np.mean((rest - clean["light_rest"]) ** 2) < 0.02
+
+
+def test_products_of_light_and_colour_sum_too(tmp_path, bilinear_models):
+    colour = np.where(picture(HEIGHT, WIDTH) > 0.3, np.float32(0.8), np.float32(0.0))
+    clean = {"DiffDir": lights()["light_key"], "DiffInd": 0.3 * picture(HEIGHT, WIDTH), "Emit": lights()["light_spot"]}
+    extra = rgb(colour, "DiffCol.")
+
+    def beauty(layers):
+        size = len(layers["Emit"])
+        albedo = colour if size == HEIGHT else downsample(np.pad(colour, ((0, 2), (0, 2), (0, 0)), "edge"), 4)
+        return (layers["DiffDir"].astype(np.float64) + layers["DiffInd"]) * albedo + layers["Emit"]
+
+    pair = write_pair(tmp_path, clean, low=False, extra=extra, beauty=beauty)
+    sums = ("components=DiffDir*DiffCol+DiffInd*DiffCol+Emit",)
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, sums=sums)
+    assert list(report.passes) == ["components"]
+    total = (layer(out, "DiffDir") + layer(out, "DiffInd")) * layer(out, "DiffCol") + layer(out, "Emit")
+    lit = layer(out, "DiffCol") > 0
+    np.testing.assert_allclose(total[lit], layer(out)[lit], rtol=1e-5, atol=1e-5)
+    assert not layer(out, "DiffDir")[~lit].any()
+
+
+@pytest.mark.parametrize(
+    ("beauty", "message"),
+    [
+        (lambda layers: layers["light_key"], "overlap"),
+        (lambda layers: noisy(sum(layers.values()).astype(np.float32), 3, 9), "denoised"),
+    ],
+)
+def test_layers_that_do_not_sum_are_passed_on(tmp_path, bilinear_models, beauty, message):
+    pair = write_pair(tmp_path, lights(), beauty=beauty)
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    assert report.passes["light groups"].startswith("passed on: does not sum to the beauty")
+    assert message in report.passes["light groups"]
+    assert same_bits(out["light_spot.G"], read_bits(pair[1])[0][1]["light_spot.G"])
+    assert not [text for text in report.warnings if "light" in text]
+    report, _ = fused(pair, tmp_path / "out.exr", bilinear_models, sums=("mine=light_spot+light_key",))
+    assert [text for text in report.warnings if text.startswith("--sum mine: does not sum to the beauty")]
+
+
+@pytest.mark.parametrize(
+    ("passes", "sums", "message"),
+    [
+        (("reflection*",), (), "--passes reflection.*no such set.*'light groups'"),
+        ((), ("a=light_key",), "write NAME=LAYER"),
+        ((), ("a=light_key+light_none",), "no layer 'light_none'"),
+    ],
+)
+def test_a_wrong_name_is_one_sentence(tmp_path, bilinear_models, passes, sums, message):
+    pair = write_pair(tmp_path, lights())
+    with pytest.raises(InputError, match=message):
+        fused(pair, tmp_path / "out.exr", bilinear_models, passes, sums)
+    assert not (tmp_path / "out.exr").exists()
+
+
+def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models):
+    pair = write_pair(tmp_path, lights())
+    results = []
+    for memory in (1 << 30, 4 << 30):
+        fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), max_memory=memory, overwrite=True)
+        results.append(read_bits(tmp_path / "out.exr"))
+    for (_, first), (_, second) in zip(*results, strict=True):
+        assert all(same_bits(first[name], second[name]) for name in first)

@@ -38,10 +38,10 @@ def data() -> dict[str, Any]:
     """What is drawn.
 
     Returns:
-        ``measures``, column -> title. ``scenes``, name -> title. ``spp``, the averages. ``cost``, scene -> seconds for
-        one sample in each of 1024 x 1024 pixels. ``series``: for each its ``name``, whether it is a ``peer``, and its
-        ``points``, each with ``method``, ``spp``, ``seconds`` for 1024 x 1024 pixels, and for each scene its
-        ``values`` in the order of the measures.
+        ``measures``, column -> title. ``machine``, the processor. ``scenes``, name -> title. ``spp``, the averages.
+        ``cost``, scene -> seconds for one sample in each of 1024 x 1024 pixels. ``series``: for each its ``name``,
+        whether it is a ``peer``, and its ``points``, each with ``method``, ``spp``, ``seconds`` for 1024 x 1024
+        pixels, and for each scene its ``values`` in the order of the measures.
     """
     rows = results.read("quality")
     found = results.index(rows, *quality.KEYS)
@@ -75,6 +75,7 @@ def data() -> dict[str, Any]:
             series.append({"name": peer, "peer": True, "points": points})
     return {
         "measures": {measure: quality.MEASURES[measure][0] for measure in MEASURES},
+        "machine": next(iter(times.values()))["machine"],
         "scenes": {name: _scene_title(name, names) for name in names},
         "spp": quality.AVERAGES,
         "cost": cost,
@@ -141,10 +142,10 @@ def draw(shown: dict[str, Any], path: Path) -> None:
         line[0].set_ylabel(title)
         if measure != "psnr":
             line[0].invert_yaxis()
-    figure.suptitle("Accuracy against time: mean of the scenes (left and up is better)")
+    figure.suptitle(f"Accuracy against time on {shown['machine']}: mean of the scenes (left and up is better)")
     handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=len(labels), fontsize=9)
-    figure.tight_layout(rect=(0, 0.04, 1, 1))
+    figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
+    figure.tight_layout(rect=(0, 0.05, 1, 1))
     figure.savefig(path, dpi=110)
 
 

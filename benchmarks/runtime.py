@@ -91,10 +91,19 @@ def peak_mb() -> float:
 
 
 def processor() -> str:
-    """The processor's name. On Linux Python does not know it, so it comes from /proc/cpuinfo."""
+    """The processor's name, and whether it has VNNI: 8-bit models are several times slower without it.
+
+    On Linux Python does not know the name, so it comes from /proc/cpuinfo. Elsewhere, VNNI is not mentioned.
+    """
     info = Path("/proc/cpuinfo")
-    names = re.findall(r"model name\s*: (.*)", info.read_text()) if info.exists() else []
-    return names[0] if names else platform.processor()
+    return named(info.read_text()) if info.exists() else platform.processor()
+
+
+def named(cpuinfo: str) -> str:
+    """The processor's name from the text of /proc/cpuinfo."""
+    names, flags = (re.findall(rf"{key}\s*: (.*)", cpuinfo) for key in ("model name", "flags"))
+    name = names[0] if names else platform.processor()
+    return f"{name} {'with' if 'vnni' in flags[0] else 'without'} VNNI" if flags else name
 
 
 def in_process(module: str, *arguments: str) -> dict[str, Any]:

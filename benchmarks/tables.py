@@ -10,17 +10,18 @@ function NAME returns. The text around it stays.
 from __future__ import annotations
 
 import argparse
+import itertools
 import re
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 
-from benchmarks import confidence, quality, results, runtime_files
+from benchmarks import confidence, quality, results, runtime_files, versus
 from benchmarks import runtime as runtimes
 from benchmarks.flicker import report as flicker_report
 from benchmarks.results import MEAN, Row
-from benchmarks.runtime import OIDN, SAME_WORK
+from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
 from oiio_msspl.model.contract import SCALES
@@ -44,9 +45,25 @@ WHEN_IT_PAYS = {
     "joint-x2": ("`joint-x2`", "LRHS and HRLS"),
     "joint-x4": ("`joint-x4`", "LRHS and HRLS"),
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
+    "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
 }
+#: OIDN at its best -> which render it gets.
+AT_ITS_BEST = {
+    "OIDN prefiltered on the HRLS": "on the HRLS",
+    "OIDN prefiltered, same samples": "at full resolution",
+}
+#: Tables of accuracy on all methods, and the renders they are about.
+SETS = {
+    "Mitsuba": "quality",
+    "box": "quality_box",
+    "Blackman-Harris": "quality_blackman_harris",
+    "Cycles": "quality_cycles",
+}
+
+#: Tables of times that were measured on one machine: of methods, and of rendering.
+MACHINES = (("runtime_vnni", "render_time_vnni"), ("runtime", "render_time"))
 
 Found = Mapping[Hashable, Row]
 #: Methods of README's table of spread noise, and their titles.
@@ -55,6 +72,7 @@ SPREAD_NOISE = {
     "joint-x2": "`joint-x2`",
     "paper-x2": "`paper-x2`, which `auto` takes",
     "OIDN on the HRLS": "OIDN on the HRLS",
+    "OIDN prefiltered on the HRLS": "OIDN on the HRLS, prefiltered",
     "OIDN, same samples": "OIDN at full resolution",
     "OIDN prefiltered, same samples": "OIDN at full resolution, prefiltered",
 }
@@ -77,25 +95,49 @@ def means_of(rows: Iterable[Row]) -> Found:
 
 def when_it_pays() -> str:
     """Accuracy at 2 and 8 spp on average, and time, of what a user can choose from."""
-    rows, times = results.read("quality"), results.index(results.read("runtime"), "method")
+    rows = results.read("quality")
+    runs = [results.index(results.read(table), "method") for table, _ in MACHINES]
     means = means_of(rows)
     body = []
     for method, (name, needs) in WHEN_IT_PAYS.items():
-        time = times.get(SAME_WORK.get(method, method))
-        relative = f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "not measured"
+        relative = []
+        for times in runs:
+            time = times.get(SAME_WORK.get(method, method))
+            relative.append(f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "not measured")
         if method == "HRLS":
-            relative = "0"  # nothing is computed
+            relative = ["0", "0"]  # nothing is computed
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
-        body.append([name, needs, *cells, relative])
-    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time / OIDN's"]
+        body.append([name, needs, *cells, *relative])
+    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time / OIDN's", "without VNNI"]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
+
+
+def how_sure() -> str:
+    """The best model against OIDN at its best, by scene."""
+    rows = results.read("quality")
+    body = []
+    for peer, render in AT_ITS_BEST.items():
+        for spp in (2, 8):
+            if found := versus.compare(rows, BEST, peer, spp):
+                without, names = f"{found.without_too_easy:+.2f}", ", ".join(found.verdicts)
+                body.append([render, str(spp), versus.cell(found.psnr, "+.2f"), without, found.wins, names])
+    head = [f"`{BEST}` against OIDN, prefiltered", "spp", "PSNR gained, dB", f"without {versus.TOO_EASY}", "better on"]
+    return results.markdown([*head, "PSNR, RelMSE"], body)
+
+
+def against_oidn() -> str:
+    """Models against OIDN at its best, with intervals, on all renders on which both were measured."""
+    tables = {name: results.read(table) for name, table in SETS.items()}
+    text = versus.table(tables, ("joint-x2", "joint-x4", "pyramid-x4"), AT_ITS_BEST, quality.AVERAGES)
+    missing = [name for name, rows in tables.items() if not versus.compare(rows, BEST, next(iter(AT_ITS_BEST)), 2)]
+    return text + f"\nPrefiltered OIDN was not measured on these renders: {', '.join(missing)}.\n" * bool(missing)
 
 
 def spread_noise() -> str:
     """Accuracy on renders whose pixel filter has spread the noise, and on how many scenes that is best."""
     rows = results.read("quality_gauss")
     means, found = means_of(rows), results.index(rows, *quality.KEYS)
-    clean = _clean_scenes(rows)
+    clean = versus.clean_scenes(rows)
     body = []
     for method, name in SPREAD_NOISE.items():
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
@@ -111,8 +153,9 @@ def scenes() -> str:
 
 
 def runtime() -> str:
-    """Time and memory of a frame on arrays, and of one from file to file."""
-    return f"{runtimes.layout(results.read('runtime'))}\n{runtime_files.layout(results.read('runtime_files'))}"
+    """Time and memory of a frame on arrays, on two processors, and of one from file to file."""
+    frames = "\n".join(runtimes.layout(results.read(table)) for table, _ in MACHINES)
+    return f"{frames}\n{runtime_files.layout(results.read('runtime_files'))}"
 
 
 def filters() -> str:
@@ -127,17 +170,19 @@ def filters() -> str:
         [title(method), *(quality.cell(means[name].get((spp, method)), "psnr", "relmse") for name, spp in cases)]
         for method in names
     )
-    clean = _clean_scenes(tables["box"])
+    clean = versus.clean_scenes(tables["box"])
     differences = []
     for name, rows in tables.items():
-        found = results.index(rows, *quality.KEYS)
         for spp in quality.AVERAGES:
-            pairs = ((found[s, spp, BEST], found[s, spp, "OIDN, same samples"]) for s in clean)
-            differences.append([f"{name}, {spp}", *(f"{ours['psnr'] - oidn['psnr']:+.2f}" for ours, oidn in pairs)])
-    between = f"\nPSNR of `{BEST}` minus that of OIDN on full resolution with the same samples, by scene:\n\n"
+            if found := versus.compare(rows, BEST, "OIDN, same samples", spp):
+                by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
+                without = f"{found.without_too_easy:+.2f}"
+                differences.append([f"{name}, {spp}", versus.cell(found.psnr, "+.2f"), without, found.wins, *by_scene])
+    between = f"\nPSNR of `{BEST}` minus that of plain OIDN on full resolution with the same samples:\n\n"
+    columns = ["filter, spp", MEAN, f"without {versus.TOO_EASY}", "better on", *clean]
     return (
         f"{results.markdown(head, body)}\n{quality.mean_note(tables['box'])}\n{between}"
-        f"{results.markdown(['filter, spp', *clean], differences)}"
+        f"{results.markdown(columns, differences)}"
     )
 
 
@@ -151,7 +196,18 @@ def cycles() -> str:
         for name in names
     )
     head = ["PSNR / RelMSE / FLIP", *(f"{spp} spp" for spp in quality.AVERAGES)]
-    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
+    clean = versus.clean_scenes(rows)
+    differences = []
+    for peer in ("OIDN on the HRLS", "OIDN, same samples"):
+        for spp in quality.AVERAGES:
+            if found := versus.compare(rows, BEST, peer, spp):
+                by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
+                differences.append([f"{peer}, {spp}", versus.cell(found.psnr, "+.2f"), found.wins, *by_scene])
+    return (
+        f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
+        f"\nPSNR of `{BEST}` minus that of plain OIDN:\n\n"
+        f"{results.markdown(['OIDN, spp', MEAN, 'better on', *clean], differences)}"
+    )
 
 
 def division() -> str:
@@ -160,10 +216,10 @@ def division() -> str:
     means = means_of(rows)
     ways = ["", *(f", {more}:{less}" for more, less in quality.UNEVEN)]
     columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, BEST + way) in means]
-    body = [
+    body = _measured(
         [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
-        for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples")
-    ]
+        for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples", "OIDN prefiltered, same samples")
+    )
     head = ["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
@@ -171,11 +227,6 @@ def division() -> str:
 def _measured(body: Iterable[list[str]]) -> list[list[str]]:
     """The lines that have more than a title."""
     return [line for line in body if any(line[1:])]
-
-
-def _clean_scenes(rows: Iterable[Row]) -> list[str]:
-    names = dict.fromkeys(row["scene"] for row in rows)
-    return [name for name in names if name != MEAN and name not in NOISY_REFERENCE]
 
 
 #: Seconds for one sample in each pixel of a frame, as candidates for the break-even cost.
@@ -188,33 +239,44 @@ def total() -> str:
     The faster method gets more samples for the time that it saves. OIDN's PSNR at those samples is interpolated over
     the logarithm of its measured ones.
     """
-    rows, times = results.read("quality"), results.index(results.read("runtime"), "method")
-    costs = {row["scene"]: row["hrls_s"] for row in results.read("render_time")}
+    rows = results.read("quality")
+    body = [line for machine in MACHINES for line in _total(rows, *(results.read(table) for table in machine))]
+    head = ["PSNR gained", "over", "spp", "gains if a sample costs", MEAN, f"without {versus.TOO_EASY}", "better on"]
+    return results.markdown(["on", *head], body)
+
+
+def _total(rows: Sequence[Row], runtime: Sequence[Row], render_time: Sequence[Row]) -> Iterator[list[str]]:
+    """The lines of one machine."""
+    times = results.index(runtime, "method")
+    costs = {row["scene"]: row["hrls_s"] for row in render_time}
     psnr = {(row["method"], row["spp"], row["scene"]): row["psnr"] for row in rows}
     clean = [name for name in costs if name not in NOISY_REFERENCE]
-    # OIDN on the HRLS of 1 spp, then on full resolution
-    measured = [("OIDN on the HRLS", 2), *(("OIDN, same samples", spp) for spp in quality.AVERAGES)]
+    # Each of OIDN's two calls on the HRLS of 1 spp, then on full resolution
+    peers = {
+        call: [(f"{call} on the HRLS", 2), *((f"{call}, same samples", spp) for spp in quality.AVERAGES)]
+        for call in (OIDN, OIDN_PREFILTERED)
+        if call in times
+    }
     octaves = np.log2([1, *quality.AVERAGES])
 
-    def gain(name: str, spp: int, scene: str, more: float) -> float:
+    def gain(name: str, call: str, spp: int, scene: str, more: float) -> float:
         """PSNR of a method minus that of OIDN with ``more`` samples. Beyond 8 spp OIDN's last slope goes on."""
-        values = [psnr[method, n, scene] for method, n in measured]
+        values = [psnr[method, n, scene] for method, n in peers[call]]
         at = np.log2(max(spp + more, 1.0))  # OIDN needs at least one sample
         beyond = max(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 
-    body = []
-    for model in ("joint-x2", "joint-x4"):
-        slower = times[model]["seconds"] - times[OIDN]["seconds"]
-        for spp in quality.AVERAGES:
-            for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
-                if (name, spp, clean[0]) not in psnr:
-                    continue
-                gains = [gain(name, spp, scene, slower / costs[scene]) for scene in clean]
-                pays = [c for c in _COSTS if np.mean([gain(name, spp, scene, slower / c) for scene in clean]) >= 0]
-                cells = (f"{value:+.2f}" for value in (float(np.mean(gains)), *gains))
-                body.append([title(name), str(spp), _range_of(pays), *cells])
-    return results.markdown(["PSNR gained", "spp", "gains if a sample costs", MEAN, *clean], body)
+    for model, call, spp in itertools.product(("joint-x2", "joint-x4"), peers, quality.AVERAGES):
+        slower = times[model]["seconds"] - times[call]["seconds"]
+        for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
+            if (name, spp, clean[0]) not in psnr:
+                continue
+            gains = {scene: gain(name, call, spp, scene, slower / costs[scene]) for scene in clean}
+            pays = [c for c in _COSTS if np.mean([gain(name, call, spp, scene, slower / c) for scene in clean]) >= 0]
+            without = np.mean([value for scene, value in gains.items() if scene != versus.TOO_EASY])
+            cells = (versus.cell(versus.with_interval(np.array(list(gains.values()))), "+.2f"), f"{without:+.2f}")
+            wins = f"{sum(value > 0 for value in gains.values())} of {len(gains)}"
+            yield [times[model]["machine"], title(name), call, str(spp), _range_of(pays), *cells, wins]
 
 
 def _range_of(costs: Sequence[float]) -> str:
@@ -235,13 +297,17 @@ def flicker() -> str:
 
 
 def stability() -> str:
-    """How often each method holds, suffers and fails."""
-    return stability_report.summary(results.read("stability"))
+    """How often each method holds, suffers and fails, and its holes and stamps."""
+    rows = results.read("stability")
+    count = len({(row["group"], row["case"]) for row in rows})
+    scales = ", ".join(f"x{scale}" for scale in dict.fromkeys(row["scale"] for row in rows))
+    return f"{count} cases at {scales}:\n\n{stability_report.summary(rows)}"
 
 
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
-    ROOT / "README.md": (when_it_pays, spread_noise),
+    ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
+        against_oidn,
         scenes,
         runtime,
         total,

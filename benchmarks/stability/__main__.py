@@ -46,6 +46,10 @@ def oidn(pair: bases.Pair) -> tuple[Array, list[str]]:
     return peers.oidn(pair.hr), []
 
 
+def oidn_prefiltered(pair: bases.Pair) -> tuple[Array, list[str]]:
+    return peers.oidn_prefiltered(pair.hr), []
+
+
 def ours(session: Session) -> Method:
     def run(pair: bases.Pair) -> tuple[Array, list[str]]:
         fused = fuse(pair.lr, pair.hr, session)
@@ -56,7 +60,8 @@ def ours(session: Session) -> Method:
 
 def methods_for(scale: int, sessions: list[Session]) -> dict[str, Method]:
     models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-    return {report.ENLARGED: enlarged, **models, "OIDN on the HRLS": oidn}
+    denoisers = {"OIDN on the HRLS": oidn, "OIDN prefiltered on the HRLS": oidn_prefiltered}
+    return {report.ENLARGED: enlarged, **models, **denoisers}
 
 
 def groups_of(base: bases.Base | None, scale: int, size: int) -> Iterator[tuple[str, Iterator[cases.Case]]]:

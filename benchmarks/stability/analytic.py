@@ -255,6 +255,36 @@ def near_black(size: int, traces: float = 0.0) -> Scene:
     return Scene(surface(features["albedo"].shape[:2], **features))
 
 
+def door_ajar(size: int, seen: float) -> Scene:
+    """A room with a plain white wall, lit through a door that is hardly open: a share ``seen`` of the samples finds the
+    light, which gets weaker to the left. Nothing else is lit."""
+    x, y = grid(size)
+    features = split(room(size).back)
+    wall = y < 0.66
+    on_ball = np.hypot(x - 0.35, y - 0.52) < 0.15
+    features["albedo"] = where(wall & ~on_ball, 0.8, np.maximum(features["albedo"], 0.2))
+    light = np.square(0.2 + x) * (0.4 + 0.6 * features["visible"])
+    dark = {"ambient": np.float32(0), "gloss": np.float32(0)}
+    return Scene(surface(x.shape[:2], **{**features, **dark, "direct": light / seen, "visible": np.float32(seen)}))
+
+
+def slit(size: int, radiance: float) -> Scene:
+    """A lamp behind a wall, seen through a vertical slit of a quarter of a pixel and a horizontal one of two pixels.
+    One sample of 50 finds its light in the room."""
+    x, y = grid(size)
+    upright = (np.abs(x * size - size // 2 - 0.375) < 0.5 / SUB) & (y > 0.2) & (y < 0.6)
+    level = (np.abs(y - 0.3) * size < 1) & (np.abs(x - 0.2) < 0.12)
+    emission = where(upright | level, radiance * np.array([1.0, 0.9, 0.7]), 0)
+    return with_emission(door_ajar(size, 1 / 50), emission)
+
+
+def dark_room(size: int) -> Scene:
+    """A room in which one sample of 10 finds the light, with a trace of ambient light."""
+    features = split(room(size).back)
+    features |= {"visible": 0.1 * features["visible"], "ambient": 0.01 * features["ambient"]}
+    return Scene(surface(features["albedo"].shape[:2], **features))
+
+
 def defocused(size: int) -> Scene:
     """Out-of-focus discs in front of the room. At their rims each sample hits the front or the back."""
     x, y = grid(size)

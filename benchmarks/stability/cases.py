@@ -231,6 +231,17 @@ def dark(size: int, scale: int) -> Iterator[Case]:
     yield Case(f"{name}, traces of 1e-3 to 1e-40 elsewhere", traces.pair(scale))
 
 
+def rare_light(size: int, scale: int) -> Iterator[Case]:
+    """A bound to the brightest sample around makes holes here: often there is no lit sample around."""
+    for samples in (20, 50):
+        made = Analytic(f"door ajar {samples}", analytic.door_ajar(size, 1 / samples))
+        yield Case(f"a room lit through a door ajar: 1 sample of {samples} is lit", made.pair(scale))
+    yield Case("a lamp seen through a slit", Analytic("slit", analytic.slit(size, 100.0)).pair(scale))
+    dim = Analytic("dark room", analytic.dark_room(size))
+    yield Case("a dark room at 1 spp", dim.pair(scale))
+    yield Case("a dark room, 1 spp in both", dim.pair(scale, 1, 1))
+
+
 def blur(size: int, scale: int) -> Iterator[Case]:
     yield Case("depth of field", Analytic("depth of field", analytic.defocused(size)).pair(scale))
     yield Case("motion blur", Analytic("motion blur", analytic.moving(size)).pair(scale))
@@ -271,6 +282,7 @@ def disagreement(size: int, scale: int) -> Iterator[Case]:
 MADE: dict[str, Callable[[int, int], Iterator[Case]]] = {
     "lights and emitters": lights,
     "near-black": dark,
+    "rare light": rare_light,
     "pixel filter": filters,
     "depth of field, motion blur": blur,
     "hair, glass": detail,

@@ -14,6 +14,7 @@ from benchmarks.stability.bases import Pair
 from benchmarks.stability.cases import DISAGREE, Case
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array, repair
+from oiio_msspl.colour import luminance
 from oiio_msspl.metrics import psnr, relmse_map
 from oiio_msspl.model.encoding import KEY, find_exposure
 
@@ -36,6 +37,17 @@ AWAY = 0.02
 """Relative change allowed in a pixel if nothing within ``NEAR`` LRHS pixels has changed."""
 NEAR = 8
 
+#: A hole is darker than these shares of the reference and of the median around it.
+HOLE, HOLE_AROUND = 0.1, 0.25
+#: "Around" a hole: this many LRHS pixels to each side, so that a hole as large as an LRHS pixel does not hide itself.
+HOLE_REACH = 2
+#: Side of the squares that are compared in search of stamps, in pixels.
+CELL = 2
+#: A step between two squares changes the brightness by this factor at least,
+STEP = 1.25
+#: and, as a logarithm, by this many times the largest change inside the squares around.
+STEP_INSIDE = 3.0
+
 
 def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warnings: list[str]) -> dict[str, Any]:
     """All figures of one result.
@@ -51,6 +63,8 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     floor = np.float32(FLOOR * KEY) / grey
     finite = bool(np.isfinite(image).all())
     low, high = input_range(pair)
+    low = np.minimum(low, window(truth, HRLS_REACH, np.minimum))
+    high = np.maximum(high, window(truth, HRLS_REACH, np.maximum))
     beyond = np.maximum((image + floor) / (high + floor), (low + floor) / (np.maximum(image, 0) + floor))
     brightest = window(truth, HRLS_REACH, np.maximum)
     errors = relmse_map(image * grey, truth * grey).mean(axis=-1)
@@ -63,6 +77,8 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
         "psnr": psnr(image * grey, truth * grey),
         "outside": float((beyond > EXCESS).mean()),
         "range": float(beyond.max()),
+        "holes": int(holes(image, truth, float(floor), pair.scale).sum()),
+        "stamps": stamps(image, truth, float(floor)),
         "warnings": warnings,
     }
     if clean is not None and case.clean is not None:
@@ -90,6 +106,8 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
         faults.append(f"does not scale: off by up to {100 * row['deviation']:.2g} %")
     if row.get("away", 0) > AWAY:
         faults.append(f"changes by up to {100 * row['away']:.2g} % far from what changed")
+    counts = {fault: row[f"{fault}s"] for fault in ("hole", "stamp")}
+    faults += [f"{count} {fault}{'s' * (count > 1)}" for fault, count in counts.items() if count]
     if row.get("cost", 0) > COST:
         faults.append(f"costs {row['cost']:.1f} dB")
     worse = row["relmse_trimmed"] > row["relmse_enlarged"]
@@ -102,6 +120,50 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
     if row["warnings"] or silent:
         text += "; the tool warns" if row["warnings"] else "; nothing is said"
     return "fails" if worse or silent else "suffers" if faults else "holds", text[0].upper() + text[1:] + "."
+
+
+def holes(image: Array, truth: Array, floor: float, scale: int) -> NDArray[np.bool_]:
+    """Pixels (h, w) that are much darker than the reference and than their surroundings.
+
+    Their luminance is below `HOLE` of the reference's and below `HOLE_AROUND` of the median of the result within
+    `HOLE_REACH` LRHS pixels. Pixels whose reference is below ``floor`` are no holes.
+    """
+    value, wanted = luminance(image), luminance(truth)
+    dark = (value < HOLE * wanted) & (wanted > floor)
+    reach = HOLE_REACH * scale
+    side = 2 * reach + 1
+    windows = np.lib.stride_tricks.sliding_window_view(np.pad(value, reach, mode="reflect"), (side, side))
+    around = np.median(windows[dark].reshape(-1, side * side), axis=1)
+    dark[dark] = value[dark] < HOLE_AROUND * around
+    return dark
+
+
+def stamps(image: Array, truth: Array, floor: float) -> int:
+    """How many rectangles stand out that no light made: a quarter of their corners, rounded up.
+
+    Networks compute in squares of 2 x 2 pixels or more, and an LRHS pixel has at least as many, so the sides of such a
+    rectangle lie along the `CELL` x `CELL` grid. A corner is a square that has a step both at a vertical and at a
+    horizontal side, and is darker than both neighbours or brighter than both. The logarithm of result / reference is
+    examined, so edges of the reference do not count. A step is the difference between the two lines of pixels along a
+    side, each as a mean. It is larger than `STEP`, and `STEP_INSIDE` times as large as every difference between lines
+    inside the squares around. Values below ``floor`` are not compared.
+    """
+    ratio = np.log((np.maximum(luminance(image), 0) + floor) / (luminance(truth) + floor))
+    corners = sum(int((_sides(r) * _sides(r.T).T).sum()) for r in (ratio, -ratio))
+    return math.ceil(corners / 4)
+
+
+def _sides(ratio: Array) -> NDArray[np.int64]:
+    """How many of the left and right side of every square are steps to a higher ratio, (h / CELL, w / CELL)."""
+    height, width = (n // CELL for n in ratio.shape)
+    lines = ratio[: height * CELL, : width * CELL].reshape(height, CELL, width * CELL).mean(axis=1)
+    steps = np.pad(np.diff(lines, axis=1), ((0, 0), (0, 1))).reshape(height, width, CELL)
+    across, inside = steps[:, :-1, -1], window(np.abs(steps[..., :-1]).max(axis=2), 1, np.maximum)
+    limit = np.maximum(math.log(STEP), STEP_INSIDE * np.maximum(inside[:, :-1], inside[:, 1:]))
+    sides = np.zeros((height, width), np.int64)
+    sides[:, :-1] += across > limit
+    sides[:, 1:] += across < -limit
+    return sides
 
 
 def trimmed(errors: NDArray[np.float64]) -> float:

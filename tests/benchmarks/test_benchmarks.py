@@ -10,7 +10,7 @@ import pytest
 
 pytest.importorskip("torch")
 
-from benchmarks import chart, paper, peers, quality, results, scenes, tables
+from benchmarks import chart, paper, peers, quality, results, runtime, scenes, tables, versus
 from datagen import views
 from oiio_msspl import Render
 from oiio_msspl.model.encoding import find_exposure
@@ -150,9 +150,71 @@ def test_every_table_can_be_laid_out():
             assert rule.replace(" ", "") == "|" + "---|" * (head.count("|") - 1)
             assert body and {line.count("|") for line in body} == {head.count("|")}, make.__name__
     body = tables.when_it_pays().split("\n\n")[0].splitlines()[2:]
-    assert len(body) == len(tables.WHEN_IT_PAYS) <= 8
+    assert len(body) == len(tables.WHEN_IT_PAYS) <= 9
     assert all(re.fullmatch(r"\d+\.\d+", cell.strip()) for line in body for cell in line.split("|")[3:7])
     assert "# The paper's tables" in paper.page()
+
+
+def _rows(method, psnr, relmse=None):
+    """A row of a scene for each value; the first scene is the easy one, and a noisy one comes last."""
+    names = [versus.TOO_EASY, *"abcdefgh"[: len(psnr) - 1], *scenes.NOISY_REFERENCE]
+    relmse = relmse or [0.01] * len(psnr)
+    values = zip(names, [*psnr, 0.0], [*relmse, 9.0], strict=True)
+    return [{"scene": name, "spp": 2, "method": method, "psnr": p, "relmse": r} for name, p, r in values]
+
+
+def test_a_lead_that_one_scene_carries_is_open():
+    """The interval over scenes decides, not the mean; the scene with a noisy reference does not count."""
+    other = _rows("OIDN", [30.0] * 5)
+    carried = versus.compare(_rows("ours", [36.0, 29.9, 29.8, 30.1, 29.9]) + other, "ours", "OIDN", 2)
+    assert carried.psnr[0] == pytest.approx(1.14)
+    assert carried.psnr[1] < 0 < carried.psnr[2]
+    assert carried.verdicts[0] == "open"
+    assert carried.without_too_easy == pytest.approx(-0.075)
+    assert carried.wins == "2 of 5"
+    ahead = versus.compare(_rows("ours", [30.2, 30.5, 30.3, 30.2, 30.4], [0.008] * 5) + other, "ours", "OIDN", 2)
+    assert ahead.verdicts == ("ahead", "ahead")
+    assert ahead.relmse == pytest.approx((0.8, 0.8, 0.8))
+    behind = versus.compare(_rows("ours", [29.8, 29.5, 29.7, 29.8, 29.6], [0.02] * 5) + other, "ours", "OIDN", 2)
+    assert behind.verdicts == ("behind", "behind")
+    assert versus.compare(_rows("ours", [36.0])[:1] + other, "ours", "OIDN", 2) is None  # four scenes are missing
+
+
+def test_the_interval_is_that_of_the_mean_over_drawn_scenes():
+    """For many scenes, the bootstrap's interval is the normal one: 1.96 standard errors to each side."""
+    values = np.random.default_rng(4).normal(1, 2, 400)
+    mean, low, high = versus.with_interval(values)
+    error = values.std() / np.sqrt(values.size)
+    assert mean == values.mean()
+    assert (mean - low, high - mean) == (pytest.approx(1.96 * error, rel=0.05), pytest.approx(1.96 * error, rel=0.05))
+    assert versus.with_interval(values) == (mean, low, high)
+
+
+def test_a_finding_that_the_measures_dispute_is_no_agreement():
+    """Two of the paper's findings hold by PSNR and not by RelMSE."""
+    text = paper.page()
+    (disputed,) = (line for line in text.splitlines() if "the LRHS's do not" in line)
+    assert "PSNR and RelMSE disagree" in disputed
+    (agreed,) = (line for line in text.splitlines() if "an HRLS beats super-resolution" in line)
+    assert agreed.endswith("| agrees |")
+    table3 = text.split("## Table 3")[1].split("## Table 4")[0]
+    assert "paper, " not in table3  # it is measured otherwise there
+
+
+@pytest.mark.parametrize(
+    ("flags", "name"),
+    [("flags\t\t: fpu avx2", "X without VNNI"), ("flags\t\t: fpu avx_vnni", "X with VNNI"), ("", "X")],
+)
+def test_a_time_says_whether_the_processor_has_vnni(flags, name):
+    assert runtime.named(f"model name\t: X\n{flags}\n") == name
+
+
+def test_times_of_different_machines_are_not_mixed():
+    """Times of methods and of rendering come from the same machine, and each line of the comparison names it."""
+    for methods, _ in tables.MACHINES:
+        (machine,) = {row["machine"] for row in results.read(methods)}
+        assert f"\n| {machine} |" in tables.total()
+    assert "OIDN prefiltered" in {row["method"] for row in results.read("runtime")}
 
 
 def test_a_page_has_its_tables_replaced():

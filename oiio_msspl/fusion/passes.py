@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuses the layers of an additive set, so that they still sum to the fused beauty.
 
-A layer is fitted, around every LRHS pixel, as a linear function of what is nearly free of noise: the fused beauty,
+A layer is fitted, around every LRHS pixel, as a linear function of what has little noise: the fused beauty,
 albedo and normal (first-order regression: Bitterli et al. 2016; the fit at low resolution: fast guided filter, He and
 Sun 2015). The function is then applied at full resolution. A fit needs the averages of noisy layers only, so eight
 layers cost about as much as the beauty. What the fitted layers lack of the fused beauty is spread over them in
@@ -122,12 +122,18 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
             refused[layers.name] = check.text if check.problem else f"shares {shared[0]} with another set"
             continue
         taken.update(channel for layer in layers.layers for channel in layer.channels)
-        names = [layer.name for layer in layers.layers]
-        lrhs = next((each for each in lr.additive_sets if [layer.name for layer in each.layers] == names), None)
-        if lrhs is not None and check_sum(lr, lrhs).problem:
-            lrhs = None
-        jobs.append(_Job(layers, lrhs, check.remainder))
+        jobs.append(_Job(layers, _same_layers(lr, layers), check.remainder))
     return jobs, refused
+
+
+def _same_layers(lr: MappedRender, layers: AdditiveSet) -> AdditiveSet | None:
+    """The same layers of the LRHS, in the same order; None if it lacks one or they do not sum to its beauty."""
+    names = [layer.name for layer in layers.layers]
+    for found in lr.additive_sets:
+        by_name = {layer.name: layer for layer in found.layers}
+        if by_name.keys() == set(names) and not check_sum(lr, found).problem:
+            return replace(found, layers=tuple(by_name[name] for name in names))
+    return None
 
 
 class _Band:

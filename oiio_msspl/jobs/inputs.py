@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -97,6 +98,10 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
     """
     features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
     rgb_only = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
+    if inputs.sums:
+        # The LRHS need not have the layers of the user's sums either.
+        with contextlib.suppress(InputError):
+            return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features, sums=inputs.sums)
     return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
 
 

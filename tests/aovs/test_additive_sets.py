@@ -1,0 +1,120 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which layers may sum to the beauty, by name, and whether they do."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.sums import check_sum
+from tests.conftest import SHARED, needs_shared, rgb, write_exr
+
+SIZE = (8, 6)
+
+
+def render(folder, layers, prefix="", sums=(), **attributes):
+    """A mapped file with these layers (RGB, constant), whose beauty is the sum of the first two."""
+    planes = {name: np.full((*SIZE, 3), value, np.float32) for name, value in layers.items()}
+    first, second = list(planes.values())[:2]
+    channels = rgb(first + second, f"{prefix}Combined." if prefix else "")
+    for name, values in planes.items():
+        channels |= rgb(values, f"{prefix}{name}.")
+    return map_render(open_exr(write_exr(folder / "in.exr", channels, **attributes)), sums=sums)
+
+
+def names(render):
+    return {each.name: [layer.name for layer in each.layers] for each in render.additive_sets}
+
+
+def test_light_groups_are_found_in_the_view_layer_of_the_beauty(tmp_path):
+    layers = {"Combined_key": 1, "Combined_fill": 2, "AO": 3}
+    found = render(tmp_path, layers, "View.", **{"cycles.View.samples": "4"})
+    assert names(found) == {"light groups": ["Combined_fill", "Combined_key"]}
+
+
+def test_a_pattern_takes_underscores_as_they_are(tmp_path):
+    found = render(tmp_path, {"C_key": 1, "C_fill": 2, "combineddiffuse": 3}, renderTime_s="1")
+    assert names(found)["light groups"] == ["C_fill", "C_key"]
+
+
+def test_products_keep_their_colour(tmp_path):
+    layers = {"DiffDir": 1, "Emit": 2, "DiffCol": 1, "GlossDir": 9}
+    found = render(tmp_path, layers, "View.", **{"cycles.View.samples": "4"})
+    (components,) = found.additive_sets
+    assert [(layer.name, layer.factor is not None) for layer in components.layers] == [
+        ("DiffDir", True),
+        ("Emit", False),
+    ]
+    assert check_sum(found, components).residual < 1e-6
+
+
+def test_a_single_layer_and_integers_are_no_set(tmp_path):
+    assert names(render(tmp_path, {"light_key": 1, "other": 2})) == {}
+    ids = rgb(np.ones((*SIZE, 3), np.uint32), "light_id.")
+    file = open_exr(
+        write_exr(
+            tmp_path / "ids.exr",
+            rgb(np.ones((*SIZE, 3), np.float32)) | ids | rgb(np.ones((*SIZE, 3), np.float32), "light_key."),
+        )
+    )
+    assert names(map_render(file)) == {}
+
+
+def test_the_user_s_sum_comes_first_and_replaces_the_same_set(tmp_path):
+    found = render(tmp_path, {"light_key": 1, "light_fill": 2}, sums=("mine=light_key+light_fill",))
+    assert names(found) == {"mine": ["light_key", "light_fill"]}
+    assert found.additive_sets[0].by_user
+
+
+@pytest.mark.parametrize(
+    "text", ["mine", "mine=light_key", "=light_key+light_fill", "mine=light_key+none", "mine=light_key+light_fill*none"]
+)
+def test_a_sum_that_cannot_be_read_is_refused(tmp_path, text):
+    with pytest.raises(InputError, match="--sum"):
+        render(tmp_path, {"light_key": 1, "light_fill": 2}, sums=(text,))
+
+
+@pytest.mark.parametrize(
+    ("layers", "remainder", "text"),
+    [
+        ({"light_a": 1, "light_b": 2}, False, "sums to the beauty but for 0 of it"),
+        ({"light_a": 1, "other": 3, "light_b": 2}, True, "25.0% of the light that is in no layer"),
+        ({"light_a": 1, "light_b": 2, "light_c": 3}, False, "they have 100.0% more light; some layers overlap"),
+    ],
+)
+def test_the_pixels_decide(tmp_path, layers, remainder, text):
+    found = render(tmp_path, layers)
+    (light_groups,) = (each for each in found.additive_sets if each.name == "light groups")
+    check = check_sum(found, light_groups)
+    assert text in check.text and check.remainder == remainder and bool(check.problem) == ("overlap" in text)
+
+
+def test_broken_pixels_do_not_decide(tmp_path):
+    planes = {name: np.ones((*SIZE, 3), np.float32) for name in ("light_a", "light_b")}
+    planes["light_a"][2, 3] = np.nan
+    channels = (
+        rgb(np.full((*SIZE, 3), 2, np.float32))
+        | rgb(planes["light_a"], "light_a.")
+        | rgb(planes["light_b"], "light_b.")
+    )
+    found = map_render(open_exr(write_exr(tmp_path / "in.exr", channels)))
+    assert not check_sum(found, found.additive_sets[0]).problem
+
+
+@needs_shared("exr")
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("cycles-4.2/cycles_viewlayer_zip32.exr", "sums to the beauty but for 2.7e-08"),
+        ("cycles-4.2/cycles_border_region.exr", "sums to the beauty but for 4.9e-08"),
+        ("cycles-4.2/cycles_viewlayer_dwaa16.exr", "stored lossily?"),
+        ("cycles-5.0/cycles_viewlayer_zip32.exr", "sums to the beauty but for 6.5e-08"),
+        ("cycles-5.0/cycles_two_dotted_viewlayers_piz16.exr", "sums to the beauty but for 0.00025"),
+        ("arnold/rgba_N_P_diffuse_direct_specular.exr", "32.0% of the light that is in no layer"),
+    ],
+)
+def test_sets_of_real_files(file, text):
+    found = map_render(open_exr(SHARED / "exr" / file))
+    (components,) = found.additive_sets
+    assert components.name == "components" and text in check_sum(found, components).text

@@ -95,10 +95,17 @@ def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Arr
     Args:
         values: (height, width, ...).
         positions: pixel indices along ``axis``, one for each pixel of the result.
+
+    Returns:
+        The samples; the image itself if they are all its pixels.
     """
     last = values.shape[axis] - 1
+    if np.array_equal(positions, np.arange(last + 1)):
+        return values
     positions = np.clip(positions, 0, last)
-    before = np.minimum(positions.astype(np.int64), last)
+    before = positions.astype(np.int64)
+    if np.array_equal(positions, before):
+        return values.take(before, axis)
     after = np.minimum(before + 1, last)
     weight = (positions - before).astype(np.float32).reshape([-1 if i == axis else 1 for i in range(values.ndim)])
     return values.take(before, axis) * (1 - weight) + values.take(after, axis) * weight

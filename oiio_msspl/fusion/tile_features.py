@@ -80,15 +80,7 @@ def read_tile(
     window = tile.area.slices(grid)
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},
-        hrls=read_features(
-            hr,
-            area,
-            alignment.hr_data_window,
-            features,
-            mirrored_at=_in_hrls_pixels(alignment.grid, scale),
-            counts=counts,
-            counted=core,
-        ),
+        hrls=read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core),
         scale=scale,
         lrhs_area=tile.area,
         hrls_area=area,
@@ -101,22 +93,27 @@ def read_tile(
 def read_lrhs(
     lr: ReadableRender, alignment: Alignment, grid: Window, features: Iterable[str], counts: RepairCounts
 ) -> dict[str, Array]:
-    """Read features of the LRHS over ``grid``, those that it has. Where an odd size was rounded, they are resampled.
+    """Read features of the LRHS over ``grid``, those that it has.
+
+    The LRHS is sampled where the HRLS pixels of each grid pixel are in the frame, on average. Those are the LRHS's own
+    pixels, unless an odd size was rounded or the HRLS ends inside an LRHS pixel. Then it is resampled.
 
     Args:
         counts: repaired values are added here.
     """
     data = alignment.lr_data_window
-    if alignment.stretch == (1.0, 1.0):
-        return read_features(lr, grid, data, features, mirrored_at=alignment.grid, counts=counts, counted=grid)
-    layers = read_features(lr, data, data, features, counts=counts, counted=data)
-    stretch_x, stretch_y = alignment.stretch
-    for axis, pixels, stretch, origin in zip(
-        (0, 1), _mirrored_pixels(grid, alignment.grid), (stretch_y, stretch_x), (data.y0, data.x0), strict=True
-    ):
-        positions = (pixels.astype(np.float64) + 0.5) * stretch - 0.5 - origin
-        layers = {name: interpolate(values, positions, axis) for name, values in layers.items()}
-    return layers
+    hrls_rows, hrls_columns = _mirrored_pixels(_in_hrls_pixels(grid, alignment.scale), alignment.hr_data_window)
+    rows = np.clip(_lrhs_positions(hrls_rows, alignment.scale, alignment.stretch[1]), data.y0, data.y1 - 1)
+    columns = np.clip(_lrhs_positions(hrls_columns, alignment.scale, alignment.stretch[0]), data.x0, data.x1 - 1)
+    y0, x0 = int(np.floor(rows.min())), int(np.floor(columns.min()))
+    stored = Window(x0, y0, int(np.ceil(columns.max())) + 1, int(np.ceil(rows.max())) + 1)
+    layers = read_features(lr, stored, data, features, counts=counts, counted=stored)
+    return {name: interpolate(interpolate(v, rows - y0, 0), columns - x0, 1) for name, v in layers.items()}
+
+
+def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float) -> NDArray[np.float64]:
+    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is."""
+    return (hrls_pixels.reshape(-1, scale).mean(axis=1) + 0.5) / scale * stretch - 0.5
 
 
 def read_features(
@@ -125,25 +122,19 @@ def read_features(
     data_window: Window,
     features: Iterable[str] | None = None,
     *,
-    mirrored_at: Window | None = None,
     counts: RepairCounts | None = None,
     counted: Window | None = None,
 ) -> dict[str, Array]:
-    """Read and repair features over a window. Beyond its end the picture is mirrored.
+    """Read and repair features over a window. Beyond the data window the picture is mirrored.
 
     Repeating the last pixel would turn its noise into lines, which networks take for texture.
 
     Args:
         window, data_window: both relative to the top left of the display window, as all windows here.
         features: names of features; all if None. Those that the render lacks are left out.
-        mirrored_at: where the picture ends, even if the render has more pixels; the data window if None. If the data
-            window ends before, the picture is mirrored there first. Both renders of a pair end at the border of the
-            same LRHS pixel, so that they show the same picture beyond it, too.
         counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
     """
-    rows, columns = _mirrored_pixels(window, mirrored_at or data_window)
-    rows = _mirrored(rows, data_window.y0, data_window.y1)
-    columns = _mirrored(columns, data_window.x0, data_window.x1)
+    rows, columns = _mirrored_pixels(window, data_window)
     stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
     layers = render.read(stored.shift(render.display_window.x0, render.display_window.y0), features)
     result = {}

@@ -42,16 +42,31 @@ def test_beyond_the_frame_both_renders_are_mirrored_alike(size, lrhs_is_larger):
 
 
 @pytest.mark.parametrize("lrhs_side", [7, 8])
-def test_odd_sizes_are_mirrored_at_the_same_lrhs_pixel(lrhs_side):
-    """59 pixels are 7.4 LRHS pixels: the eighth is completed first."""
+def test_odd_sizes_are_mirrored_once_at_the_last_hrls_pixel(lrhs_side):
+    """59 pixels are 7.4 LRHS pixels. Mirroring at the border of the eighth as well would show pixels 54 to 58 four
+    times, and repeated noise looks like texture."""
     clean = np.random.default_rng(0).random((59, 59, 3), np.float32)
     low = Render.from_arrays("lr", rgb=clean[:lrhs_side, :lrhs_side].copy())
-    pair, alignment = features_beyond(low, Render.from_arrays("hr", rgb=clean), 16)
-    assert alignment.grid == Window(0, 0, 8, 8)
-    for values, side in ((pair.lrhs["rgb"], 8), (pair.hrls["rgb"], 64)):
-        np.testing.assert_array_equal(values[side:], values[:side][::-1])
-        np.testing.assert_array_equal(values[:, side:], values[:, :side][:, ::-1])
-    np.testing.assert_array_equal(pair.hrls["rgb"][59:64, :59], clean[:53:-1])
+    pair, _ = features_beyond(low, Render.from_arrays("hr", rgb=clean), 16)
+    mirrored = np.pad(clean, ((0, 128 - 59), (0, 128 - 59), (0, 0)), mode="symmetric")
+    np.testing.assert_array_equal(pair.hrls["rgb"], mirrored)
+
+
+@pytest.mark.parametrize("first", [0, 3])
+@pytest.mark.parametrize("lrhs", ["rounded up", "rounded down", "of a larger frame"])
+def test_beyond_odd_sizes_both_renders_show_the_same_place(first, lrhs):
+    """A ramp tells where a pixel is in the frame: that of an LRHS pixel is the mean of its HRLS pixels."""
+    scale, side = 4, 59
+    frame = 80 if lrhs == "of a larger frame" else side
+    lrhs_side = -(-frame // scale) - (lrhs == "rounded down")
+    ramps = [(np.arange(n, dtype=np.float32) + 0.5) / n * frame for n in (lrhs_side, frame)]
+    low, high = (np.dstack([*np.meshgrid(ramp, ramp), np.ones((len(ramp),) * 2)]) for ramp in ramps)
+    window, shown = Window(first, first, side, side), Window(0, 0, frame, frame)
+    cropped = Render({"rgb": high[first:side, first:side].astype(np.float32)}, window, shown, name="hr")
+    pair, _ = features_beyond(Render.from_arrays("lr", rgb=low), cropped, 32)
+    places = box_downsample(pair.hrls["rgb"], scale)
+    places[..., :2] = places[..., :2].clip(ramps[0][0], ramps[0][-1])  # the centres of the LRHS's first and last pixels
+    np.testing.assert_allclose(pair.lrhs["rgb"], places, atol=1e-4)
 
 
 @pytest.mark.parametrize("rows", [1080, 1081, 858, 2160, 230])

@@ -29,7 +29,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.metrics import psnr
 from oiio_msspl.model.contract import SCALES
-from oiio_msspl.model.render_mean import NO_IMAGES, Images, denoiser_images, mean_of_renders
+from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
 from training.checkpoints import load as load_checkpoint
 from training.data import to_tensor
 from training.joint import JointFusion
@@ -72,11 +72,17 @@ class InTorch(Session):
         self._network = network
 
     def run(
-        self, lrhs: Array, hrls: Array, *, lrhs_aovs: Images = NO_IMAGES, error: bool = False
+        self,
+        lrhs: Array,
+        hrls: Array,
+        *,
+        lrhs_aovs: Images = NO_IMAGES,
+        mean: MeanSettings | None = None,
+        error: bool = False,
     ) -> tuple[Array, Array | None]:
         light = lrhs[..., :3]
-        mean = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs)
-        images = np.concatenate([light, self._network.mean_denoiser.denoise(mean)], axis=-1), hrls
+        layers = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs, mean)
+        images = np.concatenate([light, self._network.mean_denoiser.denoise(layers)], axis=-1), hrls
         with torch.inference_mode():
             fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
         return fused[0].permute(1, 2, 0).numpy(), None

@@ -13,7 +13,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.alpha import fuse_alpha
+from oiio_msspl.fusion.alpha import encode_alpha, fuse_alpha
 from oiio_msspl.fusion.guards import (
     EmptyRegions,
     Mask,
@@ -32,9 +32,11 @@ from oiio_msspl.fusion.tiling import (
     memory_for_tiles,
     plan_tiles,
     require_memory,
+    sample_bands,
 )
+from oiio_msspl.model.contract import NO_DENOISER
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
-from oiio_msspl.model.render_mean import Images
+from oiio_msspl.model.render_mean import Images, MeanSettings, mean_settings
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import limit_threads, one_ahead
 
@@ -103,9 +105,10 @@ def fuse(
         frame = _blank_frame(alignment, pair.exposure, error=error)
         tiles = plan_tiles(pair.grid, session.contract)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
+            means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
             # The next tile is read and encoded while the network works on this one.
             for done, tile in enumerate(one_ahead(map(pair.prepare, tiles)), start=1):
-                _fuse_tile(tile, session, frame)
+                _fuse_tile(tile, session, frame, means)
                 if progress is not None:
                     progress(done, len(tiles))
         frame.warnings += pair.check()
@@ -143,6 +146,14 @@ def _blank_frame(alignment: Alignment, exposure: float, *, error: bool) -> Fused
     size = (alignment.hr_data_window.height, alignment.hr_data_window.width)
     errors = np.zeros((*size, 1), dtype=np.float32) if error else None
     return FusedFrame(np.zeros((*size, 3), dtype=np.float32), None, errors, alignment, exposure, {})
+
+
+@dataclass(frozen=True)
+class _FrameMeans:
+    """How a denoiser averages both renders of a frame; None: as each tile suggests."""
+
+    rgb: MeanSettings | None = None
+    alpha: MeanSettings | None = None
 
 
 @dataclass
@@ -197,10 +208,7 @@ class _Pair:
         pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
         self._averages.add(pair)
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
-        lrhs_aovs = {
-            name: encode_feature(name, pair.lrhs[name], 1.0) for name in self._session.lrhs_aovs if name in pair.lrhs
-        }
-        hrls = pair.hrls
+        lrhs_aovs, hrls = self._lrhs_aovs(pair), pair.hrls
         # Copies, because views would keep the memory of all features.
         for_alpha = [name for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls]
         needed_for_alpha = {name: hrls[name].copy("K") for name in for_alpha}
@@ -213,12 +221,34 @@ class _Pair:
             prepared.noise_free = is_noise_free(pair, prepared.lrhs, hrls[RGB], self.exposure)
         return prepared
 
+    def sample_means(self) -> _FrameMeans:
+        """Decide how to average both renders, from a sample of the frame, so that neighbouring tiles agree."""
+        contract = self._session.contract
+        if contract.denoiser == NO_DENOISER:
+            return _FrameMeans()
+        rgb, alpha = [], []
+        for band in sample_bands(self._alignment.grid, contract.scale):
+            features, counts = [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts()
+            pair = read_tile(Tile(band, band), self._lrhs, self.grid, self._hr, self._alignment, features, counts)
+            lrhs_rgb, hrls = dim_fireflies(pair)
+            lrhs_aovs = self._lrhs_aovs(pair)
+            lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure)
+            rgb.append((lrhs, encode_features(hrls, contract.features, self.exposure), lrhs_aovs))
+            if "alpha" in pair.lrhs and "alpha" in pair.hrls:
+                lrhs_alpha, hrls_alpha = encode_alpha(pair, contract)
+                alpha.append((lrhs_alpha[..., : lrhs.shape[-1]], hrls_alpha, lrhs_aovs))
+        return _FrameMeans(mean_settings(rgb), mean_settings(alpha) if alpha else None)
+
+    def _lrhs_aovs(self, pair: TilePair) -> Images:
+        names = [name for name in self._session.lrhs_aovs if name in pair.lrhs]
+        return {name: encode_feature(name, pair.lrhs[name], 1.0) for name in names}
+
     def check(self) -> list[str]:
         """Compare the two renders once all tiles are prepared, see :func:`check_pair`."""
         return check_pair(self._lrhs_rgb, self._averages, self._lr.name, self._hr.name)
 
 
-def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None:
+def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: _FrameMeans) -> None:
     """Run the network on a tile and write its core into the frame."""
     pair, empty = tile.pair, tile.empty
     target = pair.hrls_target.slices(frame.alignment.hr_data_window)
@@ -229,7 +259,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None
             encoded, encoded_error = tile.hrls[..., :3], np.zeros_like(tile.hrls[..., :1])
         else:
             encoded, encoded_error = session.run(
-                tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, error=frame.error is not None
+                tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, mean=means.rgb, error=frame.error is not None
             )
         check_finite(session, encoded, encoded_error)
         rgb = frame.rgb[target]
@@ -246,7 +276,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame) -> None
     if "alpha" in pair.hrls:
         if frame.alpha is None:
             frame.alpha = np.empty((*frame.rgb.shape[:2], 1), dtype=np.float32)
-        frame.alpha[target] = fuse_alpha(pair, session, tile.lrhs_aovs)[core]
+        frame.alpha[target] = fuse_alpha(pair, session, tile.lrhs_aovs, means.alpha)[core]
 
 
 def _scene_linear_error(encoded: Array, error: Array, exposure: float) -> Array:

@@ -26,6 +26,8 @@ STRIPS_SHARE = 1 / 6
 #: Memory of a tile. It is as large as ``MAX_MEMORY`` allows beside an 8K frame. Other tiles give other pixels, so this
 #: does not depend on what the user allows.
 TILE_MEMORY = 1872 << 20
+#: Bands of rows that :func:`sample_bands` spreads over a frame.
+SAMPLE_BANDS = 8
 
 
 @dataclass(frozen=True)
@@ -68,6 +70,17 @@ def plan_tiles(grid: Window, contract: Contract) -> list[Tile]:
         for y0, y1 in rows.cores
         for x0, x1 in columns.cores
     ]
+
+
+def sample_bands(grid: Window, scale: int) -> list[Window]:
+    """Bands of rows, evenly spread over ``grid``, from which the whole frame is judged before its tiles are read.
+
+    They are as wide as the grid, because EXR files store whole rows, often in blocks of 16.
+    """
+    rows = min(max(16 // scale, 4), grid.height)
+    last = grid.height // rows - 1
+    tops = sorted({grid.y0 + last * i // (SAMPLE_BANDS - 1) * rows for i in range(SAMPLE_BANDS)})
+    return [Window(grid.x0, top, grid.x1, top + rows) for top in tops]
 
 
 def check_memory(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, max_memory: int) -> None:

@@ -17,7 +17,7 @@ from oiio_msspl.aovs.features import LRHS_FEATURES
 from oiio_msspl.arrays import Array
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.pu_curve import largest_log_encoded, pu_decode, pu_encode_log
-from oiio_msspl.model.render_mean import NO_IMAGES, Images, denoiser_images, mean_of_renders
+from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
 from oiio_msspl.model.runtime import load_network
 from oiio_msspl.parallel import for_row_blocks
 
@@ -50,13 +50,15 @@ class MeanDenoiser:
     def __init__(self, threads: int = 0) -> None:
         self._session = load_network(WEIGHTS, threads)
 
-    def __call__(self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES) -> tuple[Array, Array]:
+    def __call__(
+        self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES, settings: MeanSettings | None = None
+    ) -> tuple[Array, Array]:
         """Denoise an encoded pair.
 
         Args:
             lrhs: (h, w, 3), encoded.
             hrls: (s*h, s*w, 9 or more), encoded: colour, albedo, normal.
-            lrhs_aovs: see :func:`oiio_msspl.model.render_mean.mean_of_renders`.
+            lrhs_aovs, settings: see :func:`oiio_msspl.model.render_mean.mean_of_renders`.
 
         Returns:
             A copy of the LRHS with the denoised mean as three more channels of log-encoded colour, (h, w, 6), and the
@@ -66,12 +68,14 @@ class MeanDenoiser:
         # Each channel is contiguous, as the network reads it.
         both = np.empty((2 * channels, height, width), dtype=np.float32).transpose(1, 2, 0)
         both[..., :channels] = lrhs
-        self.fill(both, hrls, lrhs_aovs)
+        self.fill(both, hrls, lrhs_aovs, settings)
         return both, hrls
 
-    def fill(self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES) -> None:
+    def fill(
+        self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES, settings: MeanSettings | None = None
+    ) -> None:
         """The same in place: fill the last three channels of the LRHS, (h, w, 6)."""
-        images = mean_of_renders(lrhs[..., :_LRHS_CHANNELS], denoiser_images(hrls), lrhs_aovs)
+        images = mean_of_renders(lrhs[..., :_LRHS_CHANNELS], denoiser_images(hrls), lrhs_aovs, settings)
         height, width = lrhs.shape[:2]
         codes = self._session.run(["codes"], {"layers": quantise(**images)[None]})[0][0, :height, :width]
         table, denoised = log_encoded_of_code(OUTPUT_SLICES), lrhs[..., _LRHS_CHANNELS:]

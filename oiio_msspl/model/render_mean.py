@@ -8,6 +8,9 @@ any.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
@@ -50,35 +53,79 @@ def denoiser_images(hrls: Array) -> Images:
     }
 
 
-def mean_of_renders(lrhs: Array, hrls_images: Images, lrhs_aovs: Images = NO_IMAGES) -> Images:
+@dataclass(frozen=True)
+class MeanSettings:
+    """How both renders are averaged. A frame has one, so that its tiles agree."""
+
+    lrhs_weight: float
+    """See :func:`lrhs_weight`."""
+    lrhs_aovs: tuple[str, ...]
+    """AOVs of the LRHS that are averaged in: those that show the same as the HRLS's."""
+
+
+def mean_settings(samples: Sequence[tuple[Array, Array, Images]]) -> MeanSettings:
+    """Decide how both renders of a frame are averaged, from parts of the frame that are equally large.
+
+    Args:
+        samples: ``lrhs``, encoded HRLS (:func:`denoiser_images`) and ``lrhs_aovs`` of each part, see
+            :func:`mean_of_renders`.
+    """
+    lrhs = np.stack([light for light, _, _ in samples])
+    means = [_box_averages(denoiser_images(hrls), len(hrls) // len(light))[1] for light, hrls, _ in samples]
+    hrls_means = {name: np.stack([images[name] for images in means]) for name in means[0]}
+    lrhs_aovs = {name: np.stack([aovs[name] for _, _, aovs in samples]) for name in samples[0][2]}
+    return _settings(lrhs, hrls_means, lrhs_aovs)
+
+
+def mean_of_renders(
+    lrhs: Array, hrls_images: Images, lrhs_aovs: Images = NO_IMAGES, settings: MeanSettings | None = None
+) -> Images:
     """Average both renders at the LRHS's resolution, weighted so that the colour has the least noise.
 
     Args:
         lrhs: (h, w, 3), log-encoded at exposure 1.
         hrls_images: see :func:`denoiser_images`, at s times the size.
         lrhs_aovs: the LRHS's own ``albedo`` and ``normal``, (h, w, 3), encoded, as far as it has them.
+        settings: those of the frame; decided from these images if None.
 
     Returns:
         ``colour``; ``albedo`` and ``normal`` as far as the HRLS has them; and ``noise``, the estimated standard
         deviation of the log-encoded colour times ``NOISE_GAIN``, at most 1.
     """
     scale = hrls_images["colour"].shape[0] // lrhs.shape[0]
-    hrls_radiance = box_downsample(decode_radiance(hrls_images["colour"], 1.0), scale)
-    hrls = encode_radiance(hrls_radiance, 1.0)
-    weight = lrhs_weight(lrhs, hrls)
+    hrls_radiance, hrls = _box_averages(hrls_images, scale)
+    if settings is None:
+        settings = _settings(lrhs, hrls, lrhs_aovs)
+    weight = settings.lrhs_weight
     mean = weight * decode_radiance(lrhs, 1.0) + (1 - weight) * hrls_radiance
     result = {"colour": encode_radiance(mean, 1.0)}
     # Scale |LRHS - HRLS| to the standard deviation of the weighted mean.
     gain = np.float32(NOISE_GAIN * (weight * (1 - weight)) ** 0.5)
-    result["noise"] = np.minimum(gain * np.abs(lrhs - hrls).mean(axis=-1, keepdims=True), 1)
+    result["noise"] = np.minimum(gain * np.abs(lrhs - hrls["colour"]).mean(axis=-1, keepdims=True), 1)
     for name in (ALBEDO, NORMAL):
-        if name in hrls_images:
-            result[name] = box_downsample(hrls_images[name], scale)
-            if name in lrhs_aovs:
-                lrhs_aov = clip(lrhs_aovs[name], -1.0, 1.0)  # an encoded albedo may reach 2
-                if _show_the_same(lrhs_aov, result[name]):
-                    result[name] += weight * (lrhs_aov - result[name])
+        if name in hrls:
+            result[name] = hrls[name]
+            if name in settings.lrhs_aovs:
+                result[name] += weight * (_clipped(lrhs_aovs[name]) - result[name])
     return result
+
+
+def _box_averages(hrls_images: Images, scale: int) -> tuple[Array, Images]:
+    """The HRLS at the LRHS's resolution: its radiance at exposure 1, and all images."""
+    radiance = box_downsample(decode_radiance(hrls_images["colour"], 1.0), scale)
+    aovs = {name: box_downsample(hrls_images[name], scale) for name in (ALBEDO, NORMAL) if name in hrls_images}
+    return radiance, {"colour": encode_radiance(radiance, 1.0), **aovs}
+
+
+def _settings(lrhs: Array, hrls: Images, lrhs_aovs: Images) -> MeanSettings:
+    """Settings from images (..., h, w, 3), all at the LRHS's resolution."""
+    same = (name for name in lrhs_aovs if name in hrls and _show_the_same(_clipped(lrhs_aovs[name]), hrls[name]))
+    return MeanSettings(lrhs_weight(lrhs, hrls["colour"]), tuple(same))
+
+
+def _clipped(lrhs_aov: Array) -> Array:
+    """An encoded AOV of the LRHS in the range of :data:`Images`: an encoded albedo may reach 2."""
+    return clip(lrhs_aov, -1.0, 1.0)
 
 
 def lrhs_weight(lrhs: Array, hrls: Array) -> float:
@@ -88,20 +135,20 @@ def lrhs_weight(lrhs: Array, hrls: Array) -> float:
     so their covariance is the variance of the picture. What each variance exceeds it by is noise.
 
     Args:
-        lrhs, hrls: (h, w, 3), log-encoded, at one resolution.
+        lrhs, hrls: (..., h, w, 3), log-encoded, at one resolution.
 
     Returns:
         A weight in [0.05, 0.95]; 0.5 if both are equally noisy, or not noisy.
     """
-    a, b = (x[1:, 1:] - x[1:, :-1] - x[:-1, 1:] + x[:-1, :-1] for x in (lrhs, hrls))
+    a, b = (x[..., 1:, 1:, :] - x[..., 1:, :-1, :] - x[..., :-1, 1:, :] + x[..., :-1, :-1, :] for x in (lrhs, hrls))
     covariance = np.mean(a * b)
     lrhs_noise, hrls_noise = (max(float(np.mean(x * x) - covariance), 1e-9) for x in (a, b))
     return float(np.clip(hrls_noise / (lrhs_noise + hrls_noise), *_WEIGHT_BOUNDS))
 
 
 def _show_the_same(lrhs_aov: Array, hrls_aov: Array) -> bool:
-    """Whether two AOVs (h, w, 3) differ by no more than noise."""
-    variance = float(hrls_aov.var(axis=(0, 1)).mean())
+    """Whether two AOVs (..., h, w, 3) differ by no more than noise."""
+    variance = float(hrls_aov.var(axis=tuple(range(hrls_aov.ndim - 1))).mean())
     return float(np.square(lrhs_aov - hrls_aov).mean()) <= _DIFFERENT * (variance + _VARIANCE_OFFSET)
 
 

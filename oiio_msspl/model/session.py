@@ -14,7 +14,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.model.contract import NO_DENOISER, Contract
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
-from oiio_msspl.model.render_mean import NO_IMAGES, Images, useful_lrhs_aovs
+from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, useful_lrhs_aovs
 from oiio_msspl.model.runtime import CPU, available_providers, load_network, runtime_version
 
 log = logging.getLogger(__name__)
@@ -92,7 +92,13 @@ class Session:
         return useful_lrhs_aovs(self.contract.scale) if self._denoiser is not None else ()
 
     def run(
-        self, lrhs: Array, hrls: Array, *, lrhs_aovs: Images = NO_IMAGES, error: bool = False
+        self,
+        lrhs: Array,
+        hrls: Array,
+        *,
+        lrhs_aovs: Images = NO_IMAGES,
+        mean: MeanSettings | None = None,
+        error: bool = False,
     ) -> tuple[Array, Array | None]:
         """Run the denoiser, if the model has one, and the model.
 
@@ -101,6 +107,7 @@ class Session:
             hrls: (s*h, s*w, 16), encoded, channels as in :data:`oiio_msspl.aovs.features.HRLS_FEATURES`. If both have
                 room for the denoised channels that the contract lists, these are filled in place; else in copies.
             lrhs_aovs: those of :attr:`lrhs_aovs` that the LRHS has, encoded, (h, w, 3) each.
+            mean: how the denoiser averages both renders of the frame; decided from these images if None.
             error: also return the expected error of a model that predicts it.
 
         Returns:
@@ -113,9 +120,9 @@ class Session:
         start = time.perf_counter()
         if self._denoiser is not None:
             if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
-                self._denoiser.fill(lrhs, hrls, lrhs_aovs)
+                self._denoiser.fill(lrhs, hrls, lrhs_aovs, mean)
             else:
-                lrhs, hrls = self._denoiser(lrhs, hrls[..., : len(self.contract.hrls)], lrhs_aovs)
+                lrhs, hrls = self._denoiser(lrhs, hrls[..., : len(self.contract.hrls)], lrhs_aovs, mean)
         feed: dict[str, Any] = {
             "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),

@@ -8,7 +8,9 @@ from oiio_msspl import find_model, fuse
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion import tiling
+from oiio_msspl.model import mean_denoiser
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
+from oiio_msspl.model.render_mean import mean_of_renders
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture
 
@@ -406,6 +408,43 @@ def texture(size):
     y, x = (np.mgrid[0:size, 0:size] + 0.5) / size
     waves = sum(np.sin(2 * np.pi * (k * x + (4 - k) * y) + k * k) for k in range(-3, 6))
     return np.repeat(np.exp(0.3 * waves)[..., None], 3, -1).astype(np.float32)
+
+
+def test_tiles_average_the_renders_alike(scale, monkeypatch):
+    """The left half has its noise in the HRLS, the right half in the LRHS. Both tiles show the denoiser the same mean
+    where they overlap, of colour, AOVs and alpha."""
+    session, means = Session(find_model(scale, "joint")), []
+
+    def recorded(*images):
+        means.append(mean_of_renders(*images))
+        return means[-1]
+
+    monkeypatch.setattr(mean_denoiser, "mean_of_renders", recorded)
+    core, overlap = core_beyond_overlap(session), session.contract.overlap
+    tiles_of(monkeypatch, session, (core + overlap) * 32 * scale**2)
+    low, high, clean = pair_of(scale, 32 * scale, 2 * core * scale)
+    half = core * scale
+    low.layers["rgb"][:, :core] = downsample(clean, scale)[:, :core]
+    low.layers["rgb"][:, core:] = noisy(downsample(clean, scale), scale**2)[:, core:]
+    high.layers["rgb"][:, half:] = clean[:, half:]
+    # The AOVs of the left half are those of another picture.
+    high.layers["albedo"] = high.layers["normal"] = np.clip(clean, 0, 1)
+    aov = downsample(high.layers["albedo"], scale)
+    low.layers["albedo"] = low.layers["normal"] = np.concatenate([1 - aov[:, :core], aov[:, core:]], axis=1)
+    low.layers["alpha"], high.layers["alpha"] = (r.layers["rgb"].clip(0.01, 0.99)[..., :1] for r in (low, high))
+    assert fuse(low, high, session).tiles == 2
+    shared = slice(core - overlap + 1, core + overlap - 1)  # fireflies at the first and last column see less around
+    for first, second in zip(means[:2], means[2:], strict=True):
+        for name in first:
+            np.testing.assert_array_equal(first[name][:, shared], second[name][:, 1 : 2 * overlap - 1])
+
+
+def test_a_frame_of_one_tile_is_averaged_as_it_suggests(scale, monkeypatch):
+    """Nothing is sampled: the whole frame is at hand."""
+    session = Session(find_model(scale, "joint"))
+    monkeypatch.setattr("oiio_msspl.fusion.fuse.sample_bands", lambda *_: pytest.fail("sampled"))
+    low, high, _ = pair_of(scale)
+    assert fuse(low, high, session).tiles == 1
 
 
 @pytest.mark.parametrize("family", ["joint", "pyramid", "paper"])

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import itertools
+
 import numpy as np
 import pytest
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion import tiling
-from oiio_msspl.fusion.tiling import aligned_grid, check_memory, plan_tiles
+from oiio_msspl.fusion.tiling import aligned_grid, check_memory, plan_tiles, sample_bands
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.contract import MEAN_DENOISER, MEAN_DENOISER_ALIGNMENT, Contract
 
@@ -65,3 +67,17 @@ def test_too_little_memory_is_said_with_what_suffices():
     with pytest.raises(InputError, match=r"this frame needs more with model test; allow at least 1\.1G"):
         check_memory(contract, tiles, 500 << 20, 1 << 30)
     check_memory(contract, tiles, 500 << 20, int(1.1 * 2**30))
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+@pytest.mark.parametrize("height", [1, 3, 8, 135, 2160])
+def test_sample_bands_are_spread_over_the_frame(scale, height):
+    """Equally high, inside the frame, from its top to its end, and few in a large frame."""
+    grid = Window(-5, 7, 500, 7 + height)
+    bands = sample_bands(grid, scale)
+    assert {(band.x0, band.x1) for band in bands} == {(-5, 500)}
+    assert len({band.height for band in bands}) == 1
+    assert all(above.y1 <= below.y0 for above, below in itertools.pairwise(bands))
+    assert bands[0].y0 == 7
+    assert 0 <= grid.y1 - bands[-1].y1 < bands[-1].height
+    assert sum(band.height for band in bands) <= max(8 * 8, height)

@@ -6,7 +6,7 @@ import pytest
 
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.model.encoding import encode_radiance
-from oiio_msspl.model.render_mean import NOISE_GAIN, lrhs_weight, mean_of_renders
+from oiio_msspl.model.render_mean import NOISE_GAIN, lrhs_weight, mean_of_renders, mean_settings
 from tests.conftest import noisy, picture
 
 
@@ -56,3 +56,17 @@ def test_the_layers_of_the_lrhs_take_noise_out_of_the_means():
     rng = np.random.default_rng(4)
     for other in (mean(clean)[:, ::-1], rng.random((96, 96, 3), dtype=np.float32), np.zeros((96, 96, 3), np.float32)):
         np.testing.assert_array_equal(mean_of_renders(lrhs, layers, {"albedo": other})["albedo"], alone["albedo"])
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_a_frame_is_averaged_as_its_parts_suggest_together(same):
+    """Cut into bands, an image gives the settings of the whole, but for what crosses their borders."""
+    clean = 0.3 + 0.4 * picture(192, 192).clip(0, 1)
+    lrhs, hrls = small(noisy(clean, 12)), np.dstack([encode_radiance(noisy(clean, 4, seed=1), 1.0), clean, clean])
+    albedo = box_downsample(clean if same else clean[::-1], 2)
+    whole = mean_settings([(lrhs, hrls, {"albedo": albedo})])
+    rows = [slice(i, i + 8) for i in range(0, 96, 8)]
+    parts = [(lrhs[r], hrls[2 * r.start : 2 * r.stop], {"albedo": albedo[r]}) for r in rows]
+    together = mean_settings(parts)
+    assert together.lrhs_weight == pytest.approx(whole.lrhs_weight, abs=0.02)
+    assert together.lrhs_aovs == whole.lrhs_aovs == (("albedo",) if same else ())

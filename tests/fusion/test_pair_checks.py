@@ -157,3 +157,12 @@ def test_pictures_without_a_framing_are_no_error(side, kind):
         image[20:40, 20:40] = 3e38
     low = Render.from_arrays("lr", rgb=image[::2, ::2].copy())
     assert not [w for w in check_renders(low, Render.from_arrays("hr", rgb=image)) if "shifted" in w or "tighter" in w]
+
+
+def test_rare_light_is_not_shared_noise(scale):
+    """Where one sample in ten finds light, both renders have black pixels in the same places."""
+    rng = np.random.default_rng(0)
+    colour = scene(scale)[0]
+    first, second = (colour * 10 * (rng.random(colour.shape[:2]) < 0.1)[..., None] for _ in range(2))
+    low = Render.from_arrays("lr", rgb=downsample(first, scale).astype(np.float32))
+    assert check_renders(low, Render.from_arrays("hr", rgb=second)) == []

@@ -26,8 +26,6 @@ MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.3, 2000
 CERTAIN = 8.0
 #: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
 JACKKNIFE_PARTS = 6
-#: A direction must have gradients in at least so many parts, by their participation ratio (sum of x)^2 / sum of x^2.
-MIN_PARTS = 6.0
 #: Side of the central area, in LRHS pixels, in which the framing is compared.
 AREA = 1024
 #: Pictures with a shorter side, in LRHS pixels, have too few edges to judge.
@@ -115,9 +113,7 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
             break
     inverses = np.linalg.pinv(total - squares, hermitian=True)
     without_part = (inverses @ (products.sum(0) - products)[..., None])[:, :3, 0]
-    # A few parts with all the gradients say little about each other.
-    shares = squares[:, range(3), range(3)] / np.maximum(squares[:, range(3), range(3)].sum(0), 1e-30)
-    error = np.where(np.square(shares).sum(0) * MIN_PARTS > 1, np.inf, jackknife_error(without_part))
+    error = jackknife_error(without_part)
     residual = float(dots[:, -1, -1].sum() - step @ products.sum(0))
     explained = 1 - residual / max(_unmoved_residual(low, high, inner), 1e-30)
     a, b = (v[inner, inner] - v[inner, inner].mean() for v in (moved, high))

@@ -166,3 +166,10 @@ def test_rare_light_is_not_shared_noise(scale):
     first, second = (colour * 10 * (rng.random(colour.shape[:2]) < 0.1)[..., None] for _ in range(2))
     low = Render.from_arrays("lr", rgb=downsample(first, scale).astype(np.float32))
     assert check_renders(low, Render.from_arrays("hr", rgb=second)) == []
+
+
+def shifted(scale, spp, seed=0):
+    """A pair whose LRHS lies a pixel too far to the right, over a large and pale picture with a noisy HRLS."""
+    colour = 1 + 0.5 * scene(scale, seed, (180, 320))[0]
+    low = np.roll(noisy(downsample(colour, scale), spp * scale**2, seed + 100), 1, axis=1)
+    return Render.from_arrays("lr", rgb=low), Render.from_arrays("hr", rgb=noisy(colour, spp, seed + 200))

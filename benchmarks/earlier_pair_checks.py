@@ -11,6 +11,7 @@ import pickle
 import sys
 
 import numpy as np
+
 from oiio_msspl import checks, fusion, schema
 from oiio_msspl.errors import InputError
 from oiio_msspl.pairing import pair

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 # mypy: ignore-errors
+# ruff: noqa: I001 -- modules of that commit, which ruff does not find here
 """The pair checks of commit 0e4f219, with which `benchmarks.pair_checks` compares those of today.
 
 It runs with that commit on the Python path: pairs are read from the standard input, warnings go to the standard output.

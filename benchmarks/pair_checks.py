@@ -1,23 +1,30 @@
 # SPDX-License-Identifier: Apache-2.0
 """How many wrong pairs the checks notice, and how many right pairs they doubt.
 
-    python -m benchmarks.pair_checks RENDERS... [--half report] [--table FILE.csv]
+    python -m benchmarks.pair_checks FRAMES --scenes chosen [--before WORKTREE] [--table FILE.csv]
+    python -m benchmarks.pair_checks FRESH --scenes fresh [--before WORKTREE] [--table FILE.csv]
 
-Each folder in RENDERS is a view, with ``hr_<n>spp.exr`` and ``lr_x<s>_<n>spp.exr``. All of its pairs are right, whole
-and cut to each quarter. Wrong pairs are made from the pairs of equal samples: the LRHS is framed, shifted, recoloured
-or made from the HRLS, or the HRLS gets layers of another scene. Nothing is said of the LRHS's own albedo and normal.
+Thresholds were chosen by the scenes in FRAMES. Those in FRESH are only measured. `benchmarks.render.frames` and
+`benchmarks.render.generated_frames` render them. Each folder is a view, with ``hr_<n>spp.exr`` and
+``lr_x<s>_<n>spp.exr``. All of its pairs are right, whole and cut to each quarter. Wrong pairs are made from the pairs
+of equal samples: the LRHS is framed, shifted, recoloured or made from the HRLS, or the HRLS gets layers of another
+scene. Frames of an odd size are measured as right pairs only, and whole. The LRHS's own albedo and normal are not used.
 
-Thresholds are chosen by the scenes of one half ("tune") and reported for the other one ("report"). Views of a scene,
-such as ``lamp`` and ``lamp-left``, are in the same half.
+``--before`` also measures the checks of commit 0e4f219, of which WORKTREE is a checkout.
 """
 
 from __future__ import annotations
 
 import argparse
-import collections
+import functools
+import os
+import pickle
 import re
+import subprocess
+import sys
 import zlib
 from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -34,7 +41,8 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.pair_checks import BOTH_BLACK, check_renders
 
-HALVES = ("all", "tune", "report")
+#: Sets of scenes: those by which thresholds were chosen, and others.
+SETS = ("chosen", "fresh")
 RIGHT, RIGHT_QUARTER = "right, whole frame", "right, a quarter of the frame"
 Layers = dict[str, Array]
 
@@ -72,7 +80,7 @@ class View:
                 lrhs, scale = self.layers(low.stem), int(numbers[0])
                 assert lrhs is not None
                 spp = int(numbers[2])
-                yield Pair(f"{self.name} {low.stem} {high.stem}", scale, spp, int(numbers[1]), lrhs, hrls).trimmed()
+                yield Pair(f"{self.name} {low.stem} {high.stem}", scale, spp, int(numbers[1]), lrhs, hrls)
 
 
 @dataclass(frozen=True)
@@ -87,6 +95,12 @@ class Pair:
     hrls: Layers
 
     @property
+    def exact(self) -> bool:
+        """Whether an LRHS pixel is exactly as wide and high as so many HRLS pixels: no odd size was rounded."""
+        low, high = self.lrhs[RGB].shape, self.hrls[RGB].shape
+        return low[:2] == (high[0] / self.scale, high[1] / self.scale)
+
+    @property
     def equal_samples(self) -> bool:
         """Whether both renders have the same number of samples for an area, and 1 spp in the HRLS."""
         return self.hr_spp == 1 and self.lr_spp == self.scale**2
@@ -98,25 +112,40 @@ class Pair:
         high = {name: v[s * y : s * (y + height), s * x : s * (x + width)] for name, v in self.hrls.items()}
         return Pair(self.name, s, self.hr_spp, self.lr_spp, low, high)
 
-    def trimmed(self) -> Pair:
-        """Without the rows and columns that only one of the renders has, where an odd size was rounded."""
-        low, high = self.lrhs[RGB].shape, self.hrls[RGB].shape
-        return self.cut(0, 0, *(min(a, b // self.scale) for a, b in zip(low[:2], high[:2], strict=True)))
-
     def quarters(self) -> Iterator[Pair]:
         """The four quarters of the frame."""
         height, width = (n // 2 for n in self.lrhs[RGB].shape[:2])
         for y, x in ((0, 0), (0, width), (height, 0), (height, width)):
             yield self.cut(y, x, height, width)
 
+    def arrays(self) -> tuple[Array, Layers]:
+        """The LRHS's beauty and the HRLS's features, contiguous."""
+        return np.ascontiguousarray(self.lrhs[RGB]), {k: np.ascontiguousarray(v) for k, v in self.hrls.items()}
+
     def warnings(self) -> list[str]:
         """What the checks say, or why they refuse the pair."""
-        low = Render.from_arrays("lr", rgb=np.ascontiguousarray(self.lrhs[RGB]))
-        high = Render.from_arrays("hr", **{name: np.ascontiguousarray(v) for name, v in self.hrls.items()})
+        lrhs, hrls = self.arrays()
         try:
-            return check_renders(low, high)
+            return check_renders(Render.from_arrays("lr", rgb=lrhs), Render.from_arrays("hr", **hrls))
         except InputError as error:
             return [str(error)]
+
+
+class EarlierChecks:
+    """The checks of another checkout, in a process of its own."""
+
+    def __init__(self, tree: Path) -> None:
+        command = [sys.executable, str(Path(__file__).with_name("earlier_pair_checks.py"))]
+        environment = os.environ | {"PYTHONPATH": str(tree)}
+        self.process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment)
+
+    def warnings(self, pair: Pair) -> list[str]:
+        """What they say."""
+        assert self.process.stdin is not None and self.process.stdout is not None
+        pickle.dump(pair.arrays(), self.process.stdin)
+        self.process.stdin.flush()
+        found: list[str] = pickle.load(self.process.stdout)
+        return found
 
 
 def wrong_pairs(pair: Pair, other: View, following: Layers | None) -> Iterator[tuple[str, Pair]]:
@@ -202,52 +231,102 @@ def _moved_object(layers: Layers, scale: int, rng: np.random.Generator) -> Layer
     return moved
 
 
-def find_views(folders: list[Path], half: str) -> list[View]:
-    """The views of a half of the scenes."""
-    views = [View(file.parent) for folder in folders for file in sorted(folder.glob("*/hr_1spp.exr"))]
-    scenes = sorted({view.scene for view in views})
-    chosen = scenes if half == "all" else scenes[HALVES.index(half) - 1 :: 2]
-    return [view for view in views if view.scene in chosen]
+def find_views(folder: Path) -> list[View]:
+    """The views in a folder."""
+    return [View(file.parent) for file in sorted(folder.glob("*/hr_1spp.exr"))]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """What the checks said of a pair."""
+
+    kind: str
+    now: list[str]
+    before: list[str] | None
+
+
+def measure(view: View, other: View, before: Path | None) -> list[Outcome]:
+    """Check all pairs of a view. ``other`` is of another scene; ``before`` is the checkout of the earlier checks."""
+    earlier = _earlier(before) if before else None
+    outcomes = []
+
+    def check(kind: str, pair: Pair) -> None:
+        now, then = (
+            None if checks is None else [warning for warning in checks(pair) if warning != BOTH_BLACK]
+            for checks in (Pair.warnings, earlier.warnings if earlier else None)
+        )
+        assert now is not None
+        outcomes.append(Outcome(kind, [f"{pair.name}: {warning}" for warning in now], then))
+
+    for pair in view.pairs():
+        if not pair.hrls[RGB].any():
+            continue  # the camera is inside a wall
+        check(RIGHT, pair)
+        if not pair.exact:
+            continue
+        for quarter in pair.quarters():
+            check(RIGHT_QUARTER, quarter)
+        if pair.equal_samples:
+            for kind, wrong in wrong_pairs(pair, other, view.layers("next_1spp")):
+                check(kind, wrong)
+    return outcomes
+
+
+@functools.cache
+def _earlier(tree: Path) -> EarlierChecks:
+    return EarlierChecks(tree)
+
+
+def rows_of(name: str, views: list[View], before: Path | None, processes: int) -> list[results.Row]:
+    """Measure views of several scenes: a row for each kind of pair, and one for all right pairs."""
+    others = [next(v for v in views[i:] + views if v.scene != view.scene) for i, view in enumerate(views)]
+    with ProcessPoolExecutor(processes) as pool:
+        found = pool.map(measure, views, others, [before] * len(views))
+        outcomes = [outcome for outcomes in found for outcome in outcomes]
+    rows = []
+    for kind in dict.fromkeys(outcome.kind for outcome in outcomes):
+        chosen = [outcome for outcome in outcomes if outcome.kind == kind]
+        row: results.Row = {"scenes": name, "pairs": kind, "count": len(chosen)}
+        if before:
+            row["before"] = sum(bool(outcome.before) for outcome in chosen)
+        rows.append(row | {"after": sum(bool(outcome.now) for outcome in chosen)})
+    for outcome in outcomes:
+        if outcome.kind in (RIGHT, RIGHT_QUARTER) and outcome.now:
+            print(f"{outcome.kind}: {'; '.join(outcome.now)}", flush=True)
+    scenes = list(dict.fromkeys(view.scene for view in views))
+    print(f"\n{name}: {len(views)} views of {len(scenes)} scenes: {', '.join(scenes)}\n")
+    return rows
+
+
+def layout(rows: list[results.Row]) -> str:
+    """A table: of each kind of pair, how many there are, and the percentage that got a warning."""
+    found = results.index(rows, "scenes", "pairs")
+    columns = [column for column in ("before", "after") if column in rows[0]]
+    sets = list(dict.fromkeys(row["scenes"] for row in rows))
+    head = ["pairs", *(f"{name}: {column}" for name in sets for column in ("number", *columns))]
+    body = []
+    for kind in dict.fromkeys(row["pairs"] for row in rows):
+        cells = [kind]
+        for name in sets:
+            row = found.get((name, kind))
+            cells += [str(row["count"])] if row else [""]
+            cells += [f"{100 * row[column] / row['count']:.1f} %" if row else "" for column in columns]
+        body.append(cells)
+    return results.markdown(head, body)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("folders", nargs="+", type=Path, metavar="RENDERS")
-    parser.add_argument("--half", choices=HALVES, default="all")
-    parser.add_argument("--verbose", action="store_true", help="print every false alarm and every miss")
+    parser.add_argument("frames", type=Path, metavar="FRAMES")
+    parser.add_argument("--scenes", choices=SETS, default=SETS[0], help="which scenes these are (%(default)s)")
+    parser.add_argument("--before", type=Path, metavar="WORKTREE", help="a checkout of commit 0e4f219")
+    parser.add_argument("--processes", type=int, default=2)
     results.add_option(parser)
     args = parser.parse_args()
-    views = find_views(args.folders, args.half)
-    noticed: dict[str, list[bool]] = collections.defaultdict(list)
-
-    def measure(kind: str, pair: Pair) -> None:
-        warnings = pair.warnings()
-        warnings = [warning for warning in warnings if warning != BOTH_BLACK]
-        noticed[kind].append(bool(warnings))
-        if args.verbose and bool(warnings) == (kind in (RIGHT, RIGHT_QUARTER)):
-            print(f"{pair.name}: {kind}: {'; '.join(warnings) or 'not noticed'}", flush=True)
-
-    for view in views:
-        other = next((v for v in views[views.index(view) :] + views if v.scene != view.scene), None)
-        for pair in view.pairs():
-            if not pair.hrls[RGB].any():
-                continue  # the camera is inside a wall
-            measure(RIGHT, pair)
-            for quarter in pair.quarters():
-                measure(RIGHT_QUARTER, quarter)
-            if pair.equal_samples and other is not None:
-                for kind, wrong in wrong_pairs(pair, other, view.layers("next_1spp")):
-                    measure(kind, wrong)
-    scenes = {view.scene for view in views}
-    print(f"{len(views)} views of {len(scenes)} scenes: {', '.join(view.name for view in views)}\n")
-    rows: list[results.Row] = [
-        {"pairs": kind, "count": len(alarms), "alarms": sum(alarms), "percent": 100 * sum(alarms) / len(alarms)}
-        for kind, alarms in noticed.items()
-    ]
-    cells = [[str(row["pairs"]), str(row["count"]), str(row["alarms"]), f"{row['percent']:.1f}"] for row in rows]
-    print(results.markdown(["pairs", "count", "alarms", "percent"], cells))
+    rows = rows_of(args.scenes, find_views(args.frames), args.before, args.processes)
+    print(layout(rows))
     if args.table:
-        results.write(args.table, rows)
+        results.merge(args.table, rows, ("scenes", "pairs"))
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import confidence, quality, results, runtime_files, versus
+from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import runtime as runtimes
 from benchmarks.flicker import report as flicker_report
 from benchmarks.results import MEAN, Row
@@ -304,6 +305,11 @@ def stability() -> str:
     return f"{count} cases at {scales}:\n\n{stability_report.summary(rows)}"
 
 
+def pair_checks() -> str:
+    """Wrong pairs that get a warning, and right ones that do."""
+    return pair_checks_benchmark.layout(results.read("pair_checks"))
+
+
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
@@ -317,6 +323,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         errors,
         flicker,
         stability,
+        pair_checks,
     ),
 }
 

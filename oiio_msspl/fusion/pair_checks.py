@@ -35,7 +35,7 @@ EXPOSURE_RATIO = 4 / 3
 #: off by its nature, and this in LRHS pixels.
 MAX_SHIFT = (0.75, 0.5)
 #: Or if the zoom moves the edge of the frame by more LRHS pixels than this.
-MAX_ZOOM = 0.6
+MAX_ZOOM = 0.8
 #: A difference of exposure must be this many standard errors from none.
 CERTAIN = 6.0
 #: Brighter pixels count as this bright, because sums of squares over a frame would overflow float32.
@@ -114,7 +114,8 @@ class HrlsAverages:
         # Gradients and straight edges cancel out of a diagonal difference, and the variance of noise is a quarter.
         variance = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
         expected = box_downsample(variance, scale // 2) / np.float32(scale**2)
-        noisy = expected > np.square(np.float32(5 * NOISY) * grey)
+        # Black pixels are equal in any two renders where light is rare.
+        noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
         phases = itertools.product(range(scale), repeat=2)
         nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
         self.noisy_pixels += int(np.count_nonzero(noisy))

@@ -11,16 +11,18 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.arrays import Array
 from oiio_msspl.fusion.pair_framing import SMALLEST, central_area, smooth
 
 #: Shifts in LRHS pixels that the control consists of; smaller ones than the first still overlap the edges.
 CONTROL = (4, 16)
-#: How many standard deviations above the control edges fit that belong together.
-FITS = 2.0
-#: AOVs that fit each other this well are of one frame.
+#: How many standard deviations above the control edges fit that belong together. The albedo is compared in two ways, of
+#: which the better counts, so chance reaches further.
+FITS = {ALBEDO: 3.5, NORMAL: 1.5}
+#: AOVs that fit each other this well are of one frame. Where one fits the picture this well, the picture has edges.
 SAME_FRAME = 4.0
-#: Both renders show the same edges if these fit this well. In a picture with fewer edges no AOV can be judged.
+#: Both renders show the same edges if these fit this well. Where neither they nor an AOV fit, no AOV can be judged.
 VISIBLE = 3.0
 #: An AOV with edges at fewer pixels says nothing.
 MIN_EDGES = 200
@@ -42,9 +44,9 @@ def foreign_aovs(low: Array, high: Array, albedo: Array | None, normal_edges: Ar
     found = {}
     if albedo is not None:
         surface = np.clip(central_area(albedo), 0, 1)
-        found["albedo"] = np.minimum(_length(_log_steps(surface, 0.05)), 1)
+        found[ALBEDO] = np.minimum(_length(_log_steps(surface, 0.05)), 1)
     if normal_edges is not None:
-        found["normal"] = np.minimum(central_area(normal_edges), 0.5)
+        found[NORMAL] = np.minimum(central_area(normal_edges), 0.5)
     edges = {name: _local_contrast(v) for name, v in found.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
     if not edges:
         return []
@@ -54,14 +56,14 @@ def foreign_aovs(low: Array, high: Array, albedo: Array | None, normal_edges: Ar
     steps_low, steps_high, steps = (_log_steps(v, f) for v, f in ((low, floor / 2), (high, floor / 2), (both, floor)))
     picture = _local_contrast(np.minimum(_length(steps), 1))
     visible = _fit(*(_local_contrast(np.minimum(_length(v), 1)) for v in (steps_low, steps_high)))
-    if visible < VISIBLE:
-        return []
     fits = {name: _fit(v, picture) for name, v in edges.items()}
-    if "albedo" in edges:
+    if ALBEDO in edges:
         # Steps have a direction, too: what has the brighter albedo is brighter. A light may turn that around.
-        fits["albedo"] = max(fits["albedo"], abs(_fit_steps(_log_steps(surface, 0.05), steps)))
-    foreign = [name for name, fit in fits.items() if fit < FITS]
-    if len(edges) == 2 and len(foreign) == 1 and _fit(edges["albedo"], edges["normal"]) > SAME_FRAME:
+        fits[ALBEDO] = max(fits[ALBEDO], abs(_fit_steps(_log_steps(surface, 0.05), steps)))
+    if visible < VISIBLE and max(fits.values()) < SAME_FRAME:
+        return []
+    foreign = [name for name, fit in fits.items() if fit < FITS[name]]
+    if len(edges) == 2 and len(foreign) == 1 and _fit(edges[ALBEDO], edges[NORMAL]) > SAME_FRAME:
         return []  # one of the two fits the picture, and the other fits that one
     return foreign
 

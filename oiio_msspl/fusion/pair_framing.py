@@ -18,16 +18,14 @@ from numpy.typing import NDArray
 from oiio_msspl.arrays import Array, box_downsample, interpolate
 
 #: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
-FRAMING_CORRELATION = 0.9
-#: It must also explain this share of the difference that is left after tone curve and blur: where a picture has few
-#: edges, noise and filters look like small shifts.
-MIN_EXPLAINED = 0.1
+FRAMING_CORRELATION = 0.8
+#: It must also explain the first share of the difference that is left after tone curve and blur, because noise looks
+#: like a shift where a picture has few edges. In a large picture, noise explains less: so many pixels suffice.
+MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.3, 2000
 #: A difference must be this many standard errors from none.
 CERTAIN = 8.0
 #: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
 JACKKNIFE_PARTS = 6
-#: A direction must have gradients in at least so many parts, by their participation ratio (sum of x)^2 / sum of x^2.
-MIN_PARTS = 6.0
 #: Side of the central area, in LRHS pixels, in which the framing is compared.
 AREA = 1024
 #: Pictures with a shorter side, in LRHS pixels, have too few edges to judge.
@@ -68,8 +66,8 @@ def find_framing(low: Array, high: Array) -> Framing:
         # A start less than half a pixel away would lead to the same result.
         if np.abs(coarse).max() >= 0.5:
             starts.append(np.clip(coarse, -12, 12))
-    fit = min((_fit(low, high, start) for start in starts), key=lambda fit: fit.residual)
-    if fit.correlation < FRAMING_CORRELATION or fit.residual > (1 - MIN_EXPLAINED) * _unmoved_residual(low, high):
+    fit = max((_fit(low, high, start) for start in starts), key=lambda fit: fit.explained)
+    if fit.correlation < FRAMING_CORRELATION or fit.explained < min(MIN_EXPLAINED, MIN_EXPLAINED_PIXELS / low.size):
         return Framing()
     x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
     return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge))
@@ -81,7 +79,8 @@ class _Fit:
     """Shift x, y, and the zoom's displacement at the edge of the longer side; in pixels."""
     error: NDArray[np.float64]
     """Standard error of ``estimate``."""
-    residual: float
+    explained: float
+    """Share of the squared difference that shift and zoom explain, of what tone curve and blur leave."""
     correlation: float
 
 
@@ -114,22 +113,21 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
             break
     inverses = np.linalg.pinv(total - squares, hermitian=True)
     without_part = (inverses @ (products.sum(0) - products)[..., None])[:, :3, 0]
-    # A few parts with all the gradients say little about each other.
-    shares = squares[:, range(3), range(3)] / np.maximum(squares[:, range(3), range(3)].sum(0), 1e-30)
-    error = np.where(np.square(shares).sum(0) * MIN_PARTS > 1, np.inf, jackknife_error(without_part))
-    residual = float(dots[:, -1, -1].sum() - step @ products.sum(0)) / planes[0].size
+    error = jackknife_error(without_part)
+    residual = float(dots[:, -1, -1].sum() - step @ products.sum(0))
+    explained = 1 - residual / max(_unmoved_residual(low, high, inner), 1e-30)
     a, b = (v[inner, inner] - v[inner, inner].mean() for v in (moved, high))
     correlation = float(np.mean(a * b)) / max(float(a.std() * b.std()), 1e-12)
-    return _Fit(estimate, error, residual, correlation)
+    return _Fit(estimate, error, explained, correlation)
 
 
-def _unmoved_residual(low: Array, high: Array) -> float:
-    """Mean squared difference that a tone curve and a blur of the LRHS do not explain."""
+def _unmoved_residual(low: Array, high: Array, inner: slice) -> float:
+    """Squared difference within rows and columns that a tone curve and a blur of the LRHS do not explain."""
     known = [low, np.square(low), smooth(low) - low, np.ones_like(low)]
-    planes = np.stack([*known, high - low])[:, 3:-3, 3:-3].reshape(5, -1).astype(np.float64)
+    planes = np.stack([*known, high - low])[:, inner, inner].reshape(5, -1).astype(np.float64)
     dots = planes @ planes.T
     coefficients = np.linalg.lstsq(dots[:4, :4], dots[:4, 4], rcond=None)[0]
-    return float(dots[4, 4] - coefficients @ dots[:4, 4]) / planes.shape[1]
+    return float(dots[4, 4] - coefficients @ dots[:4, 4])
 
 
 def _move(values: Array, by: NDArray[np.float64]) -> Array:

@@ -8,6 +8,7 @@ from oiio_msspl.arrays import interpolate
 from oiio_msspl.colour import ACES2065, ACESCG, REC709, conversion
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.pair_checks import check_renders
+from oiio_msspl.fusion.pair_framing import Framing, find_framing
 from tests.conftest import downsample, noisy
 
 #: Height and width of the LRHS.
@@ -157,3 +158,46 @@ def test_pictures_without_a_framing_are_no_error(side, kind):
         image[20:40, 20:40] = 3e38
     low = Render.from_arrays("lr", rgb=image[::2, ::2].copy())
     assert not [w for w in check_renders(low, Render.from_arrays("hr", rgb=image)) if "shifted" in w or "tighter" in w]
+
+
+def test_rare_light_is_not_shared_noise(scale):
+    """Where one sample in ten finds light, both renders have black pixels in the same places."""
+    rng = np.random.default_rng(0)
+    colour = scene(scale)[0]
+    first, second = (colour * 10 * (rng.random(colour.shape[:2]) < 0.1)[..., None] for _ in range(2))
+    low = Render.from_arrays("lr", rgb=downsample(first, scale).astype(np.float32))
+    assert check_renders(low, Render.from_arrays("hr", rgb=second)) == []
+
+
+def test_a_shift_under_noise_is_noticed():
+    """By one LRHS pixel, in a large and pale picture: noise is most of the difference, yet the shift is certain."""
+    colour = 0.4 + 0.6 * scene(2, size=(180, 320))[0]
+    low = np.roll(noisy(downsample(colour, 2), 64, seed=100), 1, axis=1)
+    (warning,) = check_renders(Render.from_arrays("lr", rgb=low), Render.from_arrays("hr", rgb=noisy(colour, 1, 200)))
+    assert "shifted against the LRHS by 2.2 pixels to the left" in warning
+
+
+@pytest.mark.parametrize("seed", [20, 39])
+def test_noise_in_a_small_picture_is_no_shift(seed):
+    """A smooth picture, in which noise explains a tenth of the difference by a shift."""
+    rng = np.random.default_rng(seed)
+    y, x = np.mgrid[:80, :80]
+    waves = np.sin(x / rng.uniform(8, 30) + seed) * np.cos(y / rng.uniform(8, 30))
+    clean = 1 + 0.6 * waves + 0.5 * (x > 70)
+    noise = rng.choice([0.05, 0.1, 0.2, 0.4], 2)
+    low, high = ((clean * rng.gamma(1 / s**2, s**2, clean.shape)).astype(np.float32) for s in noise)
+    assert find_framing(low, high) == Framing()
+
+
+def test_one_object_suffices_to_notice_a_shift():
+    """A pillar in front of a flat wall, by which most of the frame says nothing of the shift."""
+    clean = np.full((128, 192), 0.5, np.float32)
+    clean[:64, 80:88] = 3
+    low = np.roll(noisy(downsample(clean, 2)[..., 0], 64, seed=100), 1, axis=1)
+    high = downsample(noisy(clean, 4, seed=200), 2)[..., 0].astype(np.float32)
+    assert find_framing(low, high).x == pytest.approx(-1, abs=0.2)
+
+
+def test_an_albedo_that_fits_by_chance_is_noticed():
+    """Of two comparisons the better counts, so a foreign albedo may fit a little."""
+    assert [w for w in warnings(2, albedo=scene(2, seed=72)[1]) if "the albedo's edges are not in the picture" in w]

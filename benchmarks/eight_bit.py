@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and accuracy of the `joint` models in 8 bits beside the same networks in 32 bits, computed by PyTorch.
+"""Accuracy of the `joint` models' files for CPUs (8 bits) and for GPUs (half floats) beside PyTorch in 32 bits.
 
+    python -m benchmarks.eight_bit RENDERS
     python -m benchmarks.eight_bit VIEWS
 
-PSNR is of sRGB pictures, with 1, 2 and 4 spp in either render, over every third validation view
-(:mod:`datagen.views`). Times are medians for a frame of 1024 x 1024 pixels; both take turns in one process.
+PSNR is of sRGB pictures, with 1, 2 and 4 spp in either render where there are such files, over the development scenes
+(:mod:`benchmarks.scenes`) or every third validation view (:mod:`datagen.views`). The CPU runs all three; it rounds the
+weights of the file for GPUs to half floats and multiplies in 32 bits. ``--time`` adds the median seconds of PyTorch and
+of the file for CPUs for a frame of 1024 x 1024 pixels, which take turns in one process.
 """
 
 from __future__ import annotations
@@ -26,15 +29,19 @@ from datagen.views import Folder
 from oiio_msspl import Render, Session, find_model, fuse
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import psnr
 from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.devices import gpu_file
+from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
 from training.checkpoints import load as load_checkpoint
 from training.data import to_tensor
 from training.joint import JointFusion
 
 SPP = (1, 2, 4)
+#: Columns: how the network computes.
+WAYS = ("32bit", "8bit", "half")
 SIZE, REPEATS = 1024, 5
 CHECKPOINT = Path(__file__).parents[1] / "training/checkpoints/joint.pt"
 
@@ -51,15 +58,14 @@ def medians(ways: list[Callable[[], object]]) -> list[float]:
     return [statistics.median(taken) for taken in seconds]
 
 
-def accuracy(
-    views: list[scenes.Scene], scale: int, ways: list[Callable[[ReadableRender, ReadableRender], Array]]
-) -> list[float]:
-    """Mean PSNR of each way to use LRHS and HRLS: for each of `SPP`, all ways."""
-    return [
-        statistics.fmean(psnr(way(view.lrhs(scale, spp), view.hrls(spp)), view.reference) for view in views)
-        for spp in SPP
-        for way in ways
-    ]
+def accuracy(views: list[scenes.Scene], scale: int, sessions: Sequence[Session]) -> Iterator[tuple[int, list[float]]]:
+    """The mean PSNR of every session, for each of `SPP` that all scenes have."""
+    for spp in SPP:
+        try:
+            pairs = [(view.lrhs(scale, spp), view.hrls(spp), view.reference) for view in views]
+        except InputError:  # no such file
+            continue
+        yield spp, [statistics.fmean(psnr(fuse(lr, hr, s).rgb, ref) for lr, hr, ref in pairs) for s in sessions]
 
 
 class InTorch(Session):
@@ -88,47 +94,50 @@ class InTorch(Session):
         return fused[0].permute(1, 2, 0).numpy(), None
 
 
-def row(name: str, seconds: list[float], psnr: Sequence[float]) -> Row:
-    """One row, from pairs of figures in 32 and in 8 bits."""
-    columns = [f"psnr_{spp}spp_{bits}bit" for spp in SPP for bits in (32, 8)]
-    return {
-        "method": name,
-        "seconds_32bit": seconds[0],
-        "seconds_8bit": seconds[1],
-        **dict(zip(columns, psnr, strict=True)),
-    }
+class ForGpus(Session):
+    """The files for GPUs, on the CPU."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(gpu_file(path) or path)
+        self._denoiser = MeanDenoiser(path=gpu_file(WEIGHTS))
 
 
-def layout(rows: list[Row]) -> str:
-    """A line for each model."""
-    head = ["", "seconds", "in 8 bits", *(cell for spp in SPP for cell in (f"PSNR at {spp} spp", "in 8 bits"))]
-    columns = [column for column in rows[0] if column != "method"]
-    body = [[r["method"], *(f"{r[c]:.2f}" for c in columns)] for r in rows]
-    return results.markdown(head, body)
-
-
-def measure(views: list[scenes.Scene], models: list[str]) -> Iterator[Row]:
-    """A row for each model."""
+def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Iterator[Row]:
+    """A row for each model and number of spp."""
     layers = frame(SIZE, SIZE)
     hr = Render.from_arrays("hr", **layers)
     for name in models:
         path = find_model(0, name)
-        sessions = [InTorch(path), Session(path)]
+        sessions = [InTorch(path), Session(path), ForGpus(path)]
         scale = sessions[0].contract.scale
         lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
-        seconds = medians([partial(fuse, lr, hr, session) for session in sessions])
-        ways = [lambda lr, hr, session=session: fuse(lr, hr, session).rgb for session in sessions]
-        yield row(name, seconds, accuracy(views, scale, ways))
+        seconds: Row = {}
+        if timed:
+            took = medians([partial(fuse, lr, hr, session) for session in sessions[:2]])
+            seconds = {f"seconds_{way}": value for way, value in zip(WAYS, took, strict=False)}
+        for spp, found in accuracy(views, scale, sessions):
+            yield {"method": name, "spp": spp} | {f"psnr_{w}": v for w, v in zip(WAYS, found, strict=True)} | seconds
+
+
+def layout(rows: list[Row]) -> str:
+    """A line for each model and number of spp."""
+    columns = list(rows[0])
+    body = [[f"{r[c]:.3f}" if isinstance(r[c], float) else str(r[c]) for c in columns] for r in rows]
+    return results.markdown(columns, body)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("views", type=Path)
+    parser.add_argument("scenes", type=Path, metavar="RENDERS_OR_VIEWS")
     parser.add_argument("--models", nargs="+", default=[f"joint-x{scale}" for scale in SCALES])
+    parser.add_argument("--time", action="store_true", help="also measure times")
     results.add_option(parser)
     args = parser.parse_args()
-    views = [scenes.of_view(view) for view in Folder(args.views).split("validation")[::3]]
-    rows = list(measure(views, args.models))
+    if any(args.scenes.glob("*/ref.exr")):
+        views = [scene for scene in scenes.load(args.scenes) if scene.name not in scenes.NOISY_REFERENCE]
+    else:
+        views = [scenes.of_view(view) for view in Folder(args.scenes).split("validation")[::3]]
+    rows = list(measure(views, args.models, timed=args.time))
     print(layout(rows))
     if args.table:
         results.write(args.table, rows)

@@ -49,7 +49,7 @@ def log_decode(encoded: Tensor) -> Tensor:
 
 def log_to_pu(encoded: Tensor) -> Tensor:
     """Log-encoded radiance to PU-encoded radiance in [0, 1], as :func:`oiio_msspl.model.pu_curve.pu_encode`."""
-    radiance = log_decode(encoded.float()).clamp(0, MAX_RADIANCE)
+    radiance = log_decode(encoded.float()).clamp(0.0, MAX_RADIANCE)
     low, middle = BOUNDS
     power = FACTOR * radiance.clamp_min(low) ** EXPONENT + OFFSET
     curve = torch.where(radiance <= middle, power, LOG_FACTOR * torch.log(radiance + LOG_SHIFT) + LOG_OFFSET)

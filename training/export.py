@@ -97,14 +97,14 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     scale, alignment = contract.scale, contract.alignment
     inputs = example(network, scale, 4 * alignment, 6 * alignment)
     aten = torch.ops.aten
-    traced: nn.Module
+    module: nn.Module
     if isinstance(network, MultiResolutionFusion):
-        traced, outputs = _with_onnx_channel_order(network), ["fused"]
+        module, outputs = _with_onnx_channel_order(network), ["fused"]
         translations = {aten.pixel_unshuffle.default: _space_to_depth}
     else:
-        traced, outputs = network, ["fused", "log_error"]
+        module, outputs = network, ["fused", "log_error"]
         translations = {aten.pixel_unshuffle.default: _unshuffle, aten.pixel_shuffle.default: _shuffle}
-    model = _traced(traced, inputs, ["lrhs", "hrls"], outputs, alignment, translations)
+    model = traced(module, inputs, ["lrhs", "hrls"], outputs, alignment, translations)
     if half:
         _store_as_half(model.graph)
     model.ir_version = IR_VERSION
@@ -113,7 +113,7 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     return model
 
 
-def _traced(
+def traced(
     module: nn.Module,
     inputs: tuple[Any, ...],
     names: list[str],
@@ -158,7 +158,7 @@ def joint_to_onnx(
     sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
     inputs = (lrhs, hrls, hrls[:, :3], [torch.rand(1, *size) for size in sizes])
     names = ["lrhs", "hrls", "denoised", *(f"logits{level}" for level in levels)]
-    mixing = _traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
+    mixing = traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
     model = joint.to_onnx(network, scale, pairs, mixing)
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return model

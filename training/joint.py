@@ -139,7 +139,8 @@ class JointFusion(nn.Module):
             features[name] = F.relu(self.convs[name](values))
             return features[name]
 
-        colour = run_unet_on_tensors(BASE, [full, half], conv)
+        inputs = [image.to(next(self.convs.parameters()).dtype) for image in (full, half)]
+        colour = run_unet_on_tensors(BASE, inputs, conv)
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))

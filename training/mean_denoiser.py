@@ -53,9 +53,11 @@ class MeanDenoiser(nn.Module):
         Returns:
             The denoised mean (N, 3, h, w), log-encoded.
         """
-        inputs = torch.cat([log_to_pu(mean), albedo.clamp(0, 1), 0.5 * normal + 0.5, noise], dim=1)
+        inputs = torch.cat([log_to_pu(mean), albedo.clamp(0.0, 1.0), 0.5 * normal + 0.5, noise], dim=1)
+        inputs = inputs.to(next(self.convs.parameters()).dtype)
         height, width = mean.shape[2:]
-        inputs = F.pad(inputs, (0, -width % ALIGNMENT, 0, -height % ALIGNMENT), mode="replicate")
+        if height % ALIGNMENT or width % ALIGNMENT:
+            inputs = F.pad(inputs, (0, -width % ALIGNMENT, 0, -height % ALIGNMENT), mode="replicate")
 
         def conv(name: str, values: Tensor) -> Tensor:
             return F.relu(self.convs[name](values))

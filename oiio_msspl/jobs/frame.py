@@ -81,7 +81,7 @@ def fuse_files(
         write: layout, compression, pixel type and layers of the result.
         model: a shipped model, a family of models (``paper``), or an ONNX file. None or ``auto`` chooses one, see
             :func:`oiio_msspl.model.catalogue.find_model`.
-        device: a key of :data:`oiio_msspl.model.session.PROVIDERS`, such as ``cpu`` or ``cuda``.
+        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
         max_memory: bytes that the process should stay below. The result does not depend on it.
         preview_path: PNG to write, or None.

@@ -21,7 +21,7 @@ from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
 from oiio_msspl.jobs.shot_checks import check_no_input, model_of_shot
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES, Contract
-from oiio_msspl.model.session import PROVIDERS
+from oiio_msspl.model.devices import PROVIDERS
 
 #: Seconds between SIGTERM and SIGKILL, in which msspl-fuse finishes the frame that it is writing.
 GRACE = 120
@@ -80,7 +80,7 @@ def make_job(
         model: as in :func:`oiio_msspl.fuse_files`. None and ``auto`` are a family that suits the noise of the first
             pair; the job names it, because all frames of a shot need the same one.
         map_file: TOML file with the user's mapping.
-        device: a key of :data:`oiio_msspl.model.session.PROVIDERS`. It need not be usable on this machine.
+        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`. It need not be usable on this machine.
         view: None, or the OpenColorIO view of the previews.
         options: more arguments of ``msspl-fuse``, for all frames. They are not checked.
         chunk: frames per task.

@@ -24,6 +24,8 @@ class FrameReport:
     model: str
     provider: str
     """The ONNX Runtime execution provider that ran the model."""
+    convolutions: dict[str, int]
+    """Number of the model's convolutions on each execution provider; empty if ONNX Runtime does not say."""
     output: Path
     preview: Path | None
     """The PNG beside the EXR; None if none was written."""
@@ -74,6 +76,7 @@ class FrameReport:
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
             "provider": self.provider,
+            "convolutions": self.convolutions,
             "aovs": self.aovs(),
             "lrhs_aovs": self.found_lrhs_aovs(),
             "passes": self.passes,
@@ -98,6 +101,7 @@ def report_on(
         scale=fused.alignment.scale,
         model=session.contract.name,
         provider=session.provider,
+        convolutions=session.convolutions,
         output=output,
         preview=preview_path,
         repaired=fused.repaired,

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The low-resolution denoiser of the `joint` models: a network with 8-bit convolutions, run by ONNX Runtime.
+"""The low-resolution denoiser of the `joint` models, run by ONNX Runtime.
 
-Colours have a range of 2^30, which 8 bits cannot hold. So the PU-encoded range is cut into equal slices, and each slice
-has a channel that says how much of it is filled, from 0 to 255. The sum over the slices is the value.
+The file for GPUs reads and returns float32 images, the file for CPUs 8-bit codes. Colours have a range of 2^30, which
+8 bits cannot hold. So the PU-encoded range is cut into equal slices, and each slice has a channel that says how much of
+it is filled, from 0 to 255. The sum over the slices is the value.
 """
 
 from __future__ import annotations
@@ -15,13 +16,14 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LRHS_FEATURES
 from oiio_msspl.arrays import Array
+from oiio_msspl.model.devices import file_for, providers
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.pu_curve import largest_log_encoded, pu_decode, pu_encode_log
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
-from oiio_msspl.model.runtime import load_network
+from oiio_msspl.model.runtime import convolutions, load_network
 from oiio_msspl.parallel import for_row_blocks
 
-#: The network.
+#: The network's file for CPUs.
 WEIGHTS = Path(__file__).parent / "weights" / "denoisers" / "mean_denoiser.onnx"
 #: Height and width of its input are multiples of this.
 ALIGNMENT = 16
@@ -45,10 +47,15 @@ class MeanDenoiser:
 
     Args:
         threads: CPU threads; 0 for one a core.
+        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
+        path: the network's file; None for the one that suits the device.
     """
 
-    def __init__(self, threads: int = 0) -> None:
-        self._session = load_network(WEIGHTS, threads)
+    def __init__(self, threads: int = 0, device: str = "cpu", path: Path | None = None) -> None:
+        self._session = load_network(path or file_for(WEIGHTS, device), threads, providers(device))
+        self._reads_codes = [each.name for each in self._session.get_inputs()] == ["layers"]
+        self.convolutions = convolutions(self._session)
+        """See :func:`oiio_msspl.model.runtime.convolutions`."""
 
     def __call__(
         self, lrhs: Array, hrls: Array, lrhs_aovs: Images = NO_IMAGES, settings: MeanSettings | None = None
@@ -77,6 +84,11 @@ class MeanDenoiser:
         """The same in place: fill the last three channels of the LRHS, (h, w, 6)."""
         images = mean_of_renders(lrhs[..., :_LRHS_CHANNELS], denoiser_images(hrls), lrhs_aovs, settings)
         height, width = lrhs.shape[:2]
+        if not self._reads_codes:
+            feed = {name: _planes(image) for name, image in images.items()}
+            result = self._session.run(["denoised"], feed)[0][0, :, :height, :width]
+            lrhs[..., _LRHS_CHANNELS:] = result.transpose(1, 2, 0)
+            return
         codes = self._session.run(["codes"], {"layers": quantise(**images)[None]})[0][0, :height, :width]
         table, denoised = log_encoded_of_code(OUTPUT_SLICES), lrhs[..., _LRHS_CHANNELS:]
 
@@ -85,6 +97,12 @@ class MeanDenoiser:
             denoised[rows] = np.take(table, codes[rows], mode="clip")
 
         for_row_blocks(dequantise, height, 3 * width)
+
+
+def _planes(image: Array) -> Array:
+    """(h, w, C) as (1, C, H, W). Sides grow to multiples of ``ALIGNMENT``; the edge pixels are repeated."""
+    margins = [(0, -side % ALIGNMENT) for side in image.shape[:2]]
+    return np.ascontiguousarray(np.pad(image, [*margins, (0, 0)], mode="edge").transpose(2, 0, 1)[None])
 
 
 def quantise(colour: Array, albedo: Array, normal: Array, noise: Array) -> Codes:

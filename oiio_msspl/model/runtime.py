@@ -3,6 +3,10 @@
 
 from __future__ import annotations
 
+import collections
+import contextlib
+import io
+import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -12,7 +16,11 @@ from oiio_msspl.errors import InputError
 if TYPE_CHECKING:
     import onnxruntime
 
+log = logging.getLogger(__name__)
+
 CPU = "CPUExecutionProvider"
+#: An execution provider and its settings.
+Provider = tuple[str, dict[str, str]]
 
 
 def available_providers() -> list[str]:
@@ -30,14 +38,14 @@ def runtime_version() -> str:
 
 
 def load_network(
-    path: str | Path, threads: int = 0, providers: Sequence[str] = (CPU,), *, optimise: bool = True
+    path: str | Path, threads: int = 0, providers: Sequence[Provider] = ((CPU, {}),), *, optimise: bool = True
 ) -> onnxruntime.InferenceSession:
     """Load a network.
 
     Args:
         path: an ONNX file.
         threads: CPU threads; 0 for one a core.
-        providers: execution providers; each node goes to the first one that supports it.
+        providers: each operator goes to the first one that supports it.
         optimise: transform the graph for speed. Loading is faster without it, for a network that does not run.
 
     Raises:
@@ -45,6 +53,8 @@ def load_network(
     """
     import onnxruntime
 
+    if any("CUDA" in name for name, _ in providers):
+        _load_cuda()
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
@@ -56,9 +66,32 @@ def load_network(
     # Processors without VNNI add two products of 8 bits in 16 bits, which overflows. This lets them use other, slower
     # instructions that do not; other processors ignore it.
     options.add_session_config_entry("session.x64quantprecision", "1")
+    options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")  # for convolutions()
     if not optimise:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     try:
-        return onnxruntime.InferenceSession(str(path), options, providers=list(providers))
+        # With its fallback, onnxruntime would go on without a provider that fails
+        return onnxruntime.InferenceSession(str(path), options, providers=list(providers), enable_fallback=False)
     except Exception as error:
         raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
+
+
+def _load_cuda() -> None:
+    """Load the CUDA libraries that pip installs, which are in no folder that the system searches."""
+    import onnxruntime
+
+    if hasattr(onnxruntime, "preload_dlls"):  # since 1.21
+        # It prints what it does not find; the libraries may be elsewhere
+        with contextlib.redirect_stdout(io.StringIO()) as printed:
+            onnxruntime.preload_dlls()
+        log.debug("preload_dlls: %s", printed.getvalue())
+
+
+def convolutions(network: onnxruntime.InferenceSession) -> dict[str, int]:
+    """Number of convolutions on each execution provider; empty for an onnxruntime before 1.24, which does not say."""
+    if not hasattr(network, "get_provider_graph_assignment_info"):
+        return {}
+    counts: collections.Counter[str] = collections.Counter()
+    for part in network.get_provider_graph_assignment_info():
+        counts[part.ep_name] += sum("Conv" in node.op_type for node in part.get_nodes())
+    return {provider: count for provider, count in counts.items() if count}

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import collections
 import logging
 import time
 from pathlib import Path
@@ -13,58 +14,45 @@ import numpy as np
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.model.contract import NO_DENOISER, Contract
+from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, useful_lrhs_aovs
-from oiio_msspl.model.runtime import CPU, available_providers, load_network, runtime_version
+from oiio_msspl.model.runtime import CPU, convolutions, load_network
 
 log = logging.getLogger(__name__)
 
-#: ``--device`` name -> onnxruntime execution provider.
-PROVIDERS = {
-    "cpu": CPU,
-    "cuda": "CUDAExecutionProvider",
-    "tensorrt": "TensorrtExecutionProvider",
-    "openvino": "OpenVINOExecutionProvider",
-    "coreml": "CoreMLExecutionProvider",
-    "directml": "DmlExecutionProvider",
-}
 
-
-def usable_devices() -> list[str]:
-    """Keys of ``PROVIDERS`` that the installed onnxruntime was built for."""
-    available = available_providers()
-    return [device for device, provider in PROVIDERS.items() if provider in available]
-
-
-def make_denoiser(mode: str, threads: int = 0) -> MeanDenoiser | None:
+def make_denoiser(mode: str, threads: int = 0, device: str = "cpu") -> MeanDenoiser | None:
     """The denoiser that runs before a model, for its contract's ``denoiser``."""
-    return None if mode == NO_DENOISER else MeanDenoiser(threads)
+    return None if mode == NO_DENOISER else MeanDenoiser(threads, device)
 
 
 class Session:
     """A loaded model on a device, with its contract.
 
     Args:
-        path: an ONNX file with a contract.
-        device: a key of ``PROVIDERS``.
+        path: an ONNX file with a contract. A GPU runs the file of the same name in the folder ``gpu`` beside it, if
+            there is one.
+        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
 
     Raises:
-        InputError: no model, no contract, or a device that this onnxruntime was not built for.
+        InputError: no model; no contract; a device that this onnxruntime was not built for or that cannot start; or a
+            model whose convolutions would stay on the CPU though the device has operators for them.
     """
 
     def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
-        if device not in PROVIDERS:
-            raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
-        if device not in usable_devices():
+        require_device(device)
+        file = file_for(Path(path), device)
+        self._session = load_network(file, threads, providers(device))
+        self.provider = self._session.get_providers()[0]
+        if self.provider != PROVIDERS[device]:
             raise InputError(
-                f"--device {device}: the installed onnxruntime {runtime_version()} has no {PROVIDERS[device]}; "
-                f"usable here: {', '.join(usable_devices())}"
+                f"--device {device} could not start: {PROVIDERS[device]} found no such device, or not the libraries "
+                "that it needs, which the lines above name; use --device cpu meanwhile"
             )
-        providers = list(dict.fromkeys([PROVIDERS[device], CPU]))
-        self._session = load_network(path, threads, providers)
         self.contract = Contract.of_network(self._session, path)
-        self._denoiser = make_denoiser(self.contract.denoiser, threads)
+        self._denoiser = make_denoiser(self.contract.denoiser, threads, device)
         self._outputs = [output.name for output in self._session.get_outputs()]
         inputs = sorted(each.name for each in self._session.get_inputs())
         if inputs != ["hrls", "lrhs"] or "fused" not in self._outputs:
@@ -76,10 +64,20 @@ class Session:
         self.threads = threads
         self.seconds = 0.0
         """Time spent in :meth:`run` so far, including the denoiser."""
-        self.provider = self._session.get_providers()[0]
-        if self.provider != PROVIDERS[device]:
-            log.warning("%s could not start on this machine; using %s", PROVIDERS[device], self.provider)
-        log.info("model %s on %s", self.contract.name, self.provider)
+        counts = collections.Counter(convolutions(self._session))
+        if self._denoiser is not None:
+            counts.update(self._denoiser.convolutions)
+        self.convolutions = dict(counts)
+        """Number of convolutions on each execution provider, see :func:`oiio_msspl.model.runtime.convolutions`."""
+        if device != "cpu" and counts[CPU]:
+            message = (
+                f"{file}: {counts[CPU]} of {counts.total()} convolutions stay on the CPU; "
+                "use --device cpu, or a --model with a file for GPUs"
+            )
+            if device in COMPLETE:
+                raise InputError(f"--device {device}: {message}")
+            log.warning(message)
+        log.info("model %s (%s), convolutions: %s", self.contract.name, file, self.convolutions or "unknown")
 
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""
@@ -128,7 +126,8 @@ class Session:
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
         }
         try:
-            results = dict(zip(self._outputs, self._session.run(self._outputs, feed), strict=True))
+            wanted = ["fused", "log_error"] if error else ["fused"]
+            results = dict(zip(wanted, self._session.run(wanted, feed), strict=True))
         except Exception as cause:
             raise MssplError(
                 f"{self.contract.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "

@@ -8,7 +8,8 @@ import pytest
 from oiio_msspl.errors import InputError
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
-from oiio_msspl.model.session import PROVIDERS, Session, usable_devices
+from oiio_msspl.model.devices import PROVIDERS, usable_devices
+from oiio_msspl.model.session import Session
 
 
 def test_a_model_ships_for_every_scale():

@@ -5,7 +5,7 @@ import pytest
 
 from oiio_msspl.aovs.features import FEATURES
 from oiio_msspl.model.catalogue import shipped_models
-from oiio_msspl.model.session import PROVIDERS
+from oiio_msspl.model.devices import PROVIDERS
 from tests.nuke_gizmo.conftest import GIZMO
 from tests.nuke_gizmo.gizmo_file import read_script, tcl_interpreters
 

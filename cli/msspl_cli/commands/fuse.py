@@ -307,6 +307,9 @@ def _print(report: FrameReport, seconds: float) -> None:
             console.say(f"{text}: {', '.join(f'{count} in {name}' for name, count in counts.items())}")
     provider = report.provider.removesuffix("ExecutionProvider")
     where = "on the CPU" if provider == "CPU" else f"on {provider}"
+    on_cpu = report.convolutions.get("CPUExecutionProvider", 0)
+    if provider != "CPU" and on_cpu:
+        where += f", {on_cpu} of {sum(report.convolutions.values())} convolutions on the CPU,"
     tiles = f" in {report.tiles} tiles" if report.tiles > 1 else ""
     steps = {"read": "loading", "fuse": "fusing", "write": "writing"}
     times = ", ".join(f"{report.seconds[key]:.1f} s {step}" for key, step in steps.items())

@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Devices: the execution provider of each, its settings, and the file of a network that it runs.
+
+A network has a file for CPUs and may have one for GPUs. Convolutions in the first compute in 8 bits, for which GPUs
+have no operators, and in half floats in the second. The rest of both is float32.
+"""
+
+from __future__ import annotations
+
+import os
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from oiio_msspl.errors import InputError
+from oiio_msspl.model.runtime import CPU, Provider, available_providers, runtime_version
+
+#: ``--device`` name -> onnxruntime execution provider.
+PROVIDERS = {
+    "cpu": CPU,
+    "cuda": "CUDAExecutionProvider",
+    "tensorrt": "TensorrtExecutionProvider",
+    "openvino": "OpenVINOExecutionProvider",
+    "coreml": "CoreMLExecutionProvider",
+    "directml": "DmlExecutionProvider",
+}
+#: The package with the execution provider of a device.
+PACKAGES = {
+    "cuda": "onnxruntime-gpu",
+    "tensorrt": "onnxruntime-gpu",
+    "openvino": "onnxruntime-openvino",
+    "coreml": "onnxruntime",
+    "directml": "onnxruntime-directml",
+}
+#: Devices that have an operator for every convolution in half floats. On them, one on the CPU is an error.
+COMPLETE = ("cuda", "tensorrt")
+#: Folder of the files for GPUs, beside the files for CPUs. A file has the same name in both.
+GPU_FOLDER = "gpu"
+
+
+def usable_devices() -> list[str]:
+    """Keys of ``PROVIDERS`` that the installed onnxruntime was built for."""
+    available = available_providers()
+    return [device for device, provider in PROVIDERS.items() if provider in available]
+
+
+def require_device(device: str) -> None:
+    """Raise InputError if there is no such device, or the installed onnxruntime was not built for it."""
+    if device not in PROVIDERS:
+        raise InputError(f"--device {device!r}: use one of {', '.join(PROVIDERS)}")
+    usable = usable_devices()
+    if device in usable:
+        return
+    package = PACKAGES[device]
+    if package != "onnxruntime" and _is_installed(package) and _is_installed("onnxruntime"):
+        raise InputError(
+            f"--device {device}: the package onnxruntime has overwritten {package}; repair it with "
+            f"'pip uninstall --yes onnxruntime' and 'pip install --force-reinstall --no-deps {package}'"
+        )
+    raise InputError(
+        f"--device {device}: the installed onnxruntime {runtime_version()} has no {PROVIDERS[device]}; "
+        f"usable here: {', '.join(usable)}; to add {device}, install {package} in its place"
+    )
+
+
+def _is_installed(package: str) -> bool:
+    try:
+        version(package)
+    except PackageNotFoundError:
+        return False
+    return True
+
+
+def providers(device: str) -> list[Provider]:
+    """The execution providers of a device with their settings. Each operator goes to the first that supports it."""
+    first: dict[str, list[Provider]] = {
+        "cpu": [],
+        "tensorrt": [
+            (
+                PROVIDERS["tensorrt"],
+                # Building an engine takes minutes, so the next run finds it in a file
+                {
+                    "trt_engine_cache_enable": "1",
+                    "trt_engine_cache_path": str(_cache_folder("tensorrt")),
+                    "trt_timing_cache_enable": "1",
+                },
+            ),
+            (PROVIDERS["cuda"], {}),
+        ],
+        # Without these, OpenVINO takes the CPU, and GPUs compute the log curve in half floats, which overflow
+        "openvino": [(PROVIDERS["openvino"], {"device_type": "AUTO:GPU,CPU", "precision": "ACCURACY"})],
+        # The older format, NeuralNetwork, has fewer operators
+        "coreml": [(PROVIDERS["coreml"], {"ModelFormat": "MLProgram"})],
+    }
+    return [*first.get(device, [(PROVIDERS[device], {})]), (CPU, {})]
+
+
+def _cache_folder(name: str) -> Path:
+    """A folder for files that can be made again."""
+    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+    folder = Path(base, "oiio_msspl", name)
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
+
+
+def gpu_file(path: Path) -> Path | None:
+    """The file for GPUs of a network, given its file for CPUs; None if it has none."""
+    file = path.parent / GPU_FOLDER / path.name
+    return file if file.is_file() else None
+
+
+def file_for(path: Path, device: str) -> Path:
+    """The file of a network that a device runs, given its file for CPUs."""
+    return path if device == "cpu" else gpu_file(path) or path

@@ -1,0 +1,198 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which file and which execution providers a device gets, and what is said if it cannot run the model."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oiio_msspl import Session, find_model
+from oiio_msspl.errors import InputError
+from oiio_msspl.model import devices, runtime, session
+from oiio_msspl.model.catalogue import WEIGHTS
+from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.devices import file_for, gpu_file, providers, require_device
+from oiio_msspl.model.mean_denoiser import WEIGHTS as DENOISER
+from oiio_msspl.model.mean_denoiser import MeanDenoiser
+from tests.conftest import SHARED, needs_shared
+
+CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
+#: Files for GPUs, relative to the folder of the weights.
+GPU_FILES = [*(f"gpu/joint-x{scale}.onnx" for scale in SCALES), "denoisers/gpu/mean_denoiser.onnx"]
+
+
+def test_a_gpu_gets_the_file_that_was_made_for_it(tmp_path):
+    for name in ("a.onnx", "b.onnx", "gpu/a.onnx"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    a, b = tmp_path / "a.onnx", tmp_path / "b.onnx"
+    assert file_for(a, "cpu") == a
+    assert file_for(a, "cuda") == file_for(a, "coreml") == tmp_path / "gpu" / "a.onnx"
+    assert file_for(b, "cuda") == b and gpu_file(b) is None
+    assert [gpu_file(find_model(scale)) for scale in SCALES] == [WEIGHTS / f"gpu/joint-x{s}.onnx" for s in SCALES]
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_a_frame_has_the_same_tiles_on_a_gpu(scale):
+    """Everything but the provenance is the same in the contracts of both files."""
+    cpu, gpu = (Contract.of_file(path(find_model(scale))).__dict__ for path in (Path, gpu_file))
+    assert "half floats" in gpu["provenance"]["precision"]
+    assert cpu["provenance"].items() <= gpu["provenance"].items()
+    assert cpu | {"provenance": None} == gpu | {"provenance": None}
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_the_files_for_gpus_compute_the_same(scale):
+    """To less than the noise of the pair takes: the file for CPUs has activations of 8 bits."""
+    rng = np.random.default_rng(0)
+    smooth = np.linspace(0.1, 0.9, 64)[:, None, None] * np.linspace(0.2, 1, 96)[None, :, None]
+    hrls = np.zeros((64 * 2, 96 * 2, 9), np.float32)
+    hrls[..., :3] = smooth.repeat(2, 0).repeat(2, 1) + 0.1 * rng.random((128, 192, 3))
+    hrls[..., 3:6] = 0.5
+    lrhs = hrls[::scale, ::scale, :3] + np.float32(0.02) * rng.random((128 // scale, 192 // scale, 3), np.float32)
+    on_cpu, on_gpu = Session(find_model(scale)), Session(gpu_file(find_model(scale)))
+    on_gpu._denoiser = MeanDenoiser(path=gpu_file(DENOISER))
+    (one, error), (other, other_error) = (s.run(lrhs, hrls, error=True) for s in (on_cpu, on_gpu))
+    assert np.abs(one - other).mean() < 0.1 * np.abs(one - hrls[..., :3]).mean()
+    assert np.abs(np.log(error / other_error)).mean() < 0.2
+
+
+def test_the_denoiser_for_gpus_takes_any_size():
+    """It repeats the edge pixels, so a part of an even image gives the same as the whole."""
+    denoiser = MeanDenoiser(1, path=gpu_file(DENOISER))
+    part, whole = (
+        denoiser(np.full((h, w, 3), 0.5, np.float32), np.full((2 * h, 2 * w, 9), 0.5, np.float32))[0]
+        for h, w in ((21, 35), (32, 48))
+    )
+    assert part.shape == (21, 35, 6)
+    np.testing.assert_allclose(part, whole[:21, :35], atol=1e-5)
+    assert np.abs(part[..., 3:] - 0.5).max() < 0.05
+
+
+def test_onnxruntime_that_has_overwritten_the_package_for_gpus_is_named(monkeypatch):
+    monkeypatch.setattr(devices, "usable_devices", lambda: ["cpu"])
+    monkeypatch.setattr(devices, "_is_installed", lambda package: True)
+    with pytest.raises(InputError, match="onnxruntime has overwritten onnxruntime-gpu; repair it with 'pip uninstall"):
+        require_device("cuda")
+    monkeypatch.setattr(devices, "_is_installed", lambda package: package == "onnxruntime")
+    with pytest.raises(
+        InputError, match="has no CUDAExecutionProvider; usable here: cpu; to add cuda, install onnxruntime-gpu"
+    ):
+        require_device("cuda")
+
+
+def test_settings_of_the_providers(monkeypatch, tmp_path):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    (tensorrt, settings), (cuda, _), (cpu, _) = providers("tensorrt")
+    assert (tensorrt, cuda, cpu) == ("TensorrtExecutionProvider", CUDA, CPU)
+    assert Path(settings["trt_engine_cache_path"]).is_dir() and settings["trt_engine_cache_enable"] == "1"
+    assert providers("openvino")[0][1]["device_type"] == "AUTO:GPU,CPU"
+    assert providers("coreml")[0][1] == {"ModelFormat": "MLProgram"}
+    assert providers("cpu") == [(CPU, {})]
+
+
+@pytest.fixture
+def only_the_cpu(monkeypatch):
+    """Every device can be asked for, and the CPU computes."""
+    monkeypatch.setattr(session, "require_device", lambda device: None)
+    monkeypatch.setattr(session, "providers", lambda device: [(CPU, {})])
+
+
+def test_a_device_that_cannot_start_is_refused(only_the_cpu, bilinear_models):
+    with pytest.raises(InputError, match="--device cuda could not start"):
+        Session(bilinear_models[2], "cuda")
+
+
+def test_convolutions_that_stay_on_the_cpu_are_refused(only_the_cpu, monkeypatch, caplog):
+    """Where the device has operators for all of them; elsewhere a warning tells."""
+    for device in ("cuda", "openvino"):
+        monkeypatch.setitem(session.PROVIDERS, device, CPU)
+    with pytest.raises(InputError, match=r"cuda: .*joint-x2.onnx: 38 of 38 convolutions stay on the CPU; use"):
+        Session(find_model(2), "cuda")
+    Session(find_model(2), "openvino")
+    assert "38 of 38 convolutions stay on the CPU" in caplog.text
+
+
+def test_convolutions_are_counted():
+    assert Session(find_model(2)).convolutions == {CPU: 36}
+    assert Session(find_model(2, "paper")).convolutions.keys() == {CPU}
+
+
+def test_the_predicted_error_is_computed_when_it_is_wanted():
+    model, asked = Session(find_model(2, "joint")), []
+    run = model._session.run
+    model._session.run = lambda outputs, feed: asked.append(outputs) or run(outputs, feed)
+    lrhs, hrls = np.zeros((32, 48, 3), np.float32), np.zeros((64, 96, 9), np.float32)
+    assert model.run(lrhs, hrls)[1] is None
+    assert model.run(lrhs, hrls, error=True)[1].shape == (64, 96, 1)
+    assert asked == [["fused"], ["fused", "log_error"]]
+
+
+def test_cuda_libraries_that_pip_installed_are_loaded(monkeypatch, capsys, bilinear_models):
+    import onnxruntime
+
+    calls = []
+    monkeypatch.setattr(onnxruntime, "preload_dlls", lambda: calls.append(1) or print("Failed to load"), raising=False)
+    runtime.load_network(bilinear_models[2], 1)
+    assert not calls
+    runtime._load_cuda()
+    assert calls and not capsys.readouterr().out
+
+
+# The real CUDA provider on libraries that do nothing. It divides a graph as on a machine with a GPU.
+
+
+@pytest.fixture(scope="module")
+def python_with_cuda():
+    """A Python with onnxruntime-gpu and OpenImageIO: MSSPL_TEST_GPU, this one, or ~/venvs/gpu/bin/python."""
+    named = os.environ.get("MSSPL_TEST_GPU")
+    for python in [named] if named else [sys.executable, str(Path.home() / "venvs/gpu/bin/python")]:
+        check = "import OpenImageIO, onnxruntime as o; assert 'CUDAExecutionProvider' in o.get_available_providers()"
+        if Path(python).exists() and not subprocess.run([python, "-c", check], capture_output=True).returncode:
+            return python
+    pytest.skip("no Python with onnxruntime-gpu; name one in MSSPL_TEST_GPU")
+
+
+@pytest.fixture(scope="module")
+def stubs(python_with_cuda, tmp_path_factory):
+    """A folder with CUDA libraries that do nothing."""
+    if not shutil.which("gcc"):
+        pytest.skip("no gcc")
+    folder = tmp_path_factory.mktemp("stubs")
+    tool = SHARED / "tools/cuda-stub/placement.py"
+    subprocess.run([python_with_cuda, tool, "--build", folder], check=True, capture_output=True)
+    return folder
+
+
+@needs_shared("tools", "cuda-stub")
+@pytest.mark.parametrize("name", GPU_FILES)
+def test_every_operator_runs_on_the_gpu(name, python_with_cuda, stubs):
+    """And nothing is copied between GPU and CPU but the inputs and outputs."""
+    tool = SHARED / "tools/cuda-stub/placement.py"
+    command = [python_with_cuda, tool, "--stubs", stubs, WEIGHTS / name]
+    found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+    assert found["nodes"].keys() == {CUDA}
+    assert (found["on_cpu"], found["copies"]) == ({}, 0)
+
+
+@needs_shared("tools", "cuda-stub")
+def test_a_session_says_that_all_convolutions_run_on_the_gpu(python_with_cuda, stubs):
+    code = (
+        # It would load pip's CUDA library, which needs a GPU
+        "import json, onnxruntime; onnxruntime.preload_dlls = lambda: None\n"
+        "from oiio_msspl.model.session import Session; from oiio_msspl.model.catalogue import find_model\n"
+        "print(json.dumps([Session(find_model(s), 'cuda').convolutions for s in (2, 4, 8)]))"
+    )
+    environment = os.environ | {"LD_LIBRARY_PATH": str(stubs), "PYTHONPATH": str(WEIGHTS.parents[2])}
+    done = subprocess.run([python_with_cuda, "-c", code], capture_output=True, text=True, env=environment)
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert [counts.keys() for counts in found] == [{CUDA}] * 3
+    assert all(counts[CUDA] > 30 for counts in found)

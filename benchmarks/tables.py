@@ -19,6 +19,7 @@ import numpy as np
 
 from benchmarks import confidence, quality, results, runtime_files, versus
 from benchmarks import pair_checks as pair_checks_benchmark
+from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
 from benchmarks.flicker import report as flicker_report
 from benchmarks.results import MEAN, Row
@@ -310,6 +311,13 @@ def pair_checks() -> str:
     return pair_checks_benchmark.layout(results.read("pair_checks"))
 
 
+def passes() -> str:
+    """Fused passes, beside other ways to clean them."""
+    rows = results.read("passes")
+    scenes = ", ".join(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
+    return f"{passes_benchmark.layout(rows)}\nMeans over all layers of these scenes: {scenes}.\n"
+
+
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
@@ -325,6 +333,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         stability,
         pair_checks,
     ),
+    ROOT / "docs/design/passes.md": (passes,),
 }
 
 

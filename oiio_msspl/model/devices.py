@@ -53,8 +53,8 @@ def require_device(device: str) -> None:
     package = PACKAGES[device]
     if package != "onnxruntime" and _is_installed(package) and _is_installed("onnxruntime"):
         raise InputError(
-            f"--device {device}: the package onnxruntime has overwritten {package}; repair it with "
-            f"'pip uninstall --yes onnxruntime' and 'pip install --force-reinstall --no-deps {package}'"
+            f"--device {device}: the package onnxruntime has overwritten {package}; uninstall both with pip, then "
+            f"install {package} again"
         )
     raise InputError(
         f"--device {device}: the installed onnxruntime {runtime_version()} has no {PROVIDERS[device]}; "

@@ -79,7 +79,7 @@ def test_the_denoiser_for_gpus_takes_any_size():
 def test_onnxruntime_that_has_overwritten_the_package_for_gpus_is_named(monkeypatch):
     monkeypatch.setattr(devices, "usable_devices", lambda: ["cpu"])
     monkeypatch.setattr(devices, "_is_installed", lambda package: True)
-    with pytest.raises(InputError, match="onnxruntime has overwritten onnxruntime-gpu; repair it with 'pip uninstall"):
+    with pytest.raises(InputError, match="onnxruntime has overwritten onnxruntime-gpu; uninstall both"):
         require_device("cuda")
     monkeypatch.setattr(devices, "_is_installed", lambda package: package == "onnxruntime")
     with pytest.raises(

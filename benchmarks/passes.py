@@ -2,6 +2,7 @@
 """Accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m benchmarks.passes PASSES --table benchmarks/results/passes.csv
+    python -m benchmarks.passes PASSES --picture docs/images/passes.png
 
 PASSES is made by :mod:`benchmarks.render.passes`. The methods, all but the first two with the albedo and the normal:
 
@@ -38,6 +39,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array
 from oiio_msspl.colour import srgb
+from oiio_msspl.exr.preview import write_png
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.passes import fuse_passes
@@ -85,18 +87,35 @@ def methods(
     yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]))
 
 
+def regraded(layers: Array) -> Array:
+    """The beauty with the first layer switched off, and four times the light of the second one."""
+    grades = np.array([0, 4, *[1] * (len(layers) - 2)], np.float32)
+    return np.einsum("i,ihwc->hwc", grades, layers)
+
+
+def picture(folder: Path, output: Path, model: str) -> None:
+    """The light groups of a scene as rendered, fused and as they should be; below them the regraded beauty."""
+    lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in ("lr_x4_32spp", "hr_2spp", "ref"))
+    beauty = fuse(lr, hr, Session(find_model(4, model))).rgb
+    layers = hr.additive_sets[0]
+    made = dict(methods(lr, hr, beauty, layers))
+    columns = [made["HRLS"](), made["msspl"](), layers_of(reference, reference.additive_sets[0])]
+    columns = [column[:, :, 100:292] for column in columns]  # a PNG of noise is large
+    rows = [np.concatenate([srgb(column[i]) for column in columns], axis=1) for i in range(2)]
+    write_png(output, np.concatenate([*rows, np.concatenate([srgb(regraded(c)) for c in columns], axis=1)], axis=0))
+
+
 def scores(layers: Array, reference: Array) -> Row:
     """Means over the layers, and the regraded picture."""
-    grades = np.array([0, 4, *[1] * (len(layers) - 2)], np.float32)[:, None, None, None]
-    picture, truth = ((values * grades).sum(axis=0) for values in (layers, reference))
-    errors = np.mean((srgb(picture) - srgb(truth)) ** 2, axis=-1).ravel()
+    graded, truth = regraded(layers), regraded(reference)
+    errors = np.mean((srgb(graded) - srgb(truth)) ** 2, axis=-1).ravel()
     worst = np.sort(errors)[-len(errors) // 100 :].mean()
     pairs = list(zip(layers, reference, strict=True))
     return {
         "psnr": float(np.mean([psnr(a, b) for a, b in pairs])),
         "relmse": float(np.mean([relmse(a, b) for a, b in pairs])),
-        "regraded_psnr": psnr(picture, truth),
-        "regraded_relmse": relmse(picture, truth),
+        "regraded_psnr": psnr(graded, truth),
+        "regraded_relmse": relmse(graded, truth),
         "worst_psnr": float(-10 * np.log10(worst)),
     }
 
@@ -158,8 +177,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--model", default="joint")
+    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="write a picture instead")
+    parser.add_argument("--scene", default="lamp", help="of the picture")
     results.add_option(parser)
     args = parser.parse_args()
+    if args.picture:
+        picture(args.passes / args.scene, args.picture, args.model)
+        return
     rows: list[Row] = []
     for file in sorted(args.passes.glob("*/ref.exr")):
         for spp in SPP:

@@ -38,8 +38,8 @@ def test_installed_programs_are_on_the_path():
 #: Options that --help shows, and how many more --help-all shows.
 SHOWN = {
     "msspl_fuse": (
-        "--map --view-layer --model --device --max-memory --output --layout --layers --passes --error-layer --overwrite "
-        "--json --frames --skip-existing --help --help-all",
+        "--map --view-layer --model --device --max-memory --output --layout --layers --passes --error-layer "
+        "--overwrite --json --frames --skip-existing --help --help-all",
         17,
     ),
     "msspl_render": (

@@ -201,3 +201,14 @@ def test_one_object_suffices_to_notice_a_shift():
 def test_an_albedo_that_fits_by_chance_is_noticed():
     """Of two comparisons the better counts, so a foreign albedo may fit a little."""
     assert [w for w in warnings(2, albedo=scene(2, seed=72)[1]) if "the albedo's edges are not in the picture" in w]
+
+
+@pytest.mark.parametrize("foreign", ["albedo", "normal"])
+def test_an_aov_of_another_frame_is_noticed_under_noise(foreign):
+    """Hardly an edge is common to both renders. The layer that does belong to them shows that there are edges."""
+    colour, *right = scene(2)
+    layers, other = (dict(zip(("albedo", "normal"), v, strict=True)) for v in (right, scene(2, seed=60)[1:]))
+    low = Render.from_arrays("lr", rgb=noisy(downsample(colour, 2), 0.8, seed=100))
+    high = Render.from_arrays("hr", rgb=noisy(colour, 0.2, seed=200), **(layers | {foreign: other[foreign]}))
+    (warning,) = check_renders(low, high)
+    assert f"the {foreign}'s edges are not in the picture" in warning

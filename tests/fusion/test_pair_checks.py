@@ -203,12 +203,10 @@ def test_an_albedo_that_fits_by_chance_is_noticed():
     assert [w for w in warnings(2, albedo=scene(2, seed=72)[1]) if "the albedo's edges are not in the picture" in w]
 
 
-@pytest.mark.parametrize("foreign", ["albedo", "normal"])
-def test_an_aov_of_another_frame_is_noticed_under_noise(foreign):
-    """Hardly an edge is common to both renders. The layer that does belong to them shows that there are edges."""
-    colour, *right = scene(2)
-    layers, other = (dict(zip(("albedo", "normal"), v, strict=True)) for v in (right, scene(2, seed=60)[1:]))
+def test_an_albedo_of_another_frame_is_noticed_under_noise():
+    """Hardly an edge is common to both renders. The normals fit, so the albedo should fit, too."""
+    colour, _, normal = scene(2)
     low = Render.from_arrays("lr", rgb=noisy(downsample(colour, 2), 0.8, seed=100))
-    high = Render.from_arrays("hr", rgb=noisy(colour, 0.2, seed=200), **(layers | {foreign: other[foreign]}))
+    high = Render.from_arrays("hr", rgb=noisy(colour, 0.2, seed=200), albedo=scene(2, seed=60)[1], normal=normal)
     (warning,) = check_renders(low, high)
-    assert f"the {foreign}'s edges are not in the picture" in warning
+    assert "the albedo's edges are not in the picture" in warning

@@ -20,9 +20,9 @@ CONTROL = (4, 16)
 #: How many standard deviations above the control edges fit that belong together. The albedo is compared in two ways, of
 #: which the better counts, so chance reaches further.
 FITS = {ALBEDO: 3.5, NORMAL: 1.5}
-#: AOVs that fit each other this well are of one frame. Where one fits the picture this well, the picture has edges.
+#: AOVs that fit each other this well are of one frame. Where normals fit the picture this well, it shows surfaces.
 SAME_FRAME = 4.0
-#: Both renders show the same edges if these fit this well. Where neither they nor an AOV fit, no AOV can be judged.
+#: Both renders show the same edges if these fit this well. In a picture with fewer edges, normals can't be judged.
 VISIBLE = 3.0
 #: An AOV with edges at fewer pixels says nothing.
 MIN_EDGES = 200
@@ -60,9 +60,10 @@ def foreign_aovs(low: Array, high: Array, albedo: Array | None, normal_edges: Ar
     if ALBEDO in edges:
         # Steps have a direction, too: what has the brighter albedo is brighter. A light may turn that around.
         fits[ALBEDO] = max(fits[ALBEDO], abs(_fit_steps(_log_steps(surface, 0.05), steps)))
-    if visible < VISIBLE and max(fits.values()) < SAME_FRAME:
-        return []
     foreign = [name for name, fit in fits.items() if fit < FITS[name]]
+    # Where shapes are seen, so are colours. Even light shows colours without shapes.
+    if visible < VISIBLE and (foreign != [ALBEDO] or fits.get(NORMAL, 0) < SAME_FRAME):
+        return []
     if len(edges) == 2 and len(foreign) == 1 and _fit(edges[ALBEDO], edges[NORMAL]) > SAME_FRAME:
         return []  # one of the two fits the picture, and the other fits that one
     return foreign

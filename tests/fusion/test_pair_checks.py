@@ -201,3 +201,12 @@ def test_one_object_suffices_to_notice_a_shift():
 def test_an_albedo_that_fits_by_chance_is_noticed():
     """Of two comparisons the better counts, so a foreign albedo may fit a little."""
     assert [w for w in warnings(2, albedo=scene(2, seed=72)[1]) if "the albedo's edges are not in the picture" in w]
+
+
+def test_an_albedo_of_another_frame_is_noticed_under_noise():
+    """Hardly an edge is common to both renders. The normals fit, so the albedo should fit, too."""
+    colour, _, normal = scene(2)
+    low = Render.from_arrays("lr", rgb=noisy(downsample(colour, 2), 0.8, seed=100))
+    high = Render.from_arrays("hr", rgb=noisy(colour, 0.2, seed=200), albedo=scene(2, seed=60)[1], normal=normal)
+    (warning,) = check_renders(low, high)
+    assert "the albedo's edges are not in the picture" in warning

@@ -6,6 +6,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -151,10 +152,13 @@ def fuse_frame_passes(
     """
     if write.passes == ("none",):
         return None
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    written = [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
     cache_bytes = int((max_memory - fused.nbytes) * STRIPS_SHARE)
-    passes = fuse_passes(lr, hr, fused.rgb, fused.alignment, write.passes, max(0, cache_bytes))
+    source = replace(hr, additive_sets=written)
+    passes = fuse_passes(lr, source, fused.rgb, fused.alignment, write.passes, max(0, cache_bytes))
     if passes is None and write.passes:
-        known = ", ".join(f"'{each.name}'" for each in hr.additive_sets) or "none"
+        known = ", ".join(f"'{each.name}'" for each in written) or "none"
         raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
     return passes
 

@@ -79,6 +79,13 @@ def test_all_else_is_what_it_is_without_passes(tmp_path, bilinear_models):
     assert same_bits(raw["light_key.R"], read_bits(pair[1])[0][1]["light_key.R"])
 
 
+def test_layers_that_are_not_written_are_not_fused(tmp_path, bilinear_models):
+    pair = write_pair(tmp_path, lights())
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, layers=("albedo",))
+    assert report.passes == {}
+    assert "light_key.R" not in out
+
+
 @pytest.mark.parametrize("layout", ["nuke", "multilayer"])
 def test_every_layout_holds_the_same_layers(tmp_path, bilinear_models, layout):
     pair = write_pair(tmp_path, lights())

@@ -95,8 +95,10 @@ def read_lrhs(
 ) -> dict[str, Array]:
     """Read features of the LRHS over ``grid``, those that it has.
 
-    The LRHS is sampled where the HRLS pixels of each grid pixel are in the frame, on average. Those are the LRHS's own
-    pixels, unless an odd size was rounded or the HRLS ends inside an LRHS pixel. Then it is resampled.
+    Each grid pixel gets the LRHS pixel that is nearest to where its HRLS pixels are in the frame, on average. Where an
+    odd size was rounded, that is off by half an LRHS pixel at most. To interpolate would be exact, but neighbouring
+    pixels would share their noise, and networks take such noise for texture. Behind the last whole LRHS pixel, where
+    the HRLS is mirrored, the LRHS is interpolated.
 
     Args:
         counts: repaired values are added here.
@@ -112,8 +114,12 @@ def read_lrhs(
 
 
 def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float) -> NDArray[np.float64]:
-    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is."""
-    return (hrls_pixels.reshape(-1, scale).mean(axis=1) + 0.5) / scale * stretch - 0.5
+    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is; a whole pixel where these
+    are not mirrored."""
+    groups = hrls_pixels.reshape(-1, scale)
+    positions = (groups.mean(axis=1) + 0.5) / scale * stretch - 0.5
+    in_place = (groups[:, 0] % scale == 0) & (groups[:, -1] - groups[:, 0] == scale - 1)
+    return np.where(in_place, np.rint(positions), positions)
 
 
 def read_features(

@@ -66,7 +66,16 @@ def test_beyond_odd_sizes_both_renders_show_the_same_place(first, lrhs):
     pair, _ = features_beyond(Render.from_arrays("lr", rgb=low), cropped, 32)
     places = box_downsample(pair.hrls["rgb"], scale)
     places[..., :2] = places[..., :2].clip(ramps[0][0], ramps[0][-1])  # the centres of the LRHS's first and last pixels
-    np.testing.assert_allclose(pair.lrhs["rgb"], places, atol=1e-4)
+    off = 1e-4 if lrhs == "of a larger frame" else frame / lrhs_side / 2 + 1e-4  # the nearest LRHS pixel
+    np.testing.assert_allclose(pair.lrhs["rgb"], places, atol=off)
+
+
+@pytest.mark.parametrize("lrhs_side", [60, 61])
+def test_pixels_of_a_rounded_lrhs_do_not_share_their_noise(lrhs_side):
+    """Networks take noise that neighbours share for texture, so it stayed in frames of 1921 pixels."""
+    noise = np.random.default_rng(0).random((lrhs_side, lrhs_side, 3), np.float32)
+    pair, _ = features_beyond(Render.from_arrays("lr", rgb=noise), Render.from_arrays("hr", rgb=picture(121, 121)), 16)
+    assert np.isin(pair.lrhs["rgb"][:60, :60], noise).all()
 
 
 @pytest.mark.parametrize("rows", [1080, 1081, 858, 2160, 230])

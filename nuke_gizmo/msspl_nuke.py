@@ -111,7 +111,7 @@ def _prepare(node: nuke.Node, first: int, last: int, as_range: bool) -> _Job:
         ranges = [ReadRange(read.name(), _file_at(read, first), _file_at(read, last)) for read in reads]
         numbers = file_numbers(ranges, out, first, last)
     settings = Settings(
-        **{knob: _text(node, knob) for knob in ("model", "device", "mapping", "layers", "options")},
+        **{knob: _text(node, knob) for knob in ("model", "device", "mapping", "layers", "passes", "options")},
         overwrite=bool(node["overwrite"].value()),
     )
     program = find_program(_path(node, "program"), os.environ)

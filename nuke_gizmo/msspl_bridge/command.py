@@ -34,6 +34,8 @@ class Settings:
     """One ``feature=layer`` per line, such as ``albedo=my_albedo``."""
     layers: str = ""
     """Layer patterns, separated by commas."""
+    passes: str = ""
+    """Patterns of the passes to fuse, separated by commas."""
     options: str = ""
     """Further options, quoted as in a shell."""
     overwrite: bool = True
@@ -65,8 +67,9 @@ def build_command(
         if not (feature.strip() and equals and layer.strip()):
             raise FuseError(f"mapping {line!r}: write one feature=layer per line, such as albedo=my_albedo")
         command += ["--map", f"{feature.strip()}={layer.strip()}"]
-    for pattern in filter(None, map(str.strip, settings.layers.split(","))):
-        command += ["--layers", pattern]
+    for option, patterns in (("--layers", settings.layers), ("--passes", settings.passes)):
+        for pattern in filter(None, map(str.strip, patterns.split(","))):
+            command += [option, pattern]
     if settings.overwrite:
         command.append("--overwrite")
     elif numbers is not None:

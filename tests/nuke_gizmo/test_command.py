@@ -19,13 +19,14 @@ def test_every_knob_reaches_the_command_line():
         device="cuda",
         mapping="\nalbedo = my albedo\ndiffuse=lighting+GI\n",
         layers="crypto*, depth",
+        passes="light groups",
         options="--hr-spp 4 --view-layer 'left eye'",
     )
     one = build_command("msspl-fuse", *files, settings)
     assert one[:5] == ["msspl-fuse", "/a/lr.1001.exr", "/a/hr.1001.exr", "-o", "/a/out.1001.exr"]
     assert " ".join(one[5:]) == (
         "--device cuda --layout nuke --no-preview --model paper-x4 --map albedo=my albedo --map diffuse=lighting+GI "
-        "--layers crypto* --layers depth --overwrite --hr-spp 4 --view-layer left eye"
+        "--layers crypto* --layers depth --passes light groups --overwrite --hr-spp 4 --view-layer left eye"
     )
     many = build_command("msspl-fuse", *files, Settings(overwrite=False), (1001, 1010))
     assert many[1:5] == ["/a/lr.%04d.exr", "/a/hr.%04d.exr", "-o", "/a/out.%04d.exr"]

@@ -34,7 +34,15 @@ def test_every_knob_has_its_kind_its_default_and_a_tooltip(nodes):
     kinds = {k.name: k.kind for k in gizmo.user_knobs if k.name}
     text, file, number, menu, tick, tab, button, lines = 1, 2, 3, 4, 6, 20, 22, 43
     assert kinds == {
-        **{"msspl": tab, "output": file, "model": text, "device": menu, "mapping": lines, "layers": text},
+        **{
+            "msspl": tab,
+            "output": file,
+            "model": text,
+            "device": menu,
+            "mapping": lines,
+            "layers": text,
+            "passes": text,
+        },
         **{"overwrite": tick, "fuse_frame": button, "first": number, "last": number, "fuse_range": button},
         **{"setup": tab, "program": file, "options": text},
     }

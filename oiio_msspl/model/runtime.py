@@ -88,7 +88,7 @@ def _load_cuda() -> None:
 
 
 def convolutions(network: onnxruntime.InferenceSession) -> dict[str, int]:
-    """Number of convolutions on each execution provider; empty for an onnxruntime before 1.24, which does not say."""
+    """Number of convolutions on each execution provider; empty if the onnxruntime is too old to say."""
     if not hasattr(network, "get_provider_graph_assignment_info"):
         return {}
     counts: collections.Counter[str] = collections.Counter()

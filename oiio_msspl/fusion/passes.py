@@ -39,6 +39,8 @@ RIDGE = 0.03
 FIREFLY = 8.0
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
+#: Larger values of fitted layers are clipped before they are scaled to the sum, which would overflow.
+BRIGHTEST = np.float32(1e30)
 
 
 @dataclass
@@ -157,7 +159,8 @@ class _Band:
         self._beauty = _planes(beauty)
         self._low_beauty = _planes(box_downsample(beauty, self._scale))
         low = np.stack([_planes(box_downsample(np.moveaxis(g, 0, -1), self._scale)) for g in self._guides])
-        self._fit = _Fit(low, self._radius)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._fit = _Fit(low, self._radius)
 
     def fuse(self, job: _Job, lr: MappedRender, hr: MappedRender, pixels: ReplacedChannels) -> None:
         """Fuse the layers of one set and store them."""
@@ -170,6 +173,11 @@ class _Band:
         flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *beauty.shape[1:])
 
         def fit(planes: slice) -> None:
+            # NumPy's settings for errors belong to the thread.
+            with np.errstate(over="ignore", invalid="ignore"):
+                fit_planes(planes)
+
+        def fit_planes(planes: slice) -> None:
             for i in range(planes.start, planes.stop):
                 coefficients = self._fit.coefficients(flat_noisy[i], i % 3)
                 *slopes, offset = (_upsample(plane, scale, core_rows) for plane in coefficients)
@@ -182,11 +190,13 @@ class _Band:
                 np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
 
         for_row_blocks(fit, len(flat_noisy), beauty[0].size)
-        colours = self._colours(job, hr, rows)
-        np.maximum(fitted, 0, out=fitted)
+        colours = self._colours(job, hr)
+        # The squares of light beyond 1e19 overflow, so there is no fit there.
+        fitted[:, ~np.isfinite(fitted).all(axis=0)] = 0
+        np.clip(fitted, 0, BRIGHTEST, out=fitted)
         # Where no layer is left, the beauty is divided as in the whole band.
         dark = fitted.sum(axis=0) == 0
-        fitted[:, dark] = noisy.sum(axis=(1, 2, 3))[:, None]
+        fitted[:, dark] = np.minimum(noisy, BRIGHTEST).mean(axis=(1, 2, 3))[:, None]
         for i, colour in colours.items():
             fitted[i] *= colour >= DARKEST_COLOUR
         _make_sum(fitted, beauty)
@@ -220,7 +230,7 @@ class _Band:
         total /= np.float32(len(renders))
         return total
 
-    def _colours(self, job: _Job, hr: MappedRender, rows: slice) -> dict[int, Array]:
+    def _colours(self, job: _Job, hr: MappedRender) -> dict[int, Array]:
         """The colour (3, h, w) that each product's light is multiplied by, by index of the layer."""
         colours: dict[int, Array] = {}
         by_channels: dict[object, Array] = {}

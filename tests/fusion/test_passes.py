@@ -139,6 +139,18 @@ def test_products_of_light_and_colour_sum_too(tmp_path, bilinear_models):
     assert not layer(out, "DiffDir")[~lit].any()
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_lamp_whose_square_overflows_stays_finite(tmp_path, bilinear_models):
+    clean = lights()
+    clean["light_spot"] = clean["light_spot"].copy()
+    clean["light_spot"][40:44, 72:76] = 1e25
+    pair = write_pair(tmp_path, clean)
+    _, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    total = layer(out, "light_key") + layer(out, "light_spot")
+    assert np.isfinite(total).all() and layer(out).max() > 1e20
+    np.testing.assert_allclose(total, layer(out), rtol=1e-5, atol=1e-6)
+
+
 @pytest.mark.parametrize(
     ("beauty", "message"),
     [

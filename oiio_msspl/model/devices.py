@@ -72,20 +72,16 @@ def _is_installed(package: str) -> bool:
 
 def providers(device: str) -> list[Provider]:
     """The execution providers of a device with their settings. Each operator goes to the first that supports it."""
+    if device == "tensorrt":
+        # Building an engine takes minutes, so the next run finds it in a file
+        settings = {
+            "trt_engine_cache_enable": "1",
+            "trt_engine_cache_path": str(_cache_folder("tensorrt")),
+            "trt_timing_cache_enable": "1",
+        }
+        return [(PROVIDERS[device], settings), (PROVIDERS["cuda"], {}), (CPU, {})]
     first: dict[str, list[Provider]] = {
         "cpu": [],
-        "tensorrt": [
-            (
-                PROVIDERS["tensorrt"],
-                # Building an engine takes minutes, so the next run finds it in a file
-                {
-                    "trt_engine_cache_enable": "1",
-                    "trt_engine_cache_path": str(_cache_folder("tensorrt")),
-                    "trt_timing_cache_enable": "1",
-                },
-            ),
-            (PROVIDERS["cuda"], {}),
-        ],
         # Without these, OpenVINO takes the CPU, and GPUs compute the log curve in half floats, which overflow
         "openvino": [(PROVIDERS["openvino"], {"device_type": "AUTO:GPU,CPU", "precision": "ACCURACY"})],
         # The older format, NeuralNetwork, has fewer operators

@@ -18,7 +18,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.model import devices, runtime, session
 from oiio_msspl.model.catalogue import WEIGHTS
 from oiio_msspl.model.contract import SCALES, Contract
-from oiio_msspl.model.devices import file_for, gpu_file, providers, require_device
+from oiio_msspl.model.devices import PROVIDERS, file_for, gpu_file, providers, require_device
 from oiio_msspl.model.mean_denoiser import WEIGHTS as DENOISER
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
 from tests.conftest import SHARED, needs_shared
@@ -196,3 +196,12 @@ def test_a_session_says_that_all_convolutions_run_on_the_gpu(python_with_cuda, s
     found = json.loads(done.stdout)
     assert [counts.keys() for counts in found] == [{CUDA}] * 3
     assert all(counts[CUDA] > 30 for counts in found)
+
+
+def test_only_tensorrt_makes_a_folder_for_its_engines(tmp_path, monkeypatch):
+    """A worker of a farm may have no home that it can write to."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    for device in set(PROVIDERS) - {"tensorrt"}:
+        providers(device)
+    assert not list(tmp_path.iterdir())
+    assert providers("tensorrt")[0][1]["trt_engine_cache_path"] == str(tmp_path / "oiio_msspl" / "tensorrt")

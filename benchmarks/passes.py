@@ -73,8 +73,8 @@ def methods(
         return np.stack([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy])
 
     def ours(low: MappedRender) -> Array:
-        fused = fuse_passes(low, replace(hr, additive_sets=[layers]), beauty, align(lr, hr))
-        assert fused is not None and not fused.refused
+        fused = fuse_passes(low, hr, beauty, align(lr, hr), [layers])
+        assert not fused.refused
         height = hr.data_window.height
         planes = [[fused.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
         return np.moveaxis(np.asarray(planes, np.float32), 1, -1)

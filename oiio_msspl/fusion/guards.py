@@ -87,7 +87,7 @@ def lights_above_ceiling(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> A
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         light, share = (reduce(np.add, _neighbours(values)) for values in (excess, clipped_share))
         small_light = ceiling + light / np.maximum(share, np.float32(1 / scale**2))
-        limit = np.maximum(_max_3x3(lrhs_rgb), small_light)
+        limit = np.maximum(max_3x3(lrhs_rgb), small_light)
         # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
         limit = np.minimum(limit, lrhs_rgb * np.float32(FIREFLY_FACTOR))
     agreed = _limit(hrls_rgb, _as_wide_as_hrls(limit, scale), scale)
@@ -97,12 +97,12 @@ def lights_above_ceiling(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> A
 
 def _brightness_limit(rgb: Array) -> Array:
     """The largest values that the other render may have, (h, w, 3): none where this render is black."""
-    brightest = _max_3x3(rgb)
+    brightest = max_3x3(rgb)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         return np.where(brightest > 0, brightest * np.float32(FIREFLY_FACTOR), np.float32(np.inf))
 
 
-def _max_3x3(values: Array) -> Array:
+def max_3x3(values: Array) -> Array:
     """The largest of the 3 x 3 pixels around each, (h, w, c)."""
     largest = values.copy()
     for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns

@@ -10,7 +10,7 @@ proportion to their light, so their sum is the beauty to the last bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -23,6 +23,7 @@ from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.guards import max_3x3
 from oiio_msspl.fusion.sums import check_sum, layer_keys, with_layers
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks
@@ -60,30 +61,22 @@ def fuse_passes(
     hr: MappedRender,
     rgb: Array,
     alignment: Alignment,
-    patterns: Sequence[str] = (),
+    sets: Sequence[AdditiveSet],
     cache_bytes: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> FusedPasses | None:
-    """Fuse the layers of the HRLS's additive sets.
+) -> FusedPasses:
+    """Fuse the layers of additive sets of the HRLS.
 
     Args:
         lr, hr: the pair. Layers that the LRHS lacks are fused from the HRLS alone.
         rgb: the fused beauty, (height, width, 3), over the HRLS's data window.
         alignment: of the pair.
-        patterns: names of sets or layers; a set that none of them matches is left out. None: all.
+        sets: of ``hr.additive_sets``. Those that do not sum to its beauty are refused.
         cache_bytes: memory for decoded rows that two bands need.
-        progress: called with (bands done, bands in all).
-
-    Returns:
-        None if the HRLS has no set of these names.
 
     Raises:
         InputError: pixels can't be decoded.
     """
-    wanted = [each for each in hr.additive_sets if not patterns or any(each.matches(p) for p in patterns)]
-    if not wanted:
-        return None
-    jobs, refused = _checked(lr, hr, wanted)
+    jobs, refused = _checked(lr, hr, sets)
     window = alignment.hr_data_window
     channels = [channel for job in jobs for layer in job.layers.layers for channel in layer.channels]
     pixels = ReplacedChannels(channels, window.width, window.height)
@@ -91,13 +84,11 @@ def fuse_passes(
     step = BAND_ROWS // alignment.scale
     tops = range(alignment.grid.y0, alignment.grid.y1, step) if jobs else []
     with hr.cache_strips(cache_bytes):
-        for done, top in enumerate(tops, start=1):
+        for top in tops:
             core = Window(alignment.grid.x0, top, alignment.grid.x1, min(top + step, alignment.grid.y1))
             band = _Band(hr, rgb, alignment, core)
             for job in jobs:
                 band.fuse(job, lr, hr, pixels)
-            if progress is not None:
-                progress(done, len(tops))
     return fused
 
 
@@ -185,7 +176,7 @@ class _Band:
                 for guide, slope in zip(guides[i % 3], slopes, strict=True):
                     flat_fitted[i] += guide * slope
                 # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
-                low, high = -_largest_around(-flat_noisy[i]), _largest_around(flat_noisy[i])
+                low, high = -max_3x3(-flat_noisy[i]), max_3x3(flat_noisy[i])
                 bounds = (_upsample(plane, scale, core_rows) for plane in (low, high))
                 np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
 
@@ -225,7 +216,7 @@ class _Band:
                 rest = np.maximum(_planes(pixels[RGB]) - layers.sum(axis=0), 0)
                 layers = np.concatenate([layers, rest[None]])
             light = layers.sum(axis=(0, 1))
-            allowed = FIREFLY * _largest_around(self._low_beauty.sum(axis=0))
+            allowed = FIREFLY * max_3x3(self._low_beauty.sum(axis=0))
             total += layers * np.minimum(1, allowed / np.maximum(light, 1e-20))
         total /= np.float32(len(renders))
         return total
@@ -330,13 +321,6 @@ def _mean_around(plane: Array, radius: int) -> Array:
         total /= count[:, None] if axis == 0 else count
         plane = total
     return plane
-
-
-def _largest_around(plane: Array) -> Array:
-    """Maximum of 3 x 3 pixels."""
-    padded = np.pad(plane, 1, mode="edge")
-    rows = np.maximum(np.maximum(padded[:-2], padded[1:-1]), padded[2:])
-    return np.maximum(np.maximum(rows[:, :-2], rows[:, 1:-1]), rows[:, 2:])
 
 
 def _upsample(plane: Array, scale: int, rows: slice) -> Array:

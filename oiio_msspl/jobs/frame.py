@@ -6,11 +6,11 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError, MssplError
@@ -110,6 +110,7 @@ def fuse_files(
     check_separate(files_read(lr, hr, inputs, model), targets)
     remove_leftovers(targets)
     dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
+    sets_to_fuse(hr, write)  # and so is a set
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
     family = resolve_auto(lr, hr, model) if fits else model or DEFAULT_FAMILY
@@ -136,10 +137,27 @@ def fuse_files(
     return report
 
 
+def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
+    """The additive sets that are asked for and of which a layer is written.
+
+    Raises:
+        InputError: a pattern matches no set.
+    """
+    if write.passes == ("none",):
+        return []
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    written = [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
+    wanted = [each for each in written if not write.passes or any(each.matches(p) for p in write.passes)]
+    if write.passes and not wanted:
+        known = ", ".join(f"'{each.name}'" for each in written) or "none"
+        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
+    return wanted
+
+
 def fuse_frame_passes(
     lr: MappedRender, hr: MappedRender, fused: FusedFrame, write: WriteOptions, max_memory: int
 ) -> FusedPasses | None:
-    """Fuse the additive sets that are asked for; None if there are none.
+    """Fuse the additive sets of :func:`sets_to_fuse`; None if there are none.
 
     Args:
         lr, hr: the pair, as files.
@@ -150,17 +168,11 @@ def fuse_frame_passes(
     Raises:
         InputError: a pattern matches no set, or pixels can't be decoded.
     """
-    if write.passes == ("none",):
+    sets = sets_to_fuse(hr, write)
+    if not sets:
         return None
-    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
-    written = [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
     cache_bytes = int((max_memory - fused.nbytes) * STRIPS_SHARE)
-    source = replace(hr, additive_sets=written)
-    passes = fuse_passes(lr, source, fused.rgb, fused.alignment, write.passes, max(0, cache_bytes))
-    if passes is None and write.passes:
-        known = ", ".join(f"'{each.name}'" for each in written) or "none"
-        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
-    return passes
+    return fuse_passes(lr, hr, fused.rgb, fused.alignment, sets, max(0, cache_bytes))
 
 
 def write_frame(

@@ -19,7 +19,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import check_frame_memory, fuse_frame_passes, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import check_frame_memory, fuse_frame_passes, sets_to_fuse, write_frame, write_frame_preview
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.jobs.sequence import Frame
@@ -108,6 +108,7 @@ class Stages:
         targets = [frame.output, frame.output.with_suffix(".png")] if self.previews else [frame.output]
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
+        sets_to_fuse(hr, self.write_options)
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
         left = self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr)
         if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= left:

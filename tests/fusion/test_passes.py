@@ -6,6 +6,7 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
+from oiio_msspl.jobs import frame
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
 HEIGHT, WIDTH = 90, 122  # no multiple of 4
@@ -177,8 +178,9 @@ def test_layers_that_do_not_sum_are_passed_on(tmp_path, bilinear_models, beauty,
         ((), ("a=light_key+light_none",), "no layer 'light_none'"),
     ],
 )
-def test_a_wrong_name_is_one_sentence(tmp_path, bilinear_models, passes, sums, message):
+def test_a_wrong_name_is_one_sentence_before_the_work(tmp_path, bilinear_models, monkeypatch, passes, sums, message):
     pair = write_pair(tmp_path, lights())
+    monkeypatch.setattr(frame, "Session", pytest.fail)
     with pytest.raises(InputError, match=message):
         fused(pair, tmp_path / "out.exr", bilinear_models, passes, sums)
     assert not (tmp_path / "out.exr").exists()

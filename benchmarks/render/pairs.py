@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks.render.film import CROP, frame_size, set_crop, write_exr
 from datagen.mitsuba.start import start as start_mitsuba
@@ -54,7 +55,7 @@ def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
     """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
     import mitsuba as mi
 
-    from datagen.mitsuba.trace import blackman_harris, box, render_passes
+    from datagen.mitsuba.trace import blackman_harris, box
 
     scene = mi.load_file(str(file))
     camera = SensorCamera(mi, scene.sensors()[0])
@@ -65,18 +66,31 @@ def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
         path = folder / f"{name}.exr"
         if path.exists():
             continue
-        size = camera.at(scale)
-        per_launch = max(1, LAUNCH // (size[0] * size[1]))
-        layers = name != "ref"
-        total, done = np.zeros((size[1], size[0], 15 if layers else 3)), 0
-        while done < spp:
-            count = min(per_launch, spp - done)
-            seed = zlib.crc32(f"{folder.name} {pixel_filter} {name} {done}".encode())
-            passes = render_passes(scene, camera, size, count, seed, layers, pixel_filter=placing)  # type: ignore[arg-type]
-            total += passes.sum(axis=0, dtype=np.float64)
-            done += count
+        title = f"{folder.name} {pixel_filter} {name}"
+        image = mean_of_samples(scene, camera, camera.at(scale), spp, title, placing, layers=name != "ref")
         path.parent.mkdir(parents=True, exist_ok=True)
-        write_exr(path, total / spp, CHANNELS)
+        write_exr(path, image, CHANNELS)
+
+
+def mean_of_samples(
+    scene: Any, camera: SensorCamera, size: tuple[int, int], spp: int, title: str, placing: Any, *, layers: bool
+) -> NDArray[np.float64]:
+    """Render samples in launches that fit into memory and average them: (h, w, 15), or (h, w, 3) without layers.
+
+    Args:
+        size: width and height.
+        title: the random numbers follow from it.
+        placing: pixel filter of :mod:`datagen.mitsuba.trace`.
+    """
+    from datagen.mitsuba.trace import render_passes
+
+    per_launch = max(1, LAUNCH // (size[0] * size[1]))
+    total = np.zeros((size[1], size[0], 15 if layers else 3))
+    for done in range(0, spp, per_launch):
+        count, seed = min(per_launch, spp - done), zlib.crc32(f"{title} {done}".encode())
+        passes = render_passes(scene, camera, size, count, seed, layers, pixel_filter=placing)  # type: ignore[arg-type]
+        total += passes.sum(axis=0, dtype=np.float64)
+    return total / spp
 
 
 def main() -> None:

@@ -14,14 +14,13 @@ from __future__ import annotations
 
 import argparse
 import time
-import zlib
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from benchmarks.render.film import write_exr
-from benchmarks.render.pairs import LAUNCH, SensorCamera
+from benchmarks.render.pairs import SensorCamera, mean_of_samples
 from datagen.mitsuba.start import start as start_mitsuba
 from oiio_msspl.model.contract import SCALES
 
@@ -52,7 +51,7 @@ def render(file: Path, folder: Path, reference: int) -> None:
     """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
     import mitsuba as mi
 
-    from datagen.mitsuba.trace import box, render_passes
+    from datagen.mitsuba.trace import box
 
     scene = mi.load_file(str(file))
     camera, lamps = SensorCamera(mi, scene.sensors()[0]), Lamps(mi, scene)
@@ -62,18 +61,11 @@ def render(file: Path, folder: Path, reference: int) -> None:
         path = folder / f"{name}.exr"
         if path.exists():
             continue
-        size = camera.at(scale)
-        per_launch = max(1, LAUNCH // (size[0] * size[1]))
-        total = np.zeros((len(lamps.groups), size[1], size[0], 15))
-        for i, group in enumerate(total):
-            lamps.switch_on(i)
-            for done in range(0, spp, per_launch):
-                count = min(per_launch, spp - done)
-                seed = zlib.crc32(f"{folder.name} {name} {done}".encode())
-                group += render_passes(scene, camera, size, count, seed, True, pixel_filter=box).sum(
-                    0, dtype=np.float64
-                )  # type: ignore[arg-type]
-        total /= spp
+        size, images = camera.at(scale), []
+        for group in range(len(lamps.groups)):
+            lamps.switch_on(group)
+            images.append(mean_of_samples(scene, camera, size, spp, f"{folder.name} {name}", box, layers=True))
+        total = np.stack(images)
         beauty, diffuse, specular = (total[..., i : i + 3].sum(axis=0) for i in (0, 9, 12))
         layers = {"": beauty, "albedo.": total[0, ..., 3:6], "nn.": total[0, ..., 6:9], "diffuse.": diffuse}
         layers |= {"specular.": specular, "other.": beauty - diffuse - specular}

@@ -32,20 +32,21 @@ def set_crop(mi: Any, parameters: Any, frame: Sequence[int], crop: Sequence[int]
     parameters.update()
 
 
-def write_exr(path: Path, image: Array, channels: Sequence[str]) -> None:
-    """Write (h, w, c) as half floats; the channels get the first c names.
+def write_exr(path: Path, image: Array, channels: Sequence[str], pixel_type: str = "half") -> None:
+    """Write (h, w, c) as half or float; the channels get the first c names.
 
     Raises:
         MssplError: the file can't be written.
     """
     height, width, count = image.shape
-    spec = oiio.ImageSpec(width, height, count, "half")
+    spec = oiio.ImageSpec(width, height, count, pixel_type)
     spec.channelnames = tuple(channels[:count])
     spec.attribute("compression", "zip")
     spec.attribute("Software", "Mitsuba 3")
+    largest = 65000 if pixel_type == "half" else np.inf
     with replacing(path, overwrite=True) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
         ok = writer.open(str(temporary), spec)
-        ok = ok and writer.write_image(np.ascontiguousarray(np.clip(image, -65000, 65000), dtype=np.float32))
+        ok = ok and writer.write_image(np.ascontiguousarray(np.clip(image, -largest, largest), dtype=np.float32))
         if not (writer.close() and ok):
             raise MssplError(f"{path}: can't be written ({writer.geterror()})")

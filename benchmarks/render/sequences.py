@@ -1,19 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders short sequences of two scenes for `benchmarks.flicker`, with Mitsuba 3.
+"""Renders short sequences for `benchmarks.temporal`, with Mitsuba 3.
 
     python -m benchmarks.render.sequences SEQUENCES --scenes SCENES
 
-Each scene gets two folders. In ``static`` the frames differ only by their noise, and there is one reference. In
-``moving`` the camera pans and trucks, so that near surfaces move faster. The files of a frame are::
+Two scenes from files get two sequences each. In ``static`` the frames differ only by their noise. In ``moving`` the
+camera pans and trucks, so that near surfaces move faster. A room of our own gets the animations of
+`benchmarks.render.moving_scenes`. A frame has these files::
 
-    hr.####.exr     1 spp                    } albedo, normal, depth, motion
-    full.####.exr   2 spp                    }
-    lr.####.exr     16 spp at a quarter of the resolution
-    ref_a.####.exr, ref_b.####.exr           two halves of the reference, with independent noise
+    hr.####.exr                      1 spp, with albedo, normal, depth, position and motion
+    full.####.exr                    2 spp, with albedo and normal
+    lr_x2.####.exr, lr_x4.####.exr   4 spp at half, 16 spp at a quarter of the resolution
+    ref_a.####.exr, ref_b.####.exr   two halves of the reference, with independent noise
+    mask.####.exr                    what lies under the centre of each pixel: position, depth, whether it moves or
+                                     reflects, motion
 
-``motion.X`` and ``motion.Y`` say where the surface of a pixel was in the frame before, in HRLS pixels from here, y
-downwards. They are the exact reprojection of the positions that rays hit. The name of a file gives its seed. Files
-that exist are kept.
+``motionBack`` and ``motionFore`` say where the surface of a pixel was in the frame before, and will be in the next
+one, in HRLS pixels from here, x to the right and y downwards. They are exact: the positions that rays hit, moved with
+their object and projected. The name of a file gives its seed. Files that exist are kept.
 """
 
 from __future__ import annotations
@@ -29,143 +32,221 @@ from typing import Any
 import numpy as np
 
 from benchmarks.render.film import set_crop, write_exr
+from benchmarks.render.moving_scenes import ANGLE, ANIMATIONS, Room, build_room, camera_matrix, object_matrix
 from datagen.mitsuba.start import start as start_mitsuba
+from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 
-SCALE = 4
+SCALES = (2, 4)
+#: The sequence in which nothing moves: one reference is enough.
+STATIC = "static"
 FRAMES = 10
-WIDTH, HEIGHT = 256, 192
-#: Longer side of the whole frame, of which a crop is rendered.
-LONGER = 1024
-#: Motion in HRLS pixels a frame: the pan moves everything, the truck moves a surface at the median depth.
+#: Width and height of a frame. Scenes from files show a crop of a frame whose longer side is `LONGER`.
+WIDTH, HEIGHT, LONGER = 320, 224, 1024
+#: Motion of the camera in files, in HRLS pixels a frame: the pan moves everything, the truck a surface at the median
+#: depth.
 PAN, TRUCK = 0.9, 0.8
 MAX_DEPTH = 8
 #: spp of each half of the reference.
-REFERENCE_HALF = 128
+REFERENCE_HALF = 48
 #: Samples that are rendered at once; more need more memory.
 LAUNCH = 2_000_000
 
-CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.T", "motion.X", "motion.Y")
 AOVS = "albedo:albedo,nn:sh_normal,dd:depth,pp:position"
+CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.Z")
+CHANNELS += ("position.X", "position.Y", "position.Z")
+MOTION = ("motionBack.X", "motionBack.Y", "motionFore.X", "motionFore.Y")
+MASK = ("position.X", "position.Y", "position.Z", "depth.Z", "moves.Y", "reflects.Y")
 #: Scene -> centre of the crop, as shares of the frame.
 SCENES = {"staircase2": (0.53, 0.60), "lamp": (0.47, 0.40)}
 
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole at ``to_world`` (4 x 4). ``focal`` is in pixels; ``centre`` is where the axis meets the crop."""
+    """A pinhole at ``to_world`` (4 x 4), with x to the left as Mitsuba's.
 
-    to_world: np.ndarray
+    ``focal`` is in pixels; ``centre`` is where the axis meets the picture.
+    """
+
+    to_world: Array
     focal: float
     centre: tuple[float, float]
 
-    def project(self, positions: np.ndarray) -> np.ndarray:
-        """World positions (..., 3) to pixels of the crop (..., 2), y downwards. Mitsuba's camera has x to the left."""
+    def project(self, positions: Array) -> Array:
+        """World positions (..., 3) to pixels (..., 2), y downwards."""
         inverse = np.linalg.inv(self.to_world)
         seen = positions @ inverse[:3, :3].T + inverse[:3, 3]
         return np.asarray(self.centre) - self.focal * seen[..., :2] / seen[..., 2:]
 
-
-def render_sequences(folder: Path, scenes: Path, names: list[str]) -> None:
-    """Render the files of both sequences of each scene that do not exist yet.
-
-    Raises:
-        InputError: no such scene, or no Mitsuba.
-    """
-    try:
-        mi = start_mitsuba()
-    except ImportError as error:
-        raise InputError("rendering needs Mitsuba 3: pip install '.[train]'") from error
-    for name in names:
-        file = scenes / name / "scene.xml"
-        if name not in SCENES or not file.is_file():
-            raise InputError(f"{file}: no such scene; --scene takes {', '.join(SCENES)}")
-        start = time.perf_counter()
-        _Sequences(mi, file, folder / name).render()
-        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    def rays(self) -> tuple[Array, Array]:
+        """Origins and directions through the centres of the pixels, (pixels, 3) each."""
+        y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+        seen = [(self.centre[0] - x) / self.focal, (self.centre[1] - y) / self.focal, np.ones_like(x)]
+        directions = np.stack(seen, axis=-1).reshape(-1, 3) @ self.to_world[:3, :3].T
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        return np.broadcast_to(self.to_world[:3, 3], directions.shape), directions
 
 
-class _Sequences:
-    """Both sequences of a scene."""
+class _FileScene:
+    """A static scene from a file, seen by a camera that stands or moves."""
 
-    def __init__(self, mi: Any, file: Path, folder: Path) -> None:
-        self.mi, self.folder = mi, folder
-        self.scene = mi.load_file(str(file))
-        self.integrator = mi.load_dict(
-            {"type": "aov", "aovs": AOVS, "img": {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 4}}
-        )
-        self.sensor = mi.traverse(self.scene.sensors()[0])
-        width, height = self.sensor["film.size"]
-        self.full = [round(v * LONGER / max(width, height) / SCALE) * SCALE for v in (width, height)]
+    def __init__(self, mi: Any, file: Path, *, moving: bool) -> None:
+        self._step = 1.0 if moving else 0.0
+        self._room = Room(mi.load_file(str(file)))
+        sensor = mi.traverse(self._room.scene.sensors()[0])
+        width, height = sensor["film.size"]
+        self.size = [round(v * LONGER / max(width, height) / 8) * 8 for v in (width, height)]
         self.offset = [
-            min(max(int((share * size - crop / 2) // SCALE * SCALE), 0), size - crop)
-            for share, size, crop in zip(SCENES[file.parent.name], self.full, (WIDTH, HEIGHT), strict=True)
+            min(max(int((share * size - crop / 2) // 8 * 8), 0), size - crop)
+            for share, size, crop in zip(SCENES[file.parent.name], self.size, (WIDTH, HEIGHT), strict=True)
         ]
-        self.focal = self.full[0] / 2 / np.tan(np.radians(float(self.sensor["x_fov"][0])) / 2)
-        self.start = np.array(self.sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
-        self.median_depth = 0.0
+        self._focal = self.size[0] / 2 / np.tan(np.radians(float(sensor["x_fov"][0])) / 2)
+        self._start = np.array(sensor["to_world"].matrix, dtype=np.float64).reshape(4, 4)
+        self._depth = float(np.median(surfaces(mi, self._room, self.camera(0.0))[..., 3]))
 
-    def render(self) -> None:
-        still = self.camera(0.0)
-        self.median_depth = float(np.median(self.shoot(still, 1, 1, seed=1)[..., 9]))
-        middle = (FRAMES - 1) / 2
-        for name, step in (("static", 0.0), ("moving", 1.0)):
-            for frame in range(FRAMES):
-                at = (frame - middle) * step
-                camera, before = self.camera(at), self.camera(at - step * (frame > 0))
-                for kind, spp in (("hr", 1), ("full", 2), ("lr", 16)):
-                    self.write(name, kind, frame, camera, before, spp)
-                if frame == 0 or step:  # a static camera needs one reference for all frames
-                    for kind in ("ref_a", "ref_b"):
-                        self.write(name, kind, frame, camera, before, REFERENCE_HALF)
+    #: Depth of what the camera moves by `TRUCK` pixels; 0 until it is known.
+    _depth = 0.0
 
     def camera(self, at: float) -> Camera:
-        """``at``: frames from the middle of the path."""
-        angle = at * PAN / self.focal
+        angle = at * self._step * PAN / self._focal
         c, s = np.cos(angle), np.sin(angle)
-        move = np.array(
-            [[c, 0, s, at * TRUCK * self.median_depth / self.focal], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]]
-        )
-        centre = tuple(size / 2 - offset for size, offset in zip(self.full, self.offset, strict=True))
-        return Camera(self.start @ move, self.focal, centre)
+        truck = at * self._step * TRUCK * self._depth / self._focal
+        move = np.array([[c, 0, s, truck], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
+        centre = self.size[0] / 2 - self.offset[0], self.size[1] / 2 - self.offset[1]
+        return Camera(self._start @ move, self._focal, centre)
 
-    def write(self, sequence: str, kind: str, frame: int, camera: Camera, before: Camera, spp: int) -> None:
-        path = self.folder / sequence / f"{kind}.{frame + 1:04d}.exr"
-        if path.exists():
-            return
-        path.parent.mkdir(parents=True, exist_ok=True)
-        seed = zlib.crc32(f"{self.folder.name}/{sequence}/{path.name}".encode())
-        image = self.shoot(camera, spp, SCALE if kind == "lr" else 1, seed)
-        positions, image = image[..., 10:13], image[..., :10]
-        if kind in ("hr", "full"):
-            image = np.concatenate([image, before.project(positions) - camera.project(positions)], axis=-1)
-        write_exr(path, image[..., :3] if kind.startswith("ref") else image, CHANNELS)
+    def room(self, frame: int, at: float) -> Room:
+        return self._room
 
-    def shoot(self, camera: Camera, spp: int, scale: int, seed: int) -> np.ndarray:
-        """The crop at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS` to depth, then world positions."""
-        mi, sensor = self.mi, self.sensor
-        sensor["to_world"] = mi.Transform4f(mi.Matrix4f(camera.to_world))
-        full, offset = ([v // scale for v in values] for values in (self.full, self.offset))
-        set_crop(mi, sensor, full, (WIDTH // scale, HEIGHT // scale), offset)
-        launch = max(1, LAUNCH // (WIDTH * HEIGHT // scale**2))
-        total, done = 0.0, 0
-        while done < spp:
-            count = min(launch, spp - done)
-            part_seed = zlib.crc32(f"{seed} {done}".encode())
-            image = np.array(mi.render(self.scene, integrator=self.integrator, spp=count, seed=part_seed), np.float64)
-            total = total + np.where(np.isfinite(image), image, 0) * count
-            done += count
-        return np.asarray(total) / spp
+    def object_moves(self, at: float, other: float) -> Array:
+        return np.eye(4)
+
+
+class _AnimatedRoom:
+    """Our own room."""
+
+    size, offset = (WIDTH, HEIGHT), (0, 0)
+
+    def __init__(self, name: str) -> None:
+        self._animation = ANIMATIONS[name]
+
+    def camera(self, at: float) -> Camera:
+        focal = WIDTH / 2 / np.tan(np.radians(ANGLE) / 2)
+        return Camera(camera_matrix(self._animation, at), focal, (WIDTH / 2, HEIGHT / 2))
+
+    def room(self, frame: int, at: float) -> Room:
+        return build_room(self._animation, frame, at)
+
+    def object_moves(self, at: float, other: float) -> Array:
+        """From the moving object's place at one time to that at another, (4, 4)."""
+        return np.asarray(object_matrix(self._animation, other) @ np.linalg.inv(object_matrix(self._animation, at)))
+
+
+def surfaces(mi: Any, room: Room, camera: Camera) -> Array:
+    """What the centre of each pixel shows, (h, w, 6): `MASK`. A ray that hits nothing has the depth 0."""
+    origins, directions = camera.rays()
+    ray = mi.Ray3f(mi.Point3f(*origins.T), mi.Vector3f(*directions.T))
+    hit = room.scene.ray_intersect(ray)
+    valid = np.array(hit.is_valid())
+    depth = np.where(valid, np.array(hit.t), 0)
+
+    def any_of(shapes: list[Any]) -> Array:
+        found = np.zeros(len(depth), bool)
+        for shape in shapes:
+            found |= np.array(hit.shape == mi.ShapePtr(shape))
+        return found
+
+    far = np.where(valid, depth, 1e5)[:, None]
+    columns = [origins + far * directions, depth[:, None]]
+    columns += [any_of(shapes)[:, None] for shapes in (room.moved, room.reflecting)]
+    return np.concatenate(columns, axis=1).reshape(HEIGHT, WIDTH, 6)
+
+
+def motion(shown: Array, scene: Any, at: float, other: float) -> Array:
+    """Where the surfaces (h, w, 6) of one time are at another, in pixels from their place, (h, w, 2)."""
+    positions = shown[..., :3]
+    matrix = scene.object_moves(at, other)
+    moved = positions @ matrix[:3, :3].T + matrix[:3, 3]
+    there = scene.camera(other).project(np.where(shown[..., 4:5] > 0, moved, positions))
+    return np.asarray(there - scene.camera(at).project(positions))
+
+
+def render_sequence(mi: Any, scene: Any, folder: Path) -> None:
+    """Render the files of a sequence that do not exist yet."""
+    path_tracer = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 4}
+    integrator = mi.load_dict(path_tracer)
+    with_aovs = mi.load_dict({"type": "aov", "aovs": AOVS, "img": path_tracer})
+    middle = (FRAMES - 1) / 2
+    kinds = [("hr", 1, 1), ("full", 1, 2), *((f"lr_x{s}", s, s * s) for s in SCALES)]
+    references = [(name, 1, REFERENCE_HALF) for name in ("ref_a", "ref_b")]
+    for frame in range(FRAMES):
+        at = frame - middle
+        wanted = kinds if folder.name == STATIC and frame > 0 else [*kinds, *references]
+        paths = {kind: folder / f"{kind}.{frame + 1:04d}.exr" for kind in ("mask", *(kind for kind, _, _ in wanted))}
+        if all(path.exists() for path in paths.values()):
+            continue
+        folder.mkdir(parents=True, exist_ok=True)
+        room, camera = scene.room(frame, at), scene.camera(at)
+        shown = surfaces(mi, room, camera)
+        vectors = np.concatenate([motion(shown, scene, at, at + step) for step in (-1, 1)], axis=-1)
+        write_exr(paths["mask"], np.concatenate([shown, vectors], axis=-1), (*MASK, *MOTION), "float")
+        for kind, scale, spp in wanted:
+            if paths[kind].exists():
+                continue
+            seed = zlib.crc32(f"{folder.parent.name}/{folder.name}/{paths[kind].name}".encode())
+            tracer = integrator if kind.startswith("ref") else with_aovs
+            image = _shoot(mi, room.scene, tracer, scene, camera, spp, scale, seed)
+            if kind == "hr":
+                write_exr(paths[kind], np.concatenate([image, vectors], axis=-1), (*CHANNELS, *MOTION), "float")
+            else:
+                write_exr(paths[kind], image[..., :9], CHANNELS)
+
+
+def _shoot(mi: Any, loaded: Any, integrator: Any, scene: Any, camera: Camera, spp: int, scale: int, seed: int) -> Array:
+    """A frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
+    angle = np.degrees(2 * np.arctan(scene.size[0] / 2 / camera.focal))
+    sensor = mi.load_dict({
+        "type": "perspective", "fov": angle, "fov_axis": "x", "to_world": mi.ScalarTransform4f(camera.to_world),
+        "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "sampler": {"type": "independent"},
+    })  # fmt: skip
+    size, offset = ([v // scale for v in values] for values in (scene.size, scene.offset))
+    set_crop(mi, mi.traverse(sensor), size, (WIDTH // scale, HEIGHT // scale), offset)
+    launch = max(1, LAUNCH // (WIDTH * HEIGHT // scale**2))
+    total, done = np.zeros(1), 0
+    while done < spp:
+        count = min(launch, spp - done)
+        part_seed = zlib.crc32(f"{seed} {done}".encode())
+        image = mi.render(loaded, integrator=integrator, sensor=sensor, spp=count, seed=part_seed)
+        values = np.array(image, np.float64)
+        total = total + np.where(np.isfinite(values), values, 0) * count
+        done += count
+    return total / spp
 
 
 def main() -> int:
+    names = [f"{scene}/{camera}" for scene in SCENES for camera in (STATIC, "moving")]
+    names += [f"room/{name}" for name in ANIMATIONS]
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=Path, required=True, help="a folder with a scene.xml for each scene")
-    parser.add_argument("--scene", action="append", default=[], help=f"{', '.join(SCENES)}; default: both")
+    parser.add_argument("--sequence", action="append", default=[], help=f"default: all of {', '.join(names)}")
+    parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     try:
-        render_sequences(args.folder, args.scenes, args.scene or list(SCENES))
+        mi = start_mitsuba(args.threads)
+        for name in args.sequence or names:
+            scene, _, kind = name.partition("/")
+            file = args.scenes / scene / "scene.xml"
+            if name not in names or (scene != "room" and not file.is_file()):
+                raise InputError(f"{name}: no such sequence, or no {file}; --sequence takes {', '.join(names)}")
+            start = time.perf_counter()
+            made = _AnimatedRoom(kind) if scene == "room" else _FileScene(mi, file, moving=kind == "moving")
+            render_sequence(mi, made, args.folder / scene / kind)
+            print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
+    except ImportError:
+        print("rendering needs Mitsuba 3: pip install '.[train]'", file=sys.stderr)
+        return 2
     except MssplError as error:
         print(error, file=sys.stderr)
         return error.exit_code

@@ -109,3 +109,41 @@ def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Arr
     after = np.minimum(before + 1, last)
     weight = (positions - before).astype(np.float32).reshape([-1 if i == axis else 1 for i in range(values.ndim)])
     return values.take(before, axis) * (1 - weight) + values.take(after, axis) * weight
+
+
+def mean_around(plane: Array, radius: int) -> Array:
+    """Mean over the pixels up to ``radius`` rows and columns away that exist."""
+    for axis in (0, 1):
+        size = plane.shape[axis]
+        total, count = plane.copy(), np.ones(size, np.float32)
+        for offset in range(1, min(radius, size - 1) + 1):
+            low, high = (slice(None, -offset), slice(offset, None))
+            take = (lambda s: (s, slice(None))) if axis == 0 else (lambda s: (slice(None), s))
+            total[take(low)] += plane[take(high)]
+            total[take(high)] += plane[take(low)]
+            count[low] += 1
+            count[high] += 1
+        total /= count[:, None] if axis == 0 else count
+        plane = total
+    return plane
+
+
+def upsample_linear(plane: Array, scale: int, rows: slice) -> Array:
+    """Interpolate a plane linearly at ``scale`` times its resolution; only these of its rows, in its own pixels."""
+    return _upsample_rows(_upsample_rows(plane, scale, rows).T, scale, slice(0, plane.shape[1])).T
+
+
+def _upsample_rows(plane: Array, scale: int, rows: slice) -> Array:
+    padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")
+    before, here, after = (padded[rows.start + i : rows.stop + i] for i in range(3))
+    result = np.empty((len(here) * scale, plane.shape[1]), np.float32)
+    for phase in range(scale):
+        position = (phase + 0.5) / scale - 0.5
+        other = before if position < 0 else after
+        result[phase::scale] = here + np.float32(abs(position)) * (other - here)
+    return result
+
+
+def planes_of(image: Array) -> Array:
+    """(h, w, c) as (c, h, w), each plane contiguous."""
+    return np.ascontiguousarray(np.moveaxis(image, -1, 0))

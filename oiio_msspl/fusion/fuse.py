@@ -10,6 +10,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
+from oiio_msspl.colour import luminance
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment, align
@@ -22,7 +23,7 @@ from oiio_msspl.fusion.guards import (
     is_noise_free,
     lights_above_ceiling,
 )
-from oiio_msspl.fusion.pair_checks import HrlsAverages, check_pair
+from oiio_msspl.fusion.pair_checks import BRIGHTEST, HrlsAverages, check_pair
 from oiio_msspl.fusion.passes import FusedPasses
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
@@ -58,6 +59,10 @@ class FusedFrame:
     """Factor that the scene was multiplied by for the network."""
     repaired: dict[str, int]
     """Numbers of values that were NaN or infinite, by layer, as ``lrhs.rgb``."""
+    lrhs_luminance: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """(h, w): luminance of the LRHS over the alignment's grid."""
+    hrls_luminance: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
+    """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
     negative: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
@@ -115,6 +120,7 @@ def fuse(
                 if progress is not None:
                     progress(done, len(tiles))
         frame.warnings += pair.check()
+        frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     frame.tiles, frame.seconds = len(tiles), session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
@@ -245,6 +251,10 @@ class _Pair:
     def _lrhs_aovs(self, pair: TilePair) -> Images:
         names = [name for name in self._session.lrhs_aovs if name in pair.lrhs]
         return {name: encode_feature(name, pair.lrhs[name], 1.0) for name in names}
+
+    def luminances(self) -> tuple[Array, Array]:
+        """Luminance of both renders over the grid, (h, w) each, once all tiles are prepared."""
+        return luminance(np.minimum(self._lrhs_rgb, BRIGHTEST)), self._averages.rgb
 
     def check(self) -> list[str]:
         """Compare the two renders once all tiles are prepared, see :func:`check_pair`."""

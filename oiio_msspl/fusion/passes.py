@@ -19,7 +19,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.arrays import Array, box_downsample, mean_around, planes_of, upsample_linear
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
@@ -147,9 +147,9 @@ class _Band:
         #: Guides by channel of colour: the same channel of beauty and albedo, and the normal. (3, guides, h, w).
         normal = [features[NORMAL][..., i] for i in range(3)] if NORMAL in features else []
         self._guides = np.stack([[*(guide[..., c] for guide in guides), *normal] for c in range(3)])
-        self._beauty = _planes(beauty)
-        self._low_beauty = _planes(box_downsample(beauty, self._scale))
-        low = np.stack([_planes(box_downsample(np.moveaxis(g, 0, -1), self._scale)) for g in self._guides])
+        self._beauty = planes_of(beauty)
+        self._low_beauty = planes_of(box_downsample(beauty, self._scale))
+        low = np.stack([planes_of(box_downsample(np.moveaxis(g, 0, -1), self._scale)) for g in self._guides])
         with np.errstate(over="ignore", invalid="ignore"):
             self._fit = _Fit(low, self._radius)
 
@@ -171,13 +171,13 @@ class _Band:
         def fit_planes(planes: slice) -> None:
             for i in range(planes.start, planes.stop):
                 coefficients = self._fit.coefficients(flat_noisy[i], i % 3)
-                *slopes, offset = (_upsample(plane, scale, core_rows) for plane in coefficients)
+                *slopes, offset = (upsample_linear(plane, scale, core_rows) for plane in coefficients)
                 flat_fitted[i] = offset
                 for guide, slope in zip(guides[i % 3], slopes, strict=True):
                     flat_fitted[i] += guide * slope
                 # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
                 low, high = -max_3x3(-flat_noisy[i]), max_3x3(flat_noisy[i])
-                bounds = (_upsample(plane, scale, core_rows) for plane in (low, high))
+                bounds = (upsample_linear(plane, scale, core_rows) for plane in (low, high))
                 np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
 
         for_row_blocks(fit, len(flat_noisy), beauty[0].size)
@@ -211,9 +211,9 @@ class _Band:
             renders.append(read_lrhs(low, self._alignment, self._area, low.features, RepairCounts()))
         total = np.zeros((len(job.layers.layers) + job.remainder, *self._low_beauty.shape), np.float32)
         for pixels in renders:
-            layers = np.stack([_planes(pixels[name]) for name in layer_keys(job.layers)])
+            layers = np.stack([planes_of(pixels[name]) for name in layer_keys(job.layers)])
             if job.remainder:
-                rest = np.maximum(_planes(pixels[RGB]) - layers.sum(axis=0), 0)
+                rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
                 layers = np.concatenate([layers, rest[None]])
             light = layers.sum(axis=(0, 1))
             allowed = FIREFLY * max_3x3(self._low_beauty.sum(axis=0))
@@ -231,7 +231,7 @@ class _Band:
                 if layer.factor not in by_channels:
                     render = replace(hr, features={"colour": FeatureFormula((layer.factor,))})
                     colour = read_features(render, window, self._alignment.hr_data_window, ["colour"])["colour"]
-                    by_channels[layer.factor] = _planes(colour)
+                    by_channels[layer.factor] = planes_of(colour)
                 colours[i] = by_channels[layer.factor]
         return colours
 
@@ -242,13 +242,13 @@ class _Fit:
     def __init__(self, guides: Array, radius: int) -> None:
         """``guides``: (3, guides, h, w)."""
         self._guides, self._radius = guides, radius
-        self._means = np.stack([[_mean_around(g, radius) for g in channel] for channel in guides])
+        self._means = np.stack([[mean_around(g, radius) for g in channel] for channel in guides])
         count = guides.shape[1]
         self._factors = []
         for c in range(3):
             matrix = [
                 [
-                    _mean_around(guides[c, i] * guides[c, j], radius) - self._means[c, i] * self._means[c, j]
+                    mean_around(guides[c, i] * guides[c, j], radius) - self._means[c, i] * self._means[c, j]
                     for j in range(i + 1)
                 ]
                 for i in range(count)
@@ -260,11 +260,11 @@ class _Fit:
     def coefficients(self, layer: Array, channel: int) -> list[Array]:
         """a_k of each guide, and b, averaged over overlapping fits: planes (h, w)."""
         guides, means, factor = self._guides[channel], self._means[channel], self._factors[channel]
-        mean = _mean_around(layer, self._radius)
-        covariances = [_mean_around(layer * g, self._radius) - mean * m for g, m in zip(guides, means, strict=True)]
+        mean = mean_around(layer, self._radius)
+        covariances = [mean_around(layer * g, self._radius) - mean * m for g, m in zip(guides, means, strict=True)]
         slopes = _solve(factor, covariances)
         offset = _minus_products(mean, slopes, means)
-        return [_mean_around(plane, SMOOTHING) for plane in (*slopes, offset)]
+        return [mean_around(plane, SMOOTHING) for plane in (*slopes, offset)]
 
 
 def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
@@ -304,41 +304,3 @@ def _make_sum(layers: Array, beauty: Array) -> None:
     total = layers.sum(axis=0)
     lit = total > 0
     layers *= np.where(lit, beauty / np.where(lit, total, 1), 0)
-
-
-def _mean_around(plane: Array, radius: int) -> Array:
-    """Mean over the pixels up to ``radius`` rows and columns away that exist."""
-    for axis in (0, 1):
-        size = plane.shape[axis]
-        total, count = plane.copy(), np.ones(size, np.float32)
-        for offset in range(1, min(radius, size - 1) + 1):
-            low, high = (slice(None, -offset), slice(offset, None))
-            take = (lambda s: (s, slice(None))) if axis == 0 else (lambda s: (slice(None), s))
-            total[take(low)] += plane[take(high)]
-            total[take(high)] += plane[take(low)]
-            count[low] += 1
-            count[high] += 1
-        total /= count[:, None] if axis == 0 else count
-        plane = total
-    return plane
-
-
-def _upsample(plane: Array, scale: int, rows: slice) -> Array:
-    """Interpolate a plane linearly at ``scale`` times its resolution; only these of its rows, in its own pixels."""
-    return _upsample_rows(_upsample_rows(plane, scale, rows).T, scale, slice(0, plane.shape[1])).T
-
-
-def _upsample_rows(plane: Array, scale: int, rows: slice) -> Array:
-    padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")
-    before, here, after = (padded[rows.start + i : rows.stop + i] for i in range(3))
-    result = np.empty((len(here) * scale, plane.shape[1]), np.float32)
-    for phase in range(scale):
-        position = (phase + 0.5) / scale - 0.5
-        other = before if position < 0 else after
-        result[phase::scale] = here + np.float32(abs(position)) * (other - here)
-    return result
-
-
-def _planes(image: Array) -> Array:
-    """(h, w, c) as (c, h, w), each plane contiguous."""
-    return np.ascontiguousarray(np.moveaxis(image, -1, 0))

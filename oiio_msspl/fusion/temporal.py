@@ -1,0 +1,292 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Averages a fused frame with its neighbours, warped along the motion of their surfaces, as far as they can be trusted.
+
+Two questions decide how much a pixel of a neighbour counts:
+
+- Does it show the same surface? A vector leads to the neighbour, and the neighbour's own vector must lead back.
+- Has the light changed? The warped neighbour is compared with the LRHS and with the HRLS of this frame, at the LRHS's
+  resolution. Both have independent noise, and the neighbour has neither's. So the mean of the product of the two
+  differences is the neighbour's squared error without the noise of the renders. (Zheng et al. 2021 estimate errors from
+  two independent buffers in the same way.)
+
+A pixel that no neighbour may change keeps its bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.arrays import Array, box_downsample, mean_around, planes_of, upsample_linear
+from oiio_msspl.colour import LUMINANCE_WEIGHTS, luminance
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.tile_features import in_hrls_pixels, mirrored_pixels
+from oiio_msspl.parallel import for_row_blocks
+
+Mask = NDArray[np.bool_]
+
+#: A vector and the way back may differ by this, in HRLS pixels.
+ROUND_TRIP = 1.0
+#: The error of a neighbour is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the
+#: edge of a shadow, the large one a faint change of all the light.
+RADII = (14, 28)
+#: The error that a fused frame has itself: the variance of the noise of this many HRLS pixels, averaged.
+PIXELS_AVERAGED = 80.0
+#: How many standard deviations of its own noise are subtracted from an estimated error.
+DOUBT = 0.5
+#: Differences relative to the local brightness are limited to this, because a firefly says nothing of the light.
+LARGEST_DIFFERENCE = 3.0
+#: The local brightness is at least this share of the frame's.
+DARKEST = 0.02
+#: Relative squared error below which two frames are equal.
+EQUAL = 1e-4
+#: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer ones blur with every frame.
+SHARPNESS = -1.0
+
+
+@dataclass(frozen=True)
+class Step:
+    """From a frame to the next one, forwards or backwards in time."""
+
+    frame: FusedFrame
+    """The frame that it leads to."""
+    vectors: Array | None
+    """(h, w, 2) over the data window of the frame that it starts from: where the surface of a pixel is, in HRLS pixels
+    from there, as (x, y) with y downwards. None: it stays."""
+    valid: Mask | None
+    """(h, w): which of them can be believed; None if all can."""
+    back: Array | None
+    """(h, w, 2) over the data window of ``frame``: the way back."""
+    back_valid: Mask | None
+
+
+@dataclass(frozen=True)
+class Accumulated:
+    """A frame that is averaged with its neighbours."""
+
+    rgb: Array
+    """(h, w, 3)"""
+    alpha: Array | None
+    """(h, w, 1)"""
+    frames: Array
+    """(h, w, 1): the number of frames with equal weight whose mean would have as little noise: 1 where the frame stands
+    alone."""
+
+
+def accumulate(frame: FusedFrame, before: Sequence[Step], after: Sequence[Step]) -> Accumulated:
+    """Average a frame with its neighbours.
+
+    Args:
+        frame: the frame.
+        before: steps to the frame before it, to the one before that, and so on.
+        after: steps to the frames after it, the nearest first.
+    """
+    window = frame.alignment.hr_data_window
+    colour = _channels(frame)
+    total, weights = colour.copy(), np.ones(colour.shape[1:], np.float32)
+    squares = np.ones_like(weights)
+    light = _Light(frame)
+    for steps in (before, after):
+        path = _Path(window)
+        trusted: Array | None = None
+        for step in steps:
+            path.follow(step)
+            warped = _warp(_channels(step.frame), step.frame.alignment.hr_data_window, path)
+            if len(warped) < len(total):  # the neighbour has no alpha
+                warped = np.concatenate([warped, colour[3:]])
+            weight = light.trust(warped[:3], path.valid)
+            # A light that has changed in the nearer frame has changed in the farther one.
+            trusted = weight if trusted is None else np.minimum(trusted, weight)
+            _add(total, weights, squares, warped, trusted * path.valid)
+    total /= weights
+    rgb = np.ascontiguousarray(np.moveaxis(total[:3], 0, -1))
+    alpha = None if frame.alpha is None else total[3][..., None]
+    return Accumulated(rgb, alpha, (np.square(weights) / squares)[..., None])
+
+
+class _Path:
+    """Where the surfaces of a frame are in another one, followed from frame to frame."""
+
+    def __init__(self, window: Window) -> None:
+        self._window = window
+        #: Positions (h, w) in pixels, and None for "at the pixel itself".
+        self.x: Array | None = None
+        self.y: Array | None = None
+        self.valid: Mask = np.ones((window.height, window.width), bool)
+        self._last = window
+
+    def follow(self, step: Step) -> None:
+        """Go on to the next frame."""
+        start, end = self._last, step.frame.alignment.hr_data_window
+        valid = self.valid.copy()
+        moves = step.vectors is not None
+        x, y = (np.empty(valid.shape, np.float32) for _ in range(2)) if moves or start != end else (self.x, self.y)
+
+        def work(rows: slice) -> None:
+            from_x, from_y = self._positions(rows)
+            to_x, to_y = from_x, from_y
+            at = _nearest(from_x, from_y, start)
+            good = valid[rows]
+            if step.valid is not None:
+                good &= step.valid[at]
+            if step.vectors is not None:
+                vectors = step.vectors[at]
+                good &= np.isfinite(vectors).all(axis=-1)
+                vectors = np.where(good[..., None], vectors, 0)
+                to_x, to_y = from_x + vectors[..., 0], from_y + vectors[..., 1]
+            good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
+            there = _nearest(to_x, to_y, end)
+            if step.back is not None and step.vectors is not None:
+                home = np.square(vectors + step.back[there]).sum(axis=-1)
+                good &= home < ROUND_TRIP**2  # false for NaN, too
+            if step.back_valid is not None:
+                good &= step.back_valid[there]
+            if x is not None and y is not None and (moves or start != end):
+                x[rows], y[rows] = to_x, to_y
+
+        for_row_blocks(work, len(valid), valid.shape[1])
+        self.x, self.y, self.valid, self._last = x, y, valid, end
+
+    def _positions(self, rows: slice) -> tuple[Array, Array]:
+        """Positions of some rows, (n, w) each."""
+        if self.x is not None and self.y is not None:
+            return self.x[rows], self.y[rows]
+        window = self._window
+        x = np.arange(window.x0, window.x1, dtype=np.float32)
+        y = np.arange(window.y0 + rows.start, window.y0 + rows.stop, dtype=np.float32)[:, None]
+        x, y = np.broadcast_arrays(x, y)
+        return x, y
+
+    def positions(self, rows: slice) -> tuple[Array, Array] | None:
+        """Positions of some rows, (n, w) each; None if every pixel stays where it is."""
+        return None if self.x is None else self._positions(rows)
+
+
+def _nearest(x: Array, y: Array, window: Window) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """Indices of the nearest pixels of a window."""
+    column = np.clip(np.rint(x) - window.x0, 0, window.width - 1).astype(np.intp)
+    row = np.clip(np.rint(y) - window.y0, 0, window.height - 1).astype(np.intp)
+    return row, column
+
+
+def _warp(planes: Array, window: Window, path: _Path) -> Array:
+    """Planes (c, h, w) of another frame, at the positions of a path: Keys' cubic, within the four nearest pixels."""
+    height, width = path.valid.shape
+    if path.positions(slice(0, 1)) is None:
+        return planes
+    padded = np.pad(planes, [(0, 0), (2, 2), (2, 2)], mode="edge").reshape(len(planes), -1)
+    stride = window.width + 4
+    result = np.empty((len(planes), height, width), np.float32)
+
+    def work(rows: slice) -> None:
+        positions = path.positions(rows)
+        assert positions is not None
+        x = np.clip(positions[0] - window.x0, -1, window.width - 0.01)
+        y = np.clip(positions[1] - window.y0, -1, window.height - 0.01)
+        left, top = np.floor(x), np.floor(y)
+        first = (top.astype(np.intp) + 2) * stride + left.astype(np.intp) + 2
+        across, down = _keys(x - left), _keys(y - top)
+        for plane, out in zip(padded, result, strict=True):
+            near = [plane.take(first + offset) for offset in (0, 1, stride, stride + 1)]
+            low, high = np.minimum.reduce(near), np.maximum.reduce(near)
+            total = np.zeros_like(low)
+            for dy, weight_y in zip(range(-1, 3), down, strict=True):
+                row = np.zeros_like(low)
+                for dx, weight_x in zip(range(-1, 3), across, strict=True):
+                    row += weight_x * plane.take(first + (dy * stride + dx))
+                total += weight_y * row
+            np.clip(total, low, high, out=out[rows])
+
+    for_row_blocks(work, height, width)
+    return result
+
+
+def _keys(t: Array) -> list[Array]:
+    """Weights of the four pixels around a position that lies ``t`` beyond the second one (Keys 1981)."""
+    a = np.float32(SHARPNESS)
+    near = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (t, 1 - t)]
+    far = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + t, 2 - t)]
+    return [far[0], near[0], near[1], far[1]]
+
+
+class _Light:
+    """The light of a frame, as both renders show it, to compare warped neighbours with."""
+
+    def __init__(self, frame: FusedFrame) -> None:
+        self._alignment = alignment = frame.alignment
+        self._scale = alignment.scale
+        self._own = luminance(frame.rgb)
+        fused = self._low(self._own)
+        floor = DARKEST * float(fused.mean()) + 1e-12
+        self._brightness = mean_around(fused, 1) + np.float32(floor)
+        self._renders = [frame.lrhs_luminance, frame.hrls_luminance]
+        low, high = (render / self._brightness for render in self._renders)
+        noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
+        #: For each radius in LRHS pixels: the variance of the mean of both renders.
+        self._noise = {reach: _wide_mean(noise, reach) for reach in (max(1, round(r / self._scale)) for r in RADII)}
+
+    def trust(self, warped: Array, valid: Mask) -> Array:
+        """How much a warped neighbour (3, h, w) counts, from 0 to 1, (h, w)."""
+        red, green, blue = warped
+        weights = np.float32(LUMINANCE_WEIGHTS)
+        grey = np.where(valid, weights[0] * red + weights[1] * green + weights[2] * blue, self._own)
+        low = self._low(grey)
+        differences = [
+            np.clip((render - low) / self._brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
+            for render in self._renders
+        ]
+        product = differences[0] * differences[1]
+        trust = np.ones_like(low)
+        for reach, noise in self._noise.items():
+            own_error = noise * np.float32(self._scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
+            uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
+            change = np.maximum(_wide_mean(product, reach) - uncertainty - own_error, 0)
+            np.minimum(trust, own_error / (own_error + change), out=trust)
+        return self._full(trust)
+
+    def _low(self, grey: Array) -> Array:
+        """A plane over the HRLS's data window at the LRHS's resolution, over the grid."""
+        window = self._alignment.hr_data_window
+        area = in_hrls_pixels(self._alignment.grid, self._scale)
+        if area != window:
+            rows, columns = mirrored_pixels(area, window)
+            grey = grey[rows - window.y0].take(columns - window.x0, axis=1)
+        return box_downsample(grey, self._scale)
+
+    def _full(self, values: Array) -> Array:
+        """Values (h, w) over the grid, interpolated over the HRLS's data window."""
+        area, window = in_hrls_pixels(self._alignment.grid, self._scale), self._alignment.hr_data_window
+        return upsample_linear(values, self._scale, slice(0, len(values)))[window.slices(area)]
+
+
+def _wide_mean(plane: Array, radius: int) -> Array:
+    """Mean over the pixels up to ``radius`` rows and columns away that exist, in a time that does not depend on it."""
+    for axis in (0, 1):
+        size = plane.shape[axis]
+        sums = np.insert(np.cumsum(plane, axis=axis, dtype=np.float64), 0, 0, axis=axis)
+        start, stop = (np.clip(np.arange(size) + offset, 0, size) for offset in (-radius, radius + 1))
+        count = stop - start
+        total = sums.take(stop, axis) - sums.take(start, axis)
+        plane = (total / (count[:, None] if axis == 0 else count)).astype(np.float32)
+    return plane
+
+
+def _channels(frame: FusedFrame) -> Array:
+    """Colour and alpha, if there is one, as planes (3 or 4, h, w)."""
+    return planes_of(frame.rgb if frame.alpha is None else np.concatenate([frame.rgb, frame.alpha], axis=-1))
+
+
+def _add(total: Array, weights: Array, squares: Array, warped: Array, weight: Array) -> None:
+    """Add weighted planes (c, h, w) to the totals."""
+
+    def work(rows: slice) -> None:
+        for plane, values in zip(total, warped, strict=False):  # this frame may lack the alpha
+            plane[rows] += weight[rows] * values[rows]
+        weights[rows] += weight[rows]
+        squares[rows] += np.square(weight[rows])
+
+    for_row_blocks(work, len(weights), weights.shape[1] * len(total))

@@ -10,7 +10,7 @@ proportion to their light, so their sum is the beauty to the last bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence, Sized
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -63,6 +63,8 @@ def fuse_passes(
     alignment: Alignment,
     sets: Sequence[AdditiveSet],
     cache_bytes: int = 0,
+    pixels: ReplacedChannels | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
     """Fuse the layers of additive sets of the HRLS.
 
@@ -72,6 +74,8 @@ def fuse_passes(
         alignment: of the pair.
         sets: of ``hr.additive_sets``. Those that do not sum to its beauty are refused.
         cache_bytes: memory for decoded rows that two bands need.
+        pixels: where the fused layers go; None for a new store.
+        progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
         InputError: pixels can't be decoded.
@@ -79,17 +83,32 @@ def fuse_passes(
     jobs, refused = _checked(lr, hr, sets)
     window = alignment.hr_data_window
     channels = [channel for job in jobs for layer in job.layers.layers for channel in layer.channels]
-    pixels = ReplacedChannels(channels, window.width, window.height)
+    pixels = ReplacedChannels() if pixels is None else pixels
+    pixels.add(channels, window.width, window.height)
     fused = FusedPasses([job.layers for job in jobs], pixels, refused)
-    step = BAND_ROWS // alignment.scale
-    tops = range(alignment.grid.y0, alignment.grid.y1, step) if jobs else []
+    tell = progress or (lambda done, count: None)
+    steps = pass_steps(alignment, sets)
+    done = steps - pass_steps(alignment, jobs)
+    tell(done, steps)
     with hr.cache_strips(cache_bytes):
-        for top in tops:
-            core = Window(alignment.grid.x0, top, alignment.grid.x1, min(top + step, alignment.grid.y1))
+        for core in _bands(alignment) if jobs else []:
             band = _Band(hr, rgb, alignment, core)
             for job in jobs:
                 band.fuse(job, lr, hr, pixels)
+                done += 1
+                tell(done, steps)
     return fused
+
+
+def pass_steps(alignment: Alignment, sets: Sized) -> int:
+    """The steps in which sets are fused, for progress: each set in each band of rows."""
+    return len(_bands(alignment)) * len(sets)
+
+
+def _bands(alignment: Alignment) -> list[Window]:
+    """The bands of LRHS rows that are fused one after the other."""
+    grid, rows = alignment.grid, BAND_ROWS // alignment.scale
+    return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
 
 
 @dataclass(frozen=True)

@@ -10,8 +10,8 @@ from pathlib import Path
 
 from .errors import Failure
 
-#: msspl-fuse prints this after each tile if it runs with -v.
-_TILE = re.compile(r"tile (\d+) of (\d+)")
+#: msspl-fuse prints this after each step if it runs with -v.
+_STEP = re.compile(r"step (\d+) of (\d+)")
 #: Seconds that a cancelled msspl-fuse has to remove its temporary file.
 _GRACE = 10
 
@@ -69,8 +69,8 @@ def run(program, lrhs, hrls, output, work, overwrite, threads):
             raise Failure(f"{program}: can't be started ({error.strerror}); check that it is msspl-fuse") from error
         try:
             while process.poll() is None:
-                tiles = _TILE.findall(_read(log))
-                yield "fuse", (2 + (int(tiles[-1][0]) / int(tiles[-1][1]) if tiles else 0)) / 3
+                steps = _STEP.findall(_read(log))
+                yield "fuse", (2 + (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)) / 3
         finally:
             _end(process)
     if process.returncode:

@@ -87,18 +87,26 @@ def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool
 
 
 def error_map(image: Array, truth: Array) -> Array:
-    """log10 of each pixel's RelMSE (0.5, 0.01), in OpenImageIO's "inferno" colours.
+    """The :func:`error_levels` of an image in the :func:`error_colours`: display values, (height, width, 3)."""
+    return error_colours(error_levels(image, truth))
+
+
+def error_levels(image: Array, truth: Array) -> Array:
+    """log10 of each pixel's RelMSE (0.5, 0.01).
 
     Args:
         image, truth: scene linear, (height, width, 3).
 
     Returns:
-        Display values in [0, 1], (height, width, 3). The darkest colour is an error of 1e-5 or less, the brightest 1
-        or more.
+        (height, width) in [0, 1]: 0 is an error of 1e-5 or less, 1 an error of 1 or more.
     """
     error = relmse_map(image, truth).mean(axis=-1)
-    grey = ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)
-    mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(grey[..., None])), 0, "inferno")
+    return ((np.log10(np.maximum(error, 1e-5)) + 5) / 5).clip(0, 1).astype(np.float32)
+
+
+def error_colours(levels: Array) -> Array:
+    """OpenImageIO's "inferno" colours, (height, width, 3) in [0, 1], of the levels (height, width)."""
+    mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(levels[..., None])), 0, "inferno")
     if mapped.has_error:
         raise MssplError(f"the error map's colours: {mapped.geterror()}")
     return np.asarray(mapped.get_pixels(oiio.FLOAT), dtype=np.float32)[..., :3]
@@ -120,12 +128,24 @@ def _read_beauty(path: Path) -> Array:
 def _read_at_size_of(truth: Array, path: Path, reference: Path) -> Array:
     """The beauty of an EXR, upsampled to the size of the reference if it is smaller by a scale of ``SCALES``."""
     image = _read_beauty(path)
-    size, wanted = image.shape[:2], truth.shape[:2]
-    if size == wanted:
-        return image
+    check_size(path, image.shape[:2], reference, truth.shape[:2])
+    return image if image.shape == truth.shape else upsample_bicubic(image, truth.shape[1], truth.shape[0])
+
+
+def check_size(path: Path, size: Sequence[int], reference: Path, wanted: Sequence[int]) -> None:
+    """Check that an image has the size of the reference, or is smaller by a scale of ``SCALES``.
+
+    Args:
+        path, reference: their files.
+        size, wanted: their height and width.
+
+    Raises:
+        InputError: the sizes do not fit.
+    """
     # An odd side may have been rounded up or down.
-    if any(all(a in (b // scale, -(-b // scale)) for a, b in zip(size, wanted, strict=True)) for scale in SCALES):
-        return upsample_bicubic(image, wanted[1], wanted[0])
-    raise InputError(
-        f"{path} is {size[1]}x{size[0]}, but {reference} is {wanted[1]}x{wanted[0]}; compare pictures of one size"
-    )
+    if tuple(size) != tuple(wanted) and not any(
+        all(a in (b // scale, -(-b // scale)) for a, b in zip(size, wanted, strict=True)) for scale in SCALES
+    ):
+        raise InputError(
+            f"{path} is {size[1]}x{size[0]}, but {reference} is {wanted[1]}x{wanted[0]}; compare pictures of one size"
+        )

@@ -17,7 +17,7 @@ from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
-from oiio_msspl.jobs.inputs import InputOptions
+from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -33,7 +33,9 @@ class Inspection:
     file: ExrFile | None = None
     """None if the headers can't be read."""
     render: MappedRender | None = None
-    """None if the layers can't be mapped."""
+    """The first view, or the one that is asked for; None if the layers can't be mapped."""
+    other_views: list[MappedRender] = field(default_factory=list)
+    """The other views and view layers, unless one is asked for."""
     contract: Contract | None = None
     """Of the model that would read the file."""
     facts: list[str] = field(default_factory=list)
@@ -48,10 +50,15 @@ class Inspection:
         """Family of the model that would read the file, such as ``joint``."""
         return self.contract.name.removesuffix(f"-x{self.contract.scale}") if self.contract else ""
 
-    def aovs(self) -> list[dict[str, str]]:
-        """What the model would read, as :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` describes it."""
-        assert self.render is not None and self.contract is not None
-        return self.render.table(self.contract.features)
+    def aovs(self, view: MappedRender | None = None) -> list[dict[str, str]]:
+        """What the model would read, as :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` describes it.
+
+        Args:
+            view: one of ``other_views``; None for ``render``.
+        """
+        render = view or self.render
+        assert render is not None and self.contract is not None
+        return render.table(self.contract.features)
 
     def as_dict(self) -> dict[str, Any]:
         """The inspection as it is written to JSON."""
@@ -78,6 +85,7 @@ class Inspection:
                 "renderer": self.render.renderer,
                 "view": self.render.view or None,
                 "other_views": self.render.other_views,
+                "views": [{"view": each.view or None, "aovs": self.aovs(each)} for each in self.other_views],
                 "spp": self.render.spp,
                 "model": self.model,
                 "aovs": self.aovs(),
@@ -108,19 +116,28 @@ def inspect_file(path: Path, inputs: InputOptions, model: str | None = None) -> 
         result.facts = _facts(file)
         render = result.render = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
         result.facts.append(_renderer_fact(render))
-        result.passed_through = render.unread_layers()
-        result.facts += _pixel_facts(render)
-        result.facts += [
-            f"{each.name} ({each.layer_names}): {check_sum(render, each).text}" for each in render.additive_sets
-        ]
+        result.facts += [*_pixel_facts(render), *_set_facts(render)]
+        for label in render.other_views if inputs.view is None else ():
+            try:
+                view = map_other_hrls(render, label, inputs)
+                facts = [*_pixel_facts(view), *_set_facts(view)]
+                result.other_views.append(view)
+            except InputError as error:
+                facts = [f"can't be fused: {str(error).removeprefix(f'{path}: ')}"]
+            result.facts += [f"{label or '(unnamed)'}: {fact}" for fact in facts]
+        result.passed_through = render.unread_layers(result.other_views)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
     return result
 
 
+def _set_facts(render: MappedRender) -> list[str]:
+    return [f"{each.name} ({each.layer_names}): {check_sum(render, each).text}" for each in render.additive_sets]
+
+
 def _renderer_fact(render: MappedRender) -> str:
     spp = "unknown spp" if render.spp is None else f"{render.spp:g} spp"
-    others = f"; also {', '.join(render.other_views)} (--view-layer)" if render.other_views else ""
+    others = f"; also {', '.join(each or '(unnamed)' for each in render.other_views)}" if render.other_views else ""
     view = f", {render.view}" if render.view else ""
     return f"renderer: {render.renderer}, {spp}{view}{others}"
 

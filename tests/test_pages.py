@@ -56,7 +56,7 @@ NOT_RUN = {
 #: An option and its value -> the same.
 NOT_RUN_WITH = {"--scheduler": "needs a running Dask scheduler", "--device cuda": "needs a GPU"}
 #: Options that name what is written.
-OUTPUTS = ("-o", "--bundle", "--report", "--error-map")
+OUTPUTS = ("-o", "--bundle", "--report", "--error-map", "--html")
 #: Packages that pages install beside those of pyproject.toml.
 OTHER_PACKAGES = {
     "onnxruntime-gpu": "takes the place of onnxruntime",
@@ -118,6 +118,9 @@ def run(command: str, folder: Path) -> subprocess.CompletedProcess[str]:
 def folder(tmp_path: Path) -> Path:
     """The files that pages name: a pair, its reference, a shot in folders and by patterns, and files shown on pages."""
     shutil.copytree(EXAMPLES, tmp_path / "examples")
+    shutil.copytree(EXAMPLES, tmp_path / "demo")  # a pair that a page renders
+    shutil.copy(EXAMPLES / "hr.exr", tmp_path / "demo/ref.exr")
+    (tmp_path / "docs").mkdir()
     for name in ("lr", "hr"):
         source = EXAMPLES / f"{name}.exr"
         shutil.copy(source, tmp_path)

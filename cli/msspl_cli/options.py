@@ -68,7 +68,7 @@ ViewLayer = Annotated[
     typer.Option(
         "--view-layer",
         metavar="NAME",
-        help="View (left) or view layer, if the file has several.",
+        help="Only this view (left) or view layer. \\[default: all]",
         rich_help_panel=INPUT,
     ),
 ]

@@ -90,7 +90,8 @@ def print_table(report: ShotReport) -> None:
     from oiio_msspl.jobs.sequence import format_frames
 
     if first := report.first:
-        view = f", view {first['view']}" if first.get("other_views") else ""
+        fused = [each["view"] or "(unnamed)" for each in first.get("fused_views", ())]
+        view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
         console.say(f"{first['renderer']} pairs at x{first['scale']}{view}; layers of frame {first['frame']}:")
         console.aov_table(first["aovs"], first["notes"])
     # Sentences that differ only in their numbers share a row, which shows the first of them.

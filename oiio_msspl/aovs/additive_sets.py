@@ -7,6 +7,7 @@ measured by :mod:`oiio_msspl.fusion.sums`.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
@@ -18,6 +19,11 @@ from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, matches_layer, same_spelling
 from oiio_msspl.exr.reader import Channel
+
+#: The words of a layer's name, also where a renderer writes them together (``directdiffuse``).
+_WORD = re.compile(r"indirect|direct|combined|rgba|(?:(?!indirect|direct|combined|rgba)[^ _.-])+")
+#: Words that mean all light.
+_ALL_LIGHT = frozenset({"rgba", "c", "combined"})
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,14 @@ class AdditiveLayer:
     """R, G, B of the layer that it is multiplied by: Cycles' light passes leave the surface colour out."""
 
     @property
+    def words(self) -> frozenset[str]:
+        """What its name says of its light: ``diffuse`` and ``key`` for ``diffuse_key``.
+
+        Words for all light are left out.
+        """
+        return frozenset(_WORD.findall(self.name.lower())) - _ALL_LIGHT
+
+    @property
     def formula(self) -> FeatureFormula:
         """The light of this layer."""
         return FeatureFormula((self.channels,), self.factor, text=self.name)
@@ -44,13 +58,16 @@ class AdditiveSet:
     name: str
     """Such as ``light groups``."""
     layers: tuple[AdditiveLayer, ...]
+    coarser: tuple[AdditiveLayer, ...] = ()
+    """Layers that by their names are sums of some of ``layers``."""
     by_user: bool = False
     """The user has named it, so it must be usable."""
 
     @property
     def layer_names(self) -> str:
         """Its layers, for the user."""
-        return ", ".join(f"{layer.name} x colour" if layer.factor else layer.name for layer in self.layers)
+        names = ", ".join(f"{layer.name} x colour" if layer.factor else layer.name for layer in self.layers)
+        return names + (f"; sums of these: {', '.join(layer.name for layer in self.coarser)}" if self.coarser else "")
 
     def matches(self, pattern: str) -> bool:
         """Whether a pattern such as ``light*`` means this set or one of its layers."""
@@ -78,8 +95,12 @@ def find_additive_sets(
     sets = [_user_set(finder, text, path) for text in sums]
     for entry in renderer.get("sets", ()):
         found = tuple(dict.fromkeys(layer for candidate in entry["layers"] for layer in finder.find(candidate)))
-        if len(found) > 1 and all(set(found) != set(other.layers) for other in sets):
-            sets.append(AdditiveSet(entry["name"], found))
+        unwanted = entry.get("except", ())
+        found = tuple(each for each in found if not any(fnmatchcase(each.name.lower(), p) for p in unwanted))
+        coarser = tuple(each for each in found if entry.get("finest") and any(each.words < o.words for o in found))
+        finest = tuple(each for each in found if each not in coarser)
+        if len(finest) > 1 and all(set(finest) != set(other.layers) for other in sets):
+            sets.append(AdditiveSet(entry["name"], finest, coarser))
     return sets
 
 

@@ -92,10 +92,11 @@ class MappedRender:
         rows.append(_row("alpha", "found", self.alpha.name) if self.alpha else _row("alpha", "absent"))
         return rows
 
-    def unread_layers(self) -> list[str]:
-        """Names of the layers, or of single channels, that no feature is read from. Those of another view than the
-        chosen one are followed by the view in brackets."""
-        used = {c for formula in self.features.values() for c in formula.channels} | {self.alpha}
+    def unread_layers(self, others: Sequence[MappedRender] = ()) -> list[str]:
+        """Names of the layers, or of single channels, that no feature is read from, in this view or in one of
+        ``others``. Those of another view than the chosen one are followed by the view in brackets."""
+        used = {c for each in (self, *others) for formula in each.features.values() for c in formula.channels}
+        used |= {each.alpha for each in (self, *others) if each.alpha}
         names = []
         for layer in layers_of(self.file):
             rest = [c for c in layer.channels.values() if c not in used]

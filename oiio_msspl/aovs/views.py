@@ -51,7 +51,7 @@ def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> 
         return beauties[0]
     if len(beauties) == 1 and not beauties[0].label:
         return beauties[0]  # the only view, and it has no name
-    for beauty in beauties:
+    for beauty in sorted(beauties, key=lambda each: each.label != wanted):  # the whole name counts more than a part
         if wanted in (beauty.view, beauty.view_layer, beauty.label):
             return beauty
     known = ", ".join(dict.fromkeys(beauty.label or "(unnamed)" for beauty in beauties))

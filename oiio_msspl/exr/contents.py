@@ -67,7 +67,7 @@ class FileContents:
     """Header attributes that are added to the part of the beauty."""
     options: WriteOptions
     replaced: ReplacedChannels | None = None
-    """New pixels for channels that are passed on, with the beauty's data window."""
+    """New pixels for channels that are passed on, over the data window of their part."""
 
     @property
     def home(self) -> Part:

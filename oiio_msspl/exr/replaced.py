@@ -24,33 +24,36 @@ class ReplacedChannels:
     the process, even a killed one. The variable ``TMPDIR`` says where it is.
     """
 
-    def __init__(self, channels: Sequence[Channel], width: int, height: int) -> None:
-        """Room for ``channels``, of ``width`` x ``height`` pixels each."""
-        self._width = width
-        self._offsets: dict[Channel, int] = {}
-        size = 0
-        for channel in dict.fromkeys(channels):
-            self._offsets[channel] = size
-            size += width * height * np.dtype(DTYPES[channel.type]).itemsize
+    def __init__(self) -> None:
+        self._places: dict[Channel, tuple[int, int]] = {}
+        """Offset in the file and width of each channel."""
+        self._size = 0
         self._file = tempfile.TemporaryFile(prefix="msspl-")  # noqa: SIM115 - it lives as long as this object
-        self._file.truncate(size)
+
+    def add(self, channels: Sequence[Channel], width: int, height: int) -> None:
+        """Make room for ``channels``, of ``width`` x ``height`` pixels each; a channel that has room keeps it."""
+        for channel in channels:
+            if channel not in self._places:
+                self._places[channel] = self._size, width
+                self._size += width * height * np.dtype(DTYPES[channel.type]).itemsize
+        self._file.truncate(self._size)
 
     def __contains__(self, channel: Channel) -> bool:
-        return channel in self._offsets
+        return channel in self._places
 
     def put(self, channel: Channel, start: int, rows: Array) -> None:
         """Store rows (n, width) of a channel from row ``start`` on; what is too bright for its type is clipped."""
         largest = HALF_MAX if channel.type == "half" else FLOAT_MAX
         stored = np.clip(rows, -largest, largest).astype(DTYPES[channel.type])
-        self._file.seek(self._place(channel, start))
+        self._seek(channel, start)
         self._file.write(stored.tobytes())
 
     def get(self, channel: Channel, start: int, stop: int) -> NDArray[Any]:
         """Rows of a channel, (stop - start, width)."""
         dtype = np.dtype(DTYPES[channel.type])
-        self._file.seek(self._place(channel, start))
-        data = self._file.read((stop - start) * self._width * dtype.itemsize)
-        return np.frombuffer(data, dtype).reshape(stop - start, self._width)
+        width = self._seek(channel, start)
+        data = self._file.read((stop - start) * width * dtype.itemsize)
+        return np.frombuffer(data, dtype).reshape(stop - start, width)
 
     def apply(self, channels: Sequence[Channel], start: int, pixels: NDArray[Any]) -> NDArray[Any]:
         """Put the new pixels over rows (n, width, channels) from row ``start`` on, in a copy."""
@@ -62,5 +65,8 @@ class ReplacedChannels:
                 pixels[..., i] = self.get(channel, start, start + len(pixels))
         return pixels
 
-    def _place(self, channel: Channel, row: int) -> int:
-        return self._offsets[channel] + row * self._width * np.dtype(DTYPES[channel.type]).itemsize
+    def _seek(self, channel: Channel, row: int) -> int:
+        """Go to a row of a channel. Returns the channel's width."""
+        offset, width = self._places[channel]
+        self._file.seek(offset + row * width * np.dtype(DTYPES[channel.type]).itemsize)
+        return width

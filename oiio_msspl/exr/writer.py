@@ -54,7 +54,7 @@ def write_fused(
         attributes: header attributes that are added to the beauty's part.
         options: layout, compression, pixel type and layers.
         error: predicted error, (height, width, 1); becomes the layer ``error``.
-        replaced: new pixels for some of the other channels, over the beauty's data window.
+        replaced: new pixels for some of the other channels, each over the data window of its part.
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
             each layer.
@@ -154,7 +154,7 @@ def _copy(contents: FileContents, part: PassedOnPart, later: Sequence[PassedOnPa
             pixels = np.concatenate([strip for _, _, strip in strips], axis=-1)
         if replaced is not None:
             channels = [channel for run in part.runs for channel in run]
-            pixels = replaced.apply(channels, y0 - contents.home.data_window.y0, pixels)
+            pixels = replaced.apply(channels, y0 - part.source.data_window.y0, pixels)
         if not writer.write_scanlines(y0, y1, 0, np.ascontiguousarray(pixels)):
             return False
     return True

@@ -13,6 +13,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.colour import luminance
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import encode_alpha, fuse_alpha
 from oiio_msspl.fusion.guards import (
@@ -69,6 +70,8 @@ class FusedFrame:
     """One sentence each."""
     passes: FusedPasses | None = None
     """The fused layers of additive sets; None if there are none."""
+    replaced: ReplacedChannels | None = None
+    """New pixels of other channels of the HRLS: the fused layers, and further views; None if there are none."""
     tiles: int = 1
     seconds: float = 0.0
     """Time in the network alone."""
@@ -137,6 +140,11 @@ def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> in
     # The tiles of larger frames are as large. A damaged header may claim millions of tiles.
     part = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + 16384, grid.y0 + 16384))
     return memory_for_tiles(session.contract, plan_tiles(part, session.contract), frame_bytes)
+
+
+def tile_count(alignment: Alignment, session: Session) -> int:
+    """The number of tiles that a pair is fused in."""
+    return len(plan_tiles(aligned_grid(alignment.grid, session.contract.alignment), session.contract))
 
 
 def result_bytes(alignment: Alignment, *, error: bool) -> int:

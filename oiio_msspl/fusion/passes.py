@@ -10,21 +10,22 @@ proportion to their light, so their sum is the beauty to the last bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, box_downsample, mean_around, planes_of, upsample_linear
+from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import max_3x3
-from oiio_msspl.fusion.sums import check_sum, layer_keys, with_layers
+from oiio_msspl.fusion.sums import check_sum, is_sum_of, layer_keys, with_layers
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks
 
@@ -40,6 +41,8 @@ RIDGE = 0.03
 FIREFLY = 8.0
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
+#: What known layers leave of the beauty counts as rounding below this share of it.
+ROUNDING = np.float32(5e-7)
 #: Larger values of fitted layers are clipped before they are scaled to the sum, which would overflow.
 BRIGHTEST = np.float32(1e30)
 
@@ -63,6 +66,8 @@ def fuse_passes(
     alignment: Alignment,
     sets: Sequence[AdditiveSet],
     cache_bytes: int = 0,
+    pixels: ReplacedChannels | None = None,
+    progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
     """Fuse the layers of additive sets of the HRLS.
 
@@ -72,24 +77,49 @@ def fuse_passes(
         alignment: of the pair.
         sets: of ``hr.additive_sets``. Those that do not sum to its beauty are refused.
         cache_bytes: memory for decoded rows that two bands need.
+        pixels: where the fused layers go; None for a new store.
+        progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
         InputError: pixels can't be decoded.
     """
     jobs, refused = _checked(lr, hr, sets)
     window = alignment.hr_data_window
-    channels = [channel for job in jobs for layer in job.layers.layers for channel in layer.channels]
-    pixels = ReplacedChannels(channels, window.width, window.height)
-    fused = FusedPasses([job.layers for job in jobs], pixels, refused)
-    step = BAND_ROWS // alignment.scale
-    tops = range(alignment.grid.y0, alignment.grid.y1, step) if jobs else []
+    pixels = ReplacedChannels() if pixels is None else pixels
+    pixels.add([channel for job in jobs for channel in job.channels], window.width, window.height)
+    in_order = sorted(jobs, key=lambda job: sets.index(job.layers))
+    fused = FusedPasses([replace(job.layers, coarser=tuple(job.coarser)) for job in in_order], pixels, refused)
+    later = {part for job in jobs for parts in job.known.values() for part in parts}
+    tell = progress or (lambda done, count: None)
+    steps = pass_steps(alignment, sets)
+    done = steps - pass_steps(alignment, jobs)
+    tell(done, steps)
     with hr.cache_strips(cache_bytes):
-        for top in tops:
-            core = Window(alignment.grid.x0, top, alignment.grid.x1, min(top + step, alignment.grid.y1))
+        for core in _bands(alignment) if jobs else []:
             band = _Band(hr, rgb, alignment, core)
+            lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
-                band.fuse(job, lr, hr, pixels)
+                made = band.fuse(job, lr, hr, pixels, lights)
+                # Copies, because a layer alone would keep the memory of its whole set.
+                lights |= {layer: made[layer].copy() for layer in made.keys() & later}
+                done += 1
+                tell(done, steps)
     return fused
+
+
+def pass_steps(alignment: Alignment, sets: Sized) -> int:
+    """The steps in which sets are fused, for progress: each set in each band of rows."""
+    return len(_bands(alignment)) * len(sets)
+
+
+def _bands(alignment: Alignment) -> list[Window]:
+    """The bands of LRHS rows that are fused one after the other."""
+    grid, rows = alignment.grid, BAND_ROWS // alignment.scale
+    return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
+
+
+#: Layers, each with the layers that it is the sum of.
+_Sums = dict[AdditiveLayer, tuple[AdditiveLayer, ...]]
 
 
 @dataclass(frozen=True)
@@ -101,22 +131,67 @@ class _Job:
     """The same layers in the LRHS."""
     remainder: bool
     """Some light is in no layer."""
+    known: _Sums
+    """Layers of this set that are sums of layers of an earlier set, or that both sets have. The other layers are
+    fitted, and share what these leave of the beauty."""
+    coarser: _Sums = field(default_factory=dict)
+    """Layers outside of all sets that are sums of layers of this one."""
+
+    @property
+    def fitted(self) -> list[AdditiveLayer]:
+        return [layer for layer in self.layers.layers if layer not in self.known]
+
+    @property
+    def channels(self) -> list[Channel]:
+        """What is written."""
+        return [channel for layer in (*self.layers.layers, *self.coarser) for channel in layer.channels]
 
 
 def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[list[_Job], dict[str, str]]:
-    """The sets that sum to the beauty, and why each of the others does not, by name."""
+    """The sets that sum to the beauty, and why each of the others does not, by name.
+
+    Sets with more layers come first, because layers of the others may be sums of theirs.
+    """
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
-    taken: set[object] = set()
-    for layers in sets:
+    for layers in sorted(sets, key=lambda each: -len(each.layers)):
         check = check_sum(hr, layers)
-        shared = [layer.name for layer in layers.layers if not taken.isdisjoint(layer.channels)]
-        if check.problem or shared:
-            refused[layers.name] = check.text if check.problem else f"shares {shared[0]} with another set"
+        if check.problem:
+            refused[layers.name] = check.text
             continue
-        taken.update(channel for layer in layers.layers for channel in layer.channels)
-        jobs.append(_Job(layers, _same_layers(lr, layers), check.remainder))
+        # All known layers come from one set. Those of two sets could have more light than the beauty.
+        known = max((_sums_of(hr, layers.layers, job.layers) for job in jobs), key=len, default={})
+        taken = {channel for job in jobs for channel in job.channels}
+        shared = [each.name for each in layers.layers if each not in known and not taken.isdisjoint(each.channels)]
+        if shared:
+            refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
+            continue
+        jobs.append(_Job(layers, _same_layers(lr, layers), check.remainder, known))
+    taken = {channel for job in jobs for channel in job.channels}
+    for job in jobs:
+        for layer in job.layers.coarser:
+            if taken.isdisjoint(layer.channels):
+                job.coarser.update(_sums_of(hr, [layer], job.layers))
     return jobs, refused
+
+
+def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> _Sums:
+    """Those of some layers that a set has, or that by name and pixels are sums of its layers.
+
+    No layer of the set belongs to two sums.
+    """
+    sums: _Sums = {}
+    used: set[AdditiveLayer] = set()
+    for layer in layers:
+        parts = tuple(each for each in finer.layers if layer.words < each.words) if layer.words else ()
+        if layer in finer.layers:
+            parts = (layer,)
+        elif layer.factor is not None or len(parts) < 2 or not is_sum_of(hr, layer, parts):
+            continue
+        if used.isdisjoint(parts):
+            sums[layer] = parts
+            used.update(parts)
+    return sums
 
 
 def _same_layers(lr: MappedRender, layers: AdditiveSet) -> AdditiveSet | None:
@@ -153,15 +228,57 @@ class _Band:
         with np.errstate(over="ignore", invalid="ignore"):
             self._fit = _Fit(low, self._radius)
 
-    def fuse(self, job: _Job, lr: MappedRender, hr: MappedRender, pixels: ReplacedChannels) -> None:
-        """Fuse the layers of one set and store them."""
+    def fuse(
+        self,
+        job: _Job,
+        lr: MappedRender,
+        hr: MappedRender,
+        pixels: ReplacedChannels,
+        earlier: Mapping[AdditiveLayer, Array],
+    ) -> dict[AdditiveLayer, Array]:
+        """Fuse the layers of one set and store them.
+
+        Args:
+            job: the set.
+            lr, hr: the pair.
+            pixels: gets the rows of the band.
+            earlier: light (3, h, w) of layers of earlier sets.
+
+        Returns:
+            The light of each layer.
+        """
+        rows = slice((self._core.y0 - self._area.y0) * self._scale, (self._core.y1 - self._area.y0) * self._scale)
+        lights = {layer: _total(earlier, parts) for layer, parts in job.known.items()}
+        colours = self._colours(job, hr)
+        if job.fitted:
+            rest = self._beauty[:, rows]
+            if lights:
+                rest = rest - _total(lights, lights)
+                rest[rest < ROUNDING * self._beauty[:, rows]] = 0
+            lights |= self._fitted(job, lr, hr, rest, colours)
+        lights |= {layer: _total(lights, parts) for layer, parts in job.coarser.items()}
+        window = self._alignment.hr_data_window
+        core = in_hrls_pixels(self._core, self._scale)
+        inside = core.intersect(window)
+        for layer, light in lights.items():
+            if layer in earlier:
+                continue  # an earlier set has stored it
+            if layer in colours:
+                light = np.divide(light, np.maximum(colours[layer], DARKEST_COLOUR), dtype=np.float32)
+            for channel, plane in zip(layer.channels, light, strict=True):
+                pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
+        return lights
+
+    def _fitted(
+        self, job: _Job, lr: MappedRender, hr: MappedRender, light: Array, colours: Mapping[AdditiveLayer, Array]
+    ) -> dict[AdditiveLayer, Array]:
+        """Divide ``light`` (3, h, w) among the layers of a set that are fitted."""
         noisy = self._average(job, lr, hr)
         core_rows = slice(self._core.y0 - self._area.y0, self._core.y1 - self._area.y0)
         scale = self._scale
-        rows = slice(core_rows.start * scale, core_rows.stop * scale)
-        beauty, guides = self._beauty[:, rows], self._guides[:, :, rows]
-        fitted = np.empty((len(noisy), *beauty.shape), np.float32)
-        flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *beauty.shape[1:])
+        guides = self._guides[:, :, core_rows.start * scale : core_rows.stop * scale]
+        fitted = np.empty((len(noisy), *light.shape), np.float32)
+        flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *light.shape[1:])
 
         def fit(planes: slice) -> None:
             # NumPy's settings for errors belong to the thread.
@@ -180,28 +297,25 @@ class _Band:
                 bounds = (upsample_linear(plane, scale, core_rows) for plane in (low, high))
                 np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
 
-        for_row_blocks(fit, len(flat_noisy), beauty[0].size)
-        colours = self._colours(job, hr)
+        for_row_blocks(fit, len(flat_noisy), light[0].size)
         # The squares of light beyond 1e19 overflow, so there is no fit there.
         fitted[:, ~np.isfinite(fitted).all(axis=0)] = 0
         np.clip(fitted, 0, BRIGHTEST, out=fitted)
         # Where no layer is left, the beauty is divided as in the whole band.
         dark = fitted.sum(axis=0) == 0
         fitted[:, dark] = np.minimum(noisy, BRIGHTEST).mean(axis=(1, 2, 3))[:, None]
-        for i, colour in colours.items():
-            fitted[i] *= colour >= DARKEST_COLOUR
-        _make_sum(fitted, beauty)
-        for i, colour in colours.items():
-            fitted[i] /= np.maximum(colour, DARKEST_COLOUR)
-        window = self._alignment.hr_data_window
-        core = in_hrls_pixels(self._core, scale)
-        inside = core.intersect(window)
-        for layer, values in zip(job.layers.layers, fitted, strict=False):
-            for channel, plane in zip(layer.channels, values, strict=True):
-                pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
+        layers = job.fitted
+        for i, layer in enumerate(layers):
+            if layer in colours:
+                fitted[i] *= colours[layer] >= DARKEST_COLOUR
+        _make_sum(fitted, light)
+        return dict(zip(layers, fitted, strict=False))
 
     def _average(self, job: _Job, lr: MappedRender, hr: MappedRender) -> Array:
-        """The mean of both renders' layers at low resolution, (layers, 3, h, w); the remainder is the last layer."""
+        """The mean of both renders' layers at low resolution, (layers, 3, h, w), of those that are fitted.
+
+        The remainder is the last layer.
+        """
         window = self._alignment.hr_data_window
         render = with_layers(hr, job.layers)
         high = read_features(render, self._hrls_area, window, render.features)
@@ -219,20 +333,21 @@ class _Band:
             allowed = FIREFLY * max_3x3(self._low_beauty.sum(axis=0))
             total += layers * np.minimum(1, allowed / np.maximum(light, 1e-20))
         total /= np.float32(len(renders))
-        return total
+        known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
+        return np.delete(total, known, axis=0) if known else total
 
-    def _colours(self, job: _Job, hr: MappedRender) -> dict[int, Array]:
-        """The colour (3, h, w) that each product's light is multiplied by, by index of the layer."""
-        colours: dict[int, Array] = {}
+    def _colours(self, job: _Job, hr: MappedRender) -> dict[AdditiveLayer, Array]:
+        """The colour (3, h, w) that the light of each product that is fitted is multiplied by."""
+        colours: dict[AdditiveLayer, Array] = {}
         by_channels: dict[object, Array] = {}
         window = in_hrls_pixels(self._core, self._scale)
-        for i, layer in enumerate(job.layers.layers):
+        for layer in job.fitted:
             if layer.factor is not None:
                 if layer.factor not in by_channels:
                     render = replace(hr, features={"colour": FeatureFormula((layer.factor,))})
                     colour = read_features(render, window, self._alignment.hr_data_window, ["colour"])["colour"]
                     by_channels[layer.factor] = planes_of(colour)
-                colours[i] = by_channels[layer.factor]
+                colours[layer] = by_channels[layer.factor]
         return colours
 
 
@@ -297,6 +412,15 @@ def _minus_products(value: Array, first: Sequence[Array], second: Sequence[Array
     for a, b in zip(first, second, strict=False):
         value = value - a * b
     return value
+
+
+def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer]) -> Array:
+    """The light of some layers together."""
+    first, *others = layers
+    total = lights[first].copy()
+    for layer in others:
+        total += lights[layer]
+    return total
 
 
 def _make_sum(layers: Array, beauty: Array) -> None:

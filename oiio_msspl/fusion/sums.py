@@ -3,11 +3,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.render import Window
@@ -73,6 +74,17 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
             residual, problem=f"they differ by {residual:.1%} both ways; is the beauty denoised, or stored lossily?"
         )
     return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; some layers overlap")
+
+
+def is_sum_of(render: MappedRender, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
+    """Whether a layer is the sum of others of the same file, on some strips of rows.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    whole = replace(render, features={RGB: layer.formula}, alpha=None)
+    check = check_sum(whole, AdditiveSet(layer.name, tuple(parts)))
+    return not check.problem and not check.remainder
 
 
 def with_layers(render: MappedRender, additive_set: AdditiveSet) -> MappedRender:

@@ -10,7 +10,6 @@ from pathlib import Path
 
 import numpy as np
 
-from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError, MssplError
@@ -21,10 +20,18 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
-from oiio_msspl.fusion.passes import FusedPasses, fuse_passes
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, STRIPS_SHARE, require_memory
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, require_memory
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair, resolve_auto
-from oiio_msspl.jobs.report import FrameReport, provenance, report_on
+from oiio_msspl.jobs.report import FrameReport, add_other_views, provenance, report_on
+from oiio_msspl.jobs.views import (
+    Progress,
+    View,
+    check_passes,
+    find_other_views,
+    fuse_frame_passes,
+    fuse_other_views,
+    steps_of,
+)
 from oiio_msspl.model.catalogue import DEFAULT_FAMILY, find_model
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import in_background, limit_threads
@@ -78,7 +85,7 @@ def fuse_files(
     Args:
         lr_path, hr_path: the low-resolution, high-spp render and the high-resolution, low-spp render of one frame.
         output: EXR to write.
-        inputs: mapping, view and spp of the two files.
+        inputs: mapping, view and spp of the two files. If it names no view, all views and view layers are fused.
         write: layout, compression, pixel type and layers of the result.
         model: a shipped model, a family of models (``paper``), or an ONNX file. None or ``auto`` chooses one, see
             :func:`oiio_msspl.model.catalogue.find_model`.
@@ -88,7 +95,7 @@ def fuse_files(
         preview_path: PNG to write, or None.
         view_transform: OpenColorIO view of the preview; None for the sRGB curve.
         overwrite: replace existing files.
-        progress: called with (tiles done, tiles in all).
+        progress: called with (steps done, steps in all). A step is a tile, or a band of rows of a set of passes.
 
     Returns:
         What was read, fused and written.
@@ -106,11 +113,12 @@ def fuse_files(
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
+    others = find_other_views(lr, hr, inputs, write)
     targets = [output] if preview_path is None else [output, preview_path]
     check_separate(files_read(lr, hr, inputs, model), targets)
     remove_leftovers(targets)
     dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
-    sets_to_fuse(hr, write)  # and so is a set
+    check_passes(hr, others, write)  # and so is a set
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
     family = resolve_auto(lr, hr, model) if fits else model or DEFAULT_FAMILY
@@ -118,11 +126,16 @@ def fuse_files(
     check_frame_memory(lr, hr, session, write, max_memory)
     opened = time.perf_counter()
 
+    if progress is not None:
+        progress = Progress(progress, steps_of([View(lr, hr), *others.views], session, write))
+    replaced, reports = fuse_other_views(others, session, write, max_memory, progress=progress)
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
-    fused.passes = fuse_frame_passes(lr, hr, fused, write, max_memory)
+    fused.replaced = replaced
+    fuse_frame_passes(lr, hr, fused, write, max_memory, progress)
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
+    add_other_views(report, reports, others.passed_on)
     del session  # its memory is for the writer's cache
     # Half of what is left: compression and the preview need memory, too.
     cache_bytes = max(0, max_memory - FIXED_MEMORY - fused.nbytes) // 2
@@ -131,48 +144,10 @@ def fuse_files(
     report.seconds = {
         "read": opened - start,
         "fuse": computed - opened,
-        "network": fused.seconds,
+        "network": report.network_seconds,
         "write": time.perf_counter() - computed,
     }
     return report
-
-
-def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
-    """The additive sets that are asked for and of which a layer is written.
-
-    Raises:
-        InputError: a pattern matches no set.
-    """
-    if write.passes == ("none",):
-        return []
-    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
-    written = [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
-    wanted = [each for each in written if not write.passes or any(each.matches(p) for p in write.passes)]
-    if write.passes and not wanted:
-        known = ", ".join(f"'{each.name}'" for each in written) or "none"
-        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
-    return wanted
-
-
-def fuse_frame_passes(
-    lr: MappedRender, hr: MappedRender, fused: FusedFrame, write: WriteOptions, max_memory: int
-) -> FusedPasses | None:
-    """Fuse the additive sets of :func:`sets_to_fuse`; None if there are none.
-
-    Args:
-        lr, hr: the pair, as files.
-        fused: its fused beauty.
-        write: ``passes`` says which.
-        max_memory: bytes that the process should stay below.
-
-    Raises:
-        InputError: a pattern matches no set, or pixels can't be decoded.
-    """
-    sets = sets_to_fuse(hr, write)
-    if not sets:
-        return None
-    cache_bytes = int((max_memory - fused.nbytes) * STRIPS_SHARE)
-    return fuse_passes(lr, hr, fused.rgb, fused.alignment, sets, max(0, cache_bytes))
 
 
 def write_frame(
@@ -201,7 +176,7 @@ def write_frame(
         provenance(report),
         options,
         error=fused.error,
-        replaced=fused.passes.pixels if fused.passes else None,
+        replaced=fused.replaced,
         overwrite=overwrite,
         cache_bytes=cache_bytes,
         stale=old_preview(report.output) if overwrite else None,

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +28,7 @@ class InputOptions:
     mapping: Mapping[str, Any] = field(default_factory=dict)
     """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
     view: str | None = None
-    """View or view layer; the first one of each file if None."""
+    """The only view or view layer to use; None for all, each file's first one in front."""
     lr_spp: float | None = None
     """Samples per pixel of the LRHS; None to read them from its header."""
     hr_spp: float | None = None
@@ -67,6 +67,43 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
     lr, hr = _map_lrhs(lr_file, inputs), _map_hrls(hr_file, inputs)
     lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
     return lr, hr
+
+
+def map_other_view(
+    lr: MappedRender, hr: MappedRender, view: str, inputs: InputOptions
+) -> tuple[MappedRender, MappedRender]:
+    """Map a pair for another view or view layer.
+
+    Args:
+        lr, hr: the pair, mapped for its first view.
+        view: one of ``hr.other_views``.
+        inputs: mapping and spp. An entry that means a layer of the first view by its full name means that view alone.
+
+    Raises:
+        InputError: one of the files has no such view, or can't be used for it.
+    """
+    high = map_other_hrls(hr, view, inputs)
+    low = _map_lrhs(lr.file, replace(inputs, view=view))
+    if low.view != view:
+        raise InputError(f"{lr.name}: has no view or view layer {view!r}")
+    low.space = high.space = hr.space
+    return low, high
+
+
+def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedRender:
+    """The HRLS of :func:`map_other_view`."""
+    inputs = replace(inputs, view=view)
+    sums = inputs.sums
+    try:
+        other = _map_hrls(hr.file, inputs)
+    except InputError:
+        sums = ()  # the other views need not have the layers of the user's sums
+        other = _map_hrls(hr.file, replace(inputs, sums=sums))
+    firsts = {name for name, each in other.features.items() if name in hr.features and each == hr.features[name]}
+    if firsts.isdisjoint(inputs.mapping):
+        return other
+    mapping = {name: each for name, each in inputs.mapping.items() if name not in firsts}
+    return _map_hrls(hr.file, replace(inputs, sums=sums, mapping=mapping))
 
 
 def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:

@@ -10,6 +10,8 @@ from typing import Any
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.pair_checks import BOTH_BLACK, check_renders
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.report import merged
+from oiio_msspl.jobs.views import find_other_views
 
 
 @dataclass(frozen=True)
@@ -21,12 +23,14 @@ class PairCheck:
     problem: str | None = None
     """Why the pair can't be fused; None if it can."""
     warnings: list[str] = field(default_factory=list)
-    """Why the renders may not show the same frame, one sentence each."""
+    """Why the renders may not show the same frame, one sentence each. One about some of several views names them."""
+    passed_on: tuple[str, ...] = ()
+    """Why views beside the first one can't be fused, one sentence each."""
 
     @property
     def fits(self) -> bool:
         """Whether the pair can be fused and nothing speaks against it."""
-        return self.problem is None and all(warning == BOTH_BLACK for warning in self.warnings)
+        return self.problem is None and all(warning.endswith(BOTH_BLACK) for warning in self.warnings)
 
     def as_dict(self) -> dict[str, Any]:
         """The check as JSON values."""
@@ -36,6 +40,7 @@ class PairCheck:
             "fits": self.fits,
             "problem": self.problem,
             "warnings": self.warnings,
+            "passed_on": self.passed_on,
         }
 
 
@@ -44,13 +49,17 @@ def check_files(lr: str | Path, hr: str | Path, inputs: InputOptions = InputOpti
 
     Args:
         lr, hr: the low-resolution and the high-resolution render.
-        inputs: mapping, view and colour space of the two files.
+        inputs: mapping, view and colour space of the two files. If it names no view, all are checked.
 
     Returns:
         What was found. A pair that can't be fused is described in ``problem``; nothing is raised for it.
     """
     lr, hr = Path(lr), Path(hr)
     try:
-        return PairCheck(lr, hr, warnings=check_renders(*map_pair(lr, hr, inputs)))
+        first = map_pair(lr, hr, inputs)
+        others = find_other_views(*first, inputs)
+        views = [first, *((view.lr, view.hr) for view in others.views)]
+        warnings = merged({high.view: check_renders(low, high) for low, high in views})
+        return PairCheck(lr, hr, warnings=warnings, passed_on=others.passed_on)
     except InputError as error:
         return PairCheck(lr, hr, problem=str(error))

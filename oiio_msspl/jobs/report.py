@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -46,6 +47,11 @@ class FrameReport:
     """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
     passes: dict[str, str] = field(default_factory=dict)
     """What was done with each additive set, by its name."""
+    network_seconds: float = 0.0
+    """``seconds["network"]``, known before the others."""
+    other_views: list[FrameReport] = field(default_factory=list)
+    """The views and view layers that were fused beside the first one. What this report counts, warns of and says of
+    passes is about all of them, with the view in front where it is not the first one's."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -57,6 +63,10 @@ class FrameReport:
     def aovs(self) -> list[dict[str, str]]:
         """The rows of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` for the HRLS."""
         return self.hr.table(self.features)
+
+    def fused_views(self) -> list[FrameReport]:
+        """The reports of all views that were fused, the first one in front; empty for a file with only one view."""
+        return [self, *self.other_views] if self.hr.other_views else []
 
     def found_lrhs_aovs(self) -> dict[str, str]:
         """The features of ``lrhs_aovs`` that the LRHS has, with the layer of each."""
@@ -72,6 +82,7 @@ class FrameReport:
             "renderer": self.hr.renderer,
             "view": self.hr.view or None,
             "other_views": self.hr.other_views,
+            "fused_views": [{"view": each.hr.view or None, "aovs": each.aovs()} for each in self.fused_views()],
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
@@ -112,7 +123,42 @@ def report_on(
         features=frozenset(session.contract.features),
         lrhs_aovs=session.lrhs_aovs,
         passes=_passes(fused),
+        network_seconds=fused.seconds,
     )
+
+
+def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on: Sequence[str]) -> None:
+    """Add other views of a frame to the report of its first one.
+
+    Args:
+        report: of the first view.
+        views: those that were fused, too.
+        passed_on: why others were not, one sentence each.
+    """
+    warnings = merged({each.hr.view: each.warnings for each in (report, *views)})
+    report.warnings = [*warnings, *passed_on]
+    report.other_views = list(views)
+    for view in views:
+        name = name_of(view.hr.view)
+        report.passes |= {f"{name}: {key}": text for key, text in view.passes.items()}
+        report.repaired |= {f"{name}: {key}": count for key, count in view.repaired.items()}
+        report.negative |= {f"{name}: {key}": count for key, count in view.negative.items()}
+        report.tiles += view.tiles
+        report.network_seconds += view.network_seconds
+
+
+def merged(sentences: Mapping[str, Sequence[str]]) -> list[str]:
+    """Sentences about several views, by view. One that not all views share begins with those that do."""
+    views: dict[str, list[str]] = {}
+    for view, texts in sentences.items():
+        for text in texts:
+            views.setdefault(text, []).append(name_of(view))
+    return [text if len(who) == len(sentences) else f"{', '.join(who)}: {text}" for text, who in views.items()]
+
+
+def name_of(view: str) -> str:
+    """A view or view layer, in words."""
+    return view or "(unnamed)"
 
 
 def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:
@@ -147,7 +193,8 @@ def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list
 def provenance(report: FrameReport) -> dict[str, str]:
     """Attributes of the fused part: model, inputs, spp and layers that the frame was made from."""
     spp = report.spp_avg
-    return {
+    views = {"msspl/views": ", ".join(name_of(each.hr.view) for each in report.fused_views())}
+    return (views if report.other_views else {}) | {
         "msspl/version": __version__,
         "msspl/model": report.model,
         "msspl/scale": str(report.scale),

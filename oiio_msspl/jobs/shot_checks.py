@@ -81,7 +81,7 @@ def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]
         if frame.lr is not None and frame.hr is not None:
             check = check_files(frame.lr, frame.hr, inputs)
             problems = [] if check.problem is None else [f"can't be checked here: {check.problem}"]
-            return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings]]
+            return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings, *check.passed_on]]
     return []
 
 

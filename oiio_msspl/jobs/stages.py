@@ -19,10 +19,11 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import check_frame_memory, fuse_frame_passes, sets_to_fuse, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import check_frame_memory, write_frame, write_frame_preview
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
-from oiio_msspl.jobs.report import FrameReport, report_on
+from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
 from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.views import OtherViews, check_passes, find_other_views, fuse_frame_passes, fuse_other_views
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 
@@ -40,6 +41,8 @@ class LoadedFrame:
     """The HRLS in memory, or ``hr`` itself if the pair does not fit."""
     seconds: float
     """Wall time of reading."""
+    others: OtherViews
+    """Views beside the first one. Their pixels are read when they are fused."""
 
     @property
     def in_memory(self) -> bool:
@@ -105,15 +108,16 @@ class Stages:
         start = time.perf_counter()
         assert frame.lr is not None and frame.hr is not None
         lr, hr = map_pair(frame.lr, frame.hr, self.inputs)
+        others = find_other_views(lr, hr, self.inputs, self.write_options)
         targets = [frame.output, frame.output.with_suffix(".png")] if self.previews else [frame.output]
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
-        sets_to_fuse(hr, self.write_options)
+        check_passes(hr, others, self.write_options)
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
         left = self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr)
         if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= left:
-            return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start)
-        return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start)
+            return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start, others)
+        return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -137,6 +141,7 @@ class Stages:
         if loaded.in_memory:
             others += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
         check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, others)
+        replaced, reports = fuse_other_views(loaded.others, session, self.write_options, self.max_memory, held=others)
         fused = fuse(
             loaded.lr_pixels,
             loaded.hr_pixels,
@@ -145,10 +150,13 @@ class Stages:
             max_memory=self.max_memory,
             held=others,
         )
-        fused.passes = fuse_frame_passes(loaded.lr, loaded.hr, fused, self.write_options, self.max_memory - others)
+        fused.replaced = replaced
+        fuse_frame_passes(loaded.lr, loaded.hr, fused, self.write_options, self.max_memory - others)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
-        report.seconds = {"read": loaded.seconds, "fuse": time.perf_counter() - start, "network": fused.seconds}
+        add_other_views(report, reports, loaded.others.passed_on)
+        seconds = time.perf_counter() - start
+        report.seconds = {"read": loaded.seconds, "fuse": seconds, "network": report.network_seconds}
         return report, fused
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:

@@ -118,3 +118,22 @@ def test_sets_of_real_files(file, text):
     found = map_render(open_exr(SHARED / "exr" / file))
     (components,) = found.additive_sets
     assert components.name == "components" and text in check_sum(found, components).text
+
+
+def test_the_finest_arnold_layers_are_a_set_and_the_coarser_ones_its_sums(tmp_path):
+    layers = {"diffuse_direct_key": 1, "diffuse_direct_fill": 2, "diffuse_indirect": 4, "specular": 1}
+    layers |= {"diffuse_direct": 3, "diffuse_key": 9, "diffuse": 7, "diffuse_albedo": 1, "coat_direct": 1}
+    found = render(tmp_path, layers, **{"arnold/AA_samples": "3"})
+    finest = next(each for each in found.additive_sets if each.name == "finest components")
+    fine = {"diffuse_direct_key", "diffuse_direct_fill", "diffuse_indirect", "specular", "coat_direct"}
+    assert {layer.name for layer in finest.layers} == fine
+    assert {layer.name for layer in finest.coarser} == {"diffuse_direct", "diffuse_key", "diffuse"}
+
+
+def test_names_that_are_written_together_have_the_same_words(tmp_path):
+    found = render(tmp_path, {"C_key": 1, "C_fill": 2, "combineddiffuse": 3, "coat": 1}, renderTime_s="1")
+    words = {layer.name: layer.words for each in found.additive_sets for layer in each.layers}
+    assert words["C_key"] == {"key"} and words["combineddiffuse"] == {"diffuse"} < {"direct", "diffuse"}
+    directs = {"directdiffuse": 1, "indirectdiffuse": 2}
+    found = render(tmp_path, directs, renderTime_s="1").additive_sets[0]
+    assert [set(layer.words) for layer in found.layers] == [{"direct", "diffuse"}, {"indirect", "diffuse"}]

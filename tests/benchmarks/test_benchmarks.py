@@ -2,8 +2,6 @@
 """Scenes, result tables, the pages and the chart that are made of them."""
 
 import re
-import shutil
-import subprocess
 
 import numpy as np
 import pytest
@@ -14,11 +12,8 @@ from benchmarks import chart, paper, peers, quality, results, runtime, scenes, t
 from datagen import views
 from oiio_msspl import Render
 from oiio_msspl.model.encoding import find_exposure
+from tests.browser import BROWSER, dump_dom
 from tests.conftest import downsample, picture, rgb, write_exr
-
-BROWSER = next(
-    (path for name in ("chromium", "chromium-browser", "google-chrome") if (path := shutil.which(name))), None
-)
 
 
 def test_views_for_testing_are_scenes(tmp_path):
@@ -251,8 +246,7 @@ def test_the_chart_draws_every_point(measure, scene, time):
     """In the browser each point of the data stands in the page, with its time and its value."""
     shown = chart.data()
     address = f"{(tables.ROOT / 'docs/chart.html').as_uri()}#measure={measure}&scene={scene}&time={time}"
-    command = [BROWSER, "--headless", "--no-sandbox", "--disable-gpu", "--dump-dom", address]
-    dom = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120).stdout
+    dom = dump_dom(address)
     drawn = re.findall(r'class="point".*?data-method="(.*?)" data-spp="(\d)" data-x="(.*?)" data-y="(.*?)"', dom)
     column = list(shown["measures"]).index(measure)
     expected = []

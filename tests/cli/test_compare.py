@@ -2,6 +2,7 @@
 """msspl compare, as a process."""
 
 import json
+import re
 
 import OpenImageIO as oiio
 import pytest
@@ -49,3 +50,38 @@ def test_compare_refuses_other_sizes(files):
     done = run("msspl", "compare", files / "small.exr", "-r", files / "ref.exr")
     assert done.returncode == 2
     assert "is 50x50, but" in done.stderr
+
+
+def test_compare_writes_a_page(files):
+    """With a reference beside the scores, without one alone."""
+    arguments = [files / "hr.exr", files / "lr.exr", "--html", files / "page.html"]
+    done = run("msspl", "compare", *arguments, "-r", files / "ref.exr")
+    assert done.returncode == 0, done.stderr
+    assert "PSNR" in done.stdout and re.search(r"Wrote .*page.html: \d\.\d MB, layers: beauty", done.stdout)
+    again = run("msspl", "compare", *arguments)
+    assert again.returncode == 2 and "pass --overwrite" in again.stderr
+    alone = run("msspl", "compare", *arguments, "--overwrite", "--layers", "albedo", "--json")
+    assert alone.returncode == 0, alone.stderr
+    assert json.loads(alone.stdout) == [{"image": str(files / "hr.exr")}, {"image": str(files / "lr.exr")}]
+    assert "layers: beauty, albedo" in alone.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ([], "scores and error maps need --reference"),
+        (["--html", "page.html", "--error-map", "e.png"], "scores and error maps need --reference"),
+        (["-r", "ref.exr", "--layers", "albedo"], "add --html PAGE"),
+        (["--html", "page.png"], "the page is HTML; name it .html"),
+        (
+            ["--html", "page.html", "--layers", "nothing"],
+            "no image has such a layer; they have: beauty, Z, ",
+        ),
+        (["--html", "gone/page.html"], "the folder gone does not exist"),
+    ],
+)
+def test_compare_refuses_options_that_do_not_fit(files, arguments, message):
+    before = set(files.iterdir())
+    done = run("msspl", "compare", "hr.exr", *arguments, cwd=files)
+    assert done.returncode == 2 and message in done.stderr
+    assert set(files.iterdir()) == before

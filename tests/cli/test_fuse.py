@@ -149,17 +149,21 @@ def test_opencolorio_views_of_the_preview(files, bilinear_models):
 
 
 def test_a_stereo_pair_says_whose_layers_are_read(tmp_path, bilinear_models):
-    """The view that is fused, the others, and negative values apart from broken ones."""
+    """The views that are fused, those that are not, and negative values apart from broken ones."""
     for name, size in (("lr", (24, 32)), ("hr", (96, 128))):
         left, right = picture(*size), picture(*size) * 2
         left[0, 0], left[0, 1, 0] = -0.1, np.nan
         write_exr(tmp_path / f"{name}.exr", rgb(left) | rgb(right, "right."), multiView=["left", "right"])
     options = ("--model", bilinear_models[4], "--no-preview", "-o", tmp_path / "out.exr")
     done = fuse(tmp_path / "lr.exr", tmp_path / "hr.exr", *options)
-    assert done.stdout.startswith("Pair at x4, view left (also there: right; --view-layer)\n"), done.stderr
+    assert done.stdout.startswith("Pair at x4, views left, right\n"), done.stderr
+    assert "\n  view right: rgb " in done.stdout
     assert "Repaired values that were NaN or infinite: 1 in lrhs.rgb, 1 in hrls.rgb\n" in done.stdout
     assert "Set negative values to 0 (colours out of gamut): 3 in lrhs.rgb, 3 in hrls.rgb\n" in done.stdout
     assert open_exr(tmp_path / "out.exr").metadata["msspl/aovs"].endswith("variance: none (optional); alpha: none")
+    done = fuse(tmp_path / "lr.exr", tmp_path / "hr.exr", *options, "--overwrite", "--view-layer", "left")
+    assert done.stdout.startswith("Pair at x4, view left (also there: right)\n"), done.stderr
+    assert "view right" not in done.stdout
 
 
 @pytest.mark.parametrize("pattern", ["crypto*", "CRYPTO*", "viewlayer.crypto*", "*Crypto*"])

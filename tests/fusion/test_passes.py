@@ -194,3 +194,115 @@ def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models):
         results.append(read_bits(tmp_path / "out.exr"))
     for (_, first), (_, second) in zip(*results, strict=True):
         assert all(same_bits(first[name], second[name]) for name in first)
+
+
+def lobes_by_light():
+    """Clean light of two lobes, direct and indirect, of two lamps; and of an emitter."""
+    lamps = {"key": lights()["light_key"], "spot": lights()["light_spot"].astype(np.float32)}
+    shares = {"diffuse_direct": 0.5, "diffuse_indirect": 0.2, "specular_direct": 0.2, "specular_indirect": 0.1}
+    layers = {f"{lobe}_{lamp}": share * light for lobe, share in shares.items() for lamp, light in lamps.items()}
+    emission = np.zeros_like(layers["diffuse_direct_key"])
+    emission[20:30, 10:30] = (3.0, 2.0, 0.5)
+    return layers | {"emission": emission}
+
+
+def write_levels(folder, extra, dtype=np.float32):
+    """A pair with :func:`lobes_by_light`, and coarser layers ``extra``: by name, the words of their parts."""
+    pair = write_pair(folder, lobes_by_light(), dtype)
+    for path in pair:
+        channels = read_bits(path)[0][1]
+        fine = [name for name in lobes_by_light() if name != "emission"]
+        for name, words in extra.items():
+            parts = [layer(channels, each) for each in fine if words <= set(each.split("_"))]
+            channels |= rgb(sum(parts).astype(dtype), f"{name}.")
+        write_exr(path, channels, **{"arnold/AA_samples": "3"})
+    return pair
+
+
+@pytest.mark.parametrize(("dtype", "rounding"), [(np.float32, 2e-6), (np.float16, 4 * HALF_ROUNDING)])
+def test_coarser_layers_are_sums_of_the_finest(tmp_path, bilinear_models, dtype, rounding):
+    extra = {name: set(name.split("_")) for name in ("diffuse", "diffuse_key", "specular_direct", "specular")}
+    extra |= {f"RGBA_{lamp}": {lamp} for lamp in ("key", "spot")}
+    pair = write_levels(tmp_path, extra, dtype)
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    fine = list(lobes_by_light())
+    assert set(report.passes) == {"light groups", "components", "finest components"}
+    assert all(text.startswith("fused: ") for text in report.passes.values())
+    assert report.passes["finest components"].endswith("sums of these: diffuse_key, specular_direct")
+    scale = layer(out).max()
+    assert np.abs(sum(layer(out, name) for name in fine) - layer(out)).max() <= rounding * scale
+    for name, words in extra.items():
+        total = sum(layer(out, each) for each in fine if words <= set(each.split("_")))
+        assert np.abs(total - layer(out, name)).max() <= rounding * scale, name
+    total = layer(out, "diffuse") + layer(out, "specular") + layer(out, "emission")
+    assert np.abs(total - layer(out)).max() <= rounding * scale
+
+
+def test_a_coarser_layer_whose_pixels_are_no_sum_is_passed_on(tmp_path, bilinear_models):
+    pair = write_levels(tmp_path, {"diffuse_key": {"diffuse", "direct"}})  # wrong by its pixels
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    assert "sums of these" not in report.passes["finest components"]
+    assert same_bits(out["diffuse_key.R"], read_bits(pair[1])[0][1]["diffuse_key.R"])
+
+
+def test_light_groups_and_components_may_share_a_layer(tmp_path, bilinear_models):
+    """Each set sums to the beauty; the shared layer has the value that the larger set gives it."""
+    emission = lobes_by_light()["emission"]
+    clean = lights() | {"light_rim": 0.2 * picture(HEIGHT, WIDTH), "emission": emission}
+    pair = write_pair(tmp_path, clean)
+    for path in pair:
+        channels = read_bits(path)[0][1]
+        lit = sum(layer(channels, name) for name in clean if name != "emission")
+        share = (np.linspace(0.2, 0.8, lit.shape[1]) * np.ones(lit.shape[:2]))[..., None]
+        channels |= rgb((lit * share).astype(np.float32), "diffuse.")
+        channels |= rgb((lit * (1 - share)).astype(np.float32), "specular.")
+        write_exr(path, channels)
+    sums = ("lights=light_key+light_spot+light_rim+emission", "parts=diffuse+specular+emission")
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, sums=sums)
+    assert report.passes["parts"] == "fused: diffuse, specular, emission"
+    assert report.passes["lights"].startswith("fused")
+    for names in (("light_key", "light_spot", "light_rim", "emission"), ("diffuse", "specular", "emission")):
+        total = sum(layer(out, name) for name in names)
+        assert np.abs(total - layer(out)).max() <= 3e-6 * layer(out).max()
+        assert all(layer(out, name).min() >= 0 for name in names)
+    _, alone = fused(pair, tmp_path / "lights.exr", bilinear_models, ("lights",), sums[:1])
+    assert all(same_bits(out[f"{name}.{c}"], alone[f"{name}.{c}"]) for name in clean for c in "RGB")
+    _, raw = fused(pair, tmp_path / "raw.exr", bilinear_models, ("none",))
+    truth = (sum(clean.values()) - emission) * np.linspace(0.2, 0.8, WIDTH)[None, :, None]
+    errors = [np.mean((layer(channels, "diffuse") - truth) ** 2) for channels in (out, raw)]
+    assert errors[0] < errors[1] / 5
+
+
+def test_a_set_that_shares_layers_with_two_others_is_passed_on(tmp_path, bilinear_models):
+    clean = lobes_by_light()
+    names = list(clean)
+    pair = write_pair(tmp_path, clean)
+    for path in pair:
+        channels = read_bits(path)[0][1]
+        half = sum(layer(channels, name) for name in names[:4])
+        rest = sum(layer(channels, name) for name in names[4:])
+        write_exr(path, channels | rgb(half.astype(np.float32), "a.") | rgb(rest.astype(np.float32), "b."))
+    sums = (f"first=b+{'+'.join(names[:4])}", f"second=a+{'+'.join(names[4:])}", "third=a+b")
+    report, _ = fused(pair, tmp_path / "out.exr", bilinear_models, sums=sums)
+    assert report.passes["third"] == "passed on: shares b with another set that does not have its other layers"
+    assert [text for text in report.warnings if text.startswith("--sum third: shares")]
+
+
+def test_an_emitter_leaves_nothing_to_the_other_set(tmp_path, bilinear_models):
+    """Where all light is the shared layer's, the other layers of the second set stay exactly black."""
+    dark = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    lamp, glow = dark.copy(), dark.copy()
+    lamp[:, :40], glow[:, 80:] = (0.7, 0.3, 0.1), (3.0, 2.0, 0.7)
+    clean = {"key": 0.5 * lamp, "fill": 0.5 * lamp, "rim": 0.1 * lamp, "glow": glow}
+    pair = write_pair(tmp_path, clean)
+    for path in pair:
+        channels = read_bits(path)[0][1]
+        lit = layer(channels, "key") + layer(channels, "fill") + layer(channels, "rim")
+        write_exr(
+            path, channels | rgb((0.4 * lit).astype(np.float32), "a.") | rgb((0.6 * lit).astype(np.float32), "b.")
+        )
+    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, sums=("x=key+fill+rim+glow", "y=a+b+glow"))
+    assert all(text.startswith("fused") for text in report.passes.values())
+    for name in ("a", "b", "key"):
+        assert not layer(out, name)[:, 88:].any()
+    assert np.abs(layer(out, "a") + layer(out, "b") + layer(out, "glow") - layer(out)).max() <= 1e-5

@@ -79,5 +79,5 @@ def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
         console.say(f"{name}: can't be fused: {pair.problem}")
     else:
         console.say(f"{name}: {'fits' if pair.fits else 'does not fit'}")
-    for warning in pair.warnings:
+    for warning in (*pair.warnings, *pair.passed_on):
         console.say(f"  {warning}")

@@ -11,46 +11,87 @@ from typing import Annotated
 import typer
 
 from msspl_cli import console, options
+from oiio_msspl.errors import InputError
 
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl compare out.exr hr.exr lr.exr --reference ref.exr
 
   msspl compare out.exr -r ref.exr --error-map error.png
+
+  msspl compare out.exr hr.exr lr.exr -r ref.exr --html page.html --layers 'light*'
 """
+
+#: Bytes from which a page loads slowly.
+LARGE_PAGE = 60_000_000
 
 
 def compare(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to measure.", show_default=False)],
     reference: Annotated[
-        Path, typer.Option("--reference", "-r", metavar="EXR", help="The converged render.", show_default=False)
-    ],
+        Path | None,
+        typer.Option(
+            "--reference",
+            "-r",
+            metavar="EXR",
+            help="The converged render. Only --html works without it.",
+            show_default=False,
+        ),
+    ] = None,
     error_map: Annotated[
         Path | None,
         typer.Option(metavar="PNG", help="Write a picture of the first image's error (log RelMSE; dark is small)."),
     ] = None,
+    html: Annotated[
+        Path | None,
+        typer.Option(metavar="HTML", help="Write a page to look at all pictures in a browser, with their layers."),
+    ] = None,
+    layers: Annotated[
+        list[str],
+        typer.Option(
+            metavar="PATTERN",
+            help="Layers that the page shows beside the beauty (light*). May be repeated. "
+            "\\[default: those that sum to the beauty]",
+        ),
+    ] = [],  # noqa: B006
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
 ) -> None:
-    """Measure images against a reference: PSNR (sRGB), RelMSE, SSIM.
+    """Measure images against a reference: PSNR (sRGB), RelMSE, SSIM. Look at them in a browser.
 
     RelMSE has two columns, one for each convention in the paper. Images smaller
     than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
     from oiio_msspl.compare import check_error_map, compare_files, write_error_map
+    from oiio_msspl.compare_page import check_page
 
+    if reference is None and (html is None or error_map is not None):
+        raise InputError("scores and error maps need --reference; without one, --html writes a page to look at")
+    if layers and html is None:
+        raise InputError("--layers chooses the layers of the page; add --html PAGE")
+    compared = [*images, reference] if reference else images
     if error_map is not None:
-        check_error_map(error_map, [*images, reference], overwrite=overwrite)
-    results = compare_files(images, reference)
-    if error_map is not None:
+        check_error_map(error_map, compared, overwrite=overwrite)
+    if html is not None:
+        check_page(html, compared, overwrite=overwrite)
+    results = compare_files(images, reference) if reference else [{} for _ in images]
+    if error_map is not None and reference is not None:
         write_error_map(error_map, images[0], reference, overwrite=overwrite)
+    wrote = _write_page(html, images, reference, layers, overwrite) if html else ""
     if as_json:
         # The PSNR of equal pictures is infinite, which JSON can't express.
         rows = [{k: v if math.isfinite(v) else None for k, v in scores.items()} for scores in results]
         print(json.dumps([{"image": str(p), **row} for p, row in zip(images, rows, strict=True)], indent=2))
-        return
+    elif reference is not None:
+        _print(images, results)
+    if wrote:
+        console.say(wrote, error=as_json)
+
+
+def _print(images: list[Path], results: list[dict[str, float]]) -> None:
+    """Print the scores as a table."""
     table = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
     for path, scores in zip(images, results, strict=True):
         table.append(
@@ -63,3 +104,21 @@ def compare(
             )
         )
     console.table(table, header=True, indent=0)
+
+
+def _write_page(html: Path, images: list[Path], reference: Path | None, layers: list[str], overwrite: bool) -> str:
+    """Write the page. Returns a sentence about it."""
+    from oiio_msspl.compare_page import write_page
+
+    with console.ProgressBar() as bar:
+        page = write_page(
+            html,
+            images,
+            reference,
+            layers=layers,
+            overwrite=overwrite,
+            progress=lambda done, total: bar.update("writing layers", done, total),
+        )
+    size = f"{page.size / 1e6:.1f} MB"
+    advice = "; choose fewer layers with --layers to make it smaller" if page.size > LARGE_PAGE else ""
+    return f"Wrote {html}: {size}, layers: {', '.join(page.layers)}{advice}"

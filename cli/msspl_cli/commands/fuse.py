@@ -256,8 +256,8 @@ def fuse(
     start = time.perf_counter()
     with console.ProgressBar(shown=not quiet and not verbose) as bar:
 
-        def show_tile(done: int, count: int) -> None:
-            logging.info("tile %d of %d", done, count)
+        def show_step(done: int, count: int) -> None:
+            logging.info("step %d of %d", done, count)
             bar.update("fusing", done, count)
 
         report = fuse_files(
@@ -265,7 +265,7 @@ def fuse(
             hr,
             output,
             preview_path=output.with_suffix(".png") if preview and output.name else None,
-            progress=show_tile,
+            progress=show_step,
             **common,
         )
     if as_json:
@@ -290,11 +290,16 @@ def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each step."""
     spp = report.spp_avg
     renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
-    view = f", view {report.hr.view}" if report.hr.view and report.hr.other_views else ""
-    others = f" (also there: {', '.join(report.hr.other_views)}; --view-layer)" if view else ""
+    fused = [each.hr.view or "(unnamed)" for each in report.fused_views()]
+    view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
+    rest = [each or "(unnamed)" for each in report.hr.other_views if (each or "(unnamed)") not in fused]
+    others = f" (also there: {', '.join(rest)})" if rest else ""
     average = f", {spp:g} spp on average" if spp is not None else ""
     console.say(f"{renderer} at x{report.scale}{average}{view}{others}")
     console.aov_table(report.aovs(), report.hr.notes)
+    for other in report.other_views:
+        read = (f"{row['feature']} {row['source']}" for row in other.aovs() if row["status"] in ("found", "computed"))
+        console.say(f"  view {other.hr.view or '(unnamed)'}: {', '.join(read)}")
     if lrhs_aovs := report.found_lrhs_aovs():
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     for name, done in report.passes.items():

@@ -99,7 +99,7 @@ def check_cancel(scene):
     program = os.environ["MSSPL_FUSE"]
     pid = WORK / "pid"
     waiting = (
-        f"open({str(pid)!r}, 'w').write(str(os.getpid())); print('INFO: tile 1 of 4', file=sys.stderr, flush=True)"
+        f"open({str(pid)!r}, 'w').write(str(os.getpid())); print('INFO: step 1 of 4', file=sys.stderr, flush=True)"
     )
     os.environ["MSSPL_FUSE"] = str(fake_fuse(f"{waiting}\ntime.sleep(60)"))
     before, folder = snapshot(scene), sorted(WORK.iterdir())

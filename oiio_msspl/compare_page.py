@@ -1,0 +1,355 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A page for the browser that shows pictures with all their layers: ``msspl compare --html``.
+
+The page is one file: ``compare_page.html`` with the pixels in it. It asks the network for nothing.
+
+**Pixels** are stored as codes, the logarithm of the light in steps of 1.1 %::
+
+    code = round(64 * (log2(x + 2**-12) + 12))         x = 2**(code / 64 - 12) - 2**-12
+
+So a step is about as large as one of an 8-bit sRGB picture near white, and smaller elsewhere, at any exposure. Three
+planes of codes are stored: green, red minus green, blue minus green. The noise of a render is mostly brightness, so the
+differences are nearly free of it and take little space. Where that is smaller, each code is stored as the difference to
+its left neighbour. Then come the low bytes of all codes, then the high bytes, in zlib's format and base64.
+
+PNGs would not be safer: browsers that protect against tracking change the pixels that a page reads from a picture.
+"""
+
+from __future__ import annotations
+
+import base64
+import json
+import math
+import zlib
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from importlib import resources
+from pathlib import Path
+from typing import Any, TextIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.formula import FeatureFormula
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.arrays import HALF_MAX, Array, repair
+from oiio_msspl.colour import REC709, conversion, space_of
+from oiio_msspl.compare import check_size, error_colours, error_levels, upsample_bicubic
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import check_separate, check_target, replacing
+from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
+from oiio_msspl.exr.reader import Channel, open_exr
+from oiio_msspl.metrics import psnr, relmse
+
+TEMPLATE = "compare_page.html"
+#: The comment of the template in whose place the data stand.
+DATA = "<!-- data -->"
+
+#: Codes for a factor of two.
+CODES_PER_STOP = 64
+#: Stops from 1 down to the light below which steps no longer shrink. At an exposure of +4 stops, the step in black is a
+#: seventh of a step of an 8-bit picture.
+STOPS_BELOW_ONE = 12
+#: Colours of an error map.
+ERROR_LEVELS = 64
+#: Part of the values of a data layer, such as depth, that is darker than black, and that is brighter than white.
+_CLIPPED = 0.005
+
+BEAUTY = "beauty"
+
+Codes = NDArray[np.int16]
+
+
+@dataclass(frozen=True)
+class PageSummary:
+    """What :func:`write_page` wrote."""
+
+    size: int
+    """Bytes of the file."""
+    layers: tuple[str, ...]
+    """Names of the layers that it shows."""
+
+
+@dataclass(frozen=True)
+class _Layer:
+    """A layer of one picture."""
+
+    name: str
+    formula: FeatureFormula
+    is_colour: bool
+    """Otherwise data, such as depth or normals: shown from their lowest to their highest value."""
+    additive: str = ""
+    """Name of the additive set that it belongs to."""
+    stored: str = ""
+    """Its name in the file."""
+
+    def matches(self, pattern: str) -> bool:
+        """Whether a pattern such as ``light*`` means it, or its set."""
+        return any(matches_layer(pattern, name) for name in (self.name, self.stored, self.additive) if name)
+
+
+@dataclass(frozen=True)
+class _Picture:
+    """One of the files that are shown."""
+
+    path: Path
+    render: MappedRender
+    layers: dict[str, _Layer]
+    """All that the file holds, by their names without what programs spell differently."""
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width."""
+        window = self.render.data_window
+        return window.height, window.width
+
+    def read(self, key: str) -> Array:
+        """A layer, (height, width, 3 or 1). Light has no NaN, infinities and negative values."""
+        layer = self.layers[key]
+        features = {RGB: self.render.features[RGB], key: layer.formula}
+        values = replace(self.render, features=features, alpha=None).read(self.render.data_window, [key])[key]
+        return repair(values)[0] if layer.is_colour else values
+
+
+def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:
+    """Check that a page of the files ``compared`` can be written at ``path``.
+
+    Raises:
+        InputError: it is not named .html, it is one of the files compared, it exists and may not be overwritten, or its
+            folder is missing or read-only.
+    """
+    if path.suffix.lower() not in (".html", ".htm"):
+        raise InputError(f"{path}: the page is HTML; name it .html")
+    check_target(path, overwrite=overwrite)
+    check_separate(compared, [path])
+
+
+def write_page(
+    path: Path,
+    images: Sequence[Path],
+    reference: Path | None = None,
+    *,
+    layers: Sequence[str] = (),
+    overwrite: bool = False,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> PageSummary:
+    """Write a page that shows images, their reference, and their errors.
+
+    Args:
+        path: the page to write.
+        images: EXR files. They may be smaller than the reference, or than the largest of them, by x2, x4 or x8. The
+            page shows such an image with its own large pixels. Scores and error maps upsample it bicubically.
+        reference: EXR file of what the images should be. Without it there are no scores and error maps.
+        layers: patterns of the layers to show beside the beauty. Without any, those that sum to the beauty are shown.
+        overwrite: replace an existing file.
+        progress: called with the number of layers done and of all.
+
+    Raises:
+        InputError: a file can't be read, sizes do not fit, no file has a layer of a pattern, or ``path`` exists.
+        MssplError: the page can't be written.
+    """
+    paths = [*images, *([reference] if reference else [])]
+    pictures = [_open(each) for each in paths]
+    largest = pictures[-1] if reference else max(pictures, key=lambda each: each.size[0] * each.size[1])
+    for picture in pictures:
+        check_size(picture.path, picture.size, largest.path, largest.size)
+    keys = _chosen(pictures, layers)
+    head, tail = resources.files("oiio_msspl").joinpath(TEMPLATE).read_text(encoding="utf-8").split(DATA)
+    with replacing(path, overwrite=overwrite) as temporary:
+        with open(temporary, "w", encoding="utf-8", newline="\n") as out:
+            out.write(head)
+            shown = []
+            for done, key in enumerate(keys):
+                progress(done, len(keys))
+                shown.append(_write_layer(out, done, key, pictures, largest if reference else None))
+            manifest = _manifest(pictures, largest, reference is not None, shown)
+            # A name may hold "</script>"; JSON may write any character as an escape.
+            text = json.dumps(manifest, allow_nan=False).replace("<", "\\u003c")
+            out.write(f'<script type="application/json" id="manifest">{text}</script>')
+            out.write(tail)
+        size = temporary.stat().st_size
+    return PageSummary(size, tuple(layer["name"] for layer in shown))
+
+
+def _open(path: Path) -> _Picture:
+    """Read the headers of a file, and find its layers."""
+    render = map_render(open_exr(path), features=())
+    beauty = render.features[RGB]
+    found = {BEAUTY: _Layer(BEAUTY, beauty, True, stored=beauty.text)}
+    in_sets = set()
+    for additive in render.additive_sets:
+        for each in additive.layers:
+            name = f"{each.name} x colour" if each.factor else each.name
+            layer = _Layer(name, each.formula, True, additive.name, stored=each.name)
+            found.setdefault(same_spelling(name), layer)
+            in_sets.add(each.channels)
+    views = render.view.split("/")
+    for stored in layers_of(render.file):
+        # Cryptomattes hold numbers that stand for objects: their pictures tell nothing.
+        if "crypto" in stored.name.lower() or (stored.view and stored.view not in views):
+            continue
+        name = next((stored.name.removeprefix(f"{v}.") for v in views if stored.name.startswith(f"{v}.")), stored.name)
+        for channels, component in _groups(stored):
+            unusable = any(channel.type == "uint" or render.file.parts[channel.part].deep for channel in channels)
+            if not unusable and channels not in in_sets and channels not in beauty.terms:
+                label = ".".join(filter(None, (name, component))) or "RGB"
+                is_colour = len(channels) == 3 and channels[0] is stored.channels.get("R")
+                layer = _Layer(label, FeatureFormula((channels,), text=label), is_colour, stored=stored.name)
+                found.setdefault(same_spelling(label), layer)
+    return _Picture(path, render, found)
+
+
+def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
+    """The channels of a layer that make a picture, and what they are called in it: three, or one of the rest."""
+    triple = layer.triple() or ()
+    if triple:
+        yield triple, ""
+    for component, channel in layer.channels.items():
+        if channel not in triple and (component != "A" or len(layer.channels) == 1):
+            yield (channel,), component if len(layer.channels) > 1 else ""
+
+
+def _chosen(pictures: Sequence[_Picture], patterns: Sequence[str]) -> list[str]:
+    """Keys of the layers to show: the beauty, then what the patterns mean, or all layers of additive sets."""
+    known: dict[str, list[_Layer]] = {}
+    for picture in pictures:
+        for key, layer in picture.layers.items():
+            known.setdefault(key, []).append(layer)
+    if not patterns:
+        return [key for key, layers in known.items() if key == BEAUTY or any(layer.additive for layer in layers)]
+    wanted = {BEAUTY}
+    for pattern in patterns:
+        meant = {key for key, layers in known.items() if any(layer.matches(pattern) for layer in layers)}
+        if not meant:
+            names = ", ".join(layers[0].name for layers in known.values())
+            raise InputError(f"--layers {pattern!r}: no image has such a layer; they have: {names}")
+        wanted |= meant
+    return [key for key in known if key in wanted]
+
+
+def _write_layer(
+    out: TextIO, index: int, key: str, pictures: Sequence[_Picture], reference: _Picture | None
+) -> dict[str, Any]:
+    """Write the codes of a layer of all pictures that have it, and of its error maps.
+
+    Returns:
+        Its entry of the manifest.
+    """
+    holders = [(place, picture) for place, picture in enumerate(pictures) if key in picture.layers]
+    first = holders[0][1].layers[key]
+    truth = None
+    if reference is not None and first.is_colour and key in reference.layers and reference.layers[key].is_colour:
+        truth = reference.read(key)
+    value_range: tuple[float, float] | None = None
+    images: dict[int, Any] = {}
+    errors: dict[int, Any] = {}
+    for place, picture in holders:
+        values = picture.read(key)
+        if not picture.layers[key].is_colour:
+            value_range = value_range or _range_of(values)
+            shown = np.nan_to_num((values - value_range[0]) / (value_range[1] - value_range[0]))
+        else:
+            shown = _to_rec709(values, picture, pictures)
+        images[place] = _write_codes(out, f"image-{index}-{place}", to_codes(shown))
+        if truth is not None and picture is not reference and picture.layers[key].is_colour:
+            height, width = truth.shape[:2]
+            image = values if values.shape == truth.shape else upsample_bicubic(values, width, height)
+            decibels = psnr(image, truth)
+            images[place] |= {"psnr": decibels if math.isfinite(decibels) else None, "relmse": relmse(image, truth)}
+            levels = np.round(error_levels(image, truth) * (ERROR_LEVELS - 1)).astype(np.int16)
+            errors[place] = _write_codes(out, f"error-{index}-{place}", levels[..., None])
+    return {"name": first.name, "range": value_range, "scored": truth is not None, "images": images, "errors": errors}
+
+
+def _range_of(values: Array) -> tuple[float, float]:
+    """The values of a data layer that are shown as black and as white. The sky is not deep but infinitely far."""
+    finite = values[np.isfinite(values) & (np.abs(values) < HALF_MAX)]
+    if not finite.size:
+        return 0.0, 1.0
+    lowest, highest = (float(v) for v in np.quantile(finite, (_CLIPPED, 1 - _CLIPPED)))
+    return lowest, highest if highest > lowest else lowest + 1
+
+
+def _to_rec709(values: Array, picture: _Picture, pictures: Sequence[_Picture]) -> Array:
+    """Colours in Rec. 709 primaries, those of sRGB. A file that declares no space has that of another picture."""
+    spaces = [space_of(each.render.metadata) for each in (picture, *pictures)]
+    space = next(filter(None, spaces), REC709)
+    if space == REC709 or values.shape[-1] == 1:
+        return values
+    return values @ conversion(space, REC709).T.astype(np.float32)
+
+
+def to_codes(values: Array) -> Codes:
+    """The codes of light, see the head of this module. Negative values and NaN become 0, infinities the largest half.
+
+    The error of ``from_codes(to_codes(x))`` is at most 0.55 % of ``x + 2**-12``.
+    """
+    light = repair(values)[0]
+    return np.round(CODES_PER_STOP * (np.log2(light + np.float32(2**-STOPS_BELOW_ONE)) + STOPS_BELOW_ONE)).astype(
+        np.int16
+    )
+
+
+def from_codes(codes: Codes) -> Array:
+    """The light that codes stand for."""
+    stops = codes.astype(np.float64) / CODES_PER_STOP - STOPS_BELOW_ONE
+    return (np.exp2(stops) - 2.0**-STOPS_BELOW_ONE).astype(np.float32)
+
+
+def pack(codes: Codes) -> tuple[bytes, bool]:
+    """Codes (height, width, 1 or 3) as compressed bytes, and whether they are differences to the left neighbour."""
+    planes = np.ascontiguousarray(np.moveaxis(codes, -1, 0))
+    if len(planes) == 3:
+        planes = np.stack([planes[1], planes[0] - planes[1], planes[2] - planes[1]])
+
+    def differences(planes: Codes) -> Codes:
+        return np.diff(planes, axis=-1, prepend=np.int16(0))
+
+    # Every 16th row tells which is smaller.
+    some = planes[:, ::16]
+    smooth = len(_compressed(differences(some), 1)) < len(_compressed(some, 1))
+    return _compressed(differences(planes) if smooth else planes, 6), smooth
+
+
+def _compressed(planes: Codes, effort: int) -> bytes:
+    """The low bytes, then the high bytes. The sign moves to the lowest bit, so small codes have a high byte of 0."""
+    unsigned = ((planes << 1) ^ (planes >> 15)).view(np.uint16)
+    low, high = (unsigned & 255).astype(np.uint8), (unsigned >> 8).astype(np.uint8)
+    # In noise, short repetitions are chance; this strategy ignores them, which saves 4 %.
+    compressor = zlib.compressobj(effort, strategy=zlib.Z_FILTERED)
+    return compressor.compress(low.tobytes()) + compressor.compress(high.tobytes()) + compressor.flush()
+
+
+def _write_codes(out: TextIO, name: str, codes: Codes) -> dict[str, Any]:
+    """Write codes (height, width, channels) as an element of the page, and return how the manifest describes it."""
+    data, smooth = pack(codes)
+    out.write(f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n')
+    height, width, channels = codes.shape
+    return {"id": name, "width": width, "height": height, "channels": channels, "differences": smooth}
+
+
+def _manifest(
+    pictures: Sequence[_Picture], largest: _Picture, has_reference: bool, layers: Sequence[dict[str, Any]]
+) -> dict[str, Any]:
+    """What the page has to know beside the pixels."""
+    colours = error_colours(np.linspace(0, 1, ERROR_LEVELS, dtype=np.float32)[None])[0]
+    return {
+        "height": largest.size[0],
+        "width": largest.size[1],
+        "pixelAspect": largest.render.pixel_aspect,
+        "codesPerStop": CODES_PER_STOP,
+        "stopsBelowOne": STOPS_BELOW_ONE,
+        "errorColours": np.round(colours * 255).astype(int).tolist(),
+        "pictures": list(_labels([picture.path for picture in pictures])),
+        "reference": len(pictures) - 1 if has_reference else None,
+        "layers": list(layers),
+    }
+
+
+def _labels(paths: Sequence[Path]) -> Iterator[str]:
+    """The files' names, or paths where two files have one name."""
+    names = [path.name for path in paths]
+    for path in paths:
+        yield path.name if names.count(path.name) == 1 else str(path)

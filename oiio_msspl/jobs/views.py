@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The views and view layers of a pair, and their passes.
+
+The first view goes the way of a file that has only one. The others are fused before it, one after the other, into a
+temporary file, so memory holds one view at a time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import HALF_MAX
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.contents import dropped_channels, widest_type
+from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, tile_count
+from oiio_msspl.fusion.passes import fuse_passes, pass_steps
+from oiio_msspl.fusion.tiling import STRIPS_SHARE, require_memory
+from oiio_msspl.jobs.inputs import InputOptions, map_other_view
+from oiio_msspl.jobs.report import FrameReport, report_on
+from oiio_msspl.model.session import Session
+
+#: Rows of a fused view that are stored at a time.
+ROWS_PER_PUT = 256
+
+
+@dataclass(frozen=True)
+class View:
+    """A pair, mapped for one view or view layer."""
+
+    lr: MappedRender
+    hr: MappedRender
+
+
+@dataclass(frozen=True)
+class OtherViews:
+    """The views beside the first one."""
+
+    views: tuple[View, ...] = ()
+    """Those that are fused."""
+    passed_on: tuple[str, ...] = ()
+    """Why others are not, one sentence each."""
+
+
+def find_other_views(
+    lr: MappedRender, hr: MappedRender, inputs: InputOptions, write: WriteOptions = WriteOptions()
+) -> OtherViews:
+    """The views and view layers to fuse beside the first one: those with a beauty in both renders that is written.
+
+    Args:
+        lr, hr: the pair, mapped for its first view.
+        inputs: how the files are to be understood. If it names a view, there are no others.
+        write: which layers are written.
+
+    Raises:
+        InputError: the first view does not fit together, or a pattern of ``write`` matches nothing.
+    """
+    if inputs.view is not None or not hr.other_views:
+        return OtherViews()
+    scale = align(lr, hr).scale
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    taken = _channels(hr)
+    views, passed_on = [], []
+    for label in hr.other_views:
+        try:
+            view = View(*map_other_view(lr, hr, label, inputs))
+            if align(view.lr, view.hr).scale != scale:
+                raise InputError(f"the pair is x{align(view.lr, view.hr).scale} here and x{scale} in {hr.view}")
+            if not taken.isdisjoint(view.hr.beauty_channels):
+                raise InputError("its beauty is a layer of another view")
+        except InputError as error:
+            passed_on.append(f"{label or '(unnamed)'} is passed on as it is: {error}")
+            continue
+        if not dropped.issuperset(view.hr.beauty_channels):
+            # A layer of no view layer may be found for several.
+            sets = [each for each in view.hr.additive_sets if taken.isdisjoint(_channels_of_set(each))]
+            view.hr.additive_sets = sets
+            taken |= _channels(view.hr)
+            views.append(view)
+    return OtherViews(tuple(views), tuple(passed_on))
+
+
+def _channels(hr: MappedRender) -> set[object]:
+    """The channels that may be fused for a view."""
+    return {*hr.beauty_channels}.union(*map(_channels_of_set, hr.additive_sets))
+
+
+def _channels_of_set(additive_set: AdditiveSet) -> set[object]:
+    return {channel for layer in additive_set.layers for channel in layer.channels}
+
+
+def fuse_other_views(
+    others: OtherViews,
+    session: Session,
+    write: WriteOptions,
+    max_memory: int,
+    *,
+    held: int = 0,
+    progress: Callable[[int, int], None] | None = None,
+) -> tuple[ReplacedChannels | None, list[FrameReport]]:
+    """Fuse the views beside the first one.
+
+    Args:
+        others: from :func:`find_other_views`.
+        session: the model of the first view.
+        write: which passes are fused.
+        max_memory: bytes that the process should stay below.
+        held: bytes of these that other frames need.
+        progress: called with (steps done, steps in all) of each part of the work, see :class:`Progress`.
+
+    Returns:
+        The fused channels, None without other views; and a report on each view.
+
+    Raises:
+        InputError: a view does not fit into memory, or pixels can't be decoded.
+        MssplError: the network failed.
+    """
+    for view in others.views:
+        needed = memory_to_fuse(align(view.lr, view.hr), session, error=False) + held
+        require_memory(needed, session.contract, max_memory)
+    replaced = ReplacedChannels() if others.views else None
+    reports = []
+    for view in others.views:
+        fused = fuse(view.lr, view.hr, session, max_memory=max_memory, held=held, progress=progress)
+        fused.replaced = replaced
+        fuse_frame_passes(view.lr, view.hr, fused, write, max_memory - held, progress)
+        assert fused.replaced is not None
+        _store(fused.replaced, view.hr, fused)
+        reports.append(report_on(view.lr, view.hr, session, fused, view.hr.file.path, None))
+    return replaced, reports
+
+
+def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> None:
+    """Keep the beauty and the alpha of a view. What half can't hold is clipped, and a warning says so."""
+    channels = hr.beauty_channels
+    height, width = fused.rgb.shape[:2]
+    replaced.add(channels, width, height)
+    for start in range(0, height, ROWS_PER_PUT):
+        rows = slice(start, start + ROWS_PER_PUT)
+        for i, channel in enumerate(channels):
+            values = fused.rgb[rows, :, i] if i < 3 or fused.alpha is None else fused.alpha[rows, :, 0]
+            replaced.put(channel, start, values)
+    clipped = int(np.count_nonzero(fused.rgb > HALF_MAX)) if widest_type(channels) == "half" else 0
+    if clipped:
+        fused.warnings.append(f"{clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}")
+
+
+def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
+    """The additive sets of a view that are asked for and of which a layer is written."""
+    return [each for each in _written_sets(hr, write) if not write.passes or any(each.matches(p) for p in write.passes)]
+
+
+def check_passes(hr: MappedRender, others: OtherViews, write: WriteOptions) -> None:
+    """Raise InputError if the user asks for additive sets by a name that no view has."""
+    views = [hr, *(view.hr for view in others.views)]
+    if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
+        names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))
+        known = ", ".join(names) or "none"
+        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
+
+
+def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
+    if write.passes == ("none",):
+        return []
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    return [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
+
+
+def fuse_frame_passes(
+    lr: MappedRender,
+    hr: MappedRender,
+    fused: FusedFrame,
+    write: WriteOptions,
+    max_memory: int,
+    progress: Callable[[int, int], None] | None = None,
+) -> None:
+    """Fuse the additive sets of :func:`sets_to_fuse` and add them to ``fused``.
+
+    Args:
+        lr, hr: the pair, as files.
+        fused: its fused beauty.
+        write: ``passes`` says which.
+        max_memory: bytes that the process should stay below.
+        progress: called with (steps done, steps in all) of this part of the work.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    sets = sets_to_fuse(hr, write)
+    if sets:
+        cache_bytes = max(0, int((max_memory - fused.nbytes) * STRIPS_SHARE))
+        fused.passes = fuse_passes(lr, hr, fused.rgb, fused.alignment, sets, cache_bytes, fused.replaced, progress)
+        fused.replaced = fused.passes.pixels
+
+
+class Progress:
+    """Joins the progress of all parts of a frame's work: tiles and passes of each view.
+
+    Args:
+        tell: called with (steps done, steps in all).
+        steps: in all.
+    """
+
+    def __init__(self, tell: Callable[[int, int], None], steps: int) -> None:
+        self._tell, self._steps, self._before = tell, steps, 0
+
+    def __call__(self, done: int, count: int) -> None:
+        """A part has done so many of its steps. It ends with all of them."""
+        self._tell(self._before + done, self._steps)
+        if done == count:
+            self._before += count
+
+
+def steps_of(views: Sequence[View], session: Session, write: WriteOptions) -> int:
+    """The steps in which views are fused: a tile is one, and so is each set of passes in each band of rows."""
+    steps = 0
+    for view in views:
+        alignment = align(view.lr, view.hr)
+        steps += tile_count(alignment, session) + pass_steps(alignment, sets_to_fuse(view.hr, write))
+    return steps

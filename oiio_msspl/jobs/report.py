@@ -3,12 +3,15 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from oiio_msspl._version import __version__
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
+from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
@@ -46,6 +49,8 @@ class FrameReport:
     """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
     passes: dict[str, str] = field(default_factory=dict)
     """What was done with each additive set, by its name."""
+    fused_sets: list[AdditiveSet] = field(default_factory=list)
+    """The additive sets that were fused."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -112,6 +117,7 @@ def report_on(
         features=frozenset(session.contract.features),
         lrhs_aovs=session.lrhs_aovs,
         passes=_passes(fused),
+        fused_sets=fused.passes.sets if fused.passes else [],
     )
 
 
@@ -145,7 +151,11 @@ def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list
 
 
 def provenance(report: FrameReport) -> dict[str, str]:
-    """Attributes of the fused part: model, inputs, spp and layers that the frame was made from."""
+    """Attributes of the fused part: model, inputs, spp and layers that the frame was made from.
+
+    ``msspl/passes`` is JSON, the fused sets: ``[{"name": NAME, "layers": [[LAYER], [LIGHT, COLOUR], ...]}, ...]``. The
+    sum of the layers, and of the products of light and colour, is the fused beauty. The names are those of the HRLS.
+    """
     spp = report.spp_avg
     return {
         "msspl/version": __version__,
@@ -157,4 +167,19 @@ def provenance(report: FrameReport) -> dict[str, str]:
         "msspl/spp_hrls": "unknown" if report.hr.spp is None else f"{report.hr.spp:g}",
         "msspl/spp_average": "unknown" if spp is None else f"{spp:g}",
         "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
+        "msspl/passes": json.dumps(_fused_layers(report)),
     }
+
+
+def _fused_layers(report: FrameReport) -> list[dict[str, Any]]:
+    """The fused sets, with the layers' full names, as :func:`provenance` describes them."""
+    names = {channel: layer.name for layer in layers_of(report.hr.file) for channel in layer.channels.values()}
+    return [
+        {
+            "name": each.name,
+            "layers": [
+                [names[channels[0]] for channels in (layer.channels, layer.factor) if channels] for layer in each.layers
+            ],
+        }
+        for each in report.fused_sets
+    ]

@@ -4,7 +4,7 @@
     python -m datagen.cycles.passes PASSES
 
 Of every seed a folder ``cycles_SEED_FILTER`` is written, with the files that :mod:`benchmarks.render.passes` describes:
-HRLS of 1 and 2 spp, LRHS with as many samples a HRLS pixel, and a reference. Each is the multi-layer EXR of Blender
+HRLS of 1, 2 and 4 spp, LRHS with 1 and 2 samples a HRLS pixel, and a reference. Each is the multi-layer EXR of Blender
 itself. Every lamp is in one of at most `GROUPS` light groups; the world has a group of its own. Caustics are off,
 because a reference with caustics takes too many samples. Files that exist are kept.
 """
@@ -29,7 +29,7 @@ SIZE = (384, 216)
 #: (seed, pixel filter). Seeds of test scenes, which training never sees: see :func:`datagen.views.split_of`. They show
 #: metal and glass under softboxes, a room with dozens of lights, glassware, and a room with three lamps.
 VIEWS = ((11261, "BOX"), (10441, "BLACKMAN_HARRIS"), (10921, "BOX"), (10121, "BLACKMAN_HARRIS"))
-SCALES, SPP = (2, 4), (1, 2)
+SCALES, HRLS, LRHS = (2, 4), (1, 2, 4), (1, 2)
 #: Most light groups of lamps.
 GROUPS = 4
 #: The components that sum to Combined. Combined itself is always on.
@@ -64,8 +64,8 @@ def group_lights(scene: bpy.types.Scene) -> None:
 def render(out: Path, seed: int, pixel_filter: str, reference: int, threads: int, assets: Assets) -> None:
     """Render the files of one seed that do not exist yet. ``reference`` is in spp."""
     folder = out / f"cycles_{seed}_{pixel_filter.lower()}"
-    jobs = [(f"hr_{spp}spp", 1, spp) for spp in SPP]
-    jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES for spp in SPP]
+    jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
+    jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES for spp in LRHS]
     missing = [job for job in [*jobs, ("ref", 1, reference)] if not (folder / f"{job[0]}.exr").exists()]
     if not missing:
         return

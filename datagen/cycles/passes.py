@@ -17,12 +17,10 @@ import tempfile
 import time
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import bpy
-
-from . import scenes
-from .assets import Assets
-from .render import Renderer, find_cameras
+if TYPE_CHECKING:
+    import bpy
 
 #: Width and height; multiples of every scale.
 SIZE = (384, 216)
@@ -61,15 +59,21 @@ def group_lights(scene: bpy.types.Scene) -> None:
         scene.world.lightgroup = groups.add(name="world").name
 
 
-def render(out: Path, seed: int, pixel_filter: str, reference: int, threads: int, assets: Assets) -> None:
+def render(out: Path, seed: int, pixel_filter: str, reference: int, threads: int) -> None:
     """Render the files of one seed that do not exist yet. ``reference`` is in spp."""
+    import bpy
+
+    from . import scenes
+    from .assets import Assets
+    from .render import Renderer, find_cameras
+
     folder = out / f"cycles_{seed}_{pixel_filter.lower()}"
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
     jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES for spp in LRHS]
     missing = [job for job in [*jobs, ("ref", 1, reference)] if not (folder / f"{job[0]}.exr").exists()]
     if not missing:
         return
-    stage = scenes.build(seed, assets)
+    stage = scenes.build(seed, Assets(None))
     stage.caustics = False
     group_lights(stage.scene)  # before the first render, because persistent data does not notice new groups
     with tempfile.TemporaryDirectory() as scratch:
@@ -104,7 +108,7 @@ def main() -> None:
     views = zip(args.seeds, filters, strict=False) if args.seeds else VIEWS
     for seed, pixel_filter in views:
         start = time.perf_counter()
-        render(args.out, seed, pixel_filter, args.reference, args.threads, Assets(None))
+        render(args.out, seed, pixel_filter, args.reference, args.threads)
         print(f"seed {seed}, {pixel_filter}: {time.perf_counter() - start:.0f} s", flush=True)
 
 

@@ -4,25 +4,33 @@
     python -m benchmarks.passes PASSES --table benchmarks/results/passes.csv
     python -m benchmarks.passes PASSES --picture docs/images/passes.png
 
-PASSES is made by :mod:`benchmarks.render.passes`. The methods, all but the first two with the albedo and the normal:
+PASSES is made by :mod:`benchmarks.render.passes` and ``datagen.cycles.passes``. The methods, all but the first two with
+the albedo and the normal:
 
 - "HRLS": the layers as they are rendered.
 - "ratio": the fused beauty, divided as the noisy layers of the HRLS divide theirs.
 - "OIDN": Open Image Denoise on each layer of the HRLS, the plain call. Its layers do not sum to a denoised beauty.
 - "OIDN, rescaled": the same, scaled so that they sum to the fused beauty.
+- "OIDN, prefiltered, rescaled": the same with the call that OIDN's documentation recommends.
+- "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
+  so that they sum to the beauty that OIDN makes of this render.
 - "msspl": :mod:`oiio_msspl.fusion.passes`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
 
+Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
+part of the sum, but is not scored: every method has a high PSNR there.
+
 "Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
 "Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
-beauty, as a multiple of OIDN's plain call on the beauty.
+beauty, as a multiple of OIDN's plain call on the beauty. The gain is the PSNR of a method minus that of `PEER`, with a
+95 % interval by :mod:`benchmarks.versus`; a win is a layer with more PSNR than that of `PEER`.
 """
 
 from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -30,11 +38,13 @@ from statistics import median
 import numpy as np
 
 from benchmarks import results
-from benchmarks.oidn import denoise
+from benchmarks.oidn import denoise, denoise_prefiltered
 from benchmarks.results import MEAN, Row
+from benchmarks.versus import cell, with_interval
 from oiio_msspl import Session, find_model, fuse
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array
@@ -48,6 +58,12 @@ from oiio_msspl.metrics import psnr, relmse
 
 SCALES, SPP, REPEATS = (2, 4), (1, 2), 3
 KEYS = ("scene", "set", "spp", "method")
+#: In the column `layer`: the mean of all layers.
+ALL = "all"
+#: Share of the beauty's light that a scored layer has at least.
+FAINT = 0.01
+#: What the gain is measured against.
+PEER = "OIDN, prefiltered, rescaled"
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
@@ -62,29 +78,54 @@ def rescaled(layers: Array, beauty: Array) -> Array:
     return layers * np.where(total > 0, beauty / np.where(total > 0, total, 1), 0)
 
 
+def colours_of(render: MappedRender, layers: AdditiveSet) -> Array:
+    """What the stored light of each layer is multiplied by, (layers, h, w, 3): 1 in a layer that is no product."""
+    formulas = {str(i): FeatureFormula((x.factor,)) for i, x in enumerate(layers.layers) if x.factor}
+    pixels = replace(render, features=formulas, alpha=None).read(render.data_window, list(formulas))
+    ones = np.ones((render.data_window.height, render.data_window.width, 3), np.float32)
+    return np.stack([pixels.get(str(i), ones) for i in range(len(layers.layers))])
+
+
 def methods(
-    lr: MappedRender, hr: MappedRender, beauty: Array, layers: AdditiveSet
+    lr: MappedRender, hr: MappedRender, beauty: Array, layers: AdditiveSet, ordinary: MappedRender | None = None
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
-    """The name of each method, and a function that computes the layers."""
-    noisy = layers_of(hr, layers)
+    """The name of each method, and a function that computes the layers.
+
+    Args:
+        ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
+    """
+    noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
 
-    def each() -> Array:
-        return np.stack([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy])
+    def each(call: Callable[..., Array], layers: Array, guides: Mapping[str, Array]) -> Array:
+        return np.maximum([call(layer, guides[ALBEDO], guides[NORMAL]) for layer in layers], np.float32(0))
 
     def ours(low: MappedRender) -> Array:
         fused = fuse_passes(low, hr, beauty, align(lr, hr), [layers])
         assert not fused.refused
         height = hr.data_window.height
         planes = [[fused.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
-        return np.moveaxis(np.asarray(planes, np.float32), 1, -1)
+        return colours * np.moveaxis(np.asarray(planes, np.float32), 1, -1)
 
     yield "HRLS", lambda: noisy
     yield "ratio", lambda: rescaled(noisy, beauty)
-    yield "OIDN", each
-    yield "OIDN, rescaled", lambda: rescaled(np.maximum(each(), 0), beauty)
+    yield "OIDN", lambda: each(denoise, noisy, guides)
+    yield "OIDN, rescaled", lambda: rescaled(each(denoise, noisy, guides), beauty)
+    yield PEER, lambda: rescaled(each(denoise_prefiltered, noisy, guides), beauty)
+    if ordinary is not None:
+        theirs = layers_of(ordinary, layers_like(ordinary, layers))
+        pixels = ordinary.load().layers
+        total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
+        yield "OIDN, ordinary render", lambda: rescaled(each(denoise_prefiltered, theirs, pixels), total)
     yield "msspl", lambda: ours(lr)
     yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]))
+
+
+def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
+    """The set of another file with the same name and layers."""
+    names = [layer.name for layer in layers.layers]
+    found = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
+    return next(found)
 
 
 def regraded(layers: Array) -> Array:
@@ -105,19 +146,20 @@ def picture(folder: Path, output: Path, model: str) -> None:
     write_png(output, np.concatenate([*rows, np.concatenate([srgb(regraded(c)) for c in columns], axis=1)], axis=0))
 
 
-def scores(layers: Array, reference: Array) -> Row:
-    """Means over the layers, and the regraded picture."""
+def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
+    """A row for each layer that is bright enough, and their mean with the regraded picture."""
+    light = reference.sum(axis=(1, 2, 3))
+    rows: list[Row] = [
+        {"layer": name, "psnr": psnr(layer, truth), "relmse": relmse(layer, truth)}
+        for name, layer, truth, share in zip(names, layers, reference, light / light.sum(), strict=True)
+        if share >= FAINT
+    ]
     graded, truth = regraded(layers), regraded(reference)
     errors = np.mean((srgb(graded) - srgb(truth)) ** 2, axis=-1).ravel()
     worst = np.sort(errors)[-len(errors) // 100 :].mean()
-    pairs = list(zip(layers, reference, strict=True))
-    return {
-        "psnr": float(np.mean([psnr(a, b) for a, b in pairs])),
-        "relmse": float(np.mean([relmse(a, b) for a, b in pairs])),
-        "regraded_psnr": psnr(graded, truth),
-        "regraded_relmse": relmse(graded, truth),
-        "worst_psnr": float(-10 * np.log10(worst)),
-    }
+    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}
+    regrade = {"regraded_psnr": psnr(graded, truth), "regraded_relmse": relmse(graded, truth)}
+    return [{"layer": ALL, **means, **regrade, "worst_psnr": float(-10 * np.log10(worst))}, *rows]
 
 
 def timed(function: Callable[[], Array]) -> tuple[Array, float]:
@@ -131,37 +173,56 @@ def timed(function: Callable[[], Array]) -> tuple[Array, float]:
 
 
 def measure(folder: Path, scale: int, spp: int, model: str) -> list[Row]:
-    """One scene: a row for each set and method."""
+    """One scene: rows for each set and method."""
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
+    other = folder / f"hr_{2 * spp}spp.exr"
+    ordinary = map_render(open_exr(other)) if other.exists() else None
     beauty = fuse(lr, hr, Session(find_model(scale, model))).rgb
     pixels = hr.load().layers
     _, oidn_seconds = timed(lambda: denoise(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]))
     rows = []
-    for layers, truth in zip(hr.additive_sets, reference.additive_sets, strict=True):
-        clean = layers_of(reference, truth)
-        for name, function in methods(lr, hr, beauty, layers):
+    for layers in hr.additive_sets:
+        clean = layers_of(reference, layers_like(reference, layers))
+        for name, function in methods(lr, hr, beauty, layers, ordinary):
             result, seconds = timed(function)
-            ours = name.startswith("msspl")
-            row: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "layers": len(clean)}
-            row |= {"method": name.replace("msspl", f"msspl-x{scale}") if ours else name}
-            rows.append(row | scores(result, clean) | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds})
+            title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
+            key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
+            total, *each = scores(result, clean, [layer.name for layer in layers.layers])
+            seconds = 0.0 if name == "HRLS" else seconds / oidn_seconds
+            rows += [key | total | {"time": seconds}, *(key | row for row in each)]
     return rows
 
 
 def means(rows: list[Row]) -> list[Row]:
-    """Means over the scenes."""
+    """Means over the scenes, of the methods that were measured on each, and the gain over `PEER`."""
     found = []
-    for key in dict.fromkeys(tuple(row[k] for k in KEYS[1:]) for row in rows):
-        same = [row for row in rows if tuple(row[k] for k in KEYS[1:]) == key]
+    totals = [row for row in rows if row["layer"] == ALL]
+    for key in dict.fromkeys(tuple(row[k] for k in KEYS[1:]) for row in totals):
+        same = [row for row in totals if tuple(row[k] for k in KEYS[1:]) == key]
+        peers = [row for row in totals if (row["set"], row["spp"], row["method"]) == (*key[:2], PEER)]
+        if len(same) < len(peers):
+            continue
         numbers = {k: float(np.mean([row[k] for row in same])) for k, v in same[0].items() if isinstance(v, float)}
-        layers = float(np.mean([row["layers"] for row in same]))
-        found.append({"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layers": layers, **numbers})
+        gains = np.array([row["psnr"] - peer["psnr"] for row, peer in zip(same, peers, strict=True)])
+        gain, low, high = with_interval(gains)
+        won = [
+            row["psnr"] > peer["psnr"]
+            for row, peer in zip(*(_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER)), strict=True)
+        ]
+        mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
+        mean |= {"gain": gain, "gain_low": low, "gain_high": high, "wins": sum(won), "layers": len(won)}
+        found.append(mean)
     return found
 
 
+def _single_layers(rows: list[Row], key: tuple[object, ...]) -> list[Row]:
+    """The rows of single layers of a set, spp and method."""
+    return [row for row in rows if tuple(row[k] for k in KEYS[1:]) == key and row["layer"] != ALL]
+
+
 def layout(rows: list[Row]) -> str:
-    """The means, as a table."""
+    """The means, as a table with the columns that were measured."""
     titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
     titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
     formats = {key: "{:.4f}" if "relmse" in key else "{:.2f}" for key in titles}
@@ -170,7 +231,13 @@ def layout(rows: list[Row]) -> str:
         [row["set"], str(row["spp"]), row["method"], *(formats[key].format(row[key]) for key in titles)]
         for row in shown
     ]
-    return results.markdown(["set", "spp", "method", *titles.values()], body)
+    head = ["set", "spp", "method", *titles.values()]
+    if all("gain" in row for row in shown):
+        head += [f"gain over {PEER}, dB", "better on"]
+        for line, row in zip(body, shown, strict=True):
+            gain = cell((row["gain"], row["gain_low"], row["gain_high"]), "+.2f")
+            line += [gain, f"{row['wins']:.0f} of {row['layers']:.0f}"]
+    return results.markdown(head, body)
 
 
 def main() -> None:

@@ -92,8 +92,12 @@ def render_and_fuse(scene, options, output, work, fuse, *, overwrite=False, wind
     hrls = InputRender("HRLS", hrls_size(scene), options.hr_spp, str(Path(work, "hr.exr")))
     values = render_settings.lrhs(scene, options), render_settings.hrls(scene, options)
     identity, moment = (scene.name, scene.session_uid), (scene.frame_current, scene.frame_subframe)
-    # With persistent data, Blender loads the scene once for both renders.
-    with override(scene, {"render.use_persistent_data": True}):
+    # With persistent data, Blender loads the scene once for both renders. Turning it off first discards the data of
+    # earlier renders: Cycles does not notice that lights have another group since, and renders that group black.
+    with (
+        override(scene, {"render.use_persistent_data": False}),
+        override(scene, {"render.use_persistent_data": True}),
+    ):
         for part, each in enumerate((lrhs, hrls)):
             yield str(each), part / 3
             scene = find_scene(*identity)

@@ -21,6 +21,8 @@ class Options:
     """``BOX``: an LRHS pixel is exactly the mean of its HRLS pixels. ``SCENE``: the scene's own pixel filter."""
     view_layer: str = ""
     """Empty: the only one that is enabled."""
+    components: bool = False
+    """Render all component passes, which together are the beauty, besides the passes that the scene has on."""
     threads: int = 0
     """0: Blender uses the number that the scene sets, and fusing uses one thread per core."""
 

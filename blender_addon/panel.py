@@ -51,6 +51,11 @@ class MSSPLSettings(bpy.types.PropertyGroup):
             ("SCENE", "Scene", "The pixel filter of the scene"),
         ],
     )
+    components: BoolProperty(
+        name="All Component Passes",
+        description="Render diffuse, glossy, transmission, emission, environment and volume passes, from which the "
+        "beauty can be built again. Passes and light groups that the view layer has on are always rendered and fused",
+    )
     output: StringProperty(
         name="Output",
         description="The EXR to write. # stands for the frame number",
@@ -64,7 +69,7 @@ class MSSPLSettings(bpy.types.PropertyGroup):
     )
 
     def options(self, view_layer):
-        return Options(int(self.scale), self.hr_spp, self.lr_spp, self.filter, view_layer)
+        return Options(int(self.scale), self.hr_spp, self.lr_spp, self.filter, view_layer, self.components)
 
 
 class MSSPLPreferences(bpy.types.AddonPreferences):
@@ -97,7 +102,7 @@ class MSSPL_PT_fuse(bpy.types.Panel):
         layout, scene = self.layout, context.scene
         settings = scene.msspl
         layout.use_property_split = True
-        for name in ("scale", "hr_spp", "lr_spp", "filter", "output", "connect"):
+        for name in ("scale", "hr_spp", "lr_spp", "filter", "components", "output", "connect"):
             layout.prop(settings, name)
         options = settings.options("")
         sizes = lrhs_size(scene, options.scale), hrls_size(scene)

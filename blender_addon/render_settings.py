@@ -22,6 +22,17 @@ _PASSES = (
     "use_pass_glossy_color",
     "cycles.denoising_store_passes",
 )
+#: The component passes: light times colour of each kind of surface, and the light that no surface reflects.
+_COMPONENTS = (
+    *(
+        f"use_pass_{kind}_{part}"
+        for kind in ("diffuse", "glossy", "transmission")
+        for part in ("direct", "indirect", "color")
+    ),
+    "use_pass_emit",
+    "cycles.use_pass_volume_direct",
+    "cycles.use_pass_volume_indirect",
+)
 #: Added to the scene's seed for the LRHS. With one seed, both renders would share samples and their noise.
 _LRHS_SEED = 1009
 
@@ -74,7 +85,11 @@ def _common(scene, options):
     image = scene.render.image_settings
     chosen = find_view_layer(scene, options)
     values = {f"{view_layer_path(each)}.use": each == chosen for each in scene.view_layers}
-    values |= {f"{view_layer_path(chosen)}.{name}": True for name in _PASSES}
+    passes = list(_PASSES)
+    if options.components:
+        # Behind a transparent film, Combined has no environment, but the pass Environment would have it.
+        passes += [*_COMPONENTS, *([] if scene.render.film_transparent else ["use_pass_environment"])]
+    values |= {f"{view_layer_path(chosen)}.{name}": True for name in passes}
     values |= {
         "cycles.use_denoising": False,
         "cycles.use_adaptive_sampling": False,

@@ -8,6 +8,7 @@ only, so the watching thread calls ``nuke.executeInMainThread``.
 from __future__ import annotations
 
 import os
+import re
 import threading
 from dataclasses import dataclass, replace
 from typing import cast
@@ -16,6 +17,7 @@ import nuke
 from msspl_bridge.command import Settings, build_command, clean_environment, find_program
 from msspl_bridge.errors import Cancelled, FuseError
 from msspl_bridge.frame_files import FrameFile, ReadRange, file_numbers, find_number, name_output
+from msspl_bridge.passes import ATTRIBUTE, FusedSet, fused_sets
 from msspl_bridge.process import run
 
 #: Nodes that change neither pixels nor time. They may stand between the Read and the gizmo.
@@ -42,6 +44,21 @@ def fuse_frame(node: nuke.Node) -> None:
 def fuse_range(node: nuke.Node) -> None:
     """Fuse the frames of the range knobs in the background."""
     _start(node, int(node["first"].value()), int(node["last"].value()), as_range=True)
+
+
+def rebuild(node: nuke.Node) -> None:
+    """Below the Read of the fused file, make a group for each fused set that builds the beauty from its layers."""
+    try:
+        with node.parent():
+            read = _made_read(node.name())
+            if read is None:
+                raise FuseError("nothing is fused yet; fuse a frame first")
+            sets = fused_sets(read.metadata(ATTRIBUTE, int(nuke.frame())), read.channels())
+            for column, fused in enumerate(sets):
+                group = _rebuild_group(read, fused)
+                group.setXYpos(read.xpos() + 120 * column, read.ypos() + 100)
+    except FuseError as error:
+        nuke.message(f"{node.name()}: {error}")
 
 
 def copy_to_group() -> None:
@@ -207,8 +224,8 @@ def _show(job: _Job, warnings: list[str]) -> None:
         nuke.message(f"{job.name} was deleted; its result is {job.out.pattern}")
         return
     with parent:
-        made = [n for n in nuke.allNodes("Read") if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name]
-        read = made[0] if made else _new_read(job.node, node_name)
+        made = _made_read(node_name)
+        read = made or _new_read(job.node, node_name)
     first, last = job.numbers or (1 if job.out.number is None else job.out.number,) * 2
     if read["file"].value() == job.out.pattern:  # Frames that were fused one by one extend the Read's range.
         first, last = min(first, int(read["first"].value())), max(last, int(read["last"].value()))
@@ -223,6 +240,12 @@ def _show(job: _Job, warnings: list[str]) -> None:
         cast(nuke.Script_Knob, read["reload"]).execute()
 
 
+def _made_read(node_name: str) -> nuke.Node | None:
+    """The Read that an earlier job made for a node of the current group."""
+    reads = (n for n in nuke.allNodes("Read") if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name)
+    return next(reads, None)
+
+
 def _new_read(node: nuke.Node, node_name: str) -> nuke.Node:
     read = nuke.nodes.Read()
     link = nuke.String_Knob(_MADE_BY)
@@ -231,3 +254,65 @@ def _new_read(node: nuke.Node, node_name: str) -> nuke.Node:
     link.setValue(node_name)
     read.setXYpos(node.xpos(), node.ypos() + 100)
     return read
+
+
+# ------------------------------------------------------------------------------- rebuild the beauty, in the main thread
+
+#: What the output of the group shows, by the index of the knob "show".
+_REBUILD, _DIFFERENCE = "rebuild", "difference"
+
+
+def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
+    """A group that adds up the layers of a set, and shows the sum or its difference from the beauty.
+
+    Every layer has a Shuffle of its own, behind which the artist may put a Grade.
+    """
+    group = nuke.nodes.Group()
+    group.setName("Rebuild_" + re.sub(r"\W", "_", fused.name))
+    group.setInput(0, read)
+    show = nuke.Enumeration_Knob("show", "show", [_REBUILD, _DIFFERENCE])
+    show.setTooltip("rebuild: the sum of the layers. difference: how far it is from the fused beauty.")
+    exposure = nuke.Double_Knob("exposure", "difference exposure")
+    exposure.setTooltip(
+        "In stops. The difference of a file with half floats is their rounding: it appears at about 10."
+    )
+    exposure.setRange(0, 20)
+    for knob in (show, exposure):
+        group.addKnob(knob)
+    with group:
+        source = nuke.nodes.Input()
+        total: nuke.Node | None = None
+        for column, term in enumerate(fused.terms):
+            light, *colours = (_shuffle(source, layer, 120 * column, 100 + 50 * i) for i, layer in enumerate(term))
+            for colour in colours:
+                light = _merge("multiply", light, colour, 120 * column, 200)
+            total = light if total is None else _merge("plus", total, light, 120 * column, 300)
+        assert total is not None
+        alpha = _node("Copy", [total, source], 0, 400, from0="rgba.alpha", to0="rgba.alpha")
+        difference = _merge("difference", source, total, 120, 400)
+        gain = _node("Multiply", [difference], 120, 450, channels="rgb")
+        gain["value"].setExpression("pow(2, parent.exposure)")
+        switch = _node("Switch", [alpha, gain], 0, 500)
+        switch["which"].setExpression("parent.show")
+        _node("Output", [switch], 0, 550)
+    return group
+
+
+def _shuffle(source: nuke.Node, layer: str, x: int, y: int) -> nuke.Node:
+    """A layer as rgb."""
+    return _node("Shuffle", [source], x, y, **{"in": layer, "label": layer})
+
+
+def _merge(operation: str, b: nuke.Node, a: nuke.Node, x: int, y: int) -> nuke.Node:
+    return _node("Merge2", [b, a], x, y, operation=operation, output="rgb")
+
+
+def _node(kind: str, inputs: list[nuke.Node], x: int, y: int, **knobs: str) -> nuke.Node:
+    """A node in the current group."""
+    node = getattr(nuke.nodes, kind)()
+    for index, each in enumerate(inputs):
+        node.setInput(index, each)
+    for name, value in knobs.items():
+        node[name].setValue(value)
+    node.setXYpos(x, y)
+    return cast(nuke.Node, node)

@@ -3,13 +3,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from oiio_msspl._version import __version__
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
+from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
@@ -52,6 +55,8 @@ class FrameReport:
     other_views: list[FrameReport] = field(default_factory=list)
     """The views and view layers that were fused beside the first one. What this report counts, warns of and says of
     passes is about all of them, with the view in front where it is not the first one's."""
+    fused_sets: list[AdditiveSet] = field(default_factory=list)
+    """The additive sets that were fused."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -124,6 +129,7 @@ def report_on(
         lrhs_aovs=session.lrhs_aovs,
         passes=_passes(fused),
         network_seconds=fused.seconds,
+        fused_sets=fused.passes.sets if fused.passes else [],
     )
 
 
@@ -191,7 +197,11 @@ def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list
 
 
 def provenance(report: FrameReport) -> dict[str, str]:
-    """Attributes of the fused part: model, inputs, spp and layers that the frame was made from."""
+    """Attributes of the fused part: model, inputs, spp and layers that the frame was made from.
+
+    ``msspl/passes`` is JSON, the fused sets: ``[{"name": NAME, "layers": [[LAYER], [LIGHT, COLOUR], ...]}, ...]``. The
+    sum of the layers, and of the products of light and colour, is the fused beauty. The names are those of the HRLS.
+    """
     spp = report.spp_avg
     views = {"msspl/views": ", ".join(name_of(each.hr.view) for each in report.fused_views())}
     return (views if report.other_views else {}) | {
@@ -204,4 +214,19 @@ def provenance(report: FrameReport) -> dict[str, str]:
         "msspl/spp_hrls": "unknown" if report.hr.spp is None else f"{report.hr.spp:g}",
         "msspl/spp_average": "unknown" if spp is None else f"{spp:g}",
         "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
+        "msspl/passes": json.dumps(_fused_layers(report)),
     }
+
+
+def _fused_layers(report: FrameReport) -> list[dict[str, Any]]:
+    """The fused sets, with the layers' full names, as :func:`provenance` describes them."""
+    names = {channel: layer.name for layer in layers_of(report.hr.file) for channel in layer.channels.values()}
+    return [
+        {
+            "name": each.name,
+            "layers": [
+                [names[channels[0]] for channels in (layer.channels, layer.factor) if channels] for layer in each.layers
+            ],
+        }
+        for each in report.fused_sets
+    ]

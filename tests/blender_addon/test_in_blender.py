@@ -69,6 +69,58 @@ def test_the_composited_frame_equals_the_fused_file(results):
         assert fused.std() > 0.01
 
 
+#: What the checks in Blender rebuild the beauty from. A component is light, or light times a colour.
+GROUPS = ("Combined_key", "Combined_rest", "Combined_world")
+COMPONENTS = (
+    *(
+        (f"{kind} {part}", f"{kind} Color")
+        for kind in ("Diffuse", "Glossy", "Transmission")
+        for part in ("Direct", "Indirect")
+    ),
+    *(("Emission",), ("Volume Direct",), ("Volume Indirect",)),
+)
+
+
+@pytest.mark.parametrize(("film", "precision"), [("opaque", 2**-11), ("transparent", 2**-22)])
+@pytest.mark.parametrize("name", ["light groups", "components"])
+def test_the_beauty_that_the_compositor_builds_from_fused_passes_is_the_fused_beauty(results, film, precision, name):
+    """Every layer is rounded once: the first file has half floats, the second one float.
+
+    A pixel whose colours are all black can hold no light in a component. At the edges of a transparent film there are
+    such pixels.
+    """
+    path = results / f"{film}.exr"
+    environment = [("Environment",)] if film == "opaque" else []
+    terms = [(group,) for group in GROUPS] if name == "light groups" else [*COMPONENTS, *environment]
+    stored = {x: layer(path, f"ViewLayer.{x}.", "RGB") for term in terms for x in term}
+    layers = [np.prod([stored[x] for x in term], axis=0) for term in terms]
+    beauty = layer(path, "ViewLayer.Combined.", "RGB")
+    holds_light = np.ones(beauty.shape, bool)
+    if (film, name) == ("transparent", "components"):
+        holds_light = np.any([stored[term[-1]] >= 1e-3 for term in terms], axis=0)
+        assert holds_light.mean() > 0.5
+    total, rebuilt = sum(layers), layer(results / f"{film}_{name}.exr", "", "RGB")
+    rounding = precision * (total + beauty) + 1e-6
+    assert (np.abs(rebuilt - total) <= rounding).all()
+    assert (np.abs(rebuilt - beauty) <= rounding)[holds_light].all()
+    fused = json.loads(open_exr(path).metadata["msspl/passes"])
+    assert {each["name"]: len(each["layers"]) for each in fused}[name] == len(terms)
+    assert sum(each.max() > 0.05 for each in layers) >= 3
+
+
+def test_light_in_no_group_stays_out_of_the_fused_groups(results):
+    """The lamp "key" has left its group. All that it lights is missing in the sum; the other groups are clean."""
+    path = results / "remainder.exr"
+    names = {channel.name for part in open_exr(path).parts for channel in part.channels}
+    assert not {name for name in names if "Transmission" in name}
+    key, rest, world = (layer(path, f"ViewLayer.{group}.", "RGB") for group in GROUPS)
+    beauty = layer(path, "ViewLayer.Combined.", "RGB")
+    assert key.max() == 0
+    assert ((key + rest + world) <= beauty * (1 + 2**-20) + 1e-6).all()
+    lost = layer(results / "transparent.exr", "ViewLayer.Combined_key.", "RGB")
+    assert (beauty - rest - world).mean() == pytest.approx(lost.mean(), rel=0.02)
+
+
 def test_both_renders_show_the_same_frame_if_the_size_is_rounded(results):
     """At x8, a ramp has the same values at the edges of both renders, within a twentieth of an HRLS pixel."""
     for name in ("wide", "tall", "squeezed"):
@@ -101,7 +153,7 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
     )
     blender.chmod(0o755)
     options = ["-s", "2", "--hr-spp", "4", "--view-layer", "ViewLayer", "--keep", "--compare", "--json"]
-    options += ["--model", "pyramid", "--error-layer"]
+    options += ["--model", "pyramid", "--error-layer", "--components"]
     frames = ["--frames", "3-4", "-o", out / "out.##.exr"]
     done = msspl_render(results / "scene.blend", "--blender", blender, *options, *frames)
     assert done.returncode == 0, done.stderr
@@ -124,6 +176,10 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
     for name, components in (("CryptoObject00", "rgba"), ("Mist", "Z"), ("Combined_key", "RGB"), ("Matte", "RGB")):
         both = [layer(out / f"out.03{s}.exr", f"ViewLayer.{name}.", components) for s in ("", "_hr")]
         np.testing.assert_array_equal(*both)
+    (fused,) = json.loads(written.metadata["msspl/passes"])
+    assert [f"ViewLayer.{term[0]}" for term in COMPONENTS] == [term[0] for term in fused["layers"]]
+    for suffix in ("", "_lr", "_hr"):  # both renders have all passes, and the fused file too
+        assert layer(out / f"out.03{suffix}.exr", "ViewLayer.Volume Direct.", "RGB").shape[2] == 3
     means = [layer(out / f"out.03{suffix}.exr", "ViewLayer.Combined.", "RGB").mean() for suffix in ("", "_lr", "_oidn")]
     assert means == pytest.approx([means[2]] * 3, rel=0.05)
 

@@ -43,7 +43,8 @@ SHOWN = {
         17,
     ),
     "msspl_render": (
-        "--view-layer --blender --scale --lr-spp --hr-spp --model --device --output --layout --error-layer --compare "
+        "--view-layer --blender --scale --lr-spp --hr-spp --components --model --device --output --layout --passes "
+        "--error-layer --compare "
         "--overwrite --json --frames --skip-existing --help --help-all",
         6,
     ),

@@ -106,7 +106,8 @@ def farm(tmp_path):
 @posix
 def test_options_reach_blender_and_times_are_printed(farm):
     _, run, folder = farm
-    code, out, err, left = run("-s", "8", "--hr-spp", "2", "--filter", "scene", "--threads", "3", "--frame", "7")
+    options = ["-s", "8", "--hr-spp", "2", "--filter", "scene", "--threads", "3", "--components", "--frame", "7"]
+    code, out, err, left = run(*options)
     assert (code, left) == (0, ["out.exr"]), err
     assert "7      1.00    1.00    0.50    2.50   about 2.2 spp" in out
     assert err == "warning: frame 7: the moon is full\n"
@@ -114,7 +115,8 @@ def test_options_reach_blender_and_times_are_printed(farm):
     assert argv[:2] == ["--background", str(folder / "scene.blend")]
     assert Path(argv[3]).is_file()
     assert job["options"] == {
-        **{"scale": 8, "hr_spp": 2, "lr_spp": 0, "filter": "SCENE", "view_layer": "", "threads": 3}
+        **{"scale": 8, "hr_spp": 2, "lr_spp": 0, "filter": "SCENE", "view_layer": "", "threads": 3},
+        "components": True,
     }
     assert job["frames"] == [[7, str(folder / "out.exr")]]
 
@@ -141,15 +143,17 @@ def model(bilinear_models, tmp_path, monkeypatch):
 
 
 @posix
-def test_frames_are_fused_here_with_the_options_of_msspl_fuse_and_a_model_that_stays_loaded(farm, model):
+@pytest.mark.parametrize("passes", ["none", "components"])
+def test_frames_are_fused_here_with_the_options_of_msspl_fuse_and_a_model_that_stays_loaded(farm, model, passes):
     _, run, folder = farm
-    options = ["--model", model, "--device", "cpu", "--layout", "nuke", "--error-layer"]
+    options = ["--model", model, "--device", "cpu", "--layout", "nuke", "--error-layer", "--passes", passes]
     code, _, err, left = run("-o", "out.##.exr", "--frames", "1-2", *options, code=ASKS)
     assert (code, err, left) == (0, "", ["out.01.exr", "out.02.exr"])
     for name in left:
         parts = open_exr(folder / name).parts
         assert [part.name for part in parts[:2]] == ["rgba", "error"]
         assert parts[0].spec.getattribute("msspl/model") == "bilinear-x4"
+        assert (parts[0].spec.getattribute("msspl/passes") == "[]") == (passes == "none")
 
 
 @posix

@@ -1,11 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
 """Layers that sum to the beauty are fused, and still sum to it."""
 
+import json
+
 import numpy as np
 import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
+from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs import frame
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
@@ -138,6 +141,10 @@ def test_products_of_light_and_colour_sum_too(tmp_path, bilinear_models):
     lit = layer(out, "DiffCol") > 0
     np.testing.assert_allclose(total[lit], layer(out)[lit], rtol=1e-5, atol=1e-5)
     assert not layer(out, "DiffDir")[~lit].any()
+    (stored,) = json.loads(open_exr(tmp_path / "out.exr").metadata["msspl/passes"])
+    assert stored == {"name": "components", "layers": [["DiffDir", "DiffCol"], ["DiffInd", "DiffCol"], ["Emit"]]}
+    fused(pair, tmp_path / "plain.exr", bilinear_models, passes=("none",))
+    assert open_exr(tmp_path / "plain.exr").metadata["msspl/passes"] == "[]"
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")

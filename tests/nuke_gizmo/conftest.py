@@ -1,10 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gizmo's files, read once."""
+"""The gizmo's files, read once, and a Nuke that has the gizmo."""
 
+import shutil
+import sys
 from pathlib import Path
 
 import pytest
+from msspl_cli.installed import find_msspl_fuse
 
+from tests.conftest import EXAMPLES
+from tests.nuke_gizmo.fake_nuke import FakeNuke
 from tests.nuke_gizmo.gizmo_file import read_script, tcl_interpreters
 
 FOLDER = Path(__file__).resolve().parents[2] / "nuke_gizmo"
@@ -23,3 +28,29 @@ def nodes():
 def button_scripts(nodes):
     """{knob: Python script} of the gizmo's buttons."""
     return {knob.name: knob.options["T"] for knob in nodes[1].user_knobs if knob.kind == 22}
+
+
+@pytest.fixture
+def host(nodes, monkeypatch, tmp_path):
+    """The fake Nuke with a gizmo. Its inputs are two Reads of frames 1001 to 1003, copies of the example pair."""
+    nuke = FakeNuke(nodes)
+    monkeypatch.setitem(sys.modules, "nuke", nuke)
+    monkeypatch.delitem(sys.modules, "msspl_nuke", raising=False)
+    program = find_msspl_fuse()
+    assert program, "install the package: pip install -e '.[test]'"
+    monkeypatch.setenv("MSSPL_FUSE", program)
+    # Nuke sets such variables for its own Python.
+    monkeypatch.setenv("PYTHONHOME", "/opt/Nuke15.1v1")
+    monkeypatch.setenv("PYTHONPATH", "/opt/Nuke15.1v1")
+    for name in ("lr", "hr"):
+        for frame in (1001, 1002, 1003):
+            shutil.copy(EXAMPLES / f"{name}.exr", tmp_path / f"{name}.{frame}.exr")
+    nuke.gizmo = nuke.createNode("MSSPLFuse")
+    nuke.gizmo.setXYpos(40, 200)
+    nuke.reads = [nuke.nodes.Read(str(tmp_path / f"{name}.%04d.exr"), 1001, 1003) for name in ("lr", "hr")]
+    for index, read in enumerate(nuke.reads):
+        nuke.gizmo.setInput(index, read)
+    nuke.frame_number = 1002
+    yield nuke
+    nuke.wait()
+    sys.modules.pop("msspl_nuke", None)

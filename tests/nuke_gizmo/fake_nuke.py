@@ -7,12 +7,16 @@ main thread calls ``executeInMainThread``. test_python.py compares its names and
 
 from __future__ import annotations
 
+import functools
+import itertools
 import queue
 import threading
 import time
 import types
 from pathlib import Path
 
+from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.reader import open_exr
 from tests.nuke_gizmo.gizmo_file import ScriptNode
 
 
@@ -44,9 +48,36 @@ class Knob:
     def setFlag(self, flag):
         self._flags |= flag
 
+    def setTooltip(self, tooltip):
+        assert tooltip
+
+    def setExpression(self, expression):
+        self.setValue(f"{{{expression}}}")
+
 
 class String_Knob(Knob):
     pass
+
+
+class Double_Knob(Knob):
+    def __init__(self, name, label="", value=0.0):
+        super().__init__(name, label, value)
+
+    def setRange(self, low, high):
+        assert low < high
+
+
+class Enumeration_Knob(Knob):
+    def __init__(self, name, label, items):
+        super().__init__(name, label, items[0])
+        self._items = items
+
+    def values(self):
+        return self._items
+
+    def setValue(self, val):
+        assert val in self._items
+        super().setValue(val)
 
 
 class File_Knob(String_Knob):
@@ -93,8 +124,10 @@ class Node:
         return self._knobs["name"].value()
 
     def setName(self, name):
-        assert name not in {n.name() for n in self.nuke.nodes_of(self._parent) if n is not self}
-        self._knobs["name"].setValue(name)
+        """Nuke takes another name if this one is taken."""
+        taken = {n.name() for n in self.nuke.nodes_of(self._parent) if n is not self}
+        names = itertools.chain([name], (f"{name}{i}" for i in itertools.count(1)))
+        self._knobs["name"].setValue(next(each for each in names if each not in taken))
 
     def fullName(self):
         above = self.parent()
@@ -127,9 +160,22 @@ class Node:
     def dependent(self, mask):
         return [n for n in self.nuke.everything if self in n._inputs]
 
+    def channels(self):
+        """Of the EXR that a Read reads at the current frame: Nuke knows no dots and spaces in the names of layers."""
+        file = open_exr(Path(self.metadata("input/filename", self.nuke.frame_number)))
+        names = {"R": "red", "G": "green", "B": "blue", "A": "alpha"}
+        return [
+            f"{layer.name.replace('.', '_').replace(' ', '_') or 'rgba'}.{names.get(component, component)}"
+            for layer in layers_of(file)
+            for component in layer.channels
+        ]
+
     def metadata(self, key, time):
-        """The file that a Read reads at a frame. The frame modes follow Foundry's guide."""
-        assert (self._kind, key) == ("Read", "input/filename")
+        """The file that a Read reads at a frame, or an attribute of it. The frame modes follow Foundry's guide."""
+        assert self._kind == "Read"
+        if key.startswith("exr/"):
+            return open_exr(Path(self.metadata("input/filename", time))).metadata.get(key.removeprefix("exr/"))
+        assert key == "input/filename"
         mode, text = self["frame_mode"].value(), str(self["frame"].value())
         number = (
             eval(text or "frame", {"frame": time}) if mode == "expression" else time - int(text) + self["first"].value()
@@ -202,12 +248,25 @@ class Menu:
         self.entries[name] = command
 
 
+#: Knobs of the nodes of a rebuild, with Nuke's defaults.
+_PLAIN_NODES = {
+    "Input": {},
+    "Output": {},
+    "Shuffle": {"in": "rgba", "label": ""},
+    "Merge2": {"operation": "over", "output": "rgba"},
+    "Copy": {"from0": "", "to0": ""},
+    "Multiply": {"channels": "all", "value": 1.0},
+    "Switch": {"which": 0},
+}
+
+
 class FakeNuke(types.ModuleType):
     """The module ``nuke`` of one session, and what a test needs to drive it."""
 
     INPUTS, HIDDEN_INPUTS, INVISIBLE = 1, 2, 1024
     EXE_PATH = "/opt/Nuke15.1v1/Nuke15.1"
     Gizmo, Node, File_Knob, Script_Knob, String_Knob = Gizmo, Node, File_Knob, Script_Knob, String_Knob
+    Double_Knob, Enumeration_Knob, Group = Double_Knob, Enumeration_Knob, Group
 
     def __init__(self, gizmo: dict[int, ScriptNode]):
         super().__init__("nuke")
@@ -219,7 +278,8 @@ class FakeNuke(types.ModuleType):
         self._root = Root("Root", "root", knobs)
         self.contexts = [self._root]
         self.frame_number, self._node = 1, None
-        self.nodes = types.SimpleNamespace(Read=self._read)
+        plain = {kind: functools.partial(self._plain_node, kind) for kind in _PLAIN_NODES}
+        self.nodes = types.SimpleNamespace(Read=self._read, Group=self._group, **plain)
 
     # The API of Nuke.
 
@@ -283,6 +343,12 @@ class FakeNuke(types.ModuleType):
         values |= {"frame_mode": "expression", "raw": False, "colorspace": "default"}
         knobs = [File_Knob(k, value=v) if k == "file" else Knob(k, value=v) for k, v in values.items()]
         return self.add(Node("Read", "Read1", [*knobs, Script_Knob("reload")]))
+
+    def _group(self):
+        return self.add(Group("Group", "Group1"))
+
+    def _plain_node(self, kind):
+        return self.add(Node(kind, f"{kind}1", [Knob(k, value=v) for k, v in _PLAIN_NODES[kind].items()]))
 
     # For the tests only.
 

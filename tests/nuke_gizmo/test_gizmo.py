@@ -44,6 +44,7 @@ def test_every_knob_has_its_kind_its_default_and_a_tooltip(nodes):
             "passes": text,
         },
         **{"overwrite": tick, "fuse_frame": button, "first": number, "last": number, "fuse_range": button},
+        "rebuild": button,
         **{"setup": tab, "program": file, "options": text},
     }
     assert {name: gizmo.knobs[name] for name in kinds if name in gizmo.knobs} == {

@@ -6,38 +6,11 @@ import shutil
 import sys
 
 import pytest
-from msspl_cli.installed import find_msspl_fuse
 
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import EXAMPLES
 from tests.nuke_gizmo.conftest import FOLDER
-from tests.nuke_gizmo.fake_nuke import FakeNuke, Node
-
-
-@pytest.fixture
-def host(nodes, monkeypatch, tmp_path):
-    """The fake Nuke with a gizmo. Its inputs are two Reads of frames 1001 to 1003, copies of the example pair."""
-    nuke = FakeNuke(nodes)
-    monkeypatch.setitem(sys.modules, "nuke", nuke)
-    monkeypatch.delitem(sys.modules, "msspl_nuke", raising=False)
-    program = find_msspl_fuse()
-    assert program, "install the package: pip install -e '.[test]'"
-    monkeypatch.setenv("MSSPL_FUSE", program)
-    # Nuke sets such variables for its own Python.
-    monkeypatch.setenv("PYTHONHOME", "/opt/Nuke15.1v1")
-    monkeypatch.setenv("PYTHONPATH", "/opt/Nuke15.1v1")
-    for name in ("lr", "hr"):
-        for frame in (1001, 1002, 1003):
-            shutil.copy(EXAMPLES / f"{name}.exr", tmp_path / f"{name}.{frame}.exr")
-    nuke.gizmo = nuke.createNode("MSSPLFuse")
-    nuke.gizmo.setXYpos(40, 200)
-    nuke.reads = [nuke.nodes.Read(str(tmp_path / f"{name}.%04d.exr"), 1001, 1003) for name in ("lr", "hr")]
-    for index, read in enumerate(nuke.reads):
-        nuke.gizmo.setInput(index, read)
-    nuke.frame_number = 1002
-    yield nuke
-    nuke.wait()
-    sys.modules.pop("msspl_nuke", None)
+from tests.nuke_gizmo.fake_nuke import Node
 
 
 def results(nuke):
@@ -247,9 +220,9 @@ def test_copy_to_group_keeps_name_knobs_and_connections_and_its_buttons_work(hos
 
 def test_a_button_without_the_module_says_what_to_install(host, monkeypatch):
     monkeypatch.setitem(sys.modules, "msspl_nuke", None)
-    for button in ("fuse_frame", "fuse_range"):
+    for button in ("fuse_frame", "fuse_range", "rebuild"):
         host.press(host.gizmo, button)
-    assert len(host.messages) == 2
+    assert len(host.messages) == 3
     for message in host.messages:
         assert message.startswith("This button needs the folder nuke_gizmo of oiio_msspl on the plug-in path of Nuke.")
 

@@ -93,6 +93,14 @@ def render(
             hidden=True,
         ),
     ] = "box",
+    components: Annotated[
+        bool,
+        typer.Option(
+            "--components",
+            help="Render all component passes, from diffuse to volume, besides the passes that the scene has on.",
+            rich_help_panel=RENDER,
+        ),
+    ] = False,
     threads: Annotated[
         int,
         typer.Option(
@@ -120,6 +128,7 @@ def render(
         ),
     ],
     layout: options.Layout = "multilayer",
+    passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     keep: Annotated[
         bool,
@@ -197,15 +206,15 @@ def render(
             "lr_spp": lr_spp or 0,
             "filter": pixel_filter.upper(),
             "view_layer": view_layer,
+            "components": components,
             "threads": threads,
         },
         "overwrite": overwrite,
         "keep": keep,
         "compare": compare,
     }
-    fuse = _fuser(
-        scale, model, device, threads, options.make_write_options(layout, None, None, [], error_layer), overwrite
-    )
+    write = options.make_write_options(layout, None, None, [], error_layer, passes)
+    fuse = _fuser(scale, model, device, threads, write, overwrite)
     if makes_folder:
         folder.mkdir(exist_ok=True)
     reports: list[dict[str, Any]] = []

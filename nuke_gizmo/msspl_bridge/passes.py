@@ -1,0 +1,51 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The layers of a fused file that sum to its beauty."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from msspl_bridge.errors import FuseError
+
+#: Where Nuke shows the EXR attribute in which msspl-fuse names the layers that it has fused.
+ATTRIBUTE = "exr/msspl/passes"
+
+
+@dataclass(frozen=True)
+class FusedSet:
+    """Layers whose sum is the fused beauty."""
+
+    name: str
+    """Such as ``light groups``."""
+    terms: list[list[str]]
+    """Nuke's names of the layers. A term is one layer, or light and the colour that it is multiplied by."""
+
+
+def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
+    """The fused sets of a file.
+
+    Args:
+        attribute: value of :data:`ATTRIBUTE`; None in a file without it.
+        channels: of the Read, such as ``ViewLayer_Emit.red``.
+
+    Raises:
+        FuseError: the file has no fused layers, or one of them was left out.
+    """
+    stored = json.loads(str(attribute or "[]"))
+    if not stored:
+        raise FuseError("the file has no fused passes; fuse it again with passes that sum to the beauty")
+    layers = {_spelling(layer): layer for layer in (channel.rpartition(".")[0] for channel in channels)}
+    missing = [name for each in stored for term in each["layers"] for name in term if _spelling(name) not in layers]
+    if missing:
+        raise FuseError(f"the file has no layer {missing[0]}; fuse it again with all layers of {stored[0]['name']}")
+    return [
+        FusedSet(each["name"], [[layers[_spelling(n)] for n in term] for term in each["layers"]]) for each in stored
+    ]
+
+
+def _spelling(layer: str) -> str:
+    """A layer's name without what Nuke replaces: dots, spaces and other signs become ``_``."""
+    return re.sub(r"[^0-9a-z]", "_", layer.lower())

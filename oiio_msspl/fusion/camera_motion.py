@@ -1,0 +1,135 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Movement of the picture by the camera alone: from the camera's matrices in the headers, and world-space positions.
+
+Renderers disagree on what their matrices mean, and some write a matrix under the wrong name. So each is tried: the
+right one projects the positions of a frame onto the pixels that hold them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import Array
+from oiio_msspl.fusion.motion_vectors import Mask
+from oiio_msspl.parallel import for_row_blocks
+
+#: Header attributes that hold such a matrix, in lower case: by Arnold, Karma, Mantra and RenderMan.
+MATRICES = ("worldtoscreen", "worldtondc", "np", "worldtocamera", "nl")
+#: Pixels by which a matrix is judged.
+SAMPLES = 4096
+#: A matrix is right if positions land this close to their pixel, in pixels. A single sample lies anywhere in it.
+CLOSE = 0.75
+
+
+@dataclass(frozen=True)
+class Projection:
+    """What the pixels of a frame have told about a matrix."""
+
+    attribute: str
+    """Name of the header attribute."""
+    divisor: int
+    """Column by which the first two are divided: 3 of a matrix to the screen, 2 of one to the camera."""
+    scale: tuple[float, float]
+    shift: tuple[float, float]
+    """pixel = projected * scale + shift, in x and y."""
+
+    def matrix(self, render: MappedRender) -> NDArray[np.float32] | None:
+        """The matrix of a frame, for row vectors; None if its header has none."""
+        return _matrix(render, self.attribute)
+
+    def project(self, positions: Array, matrix: NDArray[np.float32]) -> Array:
+        """Where positions (..., 3) lie in the frame: (..., 2), x and y in pixels; NaN behind the camera."""
+        seen = positions @ matrix[:3] + matrix[3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result: Array = seen[..., :2] / seen[..., self.divisor : self.divisor + 1]
+        return result * np.array(self.scale, np.float32) + np.array(self.shift, np.float32)
+
+
+def find_projection(render: MappedRender) -> Projection | None:
+    """The matrix of the header that projects positions onto their pixels; None if there is none.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    if render.motion.position is None or not any(key.lower() in MATRICES for key in render.metadata):
+        return None
+    window = render.data_window
+    positions = render.file.read(render.motion.position, window)
+    good = np.isfinite(positions).all(axis=-1) & (positions != 0).any(axis=-1)
+    y, x = np.nonzero(good)
+    if len(x) < 64:
+        return None
+    chosen = np.linspace(0, len(x) - 1, min(len(x), SAMPLES)).astype(np.int64)
+    points = positions[y[chosen], x[chosen]]
+    pixels = np.stack([x[chosen] + window.x0, y[chosen] + window.y0], axis=-1).astype(np.float32)
+    for name in MATRICES:
+        for attribute in (key for key in render.metadata if key.lower() == name):
+            matrix = _matrix(render, attribute)
+            if matrix is not None and (found := _fit(attribute, matrix, points, pixels)):
+                return found
+    return None
+
+
+def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Projection) -> tuple[Array, Mask]:
+    """Vectors to a neighbour (h, w, 2) as if all surfaces stood still, and where there are any (h, w).
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window = render.data_window
+    vectors = np.zeros((window.height, window.width, 2), np.float32)
+    known = np.zeros(vectors.shape[:2], np.bool_)
+    here, there = projection.matrix(render), projection.matrix(neighbour)
+    if here is None or there is None or render.motion.position is None:
+        return vectors, known
+    positions = render.file.read(render.motion.position, window)
+    distances = np.empty(known.shape, np.float32)
+
+    def work(rows: slice) -> None:
+        points = positions[rows]
+        y, x = np.mgrid[rows.start : rows.stop, 0 : window.width].astype(np.float32)
+        now = projection.project(points, here)
+        way = projection.project(points, there) - now
+        distances[rows] = np.hypot(now[..., 0] - x - window.x0, now[..., 1] - y - window.y0)
+        limit = np.hypot(render.display_window.width, render.display_window.height)
+        known[rows] = (np.hypot(way[..., 0], way[..., 1]) < limit) & (points != 0).any(axis=-1)
+        vectors[rows] = np.where(known[rows, :, None], way, 0)
+
+    with np.errstate(invalid="ignore"):
+        for_row_blocks(work, window.height, window.width * 12)
+    # A lens that zooms changes the scale, which a matrix to the camera alone does not say.
+    if not known.any() or np.median(distances[known]) > CLOSE:
+        known[:] = False
+        vectors[:] = 0
+    return vectors, known
+
+
+def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:
+    """A matrix of the header. OpenEXR and OpenImageIO store it for row vectors."""
+    try:
+        values = np.array(render.metadata.get(attribute), np.float32).reshape(4, 4)
+    except (TypeError, ValueError):
+        return None
+    return values if np.isfinite(values).all() else None
+
+
+def _fit(attribute: str, matrix: NDArray[np.float32], points: Array, pixels: Array) -> Projection | None:
+    """The scale and shift with which a matrix projects points (n, 3) onto pixels (n, 2); None if no such fit."""
+    seen = points @ matrix[:3] + matrix[3]
+    divisor = 2 if np.allclose(matrix[:, 3], (0, 0, 0, 1)) else 3
+    if np.abs(seen[:, divisor]).min() < 1e-9:
+        return None
+    projected = (seen[:, :2] / seen[:, divisor : divisor + 1]).astype(np.float64)
+    use = np.ones(len(points), np.bool_)
+    for _ in range(4):  # edges of surfaces, where positions are mixtures, drop out
+        fits = [np.polyfit(projected[use, axis], pixels[use, axis], 1) for axis in (0, 1)]
+        wrong = np.hypot(*(projected[:, axis] * fits[axis][0] + fits[axis][1] - pixels[:, axis] for axis in (0, 1)))
+        use = wrong <= max(2 * float(np.median(wrong)), 1e-3)
+    if np.median(wrong) > CLOSE:
+        return None
+    (scale_x, shift_x), (scale_y, shift_y) = fits
+    return Projection(attribute, divisor, (float(scale_x), float(scale_y)), (float(shift_x), float(shift_y)))

@@ -146,13 +146,26 @@ def find_motion(
 
 def _check(pair: Pair, each: MotionField) -> FieldCheck:
     """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
-    channels = [render.motion.channels(each.layer, each.components) for render in (pair.first, pair.second)]
-    if channels[0] is None or channels[1] is None:
+    stored = [_stored(pair, frame, each) for frame in (0, 1)]
+    if stored[0] is None or stored[1] is None:
         return FieldCheck(each, f"{pair.second.name} lacks it")
-    check = check_field(pair, each, (pair.read(0, channels[0]), pair.read(1, channels[1])))
+    check = check_field(pair, each, (stored[0], stored[1]))
     if check.problem and not check.zero and check.fit <= 1 and {"to", "x", "y", "unit"} <= each.fixed:
         return replace(check, problem="", by_user=True)
     return check
+
+
+def _stored(pair: Pair, frame: int, each: MotionField) -> Array | None:
+    """Stored vectors of a frame, not multiplied by alpha; None if the frame lacks the layer."""
+    render = (pair.first, pair.second)[frame]
+    channels = render.motion.channels(each.layer, each.components)
+    if channels is None:
+        return None
+    stored = pair.read(frame, channels)
+    if each.format.premultiplied and render.alpha:
+        alpha = pair.read(frame, [render.alpha])
+        stored = np.where(alpha > 0, stored / np.where(alpha > 0, alpha, 1), 0).astype(np.float32)
+    return stored
 
 
 def _one_each_way(checks: Sequence[FieldCheck]) -> list[FieldCheck]:

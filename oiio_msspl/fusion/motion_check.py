@@ -16,7 +16,7 @@ import numpy as np
 from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
 from oiio_msspl.arrays import Array
 from oiio_msspl.fusion.motion_guides import POSITION, Guide, Pair, steepness
-from oiio_msspl.fusion.motion_vectors import sample
+from oiio_msspl.fusion.motion_vectors import Mask, sample
 
 #: The best format must fit so many times as well as no motion, and as the runner-up.
 MARGIN = 1.5
@@ -67,7 +67,12 @@ def check_field(pair: Pair, field: MotionField, stored: tuple[Array, Array]) -> 
         field: the layer, with the format that is expected. Words in ``fixed`` are not varied.
         stored: its pixels (h, w, 2) in both frames, over the pair's window and reduced as the guides are.
     """
-    offset = _offset(field, stored)
+    checks = [_check_offset(pair, field, stored, offset) for offset in _offsets(field, stored)]
+    return min(checks, key=lambda check: (bool(check.problem), not check.zero, check.fit))
+
+
+def _check_offset(pair: Pair, field: MotionField, stored: tuple[Array, Array], offset: float) -> FieldCheck:
+    """Find the format of vectors whose offset is known."""
     field = replace(field, format=replace(field.format, offset=offset))
     if all(not _moving(values, offset).any() for values in stored):
         return FieldCheck(field, "is zero everywhere", zero=True)
@@ -76,18 +81,20 @@ def check_field(pair: Pair, field: MotionField, stored: tuple[Array, Array]) -> 
     trial = _Trial(pair, field, stored, offset)
     if not trial.usable:
         return FieldCheck(field, "albedo, normal and position are too even to verify it by")
-    formats = list(_formats(field, encoded=offset != 0))
-    fits = trial.fits(formats)
+    fits = trial.fits(_formats(field, encoded=offset != 0))
     best = min(fits, key=lambda form: fits[form])
     if "scale" not in field.fixed:
-        best, fits[best] = trial.fit_scale(best, fits[best])
-        fits |= trial.fits(set(_formats(replace(field, format=best), encoded=False, scales=(best.scale,))) - set(fits))
+        for form in (best, _mirrored(best)):
+            if form in fits:
+                scale = trial.fit_scale(form, fits[form])
+                fits |= trial.fits(_formats(replace(field, format=form), encoded=False, scales=[scale]))
         best = min(fits, key=lambda form: fits[form])
     # Even movement fits equally well if the vectors are taken for those from the other frame: the table decides.
-    for form in (_mirrored(best), field.format, _mirrored(field.format)):
-        like = form in fits and fits[form] < MARGIN * fits[best]
-        if like and form.to == field.format.to and (form == field.format or form == _mirrored(best)):
-            best = form
+    mirrored = _mirrored(best)
+    if mirrored.to == field.format.to and fits.get(mirrored, np.inf) < MARGIN * fits[best]:
+        best = mirrored
+    # Formats may differ in nothing that these frames show: a camera that moves sideways does not tell y.
+    best = next(form for form in (field.format, best) if form == best or trial.is_same(form, best, fits))
     if fits[best] * MARGIN > 1:
         return FieldCheck(field, _no_format(pair, fits[best]), fit=fits[best])
     rivals = [f for f in fits if f.to == best.to and f != best and fits[f] < MARGIN**2 * max(fits[best], FLOOR)]
@@ -102,18 +109,17 @@ def _no_format(pair: Pair, fit: float) -> str:
     return f"no known format makes {names} of both frames agree (at best {fit:.0%} of the differences are left)"
 
 
-def _offset(field: MotionField, stored: tuple[Array, Array]) -> float:
-    """0.5 for vectors that are encoded as colours: all are within 0 to 1, and most near 0.5."""
+def _offsets(field: MotionField, stored: tuple[Array, Array]) -> tuple[float, ...]:
+    """The stored values that may mean no motion. Vectors that are encoded as colours lie between 0 and 1."""
     if "offset" in field.fixed:
-        return field.format.offset
-    values = np.concatenate([v.reshape(-1) for v in stored])
-    encoded = values.min() >= 0 and values.max() <= 1 and bool(np.mean(np.abs(values - 0.5) < 0.25) > 0.5)
-    return 0.5 if encoded else 0.0
+        return (field.format.offset,)
+    lowest, highest = (float(f([f(values) for values in stored])) for f in (np.min, np.max))
+    return (0.0, 0.5) if lowest >= 0 and 0.25 < highest <= 1 else (0.0,)
 
 
-def _moving(stored: Array, offset: float) -> Array:
+def _moving(stored: Array, offset: float) -> Mask:
     """Where (h, w) vectors are not 0."""
-    result: Array = (np.abs(stored - np.float32(offset)) > 1e-6).any(axis=-1)
+    result: Mask = (np.abs(stored - np.float32(offset)) > 1e-6).any(axis=-1)
     return result
 
 
@@ -156,7 +162,6 @@ class _Trial:
     def __init__(self, pair: Pair, field: MotionField, stored: tuple[Array, Array], offset: float) -> None:
         self._frame = (pair.first.display_window.width, pair.first.display_window.height)
         self._reduction = pair.reduction
-        self._expected = field.format
         self._places = [
             place for frame in (0, 1) for guide in pair.guides if (place := _place(guide, frame, stored[frame], offset))
         ]
@@ -179,28 +184,34 @@ class _Trial:
             for form, each in left.items()
         }
 
-    def fit_scale(self, form: MotionFormat, fit: float) -> tuple[MotionFormat, float]:
-        """The format with another scale, if that fits clearly better: a shutter may have any length."""
+    def fit_scale(self, form: MotionFormat, fit: float) -> float:
+        """The scale of a format that fits clearly better than its own, if there is one: a shutter may have any
+        length."""
         best, best_fit = form, fit
         for width, steps in ((2.0, 8), (2 ** (1 / 8), 8), (2 ** (1 / 64), 8)):
             scales = [best.scale * width ** (k / steps) for k in range(-steps, steps + 1)]
             fits = self.fits([replace(best, scale=float(f"{s:.4g}")) for s in scales] + [best])
             best = min(fits, key=lambda f: fits[f])
             best_fit = fits[best]
-        return (best, best_fit) if best_fit * MARGIN < fit else (form, fit)
+        return best.scale if best_fit * MARGIN < fit else form.scale
+
+    def is_same(self, form: MotionFormat, other: MotionFormat, fits: dict[MotionFormat, float]) -> bool:
+        """Whether two formats say the same places in these frames."""
+        if form not in fits or form.to != other.to:
+            return False
+        return not any(self._apart(place, form, other).any() for place in self._of(form))
 
     def beats(self, form: MotionFormat, rival: MotionFormat) -> bool:
         """Whether a format fits clearly better where the two say different places; True if they nowhere do."""
         wins = losses = 0
         for place in self._of(form):
-            mine, other = self._vectors(place, form), self._vectors(place, rival)
-            apart = np.hypot(*(mine - other).T) * self._reduction > DIFFERENT
+            apart = self._apart(place, form, rival)
             if np.count_nonzero(apart) < FEWEST:
                 continue
-            with np.errstate(invalid="ignore"):
-                mine, other = (np.nanmedian(self._errors(place, v)[apart]) for v in (mine, other))
+            vectors = (self._vectors(place, each)[apart] for each in (form, rival))
+            mine, other = (_median(self._errors(place, v, apart)) for v in vectors)
             still = np.median(place.still[apart])
-            wins += bool(mine * MARGIN < other or not np.isfinite(other))
+            wins += mine * MARGIN < other
             losses += bool(mine * MARGIN >= other and still > mine)
         return wins > 0 or losses == 0
 
@@ -214,15 +225,25 @@ class _Trial:
             vectors: Array = (place.stored - np.float32(form.offset)) * factors
         return vectors
 
-    def _errors(self, place: _Place, vectors: Array) -> Array:
-        """Differences (n) between this frame and the places of the other one; NaN outside."""
+    def _apart(self, place: _Place, form: MotionFormat, other: MotionFormat) -> Mask:
+        """Where (n) two formats say different places."""
+        difference = self._vectors(place, form) - self._vectors(place, other)
+        apart: Mask = np.hypot(difference[:, 0], difference[:, 1]) * self._reduction > DIFFERENT
+        return apart
+
+    def _errors(self, place: _Place, vectors: Array, which: Mask | slice = slice(None)) -> Array:
+        """Differences (n) between this frame and the places of the other one; NaN outside.
+
+        Args:
+            vectors: one for each pixel of the place that ``which`` names.
+        """
         other = place.guide.images[1 - place.frame]
         height, width = other.shape[:2]
-        with np.errstate(invalid="ignore"):
-            x, y = place.x + vectors[:, 0], place.y + vectors[:, 1]
+        with np.errstate(invalid="ignore", over="ignore"):
+            x, y = place.x[which] + vectors[:, 0], place.y[which] + vectors[:, 1]
             inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
         found = sample(other, np.where(inside, x, 0), np.where(inside, y, 0))
-        errors = np.abs(found - place.here).mean(axis=-1)
+        errors = np.abs(found - place.here[which]).mean(axis=-1)
         errors[~inside] = np.nan
         return errors
 
@@ -233,6 +254,12 @@ class _Trial:
             return 2.0  # a format that leads out of the picture
         still = float(np.median(place.still[inside]))
         return float(np.median(errors[inside])) / still if still > 0 else 1.0
+
+
+def _median(errors: Array) -> float:
+    """Median of the finite values; infinite if there are none."""
+    finite = errors[np.isfinite(errors)]
+    return float(np.median(finite)) if finite.size else float("inf")
 
 
 def _place(guide: Guide, frame: int, stored: Array, offset: float) -> _Place | None:

@@ -6,7 +6,7 @@ for any frame and neighbour. The best source comes first:
 
 1. motion vectors whose format two frames have verified;
 2. none needed: the camera stands still;
-3. the camera's matrices and world-space positions: exact for what does not move itself;
+3. the camera's matrices with world-space positions or depth: exact for what does not move itself;
 4. optical flow, computed on the fused pictures.
 """
 
@@ -192,9 +192,10 @@ def _without_vectors(pair: Pair, checks: Sequence[FieldCheck]) -> MotionSource:
     seen = f"{_problems(checks)}; " if checks else "no motion vectors; "
     if checks and all(check.zero for check in checks) and moved.any():
         seen = f"{_problems(checks)}, though the picture moves (Cycles writes zeros if motion blur is on); "
-    if projection := find_projection(pair.first):
+    if projection := find_projection(pair):
+        places = "depth" if projection.depth else "positions"
         text = (
-            f"{seen}the camera's matrices ({projection.attribute}) and positions say where surfaces go that stand still"
+            f"{seen}the camera's matrix {projection.attribute} and {places} say where everything goes that stands still"
         )
         return MotionSource(CAMERA, text, projection=projection)
     if any(not check.zero for check in checks):

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.motion import MotionSource, find_motion
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
 from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls
@@ -40,6 +42,8 @@ class Inspection:
     """Of the model that would read the file."""
     facts: list[str] = field(default_factory=list)
     """What was found, one line each."""
+    motion: MotionSource | None = None
+    """How the movement to the next frame is known; None if there is no next frame beside this one."""
     passed_through: list[str] = field(default_factory=list)
     """Names of the layers and channels that no feature is read from."""
     problems: list[str] = field(default_factory=list)
@@ -91,18 +95,25 @@ class Inspection:
                 "aovs": self.aovs(),
                 "notes": self.render.notes,
                 "passed_through": self.passed_through,
+                "motion_layers": {each.name: str(each.format) for each in self.render.motion.fields},
+                "motion": {"kind": self.motion.kind, "text": self.motion.text} if self.motion else None,
             }
         return result
 
 
-def inspect_file(path: Path, inputs: InputOptions, model: str | None = None) -> Inspection:
+def inspect_file(
+    path: Path, inputs: InputOptions, model: str | None = None, motion_format: str | None = None
+) -> Inspection:
     """Open a file, map its layers and read all pixels of its features once.
+
+    If the next frame lies beside it, the two verify the motion vectors.
 
     Args:
         path: an EXR.
         inputs: how its layers are to be understood; ``hr_spp`` says the samples per pixel.
         model: the model that would read it, see :func:`oiio_msspl.model.catalogue.find_model`. The models of a family
             read the same features at every scale.
+        motion_format: the user's description of motion vectors, see :func:`oiio_msspl.aovs.motion.user_fields`.
 
     Returns:
         What was found. A file that can't be used is described in ``problems``; nothing is raised for it.
@@ -126,6 +137,7 @@ def inspect_file(path: Path, inputs: InputOptions, model: str | None = None) -> 
                 facts = [f"can't be fused: {str(error).removeprefix(f'{path}: ')}"]
             result.facts += [f"{label or '(unnamed)'}: {fact}" for fact in facts]
         result.passed_through = render.unread_layers(result.other_views)
+        _inspect_motion(result, render, inputs, motion_format)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
     return result
@@ -133,6 +145,31 @@ def inspect_file(path: Path, inputs: InputOptions, model: str | None = None) -> 
 
 def _set_facts(render: MappedRender) -> list[str]:
     return [f"{each.name} ({each.layer_names}): {check_sum(render, each).text}" for each in render.additive_sets]
+
+
+def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptions, wanted: str | None) -> None:
+    """Find the layers of motion vectors, and verify them with the next frame if there is one.
+
+    Raises:
+        InputError: a frame can't be read, or ``wanted`` does not fit.
+    """
+    path = _next_frame(result.path)
+    if path is not None:
+        following = map_render(open_exr(path), inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+        result.motion = find_motion(render, following, wanted)
+        result.facts.append(f"motion, by {path.name}: {result.motion.text}")
+    elif render.motion.fields:
+        layers = " and ".join(f"{each.name} ({each.format})" for each in render.motion.fields)
+        result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")
+
+
+def _next_frame(path: Path) -> Path | None:
+    """The file beside this one whose number, the last one in the name, is one higher."""
+    match = re.fullmatch(r"(.*?)(\d+)(\D*)", path.stem, re.DOTALL)
+    if match is None:
+        return None
+    following = path.with_name(f"{match[1]}{int(match[2]) + 1:0{len(match[2])}d}{match[3]}{path.suffix}")
+    return following if following.is_file() else None
 
 
 def _renderer_fact(render: MappedRender) -> str:

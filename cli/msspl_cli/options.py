@@ -151,6 +151,19 @@ Sum = Annotated[
 ]
 
 
+MotionFormat = Annotated[
+    str | None,
+    typer.Option(
+        "--motion-format",
+        metavar="LAYER",
+        help="How motion vectors are stored, if the pixels can't tell: layer=NAME, and any of to=next|previous, "
+        "x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5.",
+        rich_help_panel=INPUT,
+        hidden=True,
+    ),
+]
+
+
 class _OneLine(logging.Formatter):
     """Prints a message on one line: it may contain names out of a file. A traceback follows on lines of its own."""
 

@@ -13,6 +13,7 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
+from oiio_msspl.aovs.motion import MotionLayers
 from oiio_msspl.arrays import Array
 from oiio_msspl.colour import REC709, ColourSpace
 from oiio_msspl.exr.layers import layers_of
@@ -44,6 +45,8 @@ class MappedRender:
     """Linear RGB space of the beauty, for the preview. :func:`oiio_msspl.jobs.inputs.map_pair` finds it."""
     additive_sets: list[AdditiveSet] = field(default_factory=list)
     """Layers that may sum to the beauty."""
+    motion: MotionLayers = field(default_factory=MotionLayers)
+    """Motion vectors, position and depth."""
     notes: list[str] = field(default_factory=list)
     """What the user should know about the mapping, one sentence each."""
 

@@ -19,6 +19,7 @@ from oiio_msspl.aovs.features import NORMAL, OPTIONAL_FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import NEEDS_SPP, FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import check_mapping
+from oiio_msspl.aovs.motion import find_motion_layers
 from oiio_msspl.aovs.renderers import detect_renderer, samples_per_pixel
 from oiio_msspl.aovs.views import Beauty, choose_beauty, find_beauties
 from oiio_msspl.arrays import Array
@@ -83,6 +84,7 @@ def map_render(
         spp=spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer),
         data_window=file.parts[found[RGB].terms[0][0].part].data_window,
         additive_sets=find_additive_sets(renderer, layers, beauty, sums, str(file.path)),
+        motion=find_motion_layers(renderer, layers, beauty),
         notes=notes,
     )
     _drop_unusable_variance(render)

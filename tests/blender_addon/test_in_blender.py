@@ -15,7 +15,9 @@ from msspl_cli.installed import find_msspl_fuse
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion import motion
 from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.motion_vectors import sample
 from tests.blender_addon.conftest import posix, render_command
 from tests.conftest import EXAMPLES
 
@@ -134,6 +136,31 @@ def test_both_renders_show_the_same_frame_if_the_size_is_rounded(results):
                 edges.append(np.polyval(np.polyfit(centres, values, 1), [0, 1]))
             pixel = abs(edges[1][1] - edges[1][0]) / (high.data_window.width if axis else high.data_window.height)
             assert np.abs(edges[0] - edges[1]).max() < 0.05 * pixel, (name, axis)
+
+
+def test_cycles_motion_vectors_are_as_the_table_says(results, monkeypatch):
+    """Both directions of a moving camera and a moving cube fetch the same world positions; the sky is not believed."""
+    monkeypatch.setattr(motion, "has_optical_flow", lambda: False)
+    frames = [map_render(open_exr(results / f"sharp.{number:04d}.exr")) for number in (2, 3)]
+    source = motion.find_motion(*frames, required=True)
+    assert source.kind == "vectors" and source.fields == frames[0].motion.fields
+    for here, there, step in ((0, 1, 1), (1, 0, -1)):
+        vectors, known = source.read(motion.MotionFrame(frames[here]), motion.MotionFrame(frames[there]), step)
+        places = [each.file.read(each.motion.position, each.data_window) for each in frames]
+        y, x = np.mgrid[0:128, 0:192].astype(np.float32)
+        fetched = sample(places[there], x + vectors[..., 0], y + vectors[..., 1])
+        cube = known & (places[here][..., 2] > 0.2)
+        floor = known & (np.abs(places[here][..., 2]) < 0.01)
+        change = np.abs(fetched - places[here]).max(axis=-1)
+        # The floor stays where it is. The cube has moved in the world, along x.
+        assert np.median(change[floor]) < 0.005
+        assert np.median((fetched - places[here])[cube, 0]) == pytest.approx(step * 0.18, abs=0.06)
+        # At the horizon, vectors are means over samples of the floor and of the sky.
+        assert known[(places[here] == 0).all(axis=-1)].mean() < 0.05
+        assert 0.7 < known.mean() < 0.9
+    blurred = [map_render(open_exr(results / f"blurred.{number:04d}.exr")) for number in (2, 3)]
+    source = motion.find_motion(*blurred)
+    assert source.kind == "none" and "Cycles writes zeros if motion blur is on" in source.text
 
 
 def msspl_render(*arguments):

@@ -6,7 +6,9 @@ import json
 import numpy as np
 import pytest
 
+from oiio_msspl.aovs.motion import MotionFormat
 from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
+from tests.moving_plane import encode, frame, layer, truck_and_dolly, vectors
 from tests.programs import run
 
 
@@ -73,3 +75,18 @@ def test_inspect_handles_every_real_file(path):
     # Of the V-Ray file only the headers are there.
     unusable |= {"rgba_z_crypto_diffuse_normals"}
     assert data["usable"] == (path.stem not in unusable), data["problems"]
+
+
+def test_inspect_verifies_motion_vectors_with_the_next_frame(tmp_path):
+    for t in (0, 1):
+        frame(tmp_path, t, layer("velocity", encode(vectors(truck_and_dolly, t, 1), MotionFormat(y="up"))))
+    first, last = (tmp_path / f"plane.{number}.exr" for number in (1001, 1002))
+    assert (
+        "motion, by plane.1002.exr: motion vectors of velocity.XY (to=next,x=right,y=up,unit=pixels)"
+        in run("msspl", "inspect", first).stdout
+    )
+    data = json.loads(run("msspl", "inspect", first, "--json").stdout)
+    assert data["motion"]["kind"] == "vectors" and list(data["motion_layers"]) == ["velocity.XY"]
+    assert "the next frame beside this one would verify it" in run("msspl", "inspect", last).stdout
+    done = run("msspl", "inspect", first, "--motion-format", "layer=velocity,to=next,x=left,y=up,unit=pixels")
+    assert done.returncode == 2 and "can't be used: --motion-format" in done.stdout

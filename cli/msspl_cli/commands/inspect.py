@@ -25,18 +25,21 @@ def inspect(
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
     model: options.Model = "auto",
+    motion_format: options.MotionFormat = None,
     as_json: options.Json = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
 ) -> None:
     """Print what a render contains, and which of its layers a model would read.
 
+    If the next frame lies beside a file, the two verify its motion vectors.
+
     If a file can't be used, the reason is printed and the exit code is 2.
     """
     from oiio_msspl.inspection import inspect_file
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
-    found = [inspect_file(path, inputs, model) for path in files]
+    found = [inspect_file(path, inputs, model, motion_format) for path in files]
     if as_json:
         data = [inspection.as_dict() for inspection in found]
         print(json.dumps(data if len(data) > 1 else data[0], indent=2))

@@ -15,6 +15,7 @@ from pathlib import Path
 
 import bpy
 from check_button import check_button, check_cancel, check_modes, check_panel
+from check_motion import render_motion
 from check_passes import check_passes
 from check_scene import check_animated, check_changes, check_samples, check_sentences, render_ramps
 from support import MODULE, WORK, build_scene
@@ -46,6 +47,7 @@ if __name__ == "__main__":
     check_cancel(scene)
     render_ramps()
     check_passes()
+    render_motion()
     bpy.ops.preferences.addon_disable(module=MODULE)
     assert not hasattr(bpy.types.Scene, "msspl")
     print("all is well", flush=True)

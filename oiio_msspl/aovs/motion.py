@@ -1,0 +1,242 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Layers about the movement of surfaces: motion vectors, position and depth.
+
+The table of renderers names the layers, and the format in which a renderer usually writes its vectors. Manuals leave
+too much open to believe that format: :mod:`oiio_msspl.fusion.motion` verifies it on two frames of the shot.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
+
+from oiio_msspl.aovs.renderers import renderers, view_layer_of
+from oiio_msspl.aovs.views import Beauty
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.layers import Layer, same_spelling
+from oiio_msspl.exr.reader import Channel
+
+#: The values that each word of a format may have.
+CHOICES = {
+    "to": ("next", "previous"),
+    "x": ("right", "left"),
+    "y": ("down", "up"),
+    "unit": ("pixels", "ndc", "screen", "width"),
+}
+#: Channels of a vector, where the entry of the table does not name them.
+_PAIRS = (("R", "G"), ("X", "Y"), ("u", "v"), ("U", "V"))
+
+
+@dataclass(frozen=True)
+class MotionFormat:
+    """How two channels say where a surface is in another frame: ``(stored - offset) * scale``, in a unit and along two
+    axes, is the way from the pixel to the surface's place in the other frame."""
+
+    to: str = "next"
+    """The other frame: ``next`` or ``previous``."""
+    x: str = "right"
+    """Where positive values of the first channel point: ``right`` or ``left``."""
+    y: str = "down"
+    """Where positive values of the second channel point: ``down`` or ``up``."""
+    unit: str = "pixels"
+    """``pixels``; ``ndc`` (1 is the width of the frame in x and its height in y); ``screen`` (the frame spans -1 to 1);
+    ``width`` (1 is the width of the frame, in both axes)."""
+    scale: float = 1.0
+    """Such as 2 where a shutter of 180 degrees has halved the vectors."""
+    offset: float = 0.0
+    """The stored value of no motion: 0.5 where vectors are encoded as colours."""
+    premultiplied: bool = False
+    """Vectors are multiplied by alpha."""
+
+    @property
+    def step(self) -> int:
+        """1 for the next frame, -1 for the previous one."""
+        return 1 if self.to == "next" else -1
+
+    def pixels_per_unit(self, width: int, height: int) -> tuple[float, float]:
+        """Pixels to the right and pixels down that a stored 1 means, offset aside, in a frame of this size."""
+        x, y = {
+            "pixels": (1.0, 1.0),
+            "ndc": (float(width), float(height)),
+            "screen": (width / 2, height / 2),
+            "width": (float(width), float(width)),
+        }[self.unit]
+        return (x if self.x == "right" else -x) * self.scale, (y if self.y == "down" else -y) * self.scale
+
+    def __str__(self) -> str:
+        """As the user may write it behind ``layer=NAME,``."""
+        words = [f"to={self.to}", f"x={self.x}", f"y={self.y}", f"unit={self.unit}"]
+        words += [f"scale={self.scale:g}"] if self.scale != 1 else []
+        words += [f"offset={self.offset:g}"] if self.offset else []
+        return ",".join(words + (["premultiplied"] if self.premultiplied else []))
+
+
+@dataclass(frozen=True)
+class MotionField:
+    """Two channels that hold motion vectors."""
+
+    layer: str
+    """Name of the layer, without the view layer in front."""
+    components: tuple[str, str]
+    """Such as ``X`` and ``Y``."""
+    channels: tuple[Channel, Channel]
+    format: MotionFormat
+    """What is expected; not verified."""
+    fixed: frozenset[str] = frozenset()
+    """The words of the format that the user has given."""
+
+    @property
+    def name(self) -> str:
+        """For the user, such as ``Vector.XY``."""
+        return f"{self.layer}.{''.join(self.components)}"
+
+
+@dataclass(frozen=True)
+class MotionLayers:
+    """What one view and view layer of a file says of the movement and the place of surfaces."""
+
+    fields: tuple[MotionField, ...] = ()
+    """Motion vectors, in the order of the table."""
+    position: tuple[Channel, ...] | None = None
+    """World-space position of the surface, X, Y, Z."""
+    depth: Channel | None = None
+    """Distance from the camera, along the view axis or along the ray."""
+    layers: Mapping[str, Layer] = field(default_factory=dict, repr=False)
+    """All layers of the view and view layer, by name without the view layer."""
+
+    def channels(self, layer: str, components: tuple[str, str]) -> tuple[Channel, Channel] | None:
+        """The channels of a vector that was found in another frame; None if this frame lacks them."""
+        found = self.layers[layer].channels if layer in self.layers else {}
+        if not all(c in found for c in components):
+            return None
+        return found[components[0]], found[components[1]]
+
+
+def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty) -> MotionLayers:
+    """Find the layers of motion vectors, position and depth.
+
+    The names that are common to all renderers are tried behind those of the renderer.
+
+    Args:
+        renderer: entry of the table.
+        layers: of the file.
+        beauty: the one that was chosen; its view and view layer are searched.
+    """
+    named = dict(_layers_of_view(layers, beauty))
+    common = renderers()[-1]
+    entries = [*renderer.get("motion", ()), *common["motion"]]
+    found: dict[tuple[Channel, Channel], MotionField] = {}
+    for entry in entries:
+        words = {key: value for key, value in entry.items() if key not in ("layer", "channels")}
+        for each in _fields(named, entry["layer"], entry.get("channels"), MotionFormat(**words)):
+            found.setdefault(each.channels, each)
+    positions = (_named(named, alias) for alias in [*renderer.get("position", ()), *common["position"]])
+    depths = [d[1] for alias in [*renderer.get("depth", ()), *common["depth"]] if (d := _named(named, alias))]
+    # Of the layer without a name only Z can be a depth: R and Y are light.
+    plain = [Layer("", "", {"Z": beauty.layer.channels["Z"]})] if "Z" in beauty.layer.channels else []
+    return MotionLayers(
+        tuple(found.values()),
+        next((triple for _, layer in filter(None, positions) if (triple := layer.triple())), None),
+        next((layer.channels[c] for layer in [*depths, *plain] for c in "ZRVYT" if c in layer.channels), None),
+        named,
+    )
+
+
+def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionField]:
+    """The motion vectors that the user's ``--motion-format`` describes.
+
+    Args:
+        layers: of the file.
+        text: ``layer=NAME`` and any of ``channels=XY``, ``to=``, ``x=``, ``y=``, ``unit=``, ``scale=``, ``offset=`` and
+            ``premultiplied``, separated by commas. Further layers follow behind ``+``. Words that are left out are
+            found by the pixels.
+        path: of the file, for messages.
+
+    Raises:
+        InputError: the text can't be read, or the file has no such layer.
+    """
+    found = []
+    for part in re.split(r"\+(?=layer=)", text.strip()):
+        words = _words(part, text)
+        layer = words.pop("layer")
+        letters = words.pop("channels", "")
+        # Words that the user leaves out keep what the table says, as long as the pixels agree.
+        named = _named(layers.layers, layer)
+        known = [each for each in layers.fields if named and each.layer == named[0]]
+        matching = [each for each in known if not letters or "".join(each.components) == letters] or list(
+            _fields(layers.layers, layer, list(letters) or None, MotionFormat())
+        )
+        if not matching:
+            raise InputError(
+                f"--motion-format {text!r}: {path} has no layer {layer!r} with two channels {letters}".strip()
+            )
+        formats = [replace(each.format, **words) for each in matching]
+        found += [
+            replace(each, format=form, fixed=frozenset(words)) for each, form in zip(matching, formats, strict=True)
+        ]
+    return found
+
+
+def _words(part: str, text: str) -> dict[str, Any]:
+    """The words of one layer's format."""
+    words: dict[str, Any] = {}
+    known = ["layer", "channels", *(f.name for f in fields(MotionFormat))]
+    for word in part.split(","):
+        key, equals, value = (piece.strip() for piece in word.partition("="))
+        problem = ""
+        if key not in known:
+            problem = f"{key!r} is none of {', '.join(known)}"
+        elif key in CHOICES and value not in CHOICES[key]:
+            problem = f"{key} is {' or '.join(CHOICES[key])}"
+        elif key in ("scale", "offset"):
+            try:
+                words[key] = float(value)
+            except ValueError:
+                problem = f"{key} is a number"
+        elif key == "channels" and len(value) != 2:
+            problem = "channels are two letters, such as XY"
+        elif key == "premultiplied":
+            words[key] = True
+        elif not equals or not value:
+            problem = f"write {key}=..."
+        else:
+            words[key] = value
+        if problem:
+            raise InputError(f"--motion-format {text!r}: {problem}; an example is layer=velocity,to=next,y=up,scale=2")
+    if "layer" not in words:
+        raise InputError(f"--motion-format {text!r}: starts with layer=NAME")
+    return words
+
+
+def _layers_of_view(layers: Sequence[Layer], beauty: Beauty) -> Iterator[tuple[str, Layer]]:
+    """The layers of the beauty's view and view layer, and those of none, by their short name."""
+    for layer in layers:
+        if layer.view not in (beauty.view, "") or not layer.name:
+            continue
+        short = layer.name.removeprefix(beauty.view_layer + ".") if beauty.view_layer else layer.name
+        yield short, layer
+
+
+def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
+    """The layer that an alias means, and its short name."""
+    for name, layer in layers.items():
+        if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias):
+            return name, layer
+    return None
+
+
+def _fields(
+    layers: Mapping[str, Layer], alias: str, components: Sequence[str] | None, form: MotionFormat
+) -> Iterator[MotionField]:
+    """The vectors in the layer that an alias means: in the channels that are named, or the first usual ones."""
+    named = _named(layers, alias)
+    if named is None:
+        return
+    name, layer = named
+    for pair in [tuple(components)] if components else _PAIRS:
+        channels = [layer.channels[c] for c in pair if c in layer.channels]
+        if len(channels) == 2 and all(c.type != "uint" for c in channels) and channels[0].part == channels[1].part:
+            yield MotionField(name, (pair[0], pair[1]), (channels[0], channels[1]), form)
+            return

@@ -1,0 +1,218 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Where do the surfaces of a frame lie in the next and in the previous one?
+
+:func:`find_motion` decides once for a shot, on two frames, how that is known. :meth:`MotionSource.read` then reads it
+for any frame and neighbour. The best source comes first:
+
+1. motion vectors whose format two frames have verified;
+2. none needed: the camera stands still;
+3. the camera's matrices with world-space positions or depth: exact for what does not move itself;
+4. optical flow, computed on the fused pictures.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.motion import MotionField, user_fields
+from oiio_msspl.arrays import Array
+from oiio_msspl.errors import InputError
+from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
+from oiio_msspl.fusion.motion_check import FieldCheck, check_field
+from oiio_msspl.fusion.motion_guides import Pair, open_pair, still_and_moved
+from oiio_msspl.fusion.motion_vectors import Mask, invert, read_vectors
+from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
+
+#: Kinds of sources.
+VECTORS, STATIC, CAMERA, FLOW, NONE = "vectors", "static", "camera", "flow", "none"
+#: The camera stands still if of all tiles that tell, at most this share has moved: a thing or two may move before it.
+STILL = 0.25
+
+
+@dataclass(frozen=True)
+class MotionFrame:
+    """A frame whose surfaces are followed."""
+
+    hr: MappedRender
+    rgb: Array | None = None
+    """Fused beauty (h, w, 3) over the data window; only optical flow needs it."""
+
+
+@dataclass(frozen=True)
+class MotionSource:
+    """How the movement in a shot is known. :func:`find_motion` makes it."""
+
+    kind: str
+    """``vectors``, ``static``, ``camera``, ``flow`` or ``none``."""
+    text: str
+    """One sentence for the user."""
+    fields: tuple[MotionField, ...] = ()
+    """``vectors``: verified layers. ``static``: layers that were 0 where the shot was examined."""
+    projection: Projection | None = None
+    """``camera``: how the matrices are to be read."""
+
+    def read(self, frame: MotionFrame, neighbour: MotionFrame, step: int) -> tuple[Array, Mask]:
+        """Where the surfaces of a frame lie in a neighbour.
+
+        Args:
+            frame: frame t.
+            neighbour: frame t + ``step``.
+            step: 1 or -1.
+
+        Returns:
+            Vectors float32 (h, w, 2) over the data window of ``frame``: the surface that pixel (x, y) shows lies at
+            (x, y) + vector in the neighbour. In HRLS pixels, x to the right, y down, in coordinates of the display
+            window; the place may lie outside the neighbour. And a mask (h, w): where the vector can be believed. Other
+            vectors are 0. The mask knows nothing of what hides the surface in the neighbour, unless the vectors were
+            inverted.
+
+        Raises:
+            InputError: pixels can't be decoded.
+            ValueError: the source is optical flow, and a frame has no ``rgb``.
+        """
+        if self.kind == VECTORS:
+            return self._read_vectors(frame.hr, neighbour.hr, step)
+        if self.kind == CAMERA and self.projection is not None:
+            return camera_vectors(frame.hr, neighbour.hr, self.projection)
+        if self.kind == FLOW:
+            if frame.rgb is None or neighbour.rgb is None:
+                raise ValueError("optical flow needs the fused beauty of both frames")
+            return flow_vectors(frame.rgb, neighbour.rgb, frame.hr.data_window, neighbour.hr.data_window)
+        vectors, known = _nothing(frame.hr)
+        if self.kind == STATIC:
+            known[:] = True
+            for each in self.fields:  # the camera may move elsewhere in the shot, by vectors that nobody has verified
+                if channels := frame.hr.motion.channels(each.layer, each.components):
+                    stored = frame.hr.file.read(channels, frame.hr.data_window)
+                    known &= (np.abs(stored - np.float32(each.format.offset)) <= 1e-3).all(axis=-1)
+            if not self.fields and not _camera_stands(*still_and_moved(open_pair(frame.hr, neighbour.hr))):
+                known[:] = False
+        return vectors, known
+
+    def _read_vectors(self, render: MappedRender, neighbour: MappedRender, step: int) -> tuple[Array, Mask]:
+        direct = self._field(step)
+        if direct is not None:
+            return _read(render, direct)
+        opposite = self._field(-step)
+        assert opposite is not None
+        own, _ = _read(render, opposite)
+        other, known = _read(neighbour, opposite)
+        return invert(own, other, known, render.data_window, neighbour.data_window)
+
+    def _field(self, step: int) -> MotionField | None:
+        return next((each for each in self.fields if each.format.step == step), None)
+
+
+def _read(render: MappedRender, verified: MotionField) -> tuple[Array, Mask]:
+    channels = render.motion.channels(verified.layer, verified.components)
+    return read_vectors(render, channels, verified.format) if channels else _nothing(render)
+
+
+def _nothing(render: MappedRender) -> tuple[Array, Mask]:
+    window = render.data_window
+    return np.zeros((window.height, window.width, 2), np.float32), np.zeros((window.height, window.width), np.bool_)
+
+
+def find_motion(
+    first: MappedRender, second: MappedRender, wanted: str | None = None, *, required: bool = False
+) -> MotionSource:
+    """Find out how the movement in a shot is known.
+
+    Args:
+        first, second: consecutive frames t and t + 1, in which something moves if anything does in the shot.
+        wanted: the user's ``--motion-format``, see :func:`oiio_msspl.aovs.motion.user_fields`.
+        required: the user wants several frames to be fused, so not to know the movement is an error.
+
+    Raises:
+        InputError: pixels can't be decoded; ``wanted`` can't be read or does not fit; or, if ``required``, nothing is
+            known of the movement.
+    """
+    pair = open_pair(first, second)
+    fields = user_fields(first.motion, wanted, first.name) if wanted else first.motion.fields
+    checks = [_check(pair, each) for each in fields]
+    if verified := _one_each_way(checks):
+        return _vectors(pair, verified)
+    source = _without_vectors(pair, checks)
+    if wanted and source.kind != STATIC:
+        raise InputError(f"--motion-format {wanted!r} does not fit {first.name}: {_problems(checks)}")
+    if required and source.kind == NONE:
+        raise InputError(f"{first.name}: {source.text}")
+    return source
+
+
+def _check(pair: Pair, each: MotionField) -> FieldCheck:
+    """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
+    stored = [_stored(pair, frame, each) for frame in (0, 1)]
+    if stored[0] is None or stored[1] is None:
+        return FieldCheck(each, f"{pair.second.name} lacks it")
+    check = check_field(pair, each, (stored[0], stored[1]))
+    if check.problem and not check.zero and check.fit <= 1 and {"to", "x", "y", "unit"} <= each.fixed:
+        return replace(check, problem="", by_user=True)
+    return check
+
+
+def _stored(pair: Pair, frame: int, each: MotionField) -> Array | None:
+    """Stored vectors of a frame, not multiplied by alpha; None if the frame lacks the layer."""
+    render = (pair.first, pair.second)[frame]
+    channels = render.motion.channels(each.layer, each.components)
+    if channels is None:
+        return None
+    stored = pair.read(frame, channels)
+    if each.format.premultiplied and render.alpha:
+        alpha = pair.read(frame, [render.alpha])
+        stored = np.where(alpha > 0, stored / np.where(alpha > 0, alpha, 1), 0).astype(np.float32)
+    return stored
+
+
+def _one_each_way(checks: Sequence[FieldCheck]) -> list[FieldCheck]:
+    """The verified layers: the first to the next frame, and the first to the previous one."""
+    found = {check.field.format.step: check for check in reversed(checks) if not check.problem}
+    return [check for check in checks if check in found.values()]
+
+
+def _vectors(pair: Pair, verified: Sequence[FieldCheck]) -> MotionSource:
+    texts = " and ".join(check.text for check in verified)
+    if len(verified) == 1:
+        opposite = "previous" if verified[0].field.format.step == 1 else "next"
+        texts += f"; vectors to the {opposite} frame are computed by inverting these"
+    return MotionSource(VECTORS, f"motion vectors of {texts}", tuple(check.field for check in verified))
+
+
+def _without_vectors(pair: Pair, checks: Sequence[FieldCheck]) -> MotionSource:
+    """The best source that needs no vectors."""
+    still, moved = still_and_moved(pair)
+    if _camera_stands(still, moved):
+        share = np.count_nonzero(moved) / moved.size
+        rest = f"; {share:.0%} of the picture moves or is noisy, and is not followed" if share else ""
+        return MotionSource(STATIC, f"the camera stands still{rest}", tuple(check.field for check in checks))
+    seen = f"{_problems(checks)}; " if checks else "no motion vectors; "
+    if checks and all(check.zero for check in checks) and moved.any():
+        seen = f"{_problems(checks)}, though the picture moves (Cycles writes zeros if motion blur is on); "
+    if projection := find_projection(pair):
+        places = "depth" if projection.depth else "positions"
+        text = (
+            f"{seen}the camera's matrix {projection.attribute} and {places} say where everything goes that stands still"
+        )
+        return MotionSource(CAMERA, text, projection=projection)
+    if any(not check.zero for check in checks):
+        return MotionSource(
+            NONE, f"{seen}describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"
+        )
+    if has_optical_flow():
+        return MotionSource(FLOW, f"{seen}optical flow is computed on the fused pictures, which is less exact")
+    if not pair.guides:
+        seen += "no albedo, world-space normal or position that shows whether anything moves; "
+    return MotionSource(NONE, f"{seen}render motion vectors, or install opencv-python-headless for optical flow")
+
+
+def _camera_stands(still: Mask, moved: Mask) -> bool:
+    count = np.count_nonzero(moved)
+    return bool(still.any() and count <= STILL * (count + np.count_nonzero(still)))
+
+
+def _problems(checks: Sequence[FieldCheck]) -> str:
+    return "; ".join(check.text for check in checks)

@@ -1,0 +1,182 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What tells whether surfaces have moved between two frames: their albedo, normals and positions.
+
+These layers have little noise and do not depend on the light. The beauty does.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.motion_vectors import Mask
+
+POSITION = "position"
+#: Larger frames are averaged down to fewer pixels than this, which bounds memory.
+MAX_PIXELS = 1 << 22
+#: Rows that are read at a time.
+ROWS = 256
+#: Side of the tiles in which movement is measured, in pixels.
+TILE = 32
+#: How far apart pixels of one frame are compared, in pixels.
+NEAR = 3
+#: A tile has moved if its content did by more than this, in pixels.
+MOVED = 0.15
+
+
+@dataclass(frozen=True)
+class Guide:
+    """One feature of both frames, over the same window."""
+
+    name: str
+    images: tuple[Array, Array]
+    """(h, w, c) of the first and the second frame."""
+
+
+@dataclass(frozen=True)
+class Pair:
+    """Two frames over the window that both have."""
+
+    first: MappedRender
+    second: MappedRender
+    window: Window
+    reduction: int
+    """Every pixel here is the mean of ``reduction`` x ``reduction`` pixels of the frames."""
+    guides: tuple[Guide, ...]
+
+    def read(self, frame: int, channels: Sequence[Channel]) -> Array:
+        """Channels of a frame (0 or 1), reduced as the guides are."""
+        render = (self.first, self.second)[frame]
+        return reduced(partial(render.file.read, channels), self.window, self.reduction)
+
+
+def open_pair(first: MappedRender, second: MappedRender) -> Pair:
+    """Read the guides of two frames.
+
+    Normals in camera space are left out, because they change with the camera.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window = first.data_window.intersect(second.data_window)
+    reduction = 1
+    while window.width * window.height > MAX_PIXELS * reduction**2:
+        reduction += 1
+    guides = []
+    for name, reads in _readers(first, second):
+        images = [reduced(read, window, reduction) for read in reads]
+        if name != POSITION:
+            images = [smooth(image) for image in images]
+        guides.append(Guide(name, (images[0], images[1])))
+    return Pair(first, second, window, reduction, tuple(guides))
+
+
+def _readers(first: MappedRender, second: MappedRender) -> Iterator[tuple[str, list[Callable[[Window], Array]]]]:
+    """The guides that both frames have, and how to read them from each."""
+    for name in (ALBEDO, NORMAL):
+        formulas = [render.features.get(name) for render in (first, second)]
+        if all(f is not None and "camera" not in f.note and "screen" not in f.note for f in formulas):
+            yield name, [partial(_read_feature, render, name) for render in (first, second)]
+    positions = [(render, render.motion.position) for render in (first, second)]
+    if all(channels for _, channels in positions):
+        yield POSITION, [partial(render.file.read, channels or ()) for render, channels in positions]
+
+
+def _read_feature(render: MappedRender, name: str, window: Window) -> Array:
+    return render.read(window, [name])[name]
+
+
+def reduced(read: Callable[[Window], Array], window: Window, reduction: int) -> Array:
+    """What ``read(window)`` gives over a window, in strips of rows and averaged down. NaN and infinities become 0."""
+    height, width = window.height // reduction, window.width // reduction
+    result: Array | None = None
+    for y in range(0, height, ROWS):
+        rows = min(ROWS, height - y)
+        top = window.y0 + y * reduction
+        strip = read(Window(window.x0, top, window.x0 + width * reduction, top + rows * reduction))
+        strip = np.nan_to_num(strip, nan=0.0, posinf=0.0, neginf=0.0)
+        if result is None:
+            result = np.empty((height, width, strip.shape[-1]), np.float32)
+        result[y : y + rows] = box_downsample(strip, reduction) if reduction > 1 else strip
+    assert result is not None
+    return result
+
+
+def smooth(image: Array) -> Array:
+    """Mean over 3 x 3 pixels of (h, w, c), to lower the noise of few samples; the edge is repeated."""
+    for axis in (0, 1):
+        padded = np.concatenate([image.take([0], axis), image, image.take([-1], axis)], axis=axis)
+        count = image.shape[axis]
+        before, here, after = (padded.take(range(i, i + count), axis) for i in range(3))
+        image = (before + here + after) / np.float32(3)
+    return image
+
+
+def steepness(image: Array) -> Array:
+    """How steeply (h, w, c) rises or falls at each pixel, (h, w)."""
+    total = np.zeros(image.shape[:2], np.float32)
+    for axis in (0, 1):
+        total += np.abs(np.gradient(image, axis=axis)).mean(axis=-1)
+    return total
+
+
+def still_and_moved(pair: Pair) -> tuple[Mask, Mask]:
+    """Tiles of ``TILE`` x ``TILE`` pixels that show the same in both frames, and those whose content has moved.
+
+    A tile is still if some guide differs less between the frames than between pixels that are ``NEAR`` pixels apart in
+    one frame. It has moved if a guide differs much more than that, or if the movement that best explains its
+    differences by its gradients (Lucas and Kanade, 1981) is larger than its own uncertainty. Tiles without texture are
+    neither.
+
+    Returns:
+        Two masks (rows of tiles, columns of tiles).
+    """
+    shape = tuple(max(side // pair.reduction // TILE, 1) for side in (pair.window.height, pair.window.width))
+    still, moved = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
+    for guide in pair.guides:
+        first, second = guide.images
+        if min(first.shape[:2]) < 2 * NEAR:
+            continue
+        mean = (first + second) / 2
+        down, right = np.gradient(mean, axis=0), np.gradient(mean, axis=1)
+        change = second - first
+        near = [np.roll(first, NEAR, axis) - first for axis in (0, 1)]
+        xx, xy, yy, xt, yt, tt, apart = (
+            _tile_sums(sum((a * b).sum(axis=-1) for a, b in pairs), shape)
+            for pairs in (
+                [(right, right)], [(right, down)], [(down, down)], [(right, change)], [(down, change)],
+                [(change, change)], [(v, v) for v in near],
+            )
+        )  # fmt: skip
+        apart = apart / 2
+        floor = 1e-6 * float(np.mean(apart)) + 1e-30
+        ridge = 0.02 * (xx + yy) + floor  # along an edge nothing can be measured
+        a, d = xx + ridge, yy + ridge
+        determinant = a * d - xy * xy
+        x, y = (xy * yt - d * xt) / determinant, (xy * xt - a * yt) / determinant
+        # Smoothing has correlated the noise over 9 pixels, so there are that many fewer independent ones.
+        noise = 9 * np.maximum(tt + x * xt + y * yt, 0) / TILE**2
+        length = np.hypot(x, y)
+        uncertainty = np.sqrt(noise * (a + d) / determinant)
+        textured = apart > floor
+        moved |= textured & ((tt > 1.5 * apart) | ((length * pair.reduction > MOVED) & (length > 3 * uncertainty)))
+        still |= textured & (tt < 0.7 * apart)
+    return still & ~moved, moved
+
+
+def _tile_sums(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Sums over tiles; what is left at the right and at the bottom belongs to the last tile."""
+    rows = np.minimum(np.arange(values.shape[0]) // TILE, shape[0] - 1)
+    columns = np.minimum(np.arange(values.shape[1]) // TILE, shape[1] - 1)
+    by_row = np.add.reduceat(values.astype(np.float64), np.flatnonzero(np.diff(rows, prepend=-1)), axis=0)
+    result: NDArray[np.float64] = np.add.reduceat(by_row, np.flatnonzero(np.diff(columns, prepend=-1)), axis=1)
+    return result

@@ -1,0 +1,167 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion vectors as this package uses them: decoded, judged pixel by pixel, and inverted.
+
+The convention: a vector (x, y) in HRLS pixels, x to the right and y down, leads from a pixel to the place of its
+surface in another frame. Pixels count in the display window, so frames may have different data windows.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.motion import MotionFormat
+from oiio_msspl.arrays import Array
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import Window
+from oiio_msspl.parallel import for_row_blocks
+
+Mask = NDArray[np.bool_]
+
+#: Shorter vectors are no movement, in pixels.
+NO_MOTION = 1e-3
+#: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
+ROUNDS, ROUND_TRIP = 3, 0.5
+
+
+def read_vectors(
+    render: MappedRender, channels: tuple[Channel, Channel], form: MotionFormat, *, judge: bool = True
+) -> tuple[Array, Mask]:
+    """Read motion vectors over the data window.
+
+    Args:
+        render: the frame.
+        channels: the two that hold the vectors.
+        form: how they are stored.
+        judge: whether zeros of the background are doubted, see :func:`_doubtful_zeros`.
+
+    Returns:
+        Vectors (h, w, 2), 0 where they can't be believed; and where they can (h, w): they are finite, shorter than the
+        frame, not clamped, and alpha is not 0.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window, frame = render.data_window, render.display_window
+    names = [*channels, *([render.alpha] if render.alpha else [])]
+    stored = render.file.read(names, window)
+    alpha = stored[..., 2] if render.alpha else None
+    vectors, known = decode(stored[..., :2], form, frame.width, frame.height, alpha)
+    inside = window.intersect(render.file.parts[channels[0].part].data_window)
+    if inside != window:  # beyond the part's data window nothing is stored
+        rendered = np.zeros_like(known)
+        rendered[inside.slices(window)] = True
+        known &= rendered
+    if judge:
+        known &= ~_doubtful_zeros(render, vectors, known)
+    vectors[~known] = 0
+    return vectors, known
+
+
+def decode(
+    stored: Array, form: MotionFormat, width: int, height: int, alpha: Array | None = None
+) -> tuple[Array, Mask]:
+    """Vectors in pixels, x right and y down, from stored values (h, w, 2); and where they can be believed.
+
+    Args:
+        stored: as the renderer wrote them.
+        form: how.
+        width, height: of the display window.
+        alpha: (h, w); None if the render has none.
+    """
+    vectors = np.empty(stored.shape, np.float32)
+    known = np.empty(stored.shape[:2], np.bool_)
+    factors = np.array(form.pixels_per_unit(width, height), np.float32)
+
+    def work(rows: slice) -> None:
+        values = stored[rows]
+        good = np.isfinite(values).all(axis=-1)
+        if form.offset:  # encoded as a colour, so the ends of its range may stand for anything beyond
+            good &= ((values > 0) & (values < 2 * form.offset)).all(axis=-1)
+        with np.errstate(all="ignore"):
+            if form.premultiplied and alpha is not None:
+                values = values / alpha[rows, :, None]
+            decoded = (values - np.float32(form.offset)) * factors
+            good &= np.hypot(decoded[..., 0], decoded[..., 1]) < np.hypot(width, height)
+        if alpha is not None:
+            good &= alpha[rows] > 0
+        vectors[rows], known[rows] = decoded, good
+
+    for_row_blocks(work, len(stored), stored[0].size)
+    return vectors, known
+
+
+def _doubtful_zeros(render: MappedRender, vectors: Array, known: Mask) -> Mask:
+    """Where a vector of 0 may mean that the renderer knows none.
+
+    Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
+    surfaces do not move either.
+    """
+    still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
+    surface = known
+    if NORMAL in render.features:
+        normal = render.read(render.data_window, [NORMAL])[NORMAL]
+        surface = known & (normal != 0).any(axis=-1)
+    count = np.count_nonzero(surface)
+    camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count
+    return np.zeros_like(known) if camera_stands else still
+
+
+def invert(own: Array, other: Array, other_known: Mask, window: Window, other_window: Window) -> tuple[Array, Mask]:
+    """The vectors to a neighbour, from those that lead from the neighbour to this frame.
+
+    The surface of pixel p is at the place q of the neighbour where q + other(q) = p. The iteration q <- p - other(q)
+    finds it (Chen et al. 2008, "A simple fixed-point approach to invert a deformation field").
+
+    Args:
+        own: this frame's vectors to its other neighbour (h, w, 2): where the movement is even, their opposite is right,
+            so the iteration starts there. Zeros do, too.
+        other, other_known: vectors of the neighbour, and where they are known.
+        window, other_window: data windows of this frame and of the neighbour.
+
+    Returns:
+        Vectors (h, w, 2), and where the way there and back ends at its pixel.
+    """
+    height, width = own.shape[:2]
+    vectors = np.zeros_like(own)
+    known = np.zeros((height, width), np.bool_)
+    shift_x, shift_y = window.x0 - other_window.x0, window.y0 - other_window.y0
+
+    def work(rows: slice) -> None:
+        y, x = np.mgrid[rows.start : rows.stop, 0:width].astype(np.float32)
+        way = -own[rows]
+        for _ in range(ROUNDS):
+            way = -sample(other, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
+        at_x, at_y = x + way[..., 0] + shift_x, y + way[..., 1] + shift_y
+        back = sample(other, at_x, at_y) + way
+        vectors[rows] = way
+        inside = (at_x >= -0.5) & (at_y >= -0.5) & (at_x <= other.shape[1] - 0.5) & (at_y <= other.shape[0] - 0.5)
+        known[rows] = inside & (np.hypot(back[..., 0], back[..., 1]) < ROUND_TRIP) & nearest(other_known, at_x, at_y)
+
+    for_row_blocks(work, height, width * 8)
+    vectors[~known] = 0
+    return vectors, known
+
+
+def sample(image: Array, x: Array, y: Array) -> Array:
+    """Bilinear samples of an image (h, w, c) at pixel positions; its edge is repeated outside."""
+    height, width = image.shape[:2]
+    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+    left, top = np.minimum(x.astype(np.int32), max(width - 2, 0)), np.minimum(y.astype(np.int32), max(height - 2, 0))
+    right, bottom = np.minimum(left + 1, width - 1), np.minimum(top + 1, height - 1)
+    u, v = (x - left)[..., None], (y - top)[..., None]
+    above = image[top, left] * (1 - u) + image[top, right] * u
+    below = image[bottom, left] * (1 - u) + image[bottom, right] * u
+    result: Array = above * (1 - v) + below * v
+    return result
+
+
+def nearest(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:
+    """The pixels (h, w) that are nearest to these positions."""
+    height, width = image.shape
+    rows = np.clip(np.rint(y), 0, height - 1).astype(np.int32)
+    columns = np.clip(np.rint(x), 0, width - 1).astype(np.int32)
+    result: Mask = image[rows, columns]
+    return result

@@ -1,0 +1,59 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which layers hold motion vectors, position and depth, by name."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.aovs.motion import MotionFormat, find_motion_layers
+from oiio_msspl.aovs.renderers import renderers
+from oiio_msspl.aovs.views import Beauty
+from oiio_msspl.exr.layers import Layer, layers_of
+from oiio_msspl.exr.reader import open_exr
+from tests.aovs.renders import H, W, layer, mapped
+from tests.conftest import write_exr
+
+ENTRIES = [(renderer, entry) for renderer in renderers() for entry in renderer.get("motion", ())]
+
+
+@pytest.mark.parametrize(("renderer", "entry"), ENTRIES, ids=lambda v: v.get("name") or v["layer"])
+def test_every_entry_of_the_table_finds_its_layer(tmp_path, renderer, entry):
+    letters = entry.get("channels") or ["R", "G"]
+    file = open_exr(write_exr(tmp_path / "in.exr", layer(f"View.{entry['layer']}", 1, letters)))
+    found = find_motion_layers(renderer, layers_of(file), Beauty("", "View", Layer("View.Combined", "")))
+    wanted = MotionFormat(**{key: value for key, value in entry.items() if key not in ("layer", "channels")})
+    assert [(each.layer, each.components, each.format) for each in found.fields] == [
+        (entry["layer"], tuple(letters), wanted)
+    ]
+
+
+def test_vectors_have_two_three_or_four_channels_by_several_names(tmp_path):
+    channels = layer("", 1) | layer("motionBack", 1, "RGBA") | layer("forward", 1, "uv") | layer("velocity", 1, "xyz")
+    found = mapped(tmp_path, channels).motion.fields
+    assert [each.name for each in found] == ["motionBack.RG", "forward.uv", "velocity.XY"]
+
+
+def test_integers_and_single_channels_are_no_vectors(tmp_path):
+    ids = {f"velocity.{c}": np.ones((H, W), np.uint32) for c in "RG"}
+    assert not mapped(tmp_path, layer("", 1) | ids | layer("forward", 1, "R")).motion.fields
+
+
+def test_vectors_of_the_chosen_view_layer_are_taken(tmp_path):
+    names = [f"{view}.{name}" for view in ("one", "two") for name in ("Combined", "Vector")]
+    channels = {c: v for name in names for c, v in layer(name, 1, "RGB" if "Comb" in name else "XYZW").items()}
+    found = mapped(tmp_path, channels, view="two", attributes={"BlenderMultiChannel": "Blender"}).motion
+    assert [each.channels[0].name for each in found.fields] == ["two.Vector.X", "two.Vector.Z"]
+
+
+@pytest.mark.parametrize(
+    ("channels", "position", "depth"),
+    [
+        (layer("P", 1, "XYZ") | layer("", 1, "RGBZ") | layer("N_denoise", 1) | layer("denoise_albedo", 1), "P.X", "Z"),
+        (layer("", 1) | layer("position", 1, "XYZ") | layer("depth", 1, "Z"), "position.X", "depth.Z"),
+        (layer("", 1) | layer("P", 1, "XYZ"), None, None),
+    ],
+)
+def test_position_and_depth_are_found(tmp_path, channels, position, depth):
+    """P is in world space for some renderers and in camera space for others: only known ones are asked."""
+    found = mapped(tmp_path, channels).motion
+    assert (found.position and found.position[0].name) == position
+    assert (found.depth and found.depth.name) == depth

@@ -18,6 +18,7 @@ from oiio_msspl.errors import InputError, printable
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.jobs.inputs import InputOptions
+    from oiio_msspl.jobs.temporal import TemporalOptions
 
 #: Groups of options in the help text.
 INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
@@ -151,6 +152,16 @@ Sum = Annotated[
 ]
 
 
+Temporal = Annotated[
+    str,
+    typer.Option(
+        "--temporal",
+        metavar="N",
+        help="Average each frame with N frames before and after it, along their motion; or off. auto: 2 where motion "
+        "is known.",
+        rich_help_panel=SHOT,
+    ),
+]
 MotionFormat = Annotated[
     str | None,
     typer.Option(
@@ -219,6 +230,17 @@ def make_write_options(
     pixel_type = None if half is None else "half" if half else "float"
     patterns = tuple(passes) if passes and "auto" not in passes else ()
     return WriteOptions(layout, compression, pixel_type, tuple(layers), patterns, error_layer)
+
+
+def make_temporal_options(frames: str, motion_format: str | None) -> TemporalOptions:
+    """The options of a shot that is fused over time.
+
+    Raises:
+        InputError: no such number of frames.
+    """
+    from oiio_msspl.jobs.temporal import TemporalOptions
+
+    return TemporalOptions(frames, motion_format)
 
 
 def parse_bytes(text: str) -> int:

@@ -94,6 +94,8 @@ def print_table(report: ShotReport) -> None:
         view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
         console.say(f"{first['renderer']} pairs at x{first['scale']}{view}; layers of frame {first['frame']}:")
         console.aov_table(first["aovs"], first["notes"])
+    if report.temporal:
+        console.say(f"Fused {report.temporal}")
     # Sentences that differ only in their numbers share a row, which shows the first of them.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}
     for frame in report.shot.frames:

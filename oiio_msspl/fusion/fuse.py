@@ -64,6 +64,9 @@ class FusedFrame:
     """(h, w): luminance of the LRHS over the alignment's grid."""
     hrls_luminance: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
+    frames: Array | None = None
+    """(height, width, 1): how many frames were averaged, see :class:`oiio_msspl.fusion.temporal.Accumulated`; None for
+    a frame that was fused alone."""
     negative: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)

@@ -105,7 +105,8 @@ def accumulate(frame: FusedFrame, before: Sequence[Step], after: Sequence[Step])
     total /= weights
     rgb = np.ascontiguousarray(np.moveaxis(total[:3], 0, -1))
     alpha = None if frame.alpha is None else total[3][..., None]
-    return Accumulated(rgb, alpha, (np.square(weights) / squares)[..., None])
+    frames = (np.square(weights) / squares).astype(np.float32)
+    return Accumulated(rgb, alpha, frames[..., None])
 
 
 class _Path:
@@ -232,7 +233,7 @@ class _Light:
     def trust(self, warped: Array, valid: Mask) -> Array:
         """How much a warped neighbour (3, h, w) counts, from 0 to 1, (h, w)."""
         red, green, blue = warped
-        weights = np.float32(LUMINANCE_WEIGHTS)
+        weights = [np.float32(weight) for weight in LUMINANCE_WEIGHTS]
         grey = np.where(valid, weights[0] * red + weights[1] * green + weights[2] * blue, self._own)
         low = self._low(grey)
         differences = [

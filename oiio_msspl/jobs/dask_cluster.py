@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot on the workers of a Dask cluster: each frame is a task.
+"""A shot on the workers of a Dask cluster: each frame is a task, or a few frames that are averaged with each other.
 
-If a worker dies, Dask gives its frame to another one. An EXR gets its name last, so a task that runs again finds a
+If a worker dies, Dask gives its task to another one. An EXR gets its name last, so a task that runs again finds a
 complete frame or none.
 """
 
@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.model.catalogue import find_model
@@ -30,6 +31,9 @@ log = logging.getLogger(__name__)
 
 #: How often a frame is tried again after a failure that may pass, such as a file server that did not answer.
 RETRIES = 2
+#: Frames of a task if frames are averaged with their neighbours. A task fuses the neighbours of its first and last
+#: frames once more, so longer ones compute less, and shorter ones keep more workers busy.
+CHUNK = 8
 
 
 def connect(scheduler: str) -> Client:
@@ -83,21 +87,31 @@ def fuse_frames(
     address = client.scheduler.address
     run = uuid.uuid4().hex
     futures = {}
-    for frame in frames:
-        key = f"msspl-fuse-{frame.number}-{run}"
-        future = client.submit(_fuse_frame, run, stages, _absolute(frame), neighbours, key=key, retries=RETRIES)
-        futures[future] = frame
+    stages = replace(stages, temporal=stages.temporal.absolute())
+    size = CHUNK if stages.temporal.count else 1
+    for chunk in (frames[start : start + size] for start in range(0, len(frames), size)):
+        key = f"msspl-fuse-{chunk[0].number}-{run}"
+        task = [frame.absolute() for frame in chunk]
+        future = client.submit(_fuse_chunk, run, stages, task, neighbours, key=key, retries=RETRIES)
+        futures[future] = chunk
     try:
         for future in as_completed(list(futures)):
-            frame = futures.pop(future)
+            chunk = futures.pop(future)
+            failure: Exception | None = None
             try:
-                yield frame, future.result()
+                yield from zip(chunk, future.result(), strict=True)
             except KilledWorker:
-                yield frame, MssplError("every worker that tried it died; if for lack of memory, lower --max-memory")
+                failure = MssplError("every worker that tried it died; if for lack of memory, lower --max-memory")
             except (CancelledError, CommClosedError) as error:
                 raise MssplError(f"{address}: the Dask scheduler is gone; run again with --skip-existing") from error
             except Exception as error:
-                yield frame, error
+                failure = error
+            if failure is not None:
+                # Frames of the chunk that were written before are complete.
+                done = [
+                    frame.output.exists() and not stages.replaces(frame.lr, frame.hr, frame.output) for frame in chunk
+                ]
+                yield from ((frame, None if fused else failure) for frame, fused in zip(chunk, done, strict=True))
     finally:
         client.cancel(list(futures))
 
@@ -121,12 +135,6 @@ def _most_workers_on_a_machine(client: Client) -> int:
     return max(Counter(worker["host"] for worker in workers.values()).values())
 
 
-def _absolute(frame: Frame) -> Frame:
-    """The frame with absolute paths, because workers have other working directories."""
-    assert frame.lr is not None and frame.hr is not None
-    return replace(frame, lr=frame.lr.absolute(), hr=frame.hr.absolute(), output=frame.output.absolute())
-
-
 # ---------------------------------------------------------------------------------------------- in a worker
 
 
@@ -136,32 +144,47 @@ def _sessions(run: str) -> dict[Path, Session]:
     return {}
 
 
-def _fuse_frame(run: str, stages: Stages, frame: Frame, neighbours: int) -> dict[str, Any] | Exception | None:
-    """Take a frame through the three stages, in a worker.
+def _fuse_chunk(
+    run: str, stages: Stages, frames: list[Frame], neighbours: int
+) -> list[dict[str, Any] | InputError | None]:
+    """Take frames through the three stages, in a worker.
 
     Args:
         run: identifies the run.
-        stages, frame: what to do, with absolute paths.
+        stages, frames: what to do, with absolute paths.
         neighbours: workers on this machine, which share its cores.
 
     Returns:
-        The frame's report as a dict; the caller's mistake, which another try can't mend; or None if the EXR exists.
+        For each frame its report as a dict; the caller's mistake, which another try can't mend; or None if the EXR
+        exists.
 
     Raises:
         Exception: any other failure, which Dask answers with another try.
     """
     from dask.system import CPU_COUNT
 
+    outcomes: dict[int, dict[str, Any] | Exception | None] = {}
     # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
-    if not stages.replaces(frame.lr, frame.hr, frame.output) and frame.output.exists():
-        return None
+    missing = []
+    for frame in frames:
+        if stages.replaces(frame.lr, frame.hr, frame.output) or not frame.output.exists():
+            missing.append(frame)
+        else:
+            outcomes[frame.number] = None
     threads = stages.threads or (max(1, CPU_COUNT // neighbours) if neighbours > 1 else 0)
-    # skip_existing lets this frame replace the preview that a dead worker left without its EXR.
+    # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
-    try:
-        report = stages.run(frame)
-    except InputError as error:
-        # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
-        replaces = stages.replaces(frame.lr, frame.hr, frame.output)
-        return None if not replaces and frame.output.exists() else error
-    return report.as_dict()
+    if missing:
+        run_pipeline(stages, missing, lambda frame, outcome: outcomes.update({frame.number: outcome}), lambda: None)
+    results: list[dict[str, Any] | InputError | None] = []
+    for frame in frames:
+        outcome = outcomes[frame.number]
+        if isinstance(outcome, InputError):
+            # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
+            replaces = stages.replaces(frame.lr, frame.hr, frame.output)
+            results.append(None if not replaces and frame.output.exists() else outcome)
+        elif isinstance(outcome, Exception):
+            raise outcome
+        else:
+            results.append(outcome)
+    return results

@@ -2,7 +2,7 @@
 """Frames through the three stages in this process: one is read and one written while another is fused.
 
 The calling thread fuses. A second thread reads the next frame, and a third writes the previous one. Each stage holds
-at most one frame, so memory does not grow with the shot.
+at most one frame, and a frame that is fused waits at most for a few neighbours, so memory does not grow with the shot.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.temporal import FrameWindow, FusedAlone
 
 
 def run_pipeline(
@@ -58,33 +59,52 @@ def run_pipeline(
         # Reset last: a signal may interrupt the lines above, and the frame is then recorded on the way out.
         writing = None
 
+    def finish(frame: Frame, outcome: FusedAlone | BaseException) -> None:
+        """Complete a frame that is fused, and hand it over to the writer; or record why it could not be."""
+        nonlocal writing
+        error = outcome if isinstance(outcome, BaseException) else None
+        if error is None and stages.temporal.count and stages.skips(frame):
+            error = InputError("another run has fused it")
+        if isinstance(outcome, FusedAlone) and error is None:
+            try:
+                fused = window.accumulate(frame.number)
+                report = stages.complete(outcome, fused)
+            except Exception as caught:
+                error = caught
+        # The previous frame is written before this one is handed over, so one is written at a time.
+        finish_writing()
+        if error is not None:
+            record_failure(frame, error)
+            return
+        # `writing` is set before the hand-over: a signal may arrive during the hand-over.
+        written: Future[None] = Future()
+        writing = frame, report, written
+        writer.submit(_write, stages, report, fused, written)
+
+    window = FrameWindow(stages.temporal, frames)
+    order = window.order()
     with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
-        reads = [reader.submit(stages.read, frame) for frame in frames[:1]]
+        reads = [reader.submit(stages.read, frame) for frame in order[:1]]
         try:
-            for index, frame in enumerate(frames):
+            for index, frame in enumerate(order):
                 reading = reads.pop()
-                reads += [reader.submit(stages.read, following) for following in frames[index + 1 : index + 2]]
-                error = reading.exception()
-                if error is None and stages.skips(frame):
-                    error = InputError("another run has fused it")  # is recorded as skipped
-                elif error is None:
+                reads += [reader.submit(stages.read, following) for following in order[index + 1 : index + 2]]
+                outcome: FusedAlone | BaseException | None = reading.exception()
+                if outcome is None and not stages.temporal.count and stages.skips(frame):
+                    outcome = InputError("another run has fused it")  # is recorded as skipped
+                elif outcome is None:
                     session = stages.session(reading.result())
                     try:
-                        report, fused = stages.fuse(reading.result(), session)
+                        outcome = stages.fuse(reading.result(), session)
                     except Exception as caught:
-                        error = caught
-                # The previous frame is written before this one is handed over, so one is written at a time.
-                finish_writing()
-                if error is None:
-                    # `writing` is set before the hand-over: a signal may arrive during the hand-over.
-                    written: Future[None] = Future()
-                    writing = frame, report, written
-                    writer.submit(_write, stages, report, fused, written)
-                    del report, fused
-                else:
-                    record_failure(frame, error)
-                del reading, error  # frees the frame's pixels before those of the next frame arrive
-                save()
+                        outcome = caught
+                if not isinstance(outcome, FusedAlone | Exception):
+                    raise outcome
+                for ready, result in window.add(frame.number, outcome):
+                    finish(ready, result)
+                    save()
+                window.release()
+                del reading, outcome  # frees the frame's pixels before those of the next frame arrive
         finally:
             for reading in reads:
                 reading.cancel()

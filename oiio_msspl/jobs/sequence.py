@@ -76,6 +76,11 @@ class Frame:
     hr: Path | None
     output: Path
 
+    def absolute(self) -> Frame:
+        """The same with absolute paths, for workers with other working directories."""
+        lr, hr = (None if path is None else path.absolute() for path in (self.lr, self.hr))
+        return Frame(self.number, lr, hr, self.output.absolute())
+
 
 @dataclass(frozen=True)
 class Shot:

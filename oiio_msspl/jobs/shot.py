@@ -26,6 +26,7 @@ from oiio_msspl.jobs.sequence import Frame, find_shot
 from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of_shot, prepare_output
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -42,6 +43,7 @@ def fuse_shot(
     frames: str | Iterable[int] | None = None,
     inputs: InputOptions = InputOptions(),
     write: WriteOptions = WriteOptions(),
+    temporal: TemporalOptions = TemporalOptions(),
     model: str | None = None,
     device: str = "cpu",
     threads: int = 0,
@@ -55,13 +57,14 @@ def fuse_shot(
     progress: Callable[[FrameResult, ShotReport], None] | None = None,
     client: Client | None = None,
 ) -> ShotReport:
-    """Fuse two sequences frame by frame. A frame that can't be fused is reported, and the others go on.
+    """Fuse two sequences. A frame that can't be fused is reported, and the others go on.
 
     Args:
         lr, hr: folders or patterns, see :func:`oiio_msspl.jobs.sequence.find_shot`.
         output: a pattern, or a folder, which is created if its parent exists.
         frames: numbers, or a range such as ``1001-1100x2``; None for all frames that exist.
         inputs, write, model, device, threads, max_memory, view_transform: as in :func:`oiio_msspl.fuse_files`.
+        temporal: which neighbours each frame is averaged with, and how motion is stored.
         previews: write a PNG beside each EXR.
         overwrite: replace existing files.
         skip_existing: skip frames whose EXR exists. This resumes a run that was ended.
@@ -91,7 +94,8 @@ def fuse_shot(
     report_path = None if report_path is None else Path(report_path)
     pngs = [frame.output.with_suffix(".png") for frame in shot.frames] if previews else []
     prepare_output(shot, inputs, model, [*pngs, *([report_path] if report_path else [])])
-    report = ShotReport(shot)
+    over_time = plan_temporal(shot, inputs, temporal)
+    report = ShotReport(shot, temporal=over_time.text)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
 
     def finish(result: FrameResult) -> None:
@@ -129,6 +133,7 @@ def fuse_shot(
         overwrite=overwrite,
         skip_existing=skip_existing or update,
         update=update,
+        temporal=over_time,
     )
     to_fuse = []
     for frame in shot.frames:

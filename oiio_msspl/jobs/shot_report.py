@@ -49,6 +49,8 @@ class ShotReport:
     """The whole report of the first fused frame: scale, model and the layers that were read."""
     seconds: float = 0.0
     """Wall time."""
+    temporal: str = ""
+    """Which neighbours frames are averaged with, and how motion is known; empty if that is switched off."""
 
     @property
     def exit_code(self) -> int:
@@ -76,6 +78,7 @@ class ShotReport:
             "exit_code": self.exit_code,
             "counts": {"all": len(self.shot.frames), **{status: counts[status] for status in STATUSES}},
             "seconds": {k: round(v, 3) for k, v in {"wall": self.seconds, **self.stage_seconds}.items()},
+            "temporal": self.temporal,
             "first_fused": self.first,
             "frames": [asdict(self.results[f.number]) for f in self.shot.frames if f.number in self.results],
             "version": __version__,

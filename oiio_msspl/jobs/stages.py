@@ -7,7 +7,7 @@ A shot runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`); a Dask worker 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
@@ -23,6 +23,7 @@ from oiio_msspl.jobs.frame import check_frame_memory, write_frame, write_frame_p
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
 from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.temporal import FusedAlone, Temporal
 from oiio_msspl.jobs.views import OtherViews, check_passes, find_other_views, fuse_frame_passes, fuse_other_views
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
@@ -44,10 +45,6 @@ class LoadedFrame:
     others: OtherViews
     """Views beside the first one. Their pixels are read when they are fused."""
 
-    @property
-    def in_memory(self) -> bool:
-        return self.hr_pixels is not self.hr
-
 
 @dataclass(frozen=True)
 class Stages:
@@ -67,18 +64,21 @@ class Stages:
     overwrite: bool = False
     skip_existing: bool = False
     update: bool = False
+    temporal: Temporal = field(default_factory=Temporal)
+    """Which neighbours each frame is fused with."""
     sessions: dict[Path, Session] = field(default_factory=dict)
     """Models that are loaded, by file."""
 
     def run(self, frame: Frame) -> FrameReport:
-        """Take a frame through all stages, one after the other.
+        """Take a frame through all stages, one after the other, without its neighbours.
 
         Raises:
             InputError, MssplError: see the stages.
         """
         loaded = self.read(frame)
-        report, fused = self.fuse(loaded, self.session(loaded))
-        self.write(report, fused)
+        alone = self.fuse(loaded, self.session(loaded))
+        report = self.complete(alone, alone.fused)
+        self.write(report, alone.fused)
         return report
 
     def skips(self, frame: Frame) -> bool:
@@ -96,7 +96,7 @@ class Stages:
         if lr is None or hr is None or not output.exists():
             return []
         written = output.stat().st_mtime
-        files = [lr, hr, *sorted(self.inputs.files(hr, self.model))]
+        files = [lr, hr, *sorted(self.inputs.files(hr, self.model)), *self.temporal.files_beside(hr)]
         return [path for path in files if path.is_file() and path.stat().st_mtime > written]
 
     def read(self, frame: Frame) -> LoadedFrame:
@@ -113,11 +113,15 @@ class Stages:
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
-        result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
-        left = self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr)
-        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= left:
+        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= self._left_for_pixels(lr, hr):
             return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start, others)
         return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
+
+    def _left_for_pixels(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Memory that is left beside a tile, two results and the neighbours."""
+        result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
+        others = self.temporal.memory(hr.data_window)
+        return self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr) - others
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -132,32 +136,61 @@ class Stages:
             self.sessions[path].require_error()
         return self.sessions[path]
 
-    def fuse(self, loaded: LoadedFrame, session: Session) -> tuple[FrameReport, FusedFrame]:
-        """Fuse a pair. The report is complete but for the time and the warnings of writing."""
+    def fuse(self, loaded: LoadedFrame, session: Session) -> FusedAlone:
+        """Fuse the beauty of a pair.
+
+        Raises:
+            InputError: the pair does not fit into memory, or pixels can't be decoded.
+            MssplError: the network failed.
+        """
         start = time.perf_counter()
-        # The pixels of the next frame and the result of the previous one are in memory at the same time.
-        result_channels = 5 if self.write_options.error_layer else 4
-        others = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
-        if loaded.in_memory:
-            others += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
-        check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, others)
-        replaced, reports = fuse_other_views(loaded.others, session, self.write_options, self.max_memory, held=others)
+        held = self._held_bytes(loaded)
+        check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, held)
         fused = fuse(
             loaded.lr_pixels,
             loaded.hr_pixels,
             session,
             error=self.write_options.error_layer,
             max_memory=self.max_memory,
-            held=others,
+            held=held,
         )
-        fused.replaced = replaced
-        fuse_frame_passes(loaded.lr, loaded.hr, fused, self.write_options, self.max_memory - others)
+        # The pixels in memory are not needed any more. A neighbour may need the frame for a while.
+        alone = replace(loaded, lr_pixels=loaded.lr, hr_pixels=loaded.hr)
+        return FusedAlone(alone, session, fused, time.perf_counter() - start)
+
+    def complete(self, alone: FusedAlone, fused: FusedFrame) -> FrameReport:
+        """Fuse what depends on the final beauty: the passes, and other views.
+
+        Args:
+            alone: the frame.
+            fused: its final beauty; gets the passes.
+
+        Returns:
+            The report, complete but for the time and the warnings of writing.
+
+        Raises:
+            InputError, MssplError: see :meth:`fuse`.
+        """
+        start = time.perf_counter()
+        loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded)
+        fused.replaced, reports = fuse_other_views(
+            loaded.others, session, self.write_options, self.max_memory, held=held
+        )
+        fuse_frame_passes(loaded.lr, loaded.hr, fused, self.write_options, self.max_memory - held)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
         add_other_views(report, reports, loaded.others.passed_on)
-        seconds = time.perf_counter() - start
+        seconds = alone.seconds + time.perf_counter() - start
         report.seconds = {"read": loaded.seconds, "fuse": seconds, "network": report.network_seconds}
-        return report, fused
+        return report
+
+    def _held_bytes(self, loaded: LoadedFrame) -> int:
+        """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
+        result_channels = 5 if self.write_options.error_layer else 4
+        held = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
+        if 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr)) <= self._left_for_pixels(loaded.lr, loaded.hr):
+            held += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+        return held + self.temporal.memory(loaded.hr.data_window)
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
         """Write preview and EXR.

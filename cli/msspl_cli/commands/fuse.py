@@ -152,6 +152,8 @@ def fuse(
     as_json: options.Json = False,
     # Shot
     frames: options.Frames = None,
+    temporal: options.Temporal = "auto",
+    motion_format: options.MotionFormat = None,
     skip_existing: options.SkipExisting = False,
     update: Annotated[
         bool,
@@ -218,6 +220,7 @@ def fuse(
         "view_transform": view,
         "overwrite": overwrite,
     }
+    over_time = options.make_temporal_options(temporal, motion_format)
     if is_sequence(lr) or is_sequence(hr):
         from oiio_msspl.jobs.shot import fuse_shot
 
@@ -231,6 +234,7 @@ def fuse(
                     hr,
                     output,
                     frames=frames,
+                    temporal=over_time,
                     previews=preview,
                     skip_existing=skip_existing,
                     update=update,
@@ -250,6 +254,8 @@ def fuse(
         ("--report", report_file),
         ("--progress", progress),
         ("--scheduler", scheduler),
+        ("--temporal", temporal not in ("auto", "off")),
+        ("--motion-format", motion_format),
     ):
         if value:
             raise InputError(f"{option} is for shots: give folders, or patterns such as lr.####.exr")

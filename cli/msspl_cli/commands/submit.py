@@ -61,6 +61,7 @@ def submit(
     options.make_write_options(
         *(given[name] for name in ("layout", "compression", "half", "layers", "error_layer", "passes"))
     )
+    options.make_temporal_options(given["temporal"], given["motion_format"])
     options.parse_bytes(given["max_memory"])
     job = make_job(
         given["lr"],

@@ -328,6 +328,12 @@ def test_data_windows_may_differ(tmp_path):
         np.testing.assert_allclose(found[known], wanted[known], atol=0.02)
 
 
+def test_frames_without_a_common_part_tell_nothing(tmp_path):
+    frames = [frame(tmp_path, t, {}, window={"x0": 60 * t, "height": 40, "width": 40}) for t in (0, 1)]
+    source = find_motion(*frames)
+    assert source.kind == "none" and "no common part" in source.text
+
+
 def test_large_frames_are_verified_on_fewer_pixels(tmp_path, monkeypatch):
     """The vectors that are read stay whole."""
     monkeypatch.setattr("oiio_msspl.fusion.motion_guides.MAX_PIXELS", WIDTH * HEIGHT // 3)

@@ -197,6 +197,8 @@ def _without_vectors(pair: Pair, checks: Sequence[FieldCheck]) -> MotionSource:
     if _camera_stands(still, moved):
         share = np.count_nonzero(moved) / moved.size
         rest = f"; {share:.0%} of the picture moves or is noisy, and is not followed" if share else ""
+        if unclear := [check for check in checks if not check.zero]:
+            rest = f"; what moves is not followed: {_problems(unclear)} (describe it with --motion-format)"
         return MotionSource(STATIC, f"the camera stands still{rest}", tuple(check.field for check in checks))
     seen = f"{_problems(checks)}; " if checks else "no motion vectors; "
     if checks and all(check.zero for check in checks) and moved.any():

@@ -270,6 +270,22 @@ def test_a_camera_that_starts_to_move_is_no_longer_static(tmp_path):
         assert not read(source, frames, 1, 1)[1].any()
 
 
+def test_a_standing_camera_does_not_make_unclear_vectors_believed(tmp_path):
+    """A few pixels move, too few to verify their vectors: they are left out, and the user may describe them."""
+    frames = []
+    for t in (0, 1):
+        way = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+        way[40:44, 60:64] = 3, 2
+        frames.append(frame(tmp_path, t, layer("forward", way), standing))
+    source = find_motion(*frames, required=True)
+    found, known = read(source, frames, 0, 1)
+    assert source.kind == "static" and "--motion-format" in source.text
+    assert np.count_nonzero(~known) == 16 and not known[40:44, 60:64].any() and not found.any()
+    source = find_motion(*frames, "layer=forward,to=next,x=right,y=down,unit=pixels")
+    found, known = read(source, frames, 0, 1)
+    assert source.kind == "vectors" and known.all() and (found[40:44, 60:64] == (3, 2)).all()
+
+
 @pytest.mark.parametrize("names", [("worldToScreen",), ("worldToCamera",), ("worldToCamera", "worldToNDC")])
 def test_matrices_and_positions_give_the_camera_s_movement(tmp_path, names):
     """Karma is known to write the matrix to the camera as worldToNDC, too: the pixels tell."""

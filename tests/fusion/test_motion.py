@@ -222,6 +222,22 @@ def test_two_formats_that_fit_equally_well_are_ambiguous(tmp_path):
     assert source.kind == "vectors"
 
 
+def test_pixels_vote_where_noise_hides_the_margin(tmp_path, monkeypatch):
+    """In noise the right format fits better than all others, but not 1.5 times as well."""
+    rng = np.random.default_rng(2)
+    slow = lambda t: np.array([0.012 * t, 0.0018 * t, 1.0])  # noqa: E731
+    frames = []
+    for t in (0, 1):
+        plane = frame(tmp_path, t, {}, slow)
+        albedo = plane.read(plane.data_window, ["albedo"])["albedo"]
+        albedo = (albedo + rng.normal(0, 0.09, albedo.shape)).astype(np.float32)
+        way = layer("forward", vectors(slow, t, 1))
+        frames.append(frame(tmp_path, t, way | layer("albedo", albedo, "RGB"), slow, guides=()))
+    assert find_motion(*frames).kind == "vectors"
+    monkeypatch.setattr("oiio_msspl.fusion.motion_check.SURE", np.inf)
+    assert "fit it equally well" in find_motion(*frames).text
+
+
 def test_vectors_that_fit_nothing_are_refused(tmp_path):
     noise = np.random.default_rng(1)
     frames = shot(tmp_path, MotionFormat(), "forward", change=lambda v: noise.normal(0, 4, v.shape).astype(np.float32))

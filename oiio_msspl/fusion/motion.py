@@ -31,6 +31,8 @@ from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
 VECTORS, STATIC, CAMERA, FLOW, NONE = "vectors", "static", "camera", "flow", "none"
 #: The camera stands still if of all tiles that tell, at most this share has moved: a thing or two may move before it.
 STILL = 0.25
+#: Rows that are looked at in every frame, to see whether the camera still stands.
+LOOK = 256
 
 
 @dataclass(frozen=True)
@@ -89,7 +91,7 @@ class MotionSource:
                 if channels := frame.hr.motion.channels(each.layer, each.components):
                     stored = frame.hr.file.read(channels, frame.hr.data_window)
                     known &= (np.abs(stored - np.float32(each.format.offset)) <= 1e-3).all(axis=-1)
-            if not self.fields and not _camera_stands(*still_and_moved(open_pair(frame.hr, neighbour.hr))):
+            if not self.fields and not _camera_stands(*still_and_moved(open_pair(frame.hr, neighbour.hr, LOOK))):
                 known[:] = False
         return vectors, known
 
@@ -131,16 +133,23 @@ def find_motion(
         InputError: pixels can't be decoded; ``wanted`` can't be read or does not fit; or, if ``required``, nothing is
             known of the movement.
     """
+    source = _find(first, second, wanted)
+    if required and source.kind == NONE:
+        raise InputError(f"{first.name}: {source.text}")
+    return source
+
+
+def _find(first: MappedRender, second: MappedRender, wanted: str | None) -> MotionSource:
     pair = open_pair(first, second)
+    if not pair.window.width or not pair.window.height:
+        return MotionSource(NONE, f"its data window and that of {second.name} have no common part")
     fields = user_fields(first.motion, wanted, first.name) if wanted else first.motion.fields
     checks = [_check(pair, each) for each in fields]
     if verified := _one_each_way(checks):
-        return _vectors(pair, verified)
+        return _vectors(verified)
     source = _without_vectors(pair, checks)
     if wanted and source.kind != STATIC:
         raise InputError(f"--motion-format {wanted!r} does not fit {first.name}: {_problems(checks)}")
-    if required and source.kind == NONE:
-        raise InputError(f"{first.name}: {source.text}")
     return source
 
 
@@ -174,7 +183,7 @@ def _one_each_way(checks: Sequence[FieldCheck]) -> list[FieldCheck]:
     return [check for check in checks if check in found.values()]
 
 
-def _vectors(pair: Pair, verified: Sequence[FieldCheck]) -> MotionSource:
+def _vectors(verified: Sequence[FieldCheck]) -> MotionSource:
     texts = " and ".join(check.text for check in verified)
     if len(verified) == 1:
         opposite = "previous" if verified[0].field.format.step == 1 else "next"
@@ -188,6 +197,8 @@ def _without_vectors(pair: Pair, checks: Sequence[FieldCheck]) -> MotionSource:
     if _camera_stands(still, moved):
         share = np.count_nonzero(moved) / moved.size
         rest = f"; {share:.0%} of the picture moves or is noisy, and is not followed" if share else ""
+        if unclear := [check for check in checks if not check.zero]:
+            rest = f"; what moves is not followed: {_problems(unclear)} (describe it with --motion-format)"
         return MotionSource(STATIC, f"the camera stands still{rest}", tuple(check.field for check in checks))
     seen = f"{_problems(checks)}; " if checks else "no motion vectors; "
     if checks and all(check.zero for check in checks) and moved.any():

@@ -22,6 +22,8 @@ from oiio_msspl.fusion.motion_vectors import Mask, sample
 MARGIN = 1.5
 #: Differences that are smaller than this share of those without motion are equally small.
 FLOOR = 1e-3
+#: Or a vote of the pixels must be so many standard deviations from a tie.
+SURE = 4.0
 #: Pixels that are compared, for each guide.
 SAMPLES = 4096
 #: A verdict needs so many of them.
@@ -202,18 +204,23 @@ class _Trial:
         return not any(self._apart(place, form, other).any() for place in self._of(form))
 
     def beats(self, form: MotionFormat, rival: MotionFormat) -> bool:
-        """Whether a format fits clearly better where the two say different places; True if they nowhere do."""
-        wins = losses = 0
+        """Whether a format fits clearly better where the two say different places; True if they nowhere do.
+
+        In noise, the best format does not fit so many times as well as another one. Then pixels vote (sign test).
+        """
+        votes = []
         for place in self._of(form):
             apart = self._apart(place, form, rival)
-            if np.count_nonzero(apart) < FEWEST:
-                continue
-            vectors = (self._vectors(place, each)[apart] for each in (form, rival))
-            mine, other = (_median(self._errors(place, v, apart)) for v in vectors)
-            still = np.median(place.still[apart])
-            wins += mine * MARGIN < other
-            losses += bool(mine * MARGIN >= other and still > mine)
-        return wins > 0 or losses == 0
+            if np.count_nonzero(apart) < FEWEST or self._left(place, form) >= 1:
+                continue  # positions of a thing that has moved in the world tell nothing
+            mine, other = (self._errors(place, self._vectors(place, f)[apart], apart) for f in (form, rival))
+            if _median(mine) * MARGIN < _median(other):
+                return True
+            both = np.isfinite(mine) & np.isfinite(other)
+            for_form = float(np.mean(mine[both] < other[both])) if both.any() else 0.5
+            # Smoothing has correlated the noise over 9 pixels.
+            votes.append((2 * for_form - 1) * np.sqrt(np.count_nonzero(both) / 9))
+        return not votes or float(np.sum(votes) / np.sqrt(len(votes))) > SURE
 
     def _of(self, form: MotionFormat) -> list[_Place]:
         """Vectors to the next frame are tried in the first one, vectors to the previous frame in the second."""

@@ -59,15 +59,24 @@ class Pair:
         return reduced(partial(render.file.read, channels), self.window, self.reduction)
 
 
-def open_pair(first: MappedRender, second: MappedRender) -> Pair:
+def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None) -> Pair:
     """Read the guides of two frames.
 
     Normals in camera space are left out, because they change with the camera.
+
+    Args:
+        first, second: the frames. If their data windows have nothing in common, the window is empty and no guide read.
+        rows: read so many rows in the middle only.
 
     Raises:
         InputError: pixels can't be decoded.
     """
     window = first.data_window.intersect(second.data_window)
+    if not window.width or not window.height:
+        return Pair(first, second, window, 1, ())
+    if rows is not None and window.height > rows:
+        top = window.y0 + (window.height - rows) // 2
+        window = Window(window.x0, top, window.x1, top + rows)
     reduction = 1
     while window.width * window.height > MAX_PIXELS * reduction**2:
         reduction += 1

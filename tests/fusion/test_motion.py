@@ -222,6 +222,22 @@ def test_two_formats_that_fit_equally_well_are_ambiguous(tmp_path):
     assert source.kind == "vectors"
 
 
+def test_pixels_vote_where_noise_hides_the_margin(tmp_path, monkeypatch):
+    """In noise the right format fits better than all others, but not 1.5 times as well."""
+    rng = np.random.default_rng(2)
+    slow = lambda t: np.array([0.012 * t, 0.0018 * t, 1.0])  # noqa: E731
+    frames = []
+    for t in (0, 1):
+        plane = frame(tmp_path, t, {}, slow)
+        albedo = plane.read(plane.data_window, ["albedo"])["albedo"]
+        albedo = (albedo + rng.normal(0, 0.09, albedo.shape)).astype(np.float32)
+        way = layer("forward", vectors(slow, t, 1))
+        frames.append(frame(tmp_path, t, way | layer("albedo", albedo, "RGB"), slow, guides=()))
+    assert find_motion(*frames).kind == "vectors"
+    monkeypatch.setattr("oiio_msspl.fusion.motion_check.SURE", np.inf)
+    assert "fit it equally well" in find_motion(*frames).text
+
+
 def test_vectors_that_fit_nothing_are_refused(tmp_path):
     noise = np.random.default_rng(1)
     frames = shot(tmp_path, MotionFormat(), "forward", change=lambda v: noise.normal(0, 4, v.shape).astype(np.float32))
@@ -268,6 +284,22 @@ def test_a_camera_that_starts_to_move_is_no_longer_static(tmp_path):
         assert source.kind == "static"
         assert read(source, frames, 0, 1)[1].all()
         assert not read(source, frames, 1, 1)[1].any()
+
+
+def test_a_standing_camera_does_not_make_unclear_vectors_believed(tmp_path):
+    """A few pixels move, too few to verify their vectors: they are left out, and the user may describe them."""
+    frames = []
+    for t in (0, 1):
+        way = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+        way[40:44, 60:64] = 3, 2
+        frames.append(frame(tmp_path, t, layer("forward", way), standing))
+    source = find_motion(*frames, required=True)
+    found, known = read(source, frames, 0, 1)
+    assert source.kind == "static" and "--motion-format" in source.text
+    assert np.count_nonzero(~known) == 16 and not known[40:44, 60:64].any() and not found.any()
+    source = find_motion(*frames, "layer=forward,to=next,x=right,y=down,unit=pixels")
+    found, known = read(source, frames, 0, 1)
+    assert source.kind == "vectors" and known.all() and (found[40:44, 60:64] == (3, 2)).all()
 
 
 @pytest.mark.parametrize("names", [("worldToScreen",), ("worldToCamera",), ("worldToCamera", "worldToNDC")])
@@ -326,6 +358,12 @@ def test_data_windows_may_differ(tmp_path):
         wanted = vectors(truck_and_dolly, 1, step, **windows[1])
         assert found.shape == wanted.shape and known.mean() >= share
         np.testing.assert_allclose(found[known], wanted[known], atol=0.02)
+
+
+def test_frames_without_a_common_part_tell_nothing(tmp_path):
+    frames = [frame(tmp_path, t, {}, window={"x0": 60 * t, "height": 40, "width": 40}) for t in (0, 1)]
+    source = find_motion(*frames)
+    assert source.kind == "none" and "no common part" in source.text
 
 
 def test_large_frames_are_verified_on_fewer_pixels(tmp_path, monkeypatch):

@@ -18,12 +18,15 @@ from oiio_msspl.jobs import shot, stages
 from oiio_msspl.jobs.frame import write_frame
 from oiio_msspl.jobs.shot_report import fused_result
 from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.session import Session
 from tests.conftest import picture, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
 
 
 def run(folder, model, **more):
+    """Fuse a shot frame by frame. tests/jobs/test_temporal.py has shots whose frames depend on each other."""
+    more = {"temporal": TemporalOptions("off")} | more
     return fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(model), **more)
 
 

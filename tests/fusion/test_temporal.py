@@ -1,0 +1,152 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Frames are averaged with their neighbours where these show the same surface in the same light, and nowhere else."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.colour import luminance
+from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.temporal import Step, accumulate
+
+HEIGHT, WIDTH, SCALE = 96, 128, 4
+#: Deviation of the error of a fused frame, as a share of its light, and of a sample's noise.
+FUSED_ERROR, SAMPLE_NOISE = 0.03, 0.5
+
+
+def texture(shift=0.0):
+    """A smooth picture (h, w, 3), moved to the right by ``shift`` pixels."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    x = x - shift
+    grey = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 7) + 0.1 * np.sin((x + y) / 11)
+    return (grey[..., None] * (1.0, 0.8, 0.6)).astype(np.float32)
+
+
+def frame_of(truth, seed, alpha=None, error=FUSED_ERROR):
+    """A fused frame, as if its two renders had independent noise."""
+    rng = np.random.default_rng(seed)
+    height, width = truth.shape[:2]
+    lrhs = box_downsample(truth, SCALE)
+    hrls = truth * (1 + rng.normal(0, SAMPLE_NOISE, truth.shape)).astype(np.float32)
+    lrhs = lrhs * (1 + rng.normal(0, SAMPLE_NOISE / SCALE, lrhs.shape)).astype(np.float32)
+    alignment = align(Render.from_arrays(rgb=lrhs), Render.from_arrays(rgb=truth))
+    # The error of a fused frame is smooth: it is what is left of the noise after a blur.
+    blotches = rng.normal(0, error, (height // 4, width // 4, 3)).repeat(4, 0).repeat(4, 1).astype(np.float32)
+    fused = FusedFrame(truth * (1 + blotches), alpha, None, alignment, 1.0, {})
+    fused.lrhs_luminance, fused.hrls_luminance = luminance(lrhs), luminance(box_downsample(hrls, SCALE))
+    return fused
+
+
+def rms(image, truth, part=slice(None)):
+    return float(np.sqrt(np.mean(np.square(image - truth)[part])))
+
+
+def still(frame):
+    return Step(frame, None, None, None, None)
+
+
+def moved(frame, x, y=0.0):
+    there = np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2))
+    return Step(frame, there, None, -there, None)
+
+
+def test_four_still_neighbours_halve_the_error():
+    truth = texture()
+    frames = [frame_of(truth, seed) for seed in range(5)]
+    result = accumulate(frames[2], [still(frames[1]), still(frames[0])], [still(frames[3]), still(frames[4])])
+    assert rms(result.rgb, truth) < 0.55 * rms(frames[2].rgb, truth)
+    assert np.median(result.frames) > 4
+
+
+def test_neighbours_are_found_where_their_surfaces_are():
+    frames = {n: frame_of(texture(1.7 * n), n + 5) for n in (-2, -1, 0, 1, 2)}
+    before, after = ([moved(frames[n], 1.7 * np.sign(n)) for n in numbers] for numbers in ((-1, -2), (1, 2)))
+    result = accumulate(frames[0], before, after)
+    inside = np.s_[:, 4:-4]
+    assert rms(result.rgb, texture(), inside) < 0.6 * rms(frames[0].rgb, texture(), inside)
+    wrong = accumulate(frames[0], [still(frames[-1])], [still(frames[1])])
+    assert rms(wrong.rgb, texture(), inside) > 1.2 * rms(result.rgb, texture(), inside)
+
+
+def test_without_neighbours_every_bit_stays():
+    frame = frame_of(texture(), 1)
+    result = accumulate(frame, [], [])
+    assert np.array_equal(result.rgb, frame.rgb) and (result.frames == 1).all()
+
+
+def test_a_frame_that_no_neighbour_shows_keeps_every_bit():
+    frame = frame_of(texture(), 1)
+    hidden = Step(frame_of(texture(), 2), None, np.zeros((HEIGHT, WIDTH), bool), None, None)
+    lost = moved(frame_of(texture(), 3), 5.0 * WIDTH)
+    there_only = Step(
+        frame_of(texture(), 4),
+        np.ones((HEIGHT, WIDTH, 2), np.float32),
+        None,
+        np.zeros((HEIGHT, WIDTH, 2), np.float32) + 9,
+        None,
+    )
+    result = accumulate(frame, [hidden], [lost])
+    assert np.array_equal(result.rgb, frame.rgb)
+    assert np.array_equal(accumulate(frame, [there_only], []).rgb, frame.rgb)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.3, 2.0])
+def test_light_that_changes_is_not_averaged(change):
+    """A lamp goes on, or a shadow moves over a part of the picture: vectors say that nothing moves."""
+    truth, other = texture(), texture()
+    other[:, WIDTH // 2 :] *= change
+    frames = [frame_of(truth, 1), frame_of(other, 2), frame_of(other, 3)]
+    result = accumulate(frames[0], [still(frames[1])], [still(frames[2])])
+    changed = np.s_[:, WIDTH // 2 + 8 :]
+    assert rms(result.rgb, truth, changed) < 1.1 * rms(frames[0].rgb, truth, changed)
+    same = np.s_[:, : WIDTH // 4]
+    assert rms(result.rgb, truth, same) < 0.7 * rms(frames[0].rgb, truth, same)
+
+
+def test_light_that_has_changed_in_the_nearer_frame_has_in_the_farther_one():
+    truth, dark = texture(), texture() * 0.2
+    frames = [frame_of(truth, 1), frame_of(dark, 2), frame_of(truth, 3)]
+    result = accumulate(frames[0], [still(frames[1]), still(frames[2])], [])
+    assert np.median(result.frames) < 1.2
+
+
+def test_a_scaled_scene_gives_a_scaled_result():
+    def result(factor):
+        frames = [frame_of(texture() * np.float32(factor), seed) for seed in range(3)]
+        return accumulate(frames[1], [moved(frames[0], 0.4)], [moved(frames[2], -0.4)]).rgb
+
+    assert np.allclose(result(1024.0) / 1024, result(1.0), rtol=1e-5)
+    assert np.isfinite(result(1e-20)).all() and np.isfinite(result(1e25)).all()
+
+
+def test_alpha_is_averaged_with_the_same_weights():
+    frames = [frame_of(texture(), seed) for seed in range(3)]
+    for frame in frames:
+        frame.alpha = frame.rgb[..., :1].copy()
+    result = accumulate(frames[1], [moved(frames[0], 0.3)], [moved(frames[2], -0.3)])
+    assert np.array_equal(result.alpha, result.rgb[..., :1])
+    without = frame_of(texture(), 4)
+    assert np.allclose(accumulate(frames[1], [still(without)], []).alpha, frames[1].alpha)
+    assert accumulate(without, [still(frames[1])], []).alpha is None
+
+
+def test_neighbours_may_have_other_data_windows():
+    """Some renderers write only the rectangle that holds something, frame by frame."""
+    truth = texture()
+    whole = [frame_of(truth, seed) for seed in range(2)]
+    part = frame_of(truth[16:80, 32:96], 5)
+    window = Window(32, 16, 96, 80)
+    part.alignment = align(
+        Render({"rgb": truth[4:20, 8:24]}, Window(8, 4, 24, 20), Window(0, 0, WIDTH // SCALE, HEIGHT // SCALE)),
+        Render({"rgb": part.rgb}, window, Window(0, 0, WIDTH, HEIGHT)),
+    )
+    result = accumulate(whole[0], [still(part)], [])
+    outside = np.ones((HEIGHT, WIDTH), bool)
+    outside[16:80, 32:96] = False
+    assert np.array_equal(result.rgb[outside], whole[0].rgb[outside])
+    assert rms(result.rgb, truth, np.s_[16:80, 32:96]) < 0.85 * rms(whole[0].rgb, truth, np.s_[16:80, 32:96])
+    assert rms(accumulate(part, [still(whole[0])], []).rgb, truth[16:80, 32:96]) < 0.85 * rms(
+        part.rgb, truth[16:80, 32:96]
+    )

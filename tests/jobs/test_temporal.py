@@ -1,0 +1,207 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Shots whose frames are averaged with their neighbours: the same pixels however the shot is cut, resumed or killed."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import numpy as np
+import pytest
+
+from oiio_msspl import InputError, fuse_shot, map_render, open_exr
+from oiio_msspl.jobs import stages
+from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.temporal import FrameWindow, Temporal, TemporalOptions
+from tests.conftest import downsample, noisy, rgb, write_exr
+from tests.moving_plane import positions, standing, texture, truck, vectors
+from tests.shots import contents
+
+FIRST, COUNT = 1001, 9
+
+
+def make_moving_shot(folder, camera=truck, count=COUNT, layers=("motion",)):
+    """Pairs at x4 of a textured plane before a moving camera; the HRLS has vectors to the next frame."""
+    for name in ("lr", "hr", "out"):
+        (folder / name).mkdir(parents=True)
+    for t in range(count):
+        places = positions(camera, t)
+        clean = texture(places[..., 0], places[..., 1])
+        albedo = rgb(clean.astype(np.float32), "albedo.")
+        there = vectors(camera, t, 1)
+        motion = {"motionFore.X": there[..., 0], "motionFore.Y": there[..., 1]} if "motion" in layers else {}
+        low = noisy(downsample(clean, 4), 16, 100 + t)
+        write_exr(folder / f"lr/lr.{FIRST + t}.exr", rgb(low.astype(np.float32)))
+        write_exr(folder / f"hr/hr.{FIRST + t}.exr", rgb(noisy(clean, 1, t).astype(np.float32)) | albedo | motion)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    return make_moving_shot(tmp_path_factory.mktemp("shot"))
+
+
+@pytest.fixture(scope="module")
+def whole(shot, bilinear_models):
+    """The shot, fused in one run."""
+    return run(shot, bilinear_models[4], "whole")
+
+
+def run(shot, model, output, temporal="auto", **more):
+    out = shot / output
+    out.mkdir(exist_ok=True)
+    report = fuse_shot(shot / "lr", shot / "hr", out, model=str(model), temporal=TemporalOptions(temporal), **more)
+    assert report.exit_code == 0, report.results
+    return report
+
+
+def beauty(path):
+    """(h, w, 3)"""
+    return map_render(open_exr(path), features=()).load().layers["rgb"]
+
+
+def test_vectors_are_verified_and_frames_are_cleaner(shot, whole, bilinear_models):
+    assert "with 2 frames before and after each: motion vectors of motionFore" in whole.temporal
+    run(shot, bilinear_models[4], "alone", "off")
+    gains = []
+    for t in range(2, COUNT - 2):
+        places = positions(truck, t)
+        clean = texture(places[..., 0], places[..., 1])
+        errors = []
+        for folder in ("alone", "whole"):
+            fused = beauty(shot / folder / f"hr.{FIRST + t}.exr")
+            errors.append(np.mean(np.square(fused - clean)[8:-8, 16:-16]))
+        gains.append(10 * np.log10(errors[0] / errors[1]))
+    assert min(gains) > 0.5, gains
+
+
+@pytest.mark.parametrize("size", [1, 3, 7])
+def test_chunks_are_one_run_bit_for_bit(shot, whole, bilinear_models, size):
+    """Each chunk plans for itself, as on a farm."""
+    for start in range(FIRST, FIRST + COUNT, size):
+        last = min(start + size, FIRST + COUNT) - 1
+        report = run(shot, bilinear_models[4], f"chunks{size}", frames=f"{start}-{last}")
+        assert report.temporal == whole.temporal
+    assert contents(shot / f"chunks{size}") == contents(shot / "whole")
+
+
+def test_every_second_frame_and_resuming_are_one_run_bit_for_bit(shot, whole, bilinear_models):
+    run(shot, bilinear_models[4], "parts", frames=f"{FIRST}-{FIRST + COUNT - 1}x2")
+    run(shot, bilinear_models[4], "parts", skip_existing=True)
+    assert contents(shot / "parts") == contents(shot / "whole")
+
+
+KILLED = """
+import sys
+from oiio_msspl import fuse_shot
+fuse_shot(sys.argv[1], sys.argv[2], sys.argv[3], model=sys.argv[4], skip_existing=True)
+"""
+
+
+@pytest.mark.skipif(not hasattr(signal, "SIGKILL"), reason="needs SIGKILL")
+def test_a_run_that_is_killed_three_times_is_one_run_bit_for_bit(shot, whole, bilinear_models):
+    out = shot / "killed"
+    out.mkdir()
+    arguments = [sys.executable, "-c", KILLED, *map(str, (shot / "lr", shot / "hr", out, bilinear_models[4]))]
+    for count in (1, 3, 6):
+        process = subprocess.Popen(arguments)
+        deadline = time.monotonic() + 120
+        while len(list(out.glob("hr.*.exr"))) < count and process.poll() is None:
+            assert time.monotonic() < deadline
+            time.sleep(0.005)
+        process.send_signal(signal.SIGKILL)
+        process.wait()
+    subprocess.run(arguments, check=True)
+    assert contents(out) == contents(shot / "whole")
+
+
+def test_a_frame_without_usable_neighbours_is_the_single_frame_bit_for_bit(tmp_path, bilinear_models):
+    """Frames 1001 and 1002 verify the vectors; 1005 is alone, and the neighbours of 1008 are broken."""
+    folder = make_moving_shot(tmp_path)
+    for missing in (1004, 1006):
+        (folder / f"lr/lr.{missing}.exr").unlink()
+    for broken in (1007, 1009):
+        (folder / f"hr/hr.{broken}.exr").write_bytes(b"no EXR")
+    out = folder / "out"
+    report = fuse_shot(folder / "lr", folder / "hr", out, model=str(bilinear_models[4]))
+    alone = folder / "alone"
+    alone.mkdir()
+    off = TemporalOptions("off")
+    fuse_shot(folder / "lr", folder / "hr", alone, model=str(bilinear_models[4]), temporal=off)
+    assert {n: result.status for n, result in report.results.items() if result.status != "fused"} == {
+        1004: "missing", 1006: "missing", 1007: "failed", 1009: "failed",
+    }  # fmt: skip
+    for number in (1005, 1008):
+        assert contents(out)[f"hr.{number}.exr"] == contents(alone)[f"hr.{number}.exr"]
+    assert contents(out)["hr.1002.exr"] != contents(alone)["hr.1002.exr"]
+    assert "frame 1004 is missing, so fewer neighbours are averaged" in report.results[1005].warnings
+    assert any(text.startswith("frame 1007 is not averaged: ") for text in report.results[1008].warnings)
+
+
+def test_without_known_motion_frames_stay_alone(tmp_path, bilinear_models):
+    folder = make_moving_shot(tmp_path, layers=(), count=3)
+    # Without OpenCV there is no source of motion at all; with it, auto does not take computed motion either.
+    report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
+    assert report.temporal.startswith("frame by frame: no motion vectors")
+    alone = run(folder, bilinear_models[4], "alone", "off")
+    assert alone.temporal == "" and contents(folder / "out") == contents(folder / "alone")
+
+
+def test_a_static_camera_needs_no_vectors(tmp_path, bilinear_models):
+    folder = make_moving_shot(tmp_path, standing, count=3, layers=())
+    report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
+    assert "the camera stands still" in report.temporal
+    run(folder, bilinear_models[4], "alone", "off")
+    clean = texture(*np.moveaxis(positions(standing, 0)[..., :2], -1, 0))
+    alone, together = (np.mean(np.square(beauty(folder / name / "hr.1002.exr") - clean)) for name in ("alone", "out"))
+    assert together < 0.6 * alone
+
+
+def test_the_number_of_neighbours_is_checked():
+    for wrong in ("two", "-1", "99", 2.5):
+        with pytest.raises(InputError, match="give auto, off, or a number of frames up to"):
+            TemporalOptions(wrong)
+
+
+def test_neighbours_that_are_asked_for_and_cannot_be_are_an_error(tmp_path, bilinear_models):
+    folder = make_moving_shot(tmp_path, count=1)
+    with pytest.raises(InputError, match="has no two frames that follow each other"):
+        run(folder, bilinear_models[4], "out", 2)
+
+
+def test_update_fuses_a_frame_again_whose_neighbour_is_newer(tmp_path, bilinear_models):
+    folder = make_moving_shot(tmp_path, count=7)
+    run(folder, bilinear_models[4], "out")
+    later = (folder / "out/hr.1007.exr").stat().st_mtime + 9
+    os.utime(folder / "hr/hr.1002.exr", (later, later))
+    report = run(folder, bilinear_models[4], "out", update=True)
+    fused = [n for n, result in report.results.items() if result.status == "fused"]
+    assert fused == [1001, 1002, 1003, 1004]
+
+
+def test_frames_are_fused_once_and_kept_as_long_as_needed(shot, bilinear_models, monkeypatch):
+    fused, most = [], 0
+    real, release = stages.Stages.fuse, FrameWindow.release
+
+    def count(self, loaded, session):
+        fused.append(loaded.frame.number)
+        return real(self, loaded, session)
+
+    def watch(self):
+        nonlocal most
+        release(self)
+        most = max(most, len(self._done))
+
+    monkeypatch.setattr(stages.Stages, "fuse", count)
+    monkeypatch.setattr(FrameWindow, "release", watch)
+    run(shot, bilinear_models[4], "once")
+    assert fused == list(range(FIRST, FIRST + COUNT)) and most == 4
+
+
+def test_the_order_of_a_part_begins_with_its_neighbours():
+    frames = {n: Frame(n, None, None, None) for n in (1, 2, 3, 5, 6, 7, 8, 9)}
+    temporal = Temporal(2, None, frames)
+    assert [frame.number for frame in FrameWindow(temporal, [frames[7]]).order()] == [5, 6, 7, 8, 9]
+    assert [frame.number for frame in FrameWindow(temporal, [frames[3]]).order()] == [1, 2, 3]
+    assert temporal.missing(3) == [4] and temporal.missing(6) == [4] and temporal.missing(1) == []

@@ -14,17 +14,18 @@ A pixel that no neighbour may change keeps its bits.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array, box_downsample, mean_around, planes_of, upsample_linear
-from oiio_msspl.colour import LUMINANCE_WEIGHTS, luminance
+from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.tile_features import in_hrls_pixels, mirrored_pixels
+from oiio_msspl.fusion.tile_features import mirrored_pixels
 from oiio_msspl.parallel import for_row_blocks
 
 Mask = NDArray[np.bool_]
@@ -36,6 +37,8 @@ ROUND_TRIP = 1.0
 RADII = (14, 28)
 #: The error that a fused frame has itself: the variance of the noise of this many HRLS pixels, averaged.
 PIXELS_AVERAGED = 80.0
+#: Rows of the frame that are averaged at a time, which bounds memory; a multiple of every scale.
+BAND_ROWS = 512
 #: How many standard deviations of its own noise are subtracted from an estimated error.
 DOUBT = 0.5
 #: Differences relative to the local brightness are limited to this, because a firefly says nothing of the light.
@@ -86,38 +89,65 @@ def accumulate(frame: FusedFrame, before: Sequence[Step], after: Sequence[Step])
         after: steps to the frames after it, the nearest first.
     """
     window = frame.alignment.hr_data_window
-    colour = _channels(frame)
-    total, weights = colour.copy(), np.ones(colour.shape[1:], np.float32)
-    squares = np.ones_like(weights)
+    rgb = np.empty_like(frame.rgb)
+    alpha = None if frame.alpha is None else np.empty_like(frame.alpha)
+    frames = np.empty((window.height, window.width, 1), np.float32)
     light = _Light(frame)
+    for core, area in _bands(frame.alignment):
+        total, weights, squares = _accumulate_band(frame, before, after, light, area)
+        total /= weights
+        inside, target = core.slices(area), core.slices(window)
+        rgb[target] = np.moveaxis(total[:3], 0, -1)[inside]
+        if alpha is not None:
+            alpha[target] = total[3][inside][..., None]
+        frames[target] = (np.square(weights) / squares)[inside][..., None]
+    return Accumulated(rgb, alpha, frames)
+
+
+def _bands(alignment: Alignment) -> Iterator[tuple[Window, Window]]:
+    """Rows of the data window, and the area around them that decides on them."""
+    window, scale = alignment.hr_data_window, alignment.scale
+    halo = -(-max(RADII) // scale) * scale + 2 * scale
+    for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, BAND_ROWS):
+        core = Window(window.x0, max(top, window.y0), window.x1, min(top + BAND_ROWS, window.y1))
+        area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + BAND_ROWS + halo, window.y1))
+        yield core, area
+
+
+def _accumulate_band(
+    frame: FusedFrame, before: Sequence[Step], after: Sequence[Step], light: _Light, area: Window
+) -> tuple[Array, Array, Array]:
+    """The weighted sum of colour and alpha (3 or 4, h, w), the weights (h, w), and their squares."""
+    window = frame.alignment.hr_data_window
+    total = _channels(frame, area)
+    weights = np.ones(total.shape[1:], np.float32)
+    squares = np.ones_like(weights)
+    own = light.luminance_of(total)
     for steps in (before, after):
-        path = _Path(window)
+        path = _Path(area, window)
         trusted: Array | None = None
         for step in steps:
             path.follow(step)
-            warped = _warp(_channels(step.frame), step.frame.alignment.hr_data_window, path)
-            if len(warped) < len(total):  # the neighbour has no alpha
-                warped = np.concatenate([warped, colour[3:]])
-            weight = light.trust(warped[:3], path.valid)
+            warped = _warp(step.frame, path)
+            weight = light.trust(np.where(path.valid, light.luminance_of(warped), own), area)
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = weight if trusted is None else np.minimum(trusted, weight)
+            if len(warped) < len(total):  # the neighbour has no alpha
+                warped = np.concatenate([warped, _channels(frame, area)[3:]])
             _add(total, weights, squares, warped, trusted * path.valid)
-    total /= weights
-    rgb = np.ascontiguousarray(np.moveaxis(total[:3], 0, -1))
-    alpha = None if frame.alpha is None else total[3][..., None]
-    frames = (np.square(weights) / squares).astype(np.float32)
-    return Accumulated(rgb, alpha, frames[..., None])
+    return total, weights, squares
 
 
 class _Path:
     """Where the surfaces of a frame are in another one, followed from frame to frame."""
 
-    def __init__(self, window: Window) -> None:
-        self._window = window
+    def __init__(self, area: Window, window: Window) -> None:
+        """``area``: the pixels that are followed, in a frame whose data window is ``window``."""
+        self._area = area
         #: Positions (h, w) in pixels, and None for "at the pixel itself".
         self.x: Array | None = None
         self.y: Array | None = None
-        self.valid: Mask = np.ones((window.height, window.width), bool)
+        self.valid: Mask = np.ones((area.height, area.width), bool)
         self._last = window
 
     def follow(self, step: Step) -> None:
@@ -128,7 +158,7 @@ class _Path:
         x, y = (np.empty(valid.shape, np.float32) for _ in range(2)) if moves or start != end else (self.x, self.y)
 
         def work(rows: slice) -> None:
-            from_x, from_y = self._positions(rows)
+            from_x, from_y = self.positions(rows)
             to_x, to_y = from_x, from_y
             at = _nearest(from_x, from_y, start)
             good = valid[rows]
@@ -152,19 +182,23 @@ class _Path:
         for_row_blocks(work, len(valid), valid.shape[1])
         self.x, self.y, self.valid, self._last = x, y, valid, end
 
-    def _positions(self, rows: slice) -> tuple[Array, Array]:
+    def positions(self, rows: slice) -> tuple[Array, Array]:
         """Positions of some rows, (n, w) each."""
         if self.x is not None and self.y is not None:
             return self.x[rows], self.y[rows]
-        window = self._window
-        x = np.arange(window.x0, window.x1, dtype=np.float32)
-        y = np.arange(window.y0 + rows.start, window.y0 + rows.stop, dtype=np.float32)[:, None]
+        area = self._area
+        x = np.arange(area.x0, area.x1, dtype=np.float32)
+        y = np.arange(area.y0 + rows.start, area.y0 + rows.stop, dtype=np.float32)[:, None]
         x, y = np.broadcast_arrays(x, y)
         return x, y
 
-    def positions(self, rows: slice) -> tuple[Array, Array] | None:
-        """Positions of some rows, (n, w) each; None if every pixel stays where it is."""
-        return None if self.x is None else self._positions(rows)
+    def place_in(self, window: Window) -> Window:
+        """The rows of a window that lie around the positions, as far as cubic interpolation reaches."""
+        if self.y is None:
+            return self._area
+        low, high = int(np.floor(self.y.min())) - 2, int(np.ceil(self.y.max())) + 3
+        top = min(max(low, window.y0), window.y1 - 1)
+        return Window(window.x0, top, window.x1, max(min(high, window.y1), top + 1))
 
 
 def _nearest(x: Array, y: Array, window: Window) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
@@ -174,33 +208,39 @@ def _nearest(x: Array, y: Array, window: Window) -> tuple[NDArray[np.intp], NDAr
     return row, column
 
 
-def _warp(planes: Array, window: Window, path: _Path) -> Array:
-    """Planes (c, h, w) of another frame, at the positions of a path: Keys' cubic, within the four nearest pixels."""
-    height, width = path.valid.shape
-    if path.positions(slice(0, 1)) is None:
+def _warp(frame: FusedFrame, path: _Path) -> Array:
+    """Colour and alpha (3 or 4, h, w) of another frame at the positions of a path: Keys' cubic, within the range of the
+    four nearest pixels."""
+    place = path.place_in(frame.alignment.hr_data_window)
+    planes = _channels(frame, place)
+    if path.x is None:
         return planes
     padded = np.pad(planes, [(0, 0), (2, 2), (2, 2)], mode="edge").reshape(len(planes), -1)
-    stride = window.width + 4
+    stride = place.width + 4
+    height, width = path.valid.shape
     result = np.empty((len(planes), height, width), np.float32)
 
     def work(rows: slice) -> None:
-        positions = path.positions(rows)
-        assert positions is not None
-        x = np.clip(positions[0] - window.x0, -1, window.width - 0.01)
-        y = np.clip(positions[1] - window.y0, -1, window.height - 0.01)
+        x, y = path.positions(rows)
+        x = np.clip(x - place.x0, -1, place.width - 0.01)
+        y = np.clip(y - place.y0, -1, place.height - 0.01)
         left, top = np.floor(x), np.floor(y)
         first = (top.astype(np.intp) + 2) * stride + left.astype(np.intp) + 2
         across, down = _keys(x - left), _keys(y - top)
         for plane, out in zip(padded, result, strict=True):
-            near = [plane.take(first + offset) for offset in (0, 1, stride, stride + 1)]
-            low, high = np.minimum.reduce(near), np.maximum.reduce(near)
-            total = np.zeros_like(low)
+            total = np.zeros(x.shape, np.float32)
+            near = []
             for dy, weight_y in zip(range(-1, 3), down, strict=True):
-                row = np.zeros_like(low)
+                row = np.zeros_like(total)
                 for dx, weight_x in zip(range(-1, 3), across, strict=True):
-                    row += weight_x * plane.take(first + (dy * stride + dx))
-                total += weight_y * row
-            np.clip(total, low, high, out=out[rows])
+                    values = plane.take(first + (dy * stride + dx))
+                    if {dx, dy} <= {0, 1}:
+                        near.append(values.copy())
+                    values *= weight_x
+                    row += values
+                row *= weight_y
+                total += row
+            np.clip(total, np.minimum.reduce(near), np.maximum.reduce(near), out=out[rows])
 
     for_row_blocks(work, height, width)
     return result
@@ -220,9 +260,10 @@ class _Light:
     def __init__(self, frame: FusedFrame) -> None:
         self._alignment = alignment = frame.alignment
         self._scale = alignment.scale
-        self._own = luminance(frame.rgb)
-        fused = self._low(self._own)
-        floor = DARKEST * float(fused.mean()) + 1e-12
+        fused = np.concatenate(
+            [self._low(self.luminance_of(_channels(frame, core)), core) for core, _ in _bands(alignment)]
+        )
+        floor = DARKEST * float(fused.mean(dtype=np.float64)) + 1e-30
         self._brightness = mean_around(fused, 1) + np.float32(floor)
         self._renders = [frame.lrhs_luminance, frame.hrls_luminance]
         low, high = (render / self._brightness for render in self._renders)
@@ -230,38 +271,50 @@ class _Light:
         #: For each radius in LRHS pixels: the variance of the mean of both renders.
         self._noise = {reach: _wide_mean(noise, reach) for reach in (max(1, round(r / self._scale)) for r in RADII)}
 
-    def trust(self, warped: Array, valid: Mask) -> Array:
-        """How much a warped neighbour (3, h, w) counts, from 0 to 1, (h, w)."""
-        red, green, blue = warped
-        weights = [np.float32(weight) for weight in LUMINANCE_WEIGHTS]
-        grey = np.where(valid, weights[0] * red + weights[1] * green + weights[2] * blue, self._own)
-        low = self._low(grey)
+    @staticmethod
+    def luminance_of(planes: Array) -> Array:
+        """Luminance (h, w) of colour (3 or more, h, w)."""
+        red, green, blue = (np.float32(w) * plane for w, plane in zip(LUMINANCE_WEIGHTS, planes, strict=False))
+        return np.asarray(red + green + blue, np.float32)
+
+    def trust(self, grey: Array, area: Window) -> Array:
+        """How much a warped neighbour with this luminance counts, from 0 to 1, (h, w) over ``area``."""
+        low = self._low(grey, area)
+        top = self._rows(area).start
+        rows = slice(top, top + len(low))
+        brightness = self._brightness[rows]
         differences = [
-            np.clip((render - low) / self._brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
+            np.clip((render[rows] - low) / brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
             for render in self._renders
         ]
         product = differences[0] * differences[1]
         trust = np.ones_like(low)
-        for reach, noise in self._noise.items():
+        for reach, variance in self._noise.items():
+            noise = variance[rows]
             own_error = noise * np.float32(self._scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
             uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
             change = np.maximum(_wide_mean(product, reach) - uncertainty - own_error, 0)
             np.minimum(trust, own_error / (own_error + change), out=trust)
-        return self._full(trust)
+        low_area = self._low_area(area)
+        return upsample_linear(trust, self._scale, slice(0, len(trust)))[area.slices(low_area)]
 
-    def _low(self, grey: Array) -> Array:
-        """A plane over the HRLS's data window at the LRHS's resolution, over the grid."""
-        window = self._alignment.hr_data_window
-        area = in_hrls_pixels(self._alignment.grid, self._scale)
-        if area != window:
-            rows, columns = mirrored_pixels(area, window)
-            grey = grey[rows - window.y0].take(columns - window.x0, axis=1)
+    def _rows(self, area: Window) -> slice:
+        """The rows of the LRHS's grid that an area covers."""
+        grid = self._alignment.grid
+        return slice(area.y0 // self._scale - grid.y0, -(-area.y1 // self._scale) - grid.y0)
+
+    def _low_area(self, area: Window) -> Window:
+        """An area, widened to whole LRHS pixels."""
+        grid, scale = self._alignment.grid, self._scale
+        return Window(grid.x0 * scale, area.y0 // scale * scale, grid.x1 * scale, -(-area.y1 // scale) * scale)
+
+    def _low(self, grey: Array, area: Window) -> Array:
+        """A plane over ``area`` at the LRHS's resolution, over the width of the grid."""
+        whole = self._low_area(area)
+        if whole != area:
+            rows, columns = mirrored_pixels(whole, area)
+            grey = grey[rows - area.y0].take(columns - area.x0, axis=1)
         return box_downsample(grey, self._scale)
-
-    def _full(self, values: Array) -> Array:
-        """Values (h, w) over the grid, interpolated over the HRLS's data window."""
-        area, window = in_hrls_pixels(self._alignment.grid, self._scale), self._alignment.hr_data_window
-        return upsample_linear(values, self._scale, slice(0, len(values)))[window.slices(area)]
 
 
 def _wide_mean(plane: Array, radius: int) -> Array:
@@ -276,9 +329,11 @@ def _wide_mean(plane: Array, radius: int) -> Array:
     return plane
 
 
-def _channels(frame: FusedFrame) -> Array:
-    """Colour and alpha, if there is one, as planes (3 or 4, h, w)."""
-    return planes_of(frame.rgb if frame.alpha is None else np.concatenate([frame.rgb, frame.alpha], axis=-1))
+def _channels(frame: FusedFrame, area: Window) -> Array:
+    """Colour and alpha, if there is one, over an area of the data window, as planes (3 or 4, h, w)."""
+    part = area.slices(frame.alignment.hr_data_window)
+    colour = planes_of(frame.rgb[part])
+    return colour if frame.alpha is None else np.concatenate([colour, frame.alpha[part][None, ..., 0]])
 
 
 def _add(total: Array, weights: Array, squares: Array, warped: Array, weight: Array) -> None:

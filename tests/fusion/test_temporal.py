@@ -7,6 +7,7 @@ import pytest
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.fusion import temporal
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.temporal import Step, accumulate
@@ -150,3 +151,20 @@ def test_neighbours_may_have_other_data_windows():
     assert rms(accumulate(part, [still(whole[0])], []).rgb, truth[16:80, 32:96]) < 0.85 * rms(
         part.rgb, truth[16:80, 32:96]
     )
+
+
+@pytest.mark.parametrize("alpha", [False, True])
+def test_bands_of_rows_agree(monkeypatch, alpha):
+    frames = [frame_of(texture(0.7 * seed), seed) for seed in range(3)]
+    for frame in frames:
+        frame.alpha = frame.rgb[..., :1].copy() if alpha else None
+    dark = np.float32([1, 0.2])[(np.mgrid[0:HEIGHT, 0:WIDTH][0] > 50).astype(int)][..., None]
+    frames[2].rgb *= dark
+
+    def result(rows):
+        monkeypatch.setattr(temporal, "BAND_ROWS", rows)
+        return accumulate(frames[1], [moved(frames[0], -0.7, 0.4)], [moved(frames[2], 0.7, -3.3)])
+
+    whole, parts = result(1024), result(16)
+    assert np.allclose(whole.rgb, parts.rgb, rtol=1e-5) and np.allclose(whole.frames, parts.frames, rtol=1e-5)
+    assert alpha == (parts.alpha is not None)

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -39,6 +40,8 @@ RADII = (14, 28)
 PIXELS_AVERAGED = 80.0
 #: Rows of the frame that are averaged at a time, which bounds memory; a multiple of every scale.
 BAND_ROWS = 512
+#: Memory for each pixel of these rows.
+BYTES_PER_PIXEL = 96
 #: How many standard deviations of its own noise are subtracted from an estimated error.
 DOUBT = 0.5
 #: Differences relative to the local brightness are limited to this, because a firefly says nothing of the light.
@@ -104,6 +107,11 @@ def accumulate(frame: FusedFrame, before: Sequence[Step], after: Sequence[Step])
     return Accumulated(rgb, alpha, frames)
 
 
+def memory_to_accumulate(window: Window) -> int:
+    """Bytes that :func:`accumulate` needs beside its arguments and its result, for a frame of this data window."""
+    return min(window.height, BAND_ROWS + 4 * max(RADII)) * window.width * BYTES_PER_PIXEL
+
+
 def _bands(alignment: Alignment) -> Iterator[tuple[Window, Window]]:
     """Rows of the data window, and the area around them that decides on them."""
     window, scale = alignment.hr_data_window, alignment.scale
@@ -143,7 +151,7 @@ class _Path:
 
     def __init__(self, area: Window, window: Window) -> None:
         """``area``: the pixels that are followed, in a frame whose data window is ``window``."""
-        self._area = area
+        self._area, self._area_window = area, window
         #: Positions (h, w) in pixels, and None for "at the pixel itself".
         self.x: Array | None = None
         self.y: Array | None = None
@@ -155,32 +163,43 @@ class _Path:
         start, end = self._last, step.frame.alignment.hr_data_window
         valid = self.valid.copy()
         moves = step.vectors is not None
+        # A complex number is gathered in half the time of two real ones.
+        vectors, back = (None if v is None else _as_complex(v) for v in (step.vectors, step.back))
         x, y = (np.empty(valid.shape, np.float32) for _ in range(2)) if moves or start != end else (self.x, self.y)
+
+        first = self.x is None and start == self._area_window
 
         def work(rows: slice) -> None:
             from_x, from_y = self.positions(rows)
             to_x, to_y = from_x, from_y
-            at = _nearest(from_x, from_y, start)
             good = valid[rows]
+            at = None if first else _nearest(from_x, from_y, start)
             if step.valid is not None:
-                good &= step.valid[at]
-            if step.vectors is not None:
-                vectors = step.vectors[at]
-                good &= np.isfinite(vectors).all(axis=-1)
-                vectors = np.where(good[..., None], vectors, 0)
-                to_x, to_y = from_x + vectors[..., 0], from_y + vectors[..., 1]
+                good &= self._at_pixels(step.valid, rows) if at is None else step.valid.reshape(-1).take(at)
+            if vectors is not None:
+                vector = self._at_pixels(vectors, rows) if at is None else vectors.reshape(-1).take(at)
+                good &= np.isfinite(vector)
+                to_x = np.where(good, from_x + vector.real, from_x)
+                to_y = np.where(good, from_y + vector.imag, from_y)
             good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
-            there = _nearest(to_x, to_y, end)
-            if step.back is not None and step.vectors is not None:
-                home = np.square(vectors + step.back[there]).sum(axis=-1)
-                good &= home < ROUND_TRIP**2  # false for NaN, too
-            if step.back_valid is not None:
-                good &= step.back_valid[there]
+            if (vectors is not None and back is not None) or step.back_valid is not None:
+                there = _nearest(to_x, to_y, end)
+                if vectors is not None and back is not None:
+                    home = vector + back.reshape(-1).take(there)
+                    good &= np.square(home.real) + np.square(home.imag) < ROUND_TRIP**2  # false for NaN, too
+                if step.back_valid is not None:
+                    good &= step.back_valid.reshape(-1).take(there)
             if x is not None and y is not None and (moves or start != end):
                 x[rows], y[rows] = to_x, to_y
 
         for_row_blocks(work, len(valid), valid.shape[1])
         self.x, self.y, self.valid, self._last = x, y, valid, end
+
+    def _at_pixels(self, values: NDArray[Any], rows: slice) -> NDArray[Any]:
+        """Values over the data window, at these rows of the area."""
+        area, window = self._area, self._area_window
+        part = Window(area.x0, area.y0 + rows.start, area.x1, area.y0 + min(rows.stop, area.height))
+        return np.asarray(values[part.slices(window)])
 
     def positions(self, rows: slice) -> tuple[Array, Array]:
         """Positions of some rows, (n, w) each."""
@@ -201,11 +220,16 @@ class _Path:
         return Window(window.x0, top, window.x1, max(min(high, window.y1), top + 1))
 
 
-def _nearest(x: Array, y: Array, window: Window) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Indices of the nearest pixels of a window."""
-    column = np.clip(np.rint(x) - window.x0, 0, window.width - 1).astype(np.intp)
-    row = np.clip(np.rint(y) - window.y0, 0, window.height - 1).astype(np.intp)
-    return row, column
+def _as_complex(vectors: Array) -> NDArray[np.complex64]:
+    """(h, w, 2) as (h, w): x + i y."""
+    return np.ascontiguousarray(vectors, np.float32).view(np.complex64)[..., 0]
+
+
+def _nearest(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
+    """Flat indices of the nearest pixels of a window."""
+    column = np.clip(np.rint(x - window.x0), 0, window.width - 1).astype(np.intp)
+    row = np.clip(np.rint(y - window.y0), 0, window.height - 1).astype(np.intp)
+    return row * window.width + column
 
 
 def _warp(frame: FusedFrame, path: _Path) -> Array:
@@ -228,19 +252,21 @@ def _warp(frame: FusedFrame, path: _Path) -> Array:
         first = (top.astype(np.intp) + 2) * stride + left.astype(np.intp) + 2
         across, down = _keys(x - left), _keys(y - top)
         for plane, out in zip(padded, result, strict=True):
-            total = np.zeros(x.shape, np.float32)
-            near = []
+            total, values = np.zeros(x.shape, np.float32), np.empty(x.shape, np.float32)
+            low, high = np.full(x.shape, np.inf, np.float32), np.full(x.shape, -np.inf, np.float32)
             for dy, weight_y in zip(range(-1, 3), down, strict=True):
                 row = np.zeros_like(total)
                 for dx, weight_x in zip(range(-1, 3), across, strict=True):
-                    values = plane.take(first + (dy * stride + dx))
+                    # "wrap" makes NumPy write straight into `values`; no index needs it.
+                    plane.take(first + (dy * stride + dx), out=values, mode="wrap")
                     if {dx, dy} <= {0, 1}:
-                        near.append(values.copy())
+                        np.minimum(low, values, out=low)
+                        np.maximum(high, values, out=high)
                     values *= weight_x
                     row += values
                 row *= weight_y
                 total += row
-            np.clip(total, np.minimum.reduce(near), np.maximum.reduce(near), out=out[rows])
+            np.clip(total, low, high, out=out[rows])
 
     for_row_blocks(work, height, width)
     return result

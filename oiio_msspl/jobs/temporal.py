@@ -8,10 +8,14 @@ chunks, or resumed, has the same pixels as one run: the neighbours of a chunk ar
 from __future__ import annotations
 
 import logging
+import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array
@@ -19,7 +23,7 @@ from oiio_msspl.errors import InputError, explain
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, Mask, MotionFrame, MotionSource, find_motion
-from oiio_msspl.fusion.temporal import Step, accumulate
+from oiio_msspl.fusion.temporal import Step, accumulate, memory_to_accumulate
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.model.session import Session
@@ -29,14 +33,18 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
+T = TypeVar("T", bound=np.generic)
+
 #: What ``--temporal`` takes beside a number.
 AUTO, OFF = "auto", "off"
 #: Frames before and after a frame, where motion is known.
 AUTO_COUNT = 2
 #: The most that can be asked for.
 MOST = 8
-#: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and all that averaging needs.
-FRAME_BYTES, VECTOR_BYTES, AVERAGING_BYTES = 16, 9, 96
+#: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
+FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
+#: The neighbours of frames with more pixels are kept in temporary files.
+MOST_PIXELS = 5_000_000
 
 
 @dataclass(frozen=True)
@@ -96,8 +104,11 @@ class Temporal:
 
     def memory(self, window: Window) -> int:
         """Bytes that the neighbours of a frame take, and averaging them; from its data window."""
-        held = 2 * self.count * (FRAME_BYTES + 2 * VECTOR_BYTES) + AVERAGING_BYTES if self.count else 0
-        return held * window.width * window.height
+        if not self.count:
+            return 0
+        pixels = window.width * window.height
+        held = 2 * self.count * (FRAME_BYTES + 2 * VECTOR_BYTES) if pixels <= MOST_PIXELS else 0
+        return (held + RESULT_BYTES) * pixels + memory_to_accumulate(window)
 
     def missing(self, number: int) -> list[int]:
         """The numbers next to a frame that lie within the shot, and of which a render is missing."""
@@ -211,6 +222,8 @@ class FrameWindow:
         Returns:
             The frames to write that have all their neighbours now, in order.
         """
+        if isinstance(outcome, FusedAlone) and self._temporal.count:
+            outcome.fused.rgb = kept(outcome.fused.rgb)
         self._done[number] = outcome
         ready = [
             (frame, self._done[n])
@@ -270,8 +283,18 @@ class FrameWindow:
             assert isinstance(one, FusedAlone) and isinstance(other, FusedAlone) and self._temporal.motion is not None
             frame, neighbour = (MotionFrame(each.loaded.hr, each.fused.rgb) for each in (one, other))
             vectors, valid = self._temporal.motion.read(frame, neighbour, end - start)
-            self._vectors[start, end] = vectors if vectors.any() else None, None if valid.all() else valid
+            self._vectors[start, end] = kept(vectors) if vectors.any() else None, None if valid.all() else kept(valid)
         return self._vectors[start, end]
+
+
+def kept(values: NDArray[T]) -> NDArray[T]:
+    """Values (h, w, ...) of a frame that waits for others: in memory, or in a temporary file if there are many."""
+    if values.shape[0] * values.shape[1] <= MOST_PIXELS:
+        return values
+    with tempfile.TemporaryFile(prefix="msspl-") as file:
+        on_disk = np.memmap(file, values.dtype, "w+", shape=values.shape)
+    on_disk[:] = values
+    return on_disk
 
 
 def _difference(frame: FusedAlone, neighbour: FusedAlone) -> str | None:

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputError, fuse_shot, map_render, open_exr
+from oiio_msspl.exr.render import Window
 from oiio_msspl.jobs import stages
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import FrameWindow, Temporal, TemporalOptions
@@ -205,3 +206,14 @@ def test_the_order_of_a_part_begins_with_its_neighbours():
     assert [frame.number for frame in FrameWindow(temporal, [frames[7]]).order()] == [5, 6, 7, 8, 9]
     assert [frame.number for frame in FrameWindow(temporal, [frames[3]]).order()] == [1, 2, 3]
     assert temporal.missing(3) == [4] and temporal.missing(6) == [4] and temporal.missing(1) == []
+
+
+def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monkeypatch):
+    monkeypatch.setattr("oiio_msspl.jobs.temporal.MOST_PIXELS", 100)
+    run(shot, bilinear_models[4], "on disk")
+    assert contents(shot / "on disk") == contents(shot / "whole")
+    window = Window(0, 0, 4096, 2160)
+    monkeypatch.undo()
+    temporal = Temporal(2)
+    assert temporal.memory(window) < temporal.memory(Window(0, 0, 2560, 1920)) < 1 << 30
+    assert Temporal().memory(window) == 0

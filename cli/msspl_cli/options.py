@@ -162,6 +162,15 @@ Temporal = Annotated[
         rich_help_panel=SHOT,
     ),
 ]
+FramesLayer = Annotated[
+    bool,
+    typer.Option(
+        "--frames-layer",
+        help="Add a layer 'frames': of how many frames each pixel is the average.",
+        rich_help_panel=SHOT,
+        hidden=True,
+    ),
+]
 MotionFormat = Annotated[
     str | None,
     typer.Option(
@@ -219,6 +228,7 @@ def make_write_options(
     layers: list[str],
     error_layer: bool,
     passes: list[str] | None = None,
+    frames_layer: bool = False,
 ) -> WriteOptions:
     """The options that describe the result.
 
@@ -229,7 +239,7 @@ def make_write_options(
 
     pixel_type = None if half is None else "half" if half else "float"
     patterns = tuple(passes) if passes and "auto" not in passes else ()
-    return WriteOptions(layout, compression, pixel_type, tuple(layers), patterns, error_layer)
+    return WriteOptions(layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer)
 
 
 def make_temporal_options(frames: str, motion_format: str | None) -> TemporalOptions:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,7 +20,7 @@ from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOpt
 
 @dataclass(frozen=True)
 class FusedPixels:
-    """The fused beauty and its predicted error.
+    """The fused beauty, and layers about it.
 
     Rows are converted to the stored type as they are written: a second copy of an 8K frame takes half a gigabyte.
     """
@@ -29,8 +29,8 @@ class FusedPixels:
     """Scene linear, (height, width, 3)."""
     alpha: Array | None
     """(height, width, 1), if the HRLS has an alpha."""
-    error: Array | None
-    """(height, width, 1), if it was asked for."""
+    extra: Mapping[str, Array]
+    """Further layers by name, (height, width, 1) each."""
     kind: str
     """Pixel type in the file: ``half`` or ``float``."""
 
@@ -41,10 +41,9 @@ class FusedPixels:
             values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
         return self._stored(values)
 
-    def error_rows(self, start: int, stop: int) -> NDArray[Any]:
-        """Rows of the error as stored, (stop - start, width, 1)."""
-        assert self.error is not None
-        return self._stored(self.error[start:stop])
+    def extra_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
+        """Rows of a further layer as stored, (stop - start, width, 1)."""
+        return self._stored(self.extra[name][start:stop])
 
     def _stored(self, values: Array) -> NDArray[Any]:
         if self.kind == "half":

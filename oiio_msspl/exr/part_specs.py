@@ -15,7 +15,6 @@ import OpenImageIO as oiio
 from oiio_msspl.exr.contents import FileContents, lossless
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, Part
-from oiio_msspl.exr.write_options import ERROR_LAYER
 
 #: Attributes that say how the source was stored. The writer sets them anew, or they have no meaning in the copy.
 _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
@@ -66,10 +65,10 @@ def beauty_spec(contents: FileContents) -> Any:
     return spec
 
 
-def error_spec(contents: FileContents, taken: set[str]) -> Any:
-    """The part of the predicted error; its name is not among ``taken`` and is added to them."""
-    channel = "Y" if contents.options.layout == "nuke" else f"{ERROR_LAYER}.Y"
-    spec = _spec(contents.home, _unique(ERROR_LAYER, taken), [channel], contents.pixels.kind)
+def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
+    """The part of a further layer; its name is not among ``taken`` and is added to them."""
+    channel = "Y" if contents.options.layout == "nuke" else f"{name}.Y"
+    spec = _spec(contents.home, _unique(name, taken), [channel], contents.pixels.kind)
     _drop_repeated_attributes(spec)
     _compress(spec, contents.compression)
     return spec

@@ -19,7 +19,6 @@ from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.part_specs import runs
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.replaced import DTYPES
-from oiio_msspl.exr.write_options import ERROR_LAYER
 
 #: Header entries that say how the source was stored. The ACES flag is forbidden in a file with AOVs (ST 2065-4).
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
@@ -45,12 +44,12 @@ def write_single_part(path: Path, contents: FileContents) -> None:
 
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
-    """The fused beauty and its error: (height, width) by channel name."""
+    """The fused beauty and the layers about it: (height, width) by channel name."""
     height = contents.pixels.rgb.shape[0]
     beauty = contents.pixels.rows(0, height)
     channels = {c.name: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate(contents.beauty)}
-    if contents.pixels.error is not None:
-        channels[f"{ERROR_LAYER}.Y"] = np.ascontiguousarray(contents.pixels.error_rows(0, height)[..., 0])
+    for name in contents.pixels.extra:
+        channels[f"{name}.Y"] = np.ascontiguousarray(contents.pixels.extra_rows(name, 0, height)[..., 0])
     return channels
 
 

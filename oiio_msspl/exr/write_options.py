@@ -20,8 +20,8 @@ COMPRESSIONS = (*LOSSLESS, "pxr24", "b44", "b44a", "dwaa", "dwab")
 #: Replaces a lossy compression of the source.
 DEFAULT_COMPRESSION = "zip"
 
-#: Name of the layer that holds the predicted error.
-ERROR_LAYER = "error"
+#: Names of the layers that hold the predicted error, and how many frames were averaged.
+ERROR_LAYER, FRAMES_LAYER = "error", "frames"
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,8 @@ class WriteOptions:
     all. Other layers are passed on."""
     error_layer: bool = False
     """Add a layer ``error``: the error that the model predicts for the fused beauty."""
+    frames_layer: bool = False
+    """Add a layer ``frames``: of how many frames a pixel of a shot is the average."""
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:

@@ -7,8 +7,10 @@ are copied strip by strip in their own type.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -19,7 +21,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
-from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, error_spec, passed_on_parts
+from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, extra_spec, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import write_single_part
@@ -37,7 +39,7 @@ def write_fused(
     attributes: dict[str, str],
     options: WriteOptions,
     *,
-    error: Array | None = None,
+    extra: Mapping[str, Array] = MappingProxyType({}),
     replaced: ReplacedChannels | None = None,
     overwrite: bool = False,
     cache_bytes: int = 0,
@@ -53,7 +55,7 @@ def write_fused(
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
         attributes: header attributes that are added to the beauty's part.
         options: layout, compression, pixel type and layers.
-        error: predicted error, (height, width, 1); becomes the layer ``error``.
+        extra: further layers by name, (height, width, 1) each, such as ``error``.
         replaced: new pixels for some of the other channels, each over the data window of its part.
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
@@ -67,7 +69,7 @@ def write_fused(
         InputError: the layout can't hold these parts, a layer can't be read, or ``path`` exists.
         MssplError: the file can't be written. What stood at ``path`` is untouched.
     """
-    pixels = FusedPixels(rgb, alpha, error, options.pixel_type or widest_type(beauty))
+    pixels = FusedPixels(rgb, alpha, extra, options.pixel_type or widest_type(beauty))
     dropped = dropped_channels(source, beauty, options.layers)
     contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options, replaced)
     with replacing(path, overwrite=overwrite, stale=stale) as temporary:
@@ -95,21 +97,21 @@ def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
-    """Write a file of several parts: the beauty, the error if there is one, and what is passed on."""
+    """Write a file of several parts: the beauty, the layers about it, and what is passed on."""
     beauty = beauty_spec(contents)
     taken = {str(beauty.getattribute("oiio:subimagename"))}
     passed_on = list(passed_on_parts(contents, taken))
-    error = error_spec(contents, taken) if contents.pixels.error is not None else None
-    specs = [beauty, *([error] if error is not None else []), *(part.spec for part in passed_on)]
+    extra = {name: extra_spec(contents, name, taken) for name in contents.pixels.extra}
+    specs = [beauty, *extra.values(), *(part.spec for part in passed_on)]
 
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:
         raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
     ok = writer.open(str(path), specs) if len(specs) > 1 else writer.open(str(path), beauty)
     ok = ok and _write_rows(writer, beauty, contents.pixels.rows)
-    if error is not None:
-        ok = ok and writer.open(str(path), error, "AppendSubimage")
-        ok = ok and _write_rows(writer, error, contents.pixels.error_rows)
+    for name, spec in extra.items():
+        ok = ok and writer.open(str(path), spec, "AppendSubimage")
+        ok = ok and _write_rows(writer, spec, partial(contents.pixels.extra_rows, name))
     with contents.source.cache_strips(cache_bytes):
         for position, part in enumerate(passed_on, start=1):
             ok = ok and writer.open(str(path), part.spec, "AppendSubimage")

@@ -11,12 +11,12 @@ from pathlib import Path
 import numpy as np
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import HALF_MAX
+from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
 from oiio_msspl.exr.contents import dropped_channels, widest_type
 from oiio_msspl.exr.preview import check_view, old_preview, write_preview
-from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.write_options import ERROR_LAYER, FRAMES_LAYER, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
@@ -175,12 +175,20 @@ def write_frame(
         fused.alpha,
         provenance(report),
         options,
-        error=fused.error,
+        extra=_layers_about(fused, options),
         replaced=fused.replaced,
         overwrite=overwrite,
         cache_bytes=cache_bytes,
         stale=old_preview(report.output) if overwrite else None,
     )
+
+
+def _layers_about(fused: FusedFrame, options: WriteOptions) -> dict[str, Array]:
+    """The layers about the fused beauty that are asked for."""
+    layers = {} if fused.error is None else {ERROR_LAYER: fused.error}
+    if options.frames_layer:
+        layers[FRAMES_LAYER] = np.ones_like(fused.rgb[..., :1]) if fused.frames is None else fused.frames
+    return layers
 
 
 @contextmanager

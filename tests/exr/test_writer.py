@@ -35,7 +35,7 @@ def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
         image[..., 3:],
         {},
         WriteOptions(layout, pixel_type="float"),
-        error=error,
+        extra={} if error is None else {"error": error},
     )
     parts = read_bits(tmp_path / "out.exr")
     layers = flat(parts)

@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputError, fuse_shot, map_render, open_exr
+from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.jobs import stages
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import FrameWindow, Temporal, TemporalOptions
@@ -217,3 +219,16 @@ def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monk
     temporal = Temporal(2)
     assert temporal.memory(window) < temporal.memory(Window(0, 0, 2560, 1920)) < 1 << 30
     assert Temporal().memory(window) == 0
+
+
+def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):
+    write = WriteOptions(frames_layer=True)
+    run(shot, bilinear_models[4], "counted", write=write, frames="1001-1003")
+    run(shot, bilinear_models[4], "ones", "off", write=write, frames="1001")
+    files = {name: open_exr(shot / f"{name}.exr") for name in ("counted/hr.1001", "counted/hr.1003", "ones/hr.1001")}
+    counts = {}
+    for name, file in files.items():
+        (layer,) = [layer for layer in layers_of(file) if layer.name == "frames"]
+        counts[name] = file.read(list(layer.channels.values()), map_render(file, features=()).data_window)
+    assert (counts["ones/hr.1001"] == 1).all()
+    assert 1 < np.median(counts["counted/hr.1001"]) <= 3 < np.median(counts["counted/hr.1003"]) <= 5

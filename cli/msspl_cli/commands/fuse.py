@@ -154,6 +154,7 @@ def fuse(
     frames: options.Frames = None,
     temporal: options.Temporal = "auto",
     motion_format: options.MotionFormat = None,
+    frames_layer: options.FramesLayer = False,
     skip_existing: options.SkipExisting = False,
     update: Annotated[
         bool,
@@ -212,7 +213,7 @@ def fuse(
 
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
-        "write": options.make_write_options(layout, compression, half, layers, error_layer, passes),
+        "write": options.make_write_options(layout, compression, half, layers, error_layer, passes, frames_layer),
         "model": model,
         "device": device,
         "threads": threads,
@@ -256,6 +257,7 @@ def fuse(
         ("--scheduler", scheduler),
         ("--temporal", temporal not in ("auto", "off")),
         ("--motion-format", motion_format),
+        ("--frames-layer", frames_layer),
     ):
         if value:
             raise InputError(f"{option} is for shots: give folders, or patterns such as lr.####.exr")

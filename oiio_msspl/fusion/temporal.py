@@ -107,6 +107,24 @@ def accumulate(frame: FusedFrame, before: Sequence[Step], after: Sequence[Step])
     return Accumulated(rgb, alpha, frames)
 
 
+def shared_noise(frame: FusedFrame, other: FusedFrame) -> float:
+    """Correlation, from -1 to 1, of the noise of two frames: of what their LRHS and HRLS differ by.
+
+    A renderer that uses one seed for all frames gives each pixel the same noise in all of them. 0 for frames whose
+    pixels lie over different places.
+    """
+    if frame.alignment.grid != other.alignment.grid:
+        return 0.0
+    noise = []
+    for each in (frame, other):
+        low, high = each.lrhs_luminance, each.hrls_luminance
+        light = low + high
+        # The difference relative to the light is at most 1, so fireflies do not decide.
+        noise.append(np.divide(low - high, light, out=np.zeros_like(light), where=light > 0).ravel())
+    lengths = np.linalg.norm(noise[0]) * np.linalg.norm(noise[1])
+    return float(np.dot(*noise) / lengths) if lengths > 0 else 0.0
+
+
 def memory_to_accumulate(window: Window) -> int:
     """Bytes that :func:`accumulate` needs beside its arguments and its result, for a frame of this data window."""
     return min(window.height, BAND_ROWS + 4 * max(RADII)) * window.width * BYTES_PER_PIXEL

@@ -23,7 +23,7 @@ from oiio_msspl.errors import InputError, explain
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, Mask, MotionFrame, MotionSource, find_motion
-from oiio_msspl.fusion.temporal import Step, accumulate, memory_to_accumulate
+from oiio_msspl.fusion.temporal import Step, accumulate, memory_to_accumulate, shared_noise
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.model.session import Session
@@ -41,6 +41,9 @@ AUTO, OFF = "auto", "off"
 AUTO_COUNT = 2
 #: The most that can be asked for.
 MOST = 8
+#: Frames have the same noise above this correlation. Independent ones stay below 0.1.
+SAME_NOISE = 0.5
+SAME_SEED = "have the same noise, which no average removes; let the renderer change its seed from frame to frame"
 #: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
 #: The neighbours of frames with more pixels are kept in temporary files.
@@ -223,7 +226,8 @@ class FrameWindow:
             The frames to write that have all their neighbours now, in order.
         """
         if isinstance(outcome, FusedAlone) and self._temporal.count:
-            outcome.fused.rgb = kept(outcome.fused.rgb)
+            fused = outcome.fused
+            fused.rgb, fused.alpha = kept(fused.rgb), None if fused.alpha is None else kept(fused.alpha)
         self._done[number] = outcome
         ready = [
             (frame, self._done[n])
@@ -266,6 +270,8 @@ class FrameWindow:
             problem = explain(there)[0] if isinstance(there, Exception) else None
             if isinstance(there, FusedAlone):
                 problem = _difference(here, there)
+                if problem is None and abs(n - number) == 1 and shared_noise(here.fused, there.fused) > SAME_NOISE:
+                    warnings.append(f"frames {number} and {n} {SAME_SEED}")
                 if problem is None:
                     (vectors, valid), (back, back_valid) = (
                         self._read_vectors(start, end) for start, end in ((n - step, n), (n, n - step))

@@ -24,19 +24,19 @@ from tests.shots import contents
 FIRST, COUNT = 1001, 9
 
 
-def make_moving_shot(folder, camera=truck, count=COUNT, layers=("motion",)):
+def make_moving_shot(folder, camera=truck, count=COUNT, layers=("motion",), seeds=range(COUNT)):
     """Pairs at x4 of a textured plane before a moving camera; the HRLS has vectors to the next frame."""
     for name in ("lr", "hr", "out"):
         (folder / name).mkdir(parents=True)
-    for t in range(count):
+    for t, seed in zip(range(count), seeds, strict=False):
         places = positions(camera, t)
         clean = texture(places[..., 0], places[..., 1])
         albedo = rgb(clean.astype(np.float32), "albedo.")
         there = vectors(camera, t, 1)
         motion = {"motionFore.X": there[..., 0], "motionFore.Y": there[..., 1]} if "motion" in layers else {}
-        low = noisy(downsample(clean, 4), 16, 100 + t)
+        low = noisy(downsample(clean, 4), 16, 100 + seed)
         write_exr(folder / f"lr/lr.{FIRST + t}.exr", rgb(low.astype(np.float32)))
-        write_exr(folder / f"hr/hr.{FIRST + t}.exr", rgb(noisy(clean, 1, t).astype(np.float32)) | albedo | motion)
+        write_exr(folder / f"hr/hr.{FIRST + t}.exr", rgb(noisy(clean, 1, seed).astype(np.float32)) | albedo | motion)
     return folder
 
 
@@ -159,6 +159,15 @@ def test_a_static_camera_needs_no_vectors(tmp_path, bilinear_models):
     clean = texture(*np.moveaxis(positions(standing, 0)[..., :2], -1, 0))
     alone, together = (np.mean(np.square(beauty(folder / name / "hr.1002.exr") - clean)) for name in ("alone", "out"))
     assert together < 0.6 * alone
+
+
+def test_frames_with_one_seed_are_named(tmp_path, bilinear_models):
+    """The noise stays where it is while the picture moves."""
+    folder = make_moving_shot(tmp_path, count=3, seeds=[0, 0, 5])
+    report = run(folder, bilinear_models[4], "out")
+    said = [[text for text in report.results[n].warnings if "same noise" in text] for n in (1001, 1002, 1003)]
+    assert [len(texts) for texts in said] == [1, 1, 0]
+    assert said[0][0].startswith("frames 1001 and 1002 have the same noise")
 
 
 def test_the_number_of_neighbours_is_checked():

@@ -22,6 +22,8 @@ from msspl_bridge.process import run
 
 #: Nodes that change neither pixels nor time. They may stand between the Read and the gizmo.
 _PASS_THROUGH = ("Dot", "NoOp", "PostageStamp")
+#: Knobs whose values go into the command line as text.
+_KNOBS = ("model", "device", "mapping", "layers", "passes", "temporal", "options")
 #: A hidden knob on the Read of a result. It holds the name of the node that made the Read.
 _MADE_BY = "msspl_made_by"
 #: Full names of the nodes that are fusing now.
@@ -128,7 +130,7 @@ def _prepare(node: nuke.Node, first: int, last: int, as_range: bool) -> _Job:
         ranges = [ReadRange(read.name(), _file_at(read, first), _file_at(read, last)) for read in reads]
         numbers = file_numbers(ranges, out, first, last)
     settings = Settings(
-        **{knob: _text(node, knob) for knob in ("model", "device", "mapping", "layers", "passes", "options")},
+        **{knob: _text(node, knob) for knob in _KNOBS},
         overwrite=bool(node["overwrite"].value()),
     )
     program = find_program(_path(node, "program"), os.environ)

@@ -36,6 +36,8 @@ class Settings:
     """Layer patterns, separated by commas."""
     passes: str = ""
     """Patterns of the passes to fuse, separated by commas."""
+    temporal: str = "auto"
+    """Neighbours that a frame is averaged with: ``auto``, ``off``, or the number of frames before and after it."""
     options: str = ""
     """Further options, quoted as in a shell."""
     overwrite: bool = True
@@ -51,13 +53,19 @@ def build_command(
 ) -> list[str]:
     """The command line for one frame or, given the first and last file number, for a range.
 
+    A single frame is averaged with the neighbours that a range would give it, so that both have the same pixels. It is
+    fused alone if its files have no numbers, or different ones: msspl-fuse pairs the files of neighbours by number.
+
     Raises:
         FuseError: the mapping or the options cannot be parsed.
     """
-    files = [each.path if numbers is None else each.pattern for each in (lrhs, hrls, out)]
+    first, last = numbers or (out.number, out.number)
+    in_shot = numbers is not None or (settings.temporal != "off" and lrhs.number == hrls.number == first is not None)
+    files = [each.pattern if in_shot else each.path for each in (lrhs, hrls, out)]
     command = [program, files[0], files[1], "-o", files[2], "--device", settings.device]
-    if numbers is not None:
-        command += ["--frames", f"{numbers[0]}-{numbers[1]}", "--progress", "openjd"]
+    if in_shot:
+        frames = f"{first}" if first == last else f"{first}-{last}"
+        command += ["--frames", frames, "--temporal", settings.temporal, "--progress", "openjd"]
     # The layout of Nuke's own Write: one part per layer, named after the layer.
     command += ["--layout", "nuke", "--no-preview"]
     if settings.model:

@@ -20,6 +20,7 @@ def test_every_knob_reaches_the_command_line():
         mapping="\nalbedo = my albedo\ndiffuse=lighting+GI\n",
         layers="crypto*, depth",
         passes="light groups",
+        temporal="off",
         options="--hr-spp 4 --view-layer 'left eye'",
     )
     one = build_command("msspl-fuse", *files, settings)
@@ -28,11 +29,34 @@ def test_every_knob_reaches_the_command_line():
         "--device cuda --layout nuke --no-preview --model paper-x4 --map albedo=my albedo --map diffuse=lighting+GI "
         "--layers crypto* --layers depth --passes light groups --overwrite --hr-spp 4 --view-layer left eye"
     )
-    many = build_command("msspl-fuse", *files, Settings(overwrite=False), (1001, 1010))
+    many = build_command("msspl-fuse", *files, Settings(overwrite=False, temporal="3"), (1001, 1010))
     assert many[1:5] == ["/a/lr.%04d.exr", "/a/hr.%04d.exr", "-o", "/a/out.%04d.exr"]
     assert " ".join(many[5:]) == (
-        "--device cpu --frames 1001-1010 --progress openjd --layout nuke --no-preview --skip-existing"
+        "--device cpu --frames 1001-1010 --temporal 3 --progress openjd --layout nuke --no-preview --skip-existing"
     )
+
+
+def test_a_frame_gets_its_neighbours_if_its_files_are_numbered_alike():
+    """Otherwise msspl-fuse could not find the neighbours, and the frame is fused by itself."""
+    lrhs, hrls, out = (FrameFile(f"/a/{name}.", 1001, 4, ".exr") for name in ("lr", "hr", "out"))
+
+    def command(*files, **settings):
+        return build_command("msspl-fuse", *files, Settings(**settings))
+
+    in_shot = command(lrhs, hrls, out, overwrite=False)
+    assert in_shot[1:5] == ["/a/lr.%04d.exr", "/a/hr.%04d.exr", "-o", "/a/out.%04d.exr"]
+    assert in_shot[in_shot.index("--frames") :][:4] == ["--frames", "1001", "--temporal", "auto"]
+    assert "--skip-existing" not in in_shot  # an existing frame is refused, as one that is fused by itself
+    still, other = FrameFile("/a/still.exr"), FrameFile("/a/lr.", 5, 4, ".exr")
+    for alone in (
+        command(lrhs, hrls, out, temporal="off"),
+        command(other, hrls, out),
+        command(still, hrls, out),
+        command(lrhs, hrls, still),
+        command(still, still, still, temporal="2"),
+    ):
+        assert not {"--frames", "--temporal", "--progress"} & {*alone}
+        assert "%" not in "".join(alone)
 
 
 @pytest.mark.parametrize(

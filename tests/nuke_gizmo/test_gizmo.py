@@ -2,8 +2,10 @@
 """The gizmo's file, read by real Tcl interpreters."""
 
 import pytest
+from msspl_bridge.command import Settings
 
 from oiio_msspl.aovs.features import FEATURES
+from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.devices import PROVIDERS
 from tests.nuke_gizmo.conftest import GIZMO
@@ -42,6 +44,7 @@ def test_every_knob_has_its_kind_its_default_and_a_tooltip(nodes):
             "mapping": lines,
             "layers": text,
             "passes": text,
+            "temporal": menu,
         },
         **{"overwrite": tick, "fuse_frame": button, "first": number, "last": number, "fuse_range": button},
         "rebuild": button,
@@ -58,6 +61,13 @@ def test_every_knob_has_its_kind_its_default_and_a_tooltip(nodes):
 
 def test_the_device_menu_lists_the_devices_of_msspl_fuse(nodes):
     assert knob(nodes, "device").items == list(PROVIDERS)
+
+
+def test_the_menu_of_neighbours_has_what_msspl_fuse_takes(nodes):
+    items = knob(nodes, "temporal").items
+    assert items == ["auto", "off", "1", "2", "3", "4"]
+    assert items[0] == Settings.temporal
+    assert [TemporalOptions(item).count for item in items] == [2, 0, 1, 2, 3, 4]
 
 
 def test_the_tooltips_name_every_model_family_and_every_feature(nodes):

@@ -9,8 +9,10 @@ import pytest
 
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import EXAMPLES
+from tests.jobs.test_temporal import make_moving_shot
 from tests.nuke_gizmo.conftest import FOLDER
 from tests.nuke_gizmo.fake_nuke import Node
+from tests.shots import contents
 
 
 def results(nuke):
@@ -76,6 +78,34 @@ def test_a_range_shows_progress_and_comes_back_as_a_read(host, tmp_path):
     (task,) = host.ProgressTask.made
     assert task.progress == [33, 66, 100]
     assert any("3 of 3" in message for message in task.messages)
+
+
+def test_a_frame_fused_with_its_neighbours_has_the_pixels_that_the_range_gives_it(host, tmp_path, bilinear_models):
+    shot = make_moving_shot(tmp_path / "shot", count=6)
+    for read, name in zip(host.reads, ("lr", "hr"), strict=True):
+        read["file"].setValue(str(shot / name / f"{name}.%04d.exr"))
+        read["last"].setValue(1006)
+    host.gizmo["model"].setValue(str(bilinear_models[4]))
+
+    def fused(button, output):
+        (shot / output).mkdir()
+        host.gizmo["output"].setValue(str(shot / output / "f.%04d.exr"))
+        host.press(host.gizmo, button)
+        host.wait()
+        assert host.messages == []
+        return contents(shot / output)["f.1003.exr"]
+
+    host.frame_number = 1003
+    alone = fused("fuse_frame", "alone")
+    host.gizmo["temporal"].setValue("auto")
+    one = fused("fuse_frame", "one")
+    assert len(contents(shot / "one")) == 1
+    assert (results(host)[0]["first"].value(), results(host)[0]["last"].value()) == (1003, 1003)
+    host.gizmo["first"].setValue(1002)
+    host.gizmo["last"].setValue(1004)
+    assert one == fused("fuse_range", "range")
+    host.gizmo["temporal"].setValue("off")
+    assert one != alone == fused("fuse_range", "range alone")
 
 
 def test_a_reads_frame_expression_is_followed(host, tmp_path):

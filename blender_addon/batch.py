@@ -3,7 +3,7 @@
 
 import os
 import time
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import bpy
@@ -24,7 +24,7 @@ def run_job(job, send, receive):
         job: the dictionary that :mod:`.headless` describes.
         send: called with the progress, with what is to be fused, and with the report of each frame, as keyword
             arguments.
-        receive: called for the answer to what is to be fused.
+        receive: called to wait until it is fused.
 
     Raises:
         Failure: a frame failed. The frames before it are complete.
@@ -37,44 +37,43 @@ def run_job(job, send, receive):
         except RuntimeError as error:
             raise Failure(f"{job['scene']}: can't be opened ({str(error).strip()})") from error
     scene, options = bpy.context.scene, Options(**job["options"])
+    if options.vectors and scene.render.use_motion_blur:
+        send(no_vectors="motion blur is on, and Cycles then writes no motion vectors; turn it off")
+        options = replace(options, vectors=False)
     for number, output in job["frames"]:
         if number is not None:
             scene.frame_set(number)
-        send(report=_run_frame(scene, options, job, Path(output), send, receive))
+        if output is not None:
+            send(report=_run_frame(scene, options, job, Path(output), send, receive))
+        elif options.vectors:
+            _run_frame(scene, options, job, None, send, receive)
 
 
 def _run_frame(scene, options, job, output, send, receive):
+    """Render a frame and have it fused. A frame without an output is rendered for its neighbours."""
     number = scene.frame_current
+    work = Path(job["work"], str(number))
+    work.mkdir()
 
     def on_step(step, fraction):
         send(frame=number, step=step, fraction=fraction)
 
     def fuse(lrhs, hrls, output):
         yield "fuse", 2 / 3
-        send(fuse={"lrhs": lrhs, "hrls": hrls, "output": output})  # msspl-render keeps its model loaded
-        return receive()
+        send(fuse={"lrhs": lrhs, "hrls": hrls})  # msspl-render keeps its model loaded
+        receive()
+        return {"warnings": []}  # msspl-render has them, and may not have written this frame yet
 
     on_step("start", 0.0)
-    steps = render_and_fuse(scene, options, output, job["work"], fuse, overwrite=job["overwrite"])
+    steps = render_and_fuse(scene, options, output or work / "none.exr", work, fuse, overwrite=job["overwrite"])
     report = run_to_end(steps, on_step)
     result = {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
-    for each, suffix in ((report.lrhs, "lr"), (report.hrls, "hr")):
-        kept = _beside(output, suffix) if job["keep"] else None
-        if kept:
-            os.replace(each.file, kept)
-        else:
-            os.unlink(each.file)
-        result[each.name.lower()]["file"] = kept and str(kept)
-    if job["compare"]:
+    if job["compare"] and output:
+        beside = output.with_name(f"{output.stem}_oidn.exr")
         result["oidn"] = _render_plain(scene, options, report, on_step, Path(job["work"]))
-        os.replace(result["oidn"]["file"], _beside(output, "oidn"))
-        result["oidn"]["file"] = str(_beside(output, "oidn"))
+        os.replace(result["oidn"]["file"], beside)
+        result["oidn"]["file"] = str(beside)
     return result
-
-
-def _beside(output, suffix):
-    """``frame.exr`` -> ``frame_suffix.exr``."""
-    return output.with_name(f"{output.stem}_{suffix}.exr")
 
 
 def _render_plain(scene, options, report, on_step, work):

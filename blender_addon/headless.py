@@ -7,16 +7,18 @@
 The job is a JSON object:
 
     scene      the .blend to open
-    frames     list of [frame number or null for the current frame, EXR to write]
+    frames     list of [frame number or null for the current frame, EXR to write or null]. A frame without an EXR is
+               rendered because its neighbours need it
     work       folder for temporary files, on the same file system as the results
     options    fields of :class:`.options.Options`
     overwrite  replace results that exist
-    keep       keep both renders beside each result
     compare    also write an ordinary render, denoised with OIDN, that takes the same time
 
 Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON object. After the line
-``MSSPL {"fuse": {"lrhs": file, "hrls": file, "output": file}}``, msspl-render fuses these files and writes a line to
-standard input, ``{"warnings": [...]}``. A frame that it can't fuse ends the input.
+``MSSPL {"fuse": {"lrhs": file, "hrls": file}}``, msspl-render fuses these files, and deletes them when no frame needs
+them any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
+
+The line ``MSSPL {"no_vectors": reason}`` says that frames can't be fused with their neighbours.
 """
 
 import importlib
@@ -42,11 +44,9 @@ def send(**message):
 
 
 def receive():
-    """Wait for the answer of msspl-render."""
-    line = sys.stdin.readline()
-    if not line:
+    """Wait until msspl-render has fused the frame."""
+    if not sys.stdin.readline():
         raise Failure("the frame was not fused", 1)
-    return json.loads(line)
 
 
 def leave(code):

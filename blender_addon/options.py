@@ -23,6 +23,8 @@ class Options:
     """Empty: the only one that is enabled."""
     components: bool = False
     """Render all component passes, which together are the beauty, besides the passes that the scene has on."""
+    vectors: bool = False
+    """Frames are averaged with their neighbours: render motion vectors, and other noise in every frame."""
     threads: int = 0
     """0: Blender uses the number that the scene sets, and fusing uses one thread per core."""
 

@@ -85,7 +85,7 @@ def _common(scene, options):
     image = scene.render.image_settings
     chosen = find_view_layer(scene, options)
     values = {f"{view_layer_path(each)}.use": each == chosen for each in scene.view_layers}
-    passes = list(_PASSES)
+    passes = [*_PASSES, *(["use_pass_vector"] if options.vectors else [])]
     if options.components:
         # Behind a transparent film, Combined has no environment, but the pass Environment would have it.
         passes += [*_COMPONENTS, *([] if scene.render.film_transparent else ["use_pass_environment"])]
@@ -108,6 +108,8 @@ def _common(scene, options):
         "render.use_sequencer": False,
         "render.use_file_extension": True,
     }
+    if options.vectors:  # With one seed, neighbouring frames would share their noise, and no average would remove it.
+        values["cycles.use_animated_seed"] = True
     if options.filter == "BOX":
         values["cycles.pixel_filter_type"] = "BOX"
     if options.threads:

@@ -53,7 +53,7 @@ def render_frames(
     job: dict[str, Any],
     folder: Path,
     on_event: Callable[[dict[str, Any]], None],
-    fuse: Callable[[Path, Path, Path], list[str]],
+    fuse: Callable[[Path, Path], None],
     *,
     verbose: bool = False,
 ) -> None:
@@ -63,21 +63,27 @@ def render_frames(
         program: Blender, or a Python that has bpy.
         scene: a .blend.
         job: what headless.py reads: frames and settings.
-        folder: of the results. Temporary files lie in it, so that a render that is kept is only renamed.
+        folder: of the results. The renders lie in it, so that one that is kept is only renamed.
         on_event: called with each event: a step that begins, the share of samples that is done, or the report of a
             frame that ended.
-        fuse: called with the files of the LRHS, of the HRLS and of the result; returns warnings.
+        fuse: called with the files of the LRHS and of the HRLS of each frame. Its errors name the frame.
         verbose: print what Blender prints.
 
     Raises:
         InputError, MssplError: a frame failed. The message names it if the job has several.
     """
-    count, reports, number = len(job["frames"]), 0, None
+    count, reports, number = sum(output is not None for _, output in job["frames"]), 0, None
+
+    def fuse_next(lr: Path, hr: Path) -> None:
+        nonlocal number
+        number = None
+        fuse(lr, hr)
+
     with tempfile.TemporaryDirectory(prefix=".msspl-", dir=folder.absolute()) as work:
         path = Path(work, "job.json")
         path.write_text(json.dumps({**job, "work": work}), encoding="utf-8")
         try:
-            for event in run_blender(command(program, scene, path), fuse, verbose=verbose):
+            for event in run_blender(command(program, scene, path), fuse_next, verbose=verbose):
                 number = event.get("frame", number)
                 if "report" in event:
                     reports += 1
@@ -100,7 +106,7 @@ def command(program: str, scene: Path, job: Path) -> list[str]:
 
 
 def run_blender(
-    arguments: Sequence[str], fuse: Callable[[Path, Path, Path], list[str]], *, verbose: bool = False
+    arguments: Sequence[str], fuse: Callable[[Path, Path], None], *, verbose: bool = False
 ) -> Iterator[dict[str, Any]]:
     """Run the add-on's headless.py. Leaving the loop ends Blender and every process that it started.
 
@@ -144,13 +150,13 @@ def run_blender(
                         error = event
                     elif "fuse" in event:
                         try:
-                            warnings = fuse(*(Path(event["fuse"][key]) for key in ("lrhs", "hrls", "output")))
+                            fuse(*(Path(event["fuse"][key]) for key in ("lrhs", "hrls")))
                         except Exception as raised:
                             failure = raised
                             process.stdin.close()  # Blender ends by itself
                         else:
                             with contextlib.suppress(BrokenPipeError):  # Blender has ended; its exit code says why
-                                print(json.dumps({"warnings": warnings}), file=process.stdin, flush=True)
+                                print("fused", file=process.stdin, flush=True)
                     else:
                         yield event
                     continue

@@ -152,6 +152,14 @@ Sum = Annotated[
 ]
 
 
+MaxMemory = Annotated[
+    str,
+    typer.Option(
+        metavar="SIZE",
+        help="Memory to stay below; the result does not depend on it.",
+        rich_help_panel=MODEL,
+    ),
+]
 Temporal = Annotated[
     str,
     typer.Option(

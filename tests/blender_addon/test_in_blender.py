@@ -211,6 +211,61 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
     assert means == pytest.approx([means[2]] * 3, rel=0.05)
 
 
+def test_msspl_render_averages_frames_along_the_vectors_that_cycles_writes(python, results, tmp_path):
+    """Vectors are those of a render without persistent data, and frames gain from them. A resumed run gives the same
+    frames."""
+    options = ["--blender", python, "-s", "2", "--hr-spp", "4", "--model", "pyramid", "--layout", "spec", "--frames"]
+    for name, more in (("alone", []), ("whole", ["--temporal", "1", "--keep"])):
+        out = tmp_path / name / "out.####.exr"
+        done = msspl_render(results / "motion.blend", *options, "1-4", *more, "-o", out)
+        assert done.returncode == 0, done.stderr
+    assert "Fused with 1 frame before and after each" in done.stdout
+    assert len(list((tmp_path / "whole").iterdir())) == 12
+    for number in (2, 3):
+        kept, sharp = (
+            layer(path, "ViewLayer.Vector.", "XYZW")
+            for path in (tmp_path / f"whole/out.{number:04d}_hr.exr", results / f"sharp.{number:04d}.exr")
+        )
+        assert np.median(np.abs(kept - sharp)) < 0.05
+        assert np.median(np.abs(sharp)) > 0.5
+
+    whole = {number: beauty(tmp_path / f"whole/out.{number:04d}.exr") for number in (2, 3)}
+    errors = np.zeros(2)
+    for number, averaged in whole.items():
+        alone, truth = beauty(tmp_path / f"alone/out.{number:04d}.exr"), beauty(results / f"clean.{number:04d}.exr")
+        errors += [np.square(np.log((each + 0.01) / (truth + 0.01))).mean() for each in (alone, averaged)]
+    assert errors[1] < 0.98 * errors[0]
+    for path in (tmp_path / "whole").glob("out.0002*.exr"):
+        path.unlink()
+    more = ["--temporal", "1", "--skip-existing", "-o", tmp_path / "whole/out.####.exr"]
+    done = msspl_render(results / "motion.blend", *options, "1-4", *more)
+    assert done.returncode == 0, done.stderr
+    np.testing.assert_allclose(beauty(tmp_path / "whole/out.0002.exr"), whole[2], rtol=1e-3)
+
+    frames = ["1-2", "-o", tmp_path / "blurred.####.exr"]
+    done = msspl_render(results / "motion_blur.blend", *options, *frames, "--temporal", "2")
+    assert done.returncode == 2
+    assert done.stderr.startswith("error: --temporal 2: motion blur is on, and Cycles then writes no motion vectors")
+    done = msspl_render(results / "motion_blur.blend", *options, *frames, "--temporal", "auto")
+    assert done.returncode == 0, done.stderr
+    assert "Fused frame by frame: motion blur is on" in done.stdout
+
+
+def beauty(path):
+    return map_render(open_exr(path), features=()).load().layers["rgb"]
+
+
+def test_neighbouring_frames_have_different_noise_if_they_are_averaged(python, results, tmp_path):
+    """The scene stands still."""
+    options = ["--blender", python, "-s", "2", "--hr-spp", "4", "--model", "pyramid", "--view-layer", "ViewLayer"]
+    for temporal in ("off", "1"):
+        more = ["--temporal", temporal, "--keep", "--frames", "1-2", "-o", tmp_path / f"{temporal}.#.exr"]
+        done = msspl_render(results / "scene.blend", *options, *more)
+        assert done.returncode == 0, done.stderr
+        one, other = (layer(tmp_path / f"{temporal}.{n}_hr.exr", "ViewLayer.Combined.", "RGB") for n in (1, 2))
+        assert (one == other).all() == (temporal == "off")
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [

@@ -18,7 +18,10 @@ from msspl_cli.installed import shipped_folder
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
-from tests.conftest import EXAMPLES
+from oiio_msspl.jobs.shot import fuse_shot
+from oiio_msspl.jobs.temporal import TemporalOptions
+from tests.conftest import EXAMPLES, read_bits
+from tests.jobs.test_temporal import make_moving_shot
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
 
@@ -65,11 +68,12 @@ def test_frames_and_names_belong_together():
 
 #: Stands in for Blender: does as headless.py would, without rendering.
 FAKE = """
-import json, sys, os, time
+import json, shutil, sys, os, time
 from pathlib import Path
 job = json.loads(Path(sys.argv[-1]).read_text())
 def tell(**what): print("MSSPL", json.dumps(what), flush=True)
 print("Blender 5.0.1 (hash unknown)")
+if "NO_VECTORS" in os.environ: tell(no_vectors=os.environ["NO_VECTORS"])
 for number, output in job["frames"]:
     tell(frame=number, step="LRHS 16x9, 16 spp", fraction=0.0)
     print("Fra:1 Mem:8M | Sample 1/2", flush=True)
@@ -97,7 +101,7 @@ def farm(tmp_path):
     def run(*arguments, code="pass"):
         with start(*arguments, code=code) as process:
             out, err = process.communicate()
-        left = sorted(p.name for p in tmp_path.iterdir() if p.name not in ("blender", "scene.blend"))
+        left = sorted(p.name for p in tmp_path.iterdir() if p.name not in ("blender", "scene.blend", "log"))
         return process.returncode, out, err, left
 
     return start, run, tmp_path
@@ -116,21 +120,29 @@ def test_options_reach_blender_and_times_are_printed(farm):
     assert Path(argv[3]).is_file()
     assert job["options"] == {
         **{"scale": 8, "hr_spp": 2, "lr_spp": 0, "filter": "SCENE", "view_layer": "", "threads": 3},
-        "components": True,
+        **{"components": True, "vectors": False},
     }
     assert job["frames"] == [[7, str(folder / "out.exr")]]
 
 
-#: In place of rendering: has the example pair fused, then spoils the model's file.
-ASKS = (
-    f"tell(fuse=dict(lrhs={str(EXAMPLES / 'lr.exr')!r}, hrls=os.environ.get('HR', {str(EXAMPLES / 'hr.exr')!r}), "
-    "output=output)); "
-    "answer = json.loads(sys.stdin.readline() or sys.exit(1)); "
-    "Path(os.environ['MODEL']).write_text('spoilt'); "
-    "take = dict(name='LRHS', size=[16, 9], spp=16, seconds=1.0, file=None); "
-    "tell(report=dict(frame=number, output=output, lrhs=take, hrls=take, fuse_seconds=0.5, seconds=2.5, "
-    "plain_spp=2.25, warnings=answer['warnings'])); continue"
-)
+#: In place of rendering: has copies of a pair fused, then spoils the model's file.
+ASKS = f"""
+    work = Path(job["work"])
+    log = open(Path(job["scene"]).with_name("log"), "a")
+    print(number, len(list(work.glob("*.exr"))), file=log, flush=True)
+    pair = [work / f"{{each}}.{{number}}.exr" for each in ("lr", "hr")]
+    for path, name in zip(pair, ("LR", "HR")):
+        shown = os.environ.get(name, {str(EXAMPLES)!r} + f"/{{name.lower()}}.exr")
+        if Path(shown.format(number)).exists(): shutil.copy(shown.format(number), path)
+    tell(fuse=dict(lrhs=str(pair[0]), hrls=str(pair[1])))
+    sys.stdin.readline() or sys.exit(1)
+    Path(os.environ["MODEL"]).write_text("spoilt")
+    def take(name): return dict(name=name, size=[16, 9], spp=16, seconds=1.0, file="")
+    if output:
+        tell(report=dict(frame=number, output=output, lrhs=take("LRHS"), hrls=take("HRLS"), fuse_seconds=0.5,
+                         seconds=2.5, plain_spp=2.25, warnings=[]))
+    continue
+"""
 
 
 @pytest.fixture
@@ -139,6 +151,7 @@ def model(bilinear_models, tmp_path, monkeypatch):
     path = tmp_path.parent / f"{tmp_path.name}.onnx"
     shutil.copy(bilinear_models[4], path)
     monkeypatch.setenv("MODEL", str(path))
+    monkeypatch.setenv("ORIGINAL", str(bilinear_models[4]))
     return str(path)
 
 
@@ -161,7 +174,85 @@ def test_a_frame_that_cannot_be_fused_ends_the_shot_with_its_sentence(farm, mode
     monkeypatch.setenv("HR", "/nothing/hr.exr")
     _, run, _ = farm
     code, _, err, left = run("-o", "out.##.exr", "--frames", "1-2", "--model", model, code=ASKS)
-    assert (code, err, left) == (2, "error: frame 1: /nothing/hr.exr: no such file\n", [])
+    assert (code, left) == (2, [])
+    assert re.fullmatch(r"error: frame 1: \S+/hr\.1\.exr: no such file\n", err), err
+
+
+@pytest.fixture(scope="module")
+def moving(tmp_path_factory, bilinear_models):
+    """A shot with motion vectors, fused by fuse_shot frame by frame and with neighbours: alone/ and whole/."""
+    folder = make_moving_shot(tmp_path_factory.mktemp("moving"), count=7)
+    for name, temporal in (("alone", "off"), ("whole", "auto")):
+        options = {"model": str(bilinear_models[4]), "temporal": TemporalOptions(temporal)}
+        assert fuse_shot(folder / "lr", folder / "hr", folder / name, **options).exit_code == 0
+    return folder
+
+
+def pixels(folder):
+    """{name: stored values} of the EXRs of a folder."""
+    bits = {path.name: read_bits(path) for path in folder.glob("*.exr")}
+    return {
+        name: [(part, {channel: values.tobytes() for channel, values in channels.items()}) for part, channels in parts]
+        for name, parts in bits.items()
+    }
+
+
+@posix
+def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model, moving, monkeypatch):
+    """The frames are those of fuse_shot on the same files. At most four pairs are on the disk, and a frame that is
+    rendered again for a resumed shot is not written."""
+    for name in ("LR", "HR"):
+        monkeypatch.setenv(name, f"{moving}/{name.lower()}/{name.lower()}.{{}}.exr")
+    _, run, folder = farm
+    options = ["--model", model, "--layout", "spec", "--temporal", "auto"]
+    shot = ["-o", "out/hr.####.exr", "--frames", "1001-1007", *options]
+    code, out, err, _ = run(*shot, "--json", code=ASKS)
+    assert (code, err) == (0, "")
+    assert [report["frame"] for report in json.loads(out)] == list(range(1001, 1008))
+    assert pixels(folder / "out") == pixels(moving / "whole") != pixels(moving / "alone")
+    rendered = [tuple(map(int, line.split())) for line in (folder / "log").read_text().splitlines()]
+    assert [number for number, _ in rendered] == list(range(1001, 1008))
+    assert max(files for _, files in rendered) == 8
+
+    (folder / "log").unlink()
+    for number in (1001, 1002):
+        (folder / f"out/hr.{number}.exr").unlink()
+    shutil.copy(moving / "hr/hr.1003.exr", folder / "out/hr.1003.exr")
+    shutil.copy(os.environ["ORIGINAL"], model)
+    code, out, err, _ = run(*shot, "--skip-existing", code=ASKS)
+    assert (code, err) == (0, "")
+    assert "Fused with 2 frames before and after each, along the motion vectors of Cycles" in out
+    assert [line.split()[0] for line in (folder / "log").read_text().splitlines()] == ["1001", "1002", "1003", "1004"]
+    written = pixels(folder / "out")
+    assert written.pop("hr.1003.exr") == pixels(moving / "hr")["hr.1003.exr"]
+    assert written.items() < pixels(moving / "whole").items()
+
+
+@posix
+def test_without_vectors_frames_are_fused_one_by_one(farm, model, moving, monkeypatch):
+    for name in ("LR", "HR"):
+        monkeypatch.setenv(name, f"{moving}/{name.lower()}/{name.lower()}.{{}}.exr")
+    _, run, folder = farm
+    shot = ["-o", "hr.####.exr", "--frames", "1003-1005", "--model", model, "--layout", "spec"]
+    monkeypatch.setenv("NO_VECTORS", "motion blur is on")
+    code, out, err, _ = run(*shot, "--temporal", "auto", code=ASKS)
+    assert (code, err) == (0, "")
+    assert "Fused frame by frame: motion blur is on\n" in out
+    assert len(pixels(folder)) == 3
+    assert pixels(folder).items() < pixels(moving / "alone").items()
+    shutil.copy(os.environ["ORIGINAL"], model)
+    code, _, err, _ = run(*shot, "--temporal", "2", "--overwrite", code=ASKS)
+    assert (code, err) == (2, "error: --temporal 2: motion blur is on\n")
+
+
+@posix
+def test_renders_are_kept_beside_each_frame(farm, model):
+    _, run, folder = farm
+    code, out, err, left = run("-o", "out.##.exr", "--frames", "1-2", "--model", model, "--keep", "--json", code=ASKS)
+    assert (code, err) == (0, "")
+    assert left == [f"out.0{number}{suffix}.exr" for number in (1, 2) for suffix in ("", "_hr", "_lr")]
+    assert (folder / "out.01_lr.exr").read_bytes() == (EXAMPLES / "lr.exr").read_bytes()
+    assert json.loads(out)[1]["hrls"]["file"] == str(folder / "out.02_hr.exr")
 
 
 @posix
@@ -192,6 +283,9 @@ def test_a_shot_and_a_report_for_machines(farm):
         (["--device", "abacus"], "", 2, "--device 'abacus': use one of cpu"),
         (["--layout", "x"], "", 2, "--layout 'x': use one of spec"),
         (["--model", "paper", "--error-layer"], "", 2, "paper-x4 does not predict its error"),
+        (["--temporal", "x"], "", 2, "--temporal x: give auto, off"),
+        (["--temporal", "2"], "", 2, "--temporal 2: no two frames follow each other"),
+        (["-o", "x.#.exr", "--frames", "1-9x2", "--temporal", "1"], "", 2, "--temporal 1: no two frames follow"),
     ],
 )
 def test_what_goes_wrong_is_one_sentence_and_a_code(farm, arguments, code, status, message):

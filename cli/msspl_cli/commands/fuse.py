@@ -79,14 +79,7 @@ def fuse(
     # Model
     model: options.Model = "auto",
     device: options.Device = "cpu",
-    max_memory: Annotated[
-        str,
-        typer.Option(
-            metavar="SIZE",
-            help="Memory to stay below; the result does not depend on it.",
-            rich_help_panel=options.MODEL,
-        ),
-    ] = "3G",
+    max_memory: options.MaxMemory = "3G",
     threads: Annotated[
         int,
         typer.Option(

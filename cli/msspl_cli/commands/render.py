@@ -4,8 +4,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,13 +15,17 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
 
 if TYPE_CHECKING:
+    from msspl_cli.rendered_shot import RenderedShot
     from oiio_msspl.exr.write_options import WriteOptions
+    from oiio_msspl.jobs.temporal import TemporalOptions
 
 EXAMPLES = """[bold]Examples[/bold]
 
   msspl-render scene.blend -s 4 --lr-spp 16 --hr-spp 1 -o frame.exr
 
   msspl-render scene.blend -o shot/frame.####.exr --frames 1001-1100 --skip-existing
+
+  msspl-render scene.blend -o shot/frame.####.exr --frames 1001-1100 --temporal auto
 
   msspl-render scene.blend -o frame.exr --blender /opt/blender-5.0/blender
 
@@ -115,6 +117,7 @@ def render(
     # Model
     model: options.Model = "auto",
     device: options.Device = "cpu",
+    max_memory: options.MaxMemory = "3G",
     # Output
     output: Annotated[
         Path,
@@ -160,6 +163,7 @@ def render(
             rich_help_panel=options.SHOT,
         ),
     ] = None,
+    temporal: options.Temporal = "off",
     skip_existing: options.SkipExisting = False,
     verbose: options.Verbose = 0,
     quiet: options.Quiet = False,
@@ -173,6 +177,7 @@ def render(
     """
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
+    from msspl_cli.rendered_shot import beside
     from oiio_msspl.model.contract import SCALES
 
     if scale not in SCALES:
@@ -182,7 +187,9 @@ def render(
     program = find_blender(blender)
     if overwrite and skip_existing:
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
-    targets = name_targets(output, frames)
+    over_time = options.make_temporal_options(temporal, None)
+    memory = options.parse_bytes(max_memory)
+    shot = targets = name_targets(output, frames)
     folder = output.parent
     makes_folder = is_pattern(output) and not folder.exists()
     if makes_folder:
@@ -197,9 +204,16 @@ def render(
         for suffix in suffixes:
             check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
     check_separate([scene], [target for _, target in targets])
+    write = options.make_write_options(layout, None, None, [], error_layer, passes)
+    wanted = {target.absolute() for _, target in targets}
+    fuser = _make_fuser(shot, wanted, scale, model, device, threads, memory, write, overwrite, over_time, keep)
     job = {
         "scene": str(scene.absolute()),
-        "frames": [(number, str(target.absolute())) for number, target in targets],
+        # A neighbour of a frame has no result. Without a range, there is one frame: that at which the scene was saved.
+        "frames": [
+            (None if frames is None else frame.number, str(frame.output) if frame.output in wanted else None)
+            for frame in fuser.order
+        ],
         "options": {
             "scale": scale,
             "hr_spp": hr_spp,
@@ -207,27 +221,38 @@ def render(
             "filter": pixel_filter.upper(),
             "view_layer": view_layer,
             "components": components,
+            "vectors": fuser.averages,
             "threads": threads,
         },
         "overwrite": overwrite,
-        "keep": keep,
         "compare": compare,
     }
-    write = options.make_write_options(layout, None, None, [], error_layer, passes)
-    fuse = _fuser(scale, model, device, threads, write, overwrite)
     if makes_folder:
         folder.mkdir(exist_ok=True)
     reports: list[dict[str, Any]] = []
+    waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
     bar = console.ProgressBar(shown=not quiet and not verbose)
     label = ""
 
+    def finish() -> None:
+        """Report the frames that are written."""
+        while waiting and not fuser.waits(result := Path(waiting[0]["output"])):
+            report = waiting.pop(0)
+            report["warnings"] += fuser.warnings(result)
+            for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
+                report[render]["file"] = str(beside(result, suffix)) if keep else None
+            reports.append(report)
+            bar.hide()
+            for warning in [] if quiet else report["warnings"]:
+                console.say(f"warning: frame {report['frame']}: {warning}", error=True)
+
     def show(event: dict[str, Any]) -> None:
         nonlocal label
+        if "no_vectors" in event:
+            fuser.fuse_alone(event["no_vectors"])
         if "report" in event:
-            reports.append(event["report"])
-            bar.hide()
-            for warning in [] if quiet else event["report"]["warnings"]:
-                console.say(f"warning: frame {event['report']['frame']}: {warning}", error=True)
+            waiting.append(event["report"])
+            finish()
             return
         if "step" in event:
             number = event.get("frame")
@@ -236,50 +261,60 @@ def render(
 
     try:
         if targets:
-            render_frames(program, scene, job, folder, show, fuse, verbose=bool(verbose))
+            render_frames(program, scene, job, folder, show, fuser.fuse, verbose=bool(verbose))
     finally:
+        finish()
         # Frames that ended are reported even if a later one failed.
         bar.hide()
         if as_json:
             print(json.dumps(reports, indent=2))
         elif reports and not quiet:
             _print(reports)
+            if fuser.text:
+                print(f"Fused {fuser.text}")
     if not (targets or as_json or quiet):
         print(f"{output}: every frame exists")
 
 
-def _fuser(
-    scale: int, model: str, device: str, threads: int, write: WriteOptions, overwrite: bool
-) -> Callable[[Path, Path, Path], list[str]]:
-    """What fuses the frames: a function of LRHS, HRLS and result that returns warnings. Its model is loaded once.
+def _make_fuser(
+    shot: list[tuple[int | None, Path]],
+    wanted: set[Path],
+    scale: int,
+    model: str,
+    device: str,
+    threads: int,
+    max_memory: int,
+    write: WriteOptions,
+    overwrite: bool,
+    temporal: TemporalOptions,
+    keep: bool,
+) -> RenderedShot:
+    """What fuses the frames. Its model is loaded once.
 
     Raises:
-        InputError: the model or the device can't be used. No frame was rendered for nothing.
+        InputError: the model, the device or the neighbours can't be had. No frame was rendered for nothing.
     """
-    from oiio_msspl.jobs.inputs import map_pair, resolve_auto
+    from msspl_cli.rendered_shot import RenderedShot
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
-    from oiio_msspl.model.catalogue import AUTO, find_model
+    from oiio_msspl.model.catalogue import find_model
     from oiio_msspl.model.session import Session
-    from oiio_msspl.parallel import limit_threads
 
     path = find_model(scale, model)
     session = Session(path, device, threads)
     if write.error_layer:
         session.require_error()
-    sessions = {path: session}
     stages = Stages(
-        write_options=write, model=model, device=device, threads=threads, overwrite=overwrite, sessions=sessions
+        write_options=write,
+        model=model,
+        device=device,
+        threads=threads,
+        max_memory=max_memory,
+        overwrite=overwrite,
+        sessions={path: session},
     )
-
-    def fuse(lr: Path, hr: Path, output: Path) -> list[str]:
-        nonlocal stages
-        with limit_threads(threads):
-            if stages.model == AUTO:  # all frames get the model that suits the first pair
-                stages = replace(stages, model=resolve_auto(*map_pair(lr, hr, stages.inputs), AUTO))
-            return stages.run(Frame(0, lr, hr, output)).warnings
-
-    return fuse
+    frames = [Frame(number or 0, None, None, target.absolute()) for number, target in shot]
+    return RenderedShot(stages, frames, [each for each in frames if each.output in wanted], temporal, keep=keep)
 
 
 def is_pattern(output: Path) -> bool:

@@ -16,6 +16,9 @@ def render_motion():
     bpy.ops.mesh.primitive_cube_add(size=1)
     cube = bpy.context.object
     cube.data.materials.append(_texture(6))
+    sun = bpy.data.objects.new("Sun", bpy.data.lights.new("Sun", "SUN"))
+    sun.data.energy, sun.data.angle, sun.rotation_euler = 3, 1.5, (0.7, 0.3, 0)
+    scene.collection.objects.link(sun)
     camera = bpy.data.objects.new("Camera", bpy.data.cameras.new("Camera"))
     scene.collection.objects.link(camera)
     scene.camera = camera
@@ -33,12 +36,21 @@ def render_motion():
     if BLENDER_5:
         image.media_type = "MULTI_LAYER_IMAGE"
     image.file_format, image.color_depth = "OPEN_EXR_MULTILAYER", "32"
+    bpy.ops.wm.save_as_mainfile(filepath=str(WORK / "motion.blend"))
     for name, render.use_motion_blur in (("sharp", False), ("blurred", True)):
         for frame in (2, 3):
             scene.frame_set(frame)
             scene.cycles.seed = frame
             render.filepath = str(WORK / f"{name}.{frame:04d}.exr")
             bpy.ops.render.render(write_still=True)
+    render.use_motion_blur = False
+    scene.cycles.samples, scene.cycles.pixel_filter_type = 512, "BOX"  # as msspl-render sets it
+    for frame in (2, 3):
+        scene.frame_set(frame)
+        render.filepath = str(WORK / f"clean.{frame:04d}.exr")
+        bpy.ops.render.render(write_still=True)
+    render.use_motion_blur = True
+    bpy.ops.wm.save_as_mainfile(filepath=str(WORK / "motion_blur.blend"))
 
 
 def _texture(scale):

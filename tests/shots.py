@@ -5,7 +5,7 @@ import re
 
 import numpy as np
 
-from tests.conftest import downsample, noisy, picture, rgb, write_exr
+from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 
 HEIGHT, WIDTH = 32, 48
 
@@ -34,3 +34,11 @@ def make_shot(folder, count, lr="lr", hr="hr", first=1001):
 def contents(folder):
     """{name: bytes}, without the date that OpenImageIO gives a file whose source has none."""
     return {path.name: re.sub(rb"\d{4}(:\d\d){2} \d\d(:\d\d){2}", b"", path.read_bytes()) for path in folder.iterdir()}
+
+
+def pixels(folder):
+    """{name: stored values} of the EXRs of a folder, for results whose inputs have other paths."""
+    return {
+        path.name: [(part, {name: x.tobytes() for name, x in channels.items()}) for part, channels in read_bits(path)]
+        for path in folder.glob("*.exr")
+    }

@@ -20,8 +20,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs.shot import fuse_shot
 from oiio_msspl.jobs.temporal import TemporalOptions
-from tests.conftest import EXAMPLES, read_bits
+from tests.conftest import EXAMPLES
 from tests.jobs.test_temporal import make_moving_shot
+from tests.shots import pixels
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
 
@@ -186,15 +187,6 @@ def moving(tmp_path_factory, bilinear_models):
         options = {"model": str(bilinear_models[4]), "temporal": TemporalOptions(temporal)}
         assert fuse_shot(folder / "lr", folder / "hr", folder / name, **options).exit_code == 0
     return folder
-
-
-def pixels(folder):
-    """{name: stored values} of the EXRs of a folder."""
-    bits = {path.name: read_bits(path) for path in folder.glob("*.exr")}
-    return {
-        name: [(part, {channel: values.tobytes() for channel, values in channels.items()}) for part, channels in parts]
-        for name, parts in bits.items()
-    }
 
 
 @posix

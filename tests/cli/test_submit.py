@@ -21,6 +21,7 @@ from tests.shots import make_shot
         (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
         (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
         (["lr", "hr", "-o", "text.onnx/out"], "the folder text.onnx does not exist"),
+        (["lr", "hr", "-o", "out", "--temporal", "9"], "--temporal 9: give auto, off, or a number of frames up to 8"),
         (["lr", "hr", "-o", "out", "--layers", "{{a}}"], "for the start of a parameter"),
         (["lr", "hr", "-o", "out", "--frames", "5-7"], "no frame is in both"),
         (["lr/lr.1001.exr", "hr/beauty.1001.exr", "-o", "out.exr"], "a job is for a shot"),
@@ -49,3 +50,13 @@ def test_a_shipped_model_goes_by_its_name_and_is_the_same_for_all_tasks(tmp_path
     assert run("msspl", "submit", *paths, *given).returncode == 0
     action = json.loads((tmp_path / "job/template.json").read_text())["steps"][0]["script"]["actions"]["onRun"]
     assert action["args"][-2:] == ["--model", model]
+
+
+def test_every_task_gets_the_options_of_neighbouring_frames(tmp_path):
+    make_shot(tmp_path, 1)
+    paths = (tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / "out", "--bundle", tmp_path / "job")
+    given = ["--temporal", "3", "--motion-format", "layer=v,to=previous,x=left"]
+    assert run("msspl", "submit", *paths, *given).returncode == 0
+    action = json.loads((tmp_path / "job/template.json").read_text())["steps"][0]["script"]["actions"]["onRun"]
+    pairs = set(zip(action["args"], action["args"][1:], strict=False))
+    assert {("--temporal", "3"), ("--motion-format", "layer=v,to=previous,x=left")} <= pairs

@@ -14,8 +14,9 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import write_exr
+from tests.jobs.test_temporal import make_moving_shot
 from tests.programs import fuse, run
-from tests.shots import contents, layers, make_shot
+from tests.shots import contents, layers, make_shot, pixels
 
 SCRIPTS = sysconfig.get_path("scripts")
 
@@ -91,6 +92,31 @@ def test_openjd_runs_it_and_names_survive(tmp_path, bilinear_models):
     local = fuse(tmp_path / names["lr"], tmp_path / names["hr"], "-o", tmp_path / "local", *frames, *more)
     assert local.returncode == 0, local.stderr
     assert contents(tmp_path / names["out"]) == contents(tmp_path / "local")
+
+
+@pytest.fixture(scope="module")
+def averaged(tmp_path_factory, bilinear_models):
+    """A shot that is averaged with its neighbours in one run: local/."""
+    folder = make_moving_shot(tmp_path_factory.mktemp("averaged"), count=8)
+    options = ("--model", bilinear_models[4], "--no-preview")
+    done = fuse(folder / "lr", folder / "hr", "-o", folder / "local", *options)
+    assert done.returncode == 0, done.stderr
+    assert "Fused with 2 frames before and after each: motion vectors" in done.stdout
+    return folder
+
+
+@pytest.mark.parametrize("chunk", [1, 3, 7])
+def test_tasks_average_frames_with_neighbours_of_other_tasks(averaged, bilinear_models, tmp_path, chunk):
+    """Each task sees the files of the whole shot, so it plans as one run does, and gives the same frames."""
+    for name in ("lr", "hr"):
+        (tmp_path / name).symlink_to(averaged / name)
+    done = submit(tmp_path, "--chunk", chunk, "--model", bilinear_models[4], "--no-preview")
+    assert done.returncode == 0, done.stderr
+    process = openjd(tmp_path)
+    said = process.communicate()[0]
+    assert process.returncode == 0, said
+    assert len(re.findall(r"Frame\(CHUNK\[INT\]\) = ", said)) == -(-8 // chunk)
+    assert pixels(tmp_path / "out") == pixels(averaged / "local")
 
 
 def test_a_bad_frame_fails_its_task_and_the_next_try_does_only_that_one(tmp_path, bilinear_models):

@@ -40,23 +40,23 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
-    """The model of all frames: ``auto`` and None are a family that suits the noise of the first pair.
+    """The model of all frames: ``auto`` and None are a family that suits the noise of the shot's first pair.
 
-    All frames need the same model, also those of other runs and machines. A pair that can't be used is passed over,
-    because the run says so when its turn comes.
+    All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and not
+    of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its turn
+    comes.
     """
     if model not in (None, AUTO):
         return model
-    for frame in shot.frames:
-        if frame.lr and frame.hr:
-            try:
-                lr, hr = map_pair(frame.lr, frame.hr, inputs)
-                family = resolve_auto(lr, hr, model)
-                if family == SPREAD_NOISE_FAMILY:
-                    log.warning("frame %d: %s", frame.number, hr.notes[-1])
-                return family
-            except MssplError as error:
-                log.debug("frame %d: %s", frame.number, error)
+    for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
+        try:
+            lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
+            family = resolve_auto(lr, hr, model)
+            if family == SPREAD_NOISE_FAMILY:
+                log.warning("frame %d: %s", number, hr.notes[-1])
+            return family
+        except MssplError as error:
+            log.debug("frame %d: %s", number, error)
     return DEFAULT_FAMILY
 
 

@@ -142,7 +142,8 @@ def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions) ->
     if source.kind == NONE or (source.kind == FLOW and not asked):
         hint = "; --temporal 2 uses it all the same" if source.kind == FLOW else ""
         return Temporal(text=f"frame by frame: {source.text}{hint}")
-    return Temporal(count, source, frames, f"with {count} frames before and after each: {source.text}")
+    frame_count = "one frame" if count == 1 else f"{count} frames"
+    return Temporal(count, source, frames, f"with {frame_count} before and after each: {source.text}")
 
 
 def _motion_of(

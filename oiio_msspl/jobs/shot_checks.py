@@ -42,9 +42,9 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
     """The model of all frames: ``auto`` and None are a family that suits the noise of the shot's first pair.
 
-    All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and not
-    of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its turn
-    comes.
+    All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and
+    not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
+    turn comes.
     """
     if model not in (None, AUTO):
         return model

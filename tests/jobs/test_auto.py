@@ -40,6 +40,8 @@ def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_pa
     assert [result.status for _, result in sorted(report.results.items())] == ["failed", "skipped", "fused"]
     assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "paper-x4"
     assert "so --model auto takes paper" in caplog.text
+    assert fuse_shot(*pair[:2], tmp_path / "chunk", frames=[3]).exit_code == 0
+    assert open_exr(tmp_path / "chunk/a.0003.exr").metadata["msspl/model"] == "paper-x4"
     monkeypatch.setattr("oiio_msspl.jobs.shot.model_of_shot", lambda *arguments: pytest.fail("reads a pair"))
     assert fuse_shot(*pair, frames=[2, 3], skip_existing=True).results[2].status == "skipped"
     monkeypatch.undo()

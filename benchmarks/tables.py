@@ -21,11 +21,11 @@ from benchmarks import confidence, quality, results, runtime_files, versus
 from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
-from benchmarks.flicker import report as flicker_report
 from benchmarks.results import MEAN, Row
 from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
+from benchmarks.temporal import report as temporal_report
 from oiio_msspl.model.contract import SCALES
 
 ROOT = Path(__file__).parents[1]
@@ -293,9 +293,9 @@ def errors() -> str:
     return confidence.layout(results.read("confidence"))
 
 
-def flicker() -> str:
-    """Flicker of sequences."""
-    return flicker_report.layout(results.read("flicker"))
+def over_time() -> str:
+    """Sequences that are averaged with their neighbours."""
+    return temporal_report.layout(results.read("temporal"))
 
 
 def stability() -> str:
@@ -329,7 +329,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         cycles,
         division,
         errors,
-        flicker,
+        over_time,
         stability,
         pair_checks,
     ),

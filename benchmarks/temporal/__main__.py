@@ -1,0 +1,113 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sequences that are fused frame by frame and with their neighbours, beside OIDN's.
+
+    python -m benchmarks.render.sequences SEQUENCES --scenes SCENES
+    python -m datagen.cycles.sequence SEQUENCES
+    python -m benchmarks.temporal SEQUENCES --table benchmarks/results/temporal.csv
+
+:mod:`benchmarks.temporal.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import results
+from benchmarks.results import Row
+from benchmarks.scenes import beauty
+from benchmarks.temporal.measures import flicker, psnr, relmse, warp_error
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
+from benchmarks.temporal.report import REFERENCE, film, layout, strip, summary
+from benchmarks.temporal.sequence import Sequence, load
+from oiio_msspl import map_render, open_exr
+from oiio_msspl.colour import srgb
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.atomic import check_target
+
+KEYS = ("sequence", "scale", "method")
+#: What is drawn: scale, frames, rows and columns, and the row that is shown over time.
+DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(56, 168), slice(80, 240)), 112
+
+
+def measure(sequence: Sequence, made: list[Made]) -> Iterator[Row]:
+    """A row for each method, and one for the reference."""
+    truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
+    for method in made:
+        images = srgb(method.images)
+        by_frame = [psnr(image, halves) for image, *halves in zip(images, *truth, strict=True)]
+        row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
+        row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
+        row |= {"relmse": relmse(method.images, sequence.truth), **flicker(images, truth)}
+        row["ewarp"] = warp_error(images, images, sequence.vectors, sequence.seen)
+        row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
+        yield row | {"motion": method.motion}
+    shares = {f"{name}_share": float(mask.mean()) for name, mask in sequence.masks.items()}
+    error = warp_error(*truth, sequence.vectors, sequence.seen)
+    yield {"sequence": sequence.name, "scale": 1, "method": REFERENCE, "ewarp": error} | shares
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="the sequences")
+    parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
+    parser.add_argument("--model", default="joint")
+    parser.add_argument("--picture", type=Path, help="draw a PNG")
+    parser.add_argument("--film", type=Path, help="draw an animated PNG")
+    results.add_option(parser)
+    args = parser.parse_args()
+    try:
+        run(args)
+    except MssplError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure sequences. Their rows replace those of the same sequences in the table.
+
+    Raises:
+        InputError: there are none, one is not complete, or a picture can't be written.
+    """
+    for path in (args.picture, args.film):
+        if path:
+            check_target(path, overwrite=True)
+    names = args.sequence or sorted(
+        f"{p.parent.parent.name}/{p.parent.name}" for p in args.folder.glob("*/*/hr.0001.exr")
+    )
+    if not names:
+        raise InputError(f"{args.folder}: holds no sequences; make them with python -m benchmarks.render.sequences")
+    rows: list[Row] = []
+    for index, name in enumerate(names):
+        sequence = load(args.folder / name)
+        made = list(all_methods(sequence, args.model))
+        of_sequence = list(measure(sequence, made))
+        print(layout(of_sequence), flush=True)
+        rows += of_sequence
+        if args.table:
+            results.merge(args.table, of_sequence, KEYS)
+        if index == 0 and (args.picture or args.film):
+            draw(args, sequence, made)
+    print(summary(rows))
+
+
+def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None:
+    """Draw a sequence."""
+    found = {each.method: each.images for each in made if each.scale in (1, DRAWN_SCALE)}
+    hrls = np.stack([beauty(map_render(open_exr(sequence.folder / f"hr.{n:04d}.exr"))) for n in sequence.numbers])
+    truth = (sequence.truth[0] + sequence.truth[1]) / 2
+    titles = {"HRLS": hrls, ALONE: found[ALONE], NEIGHBOURS: found[NEIGHBOURS], OIDN_BEST: found[OIDN_BEST]}
+    shown = {title: srgb(images) for title, images in (titles | {REFERENCE: truth}).items()}
+    if args.picture:
+        strip(args.picture, shown, FRAMES, CROP, ROW)
+    if args.film:
+        film(args.film, shown, CROP)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lays out the table of sequences and what it shows, and draws one of them."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence as Rows
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks import results
+from benchmarks.results import Row
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, SCALES
+from benchmarks.temporal.sequence import MASKS
+from oiio_msspl.arrays import Array
+from oiio_msspl.exr.atomic import replacing
+
+#: In the column ``method``: the reference itself.
+REFERENCE = "reference"
+#: Sequences by which the method was chosen. It was not changed after a look at the others.
+DEVELOPMENT = ("lamp/moving", "lamp/static", "room/slide", "room/shadow", "room/mirror")
+#: Sequences whose camera moves.
+MOVING_CAMERA = ("lamp/moving", "staircase2/moving", "room/mirror", "room/foliage", "room/dolly", "cycles/slide")
+STATIC_CAMERA = ("lamp/static", "staircase2/static")
+#: What averaging is to gain over single frames and over OIDN at its best, in dB, with a moving camera and where nothing
+#: moves.
+GAIN, PEER_GAIN, STATIC_GAIN = 1.3, 0.8, 2.5
+#: Largest share of single frames' and OIDN's flicker, and largest loss inside a mask, in dB.
+FLICKER, LOSS = 0.7, 0.1
+
+
+def layout(rows: Rows[Row]) -> str:
+    """What averaging gains, and all measures of all methods."""
+    return f"{summary(rows)}\n{details(rows)}"
+
+
+def summary(rows: Rows[Row]) -> str:
+    """Gains of averaging by sequence, and in how many it reaches what is wanted."""
+    found = results.index(rows, "sequence", "scale", "method")
+    peers = results.index((row for row in rows if row["method"] == OIDN_BEST), "sequence")
+    body, missed = [], []
+    compared = [row for row in rows if row["method"] == NEIGHBOURS]
+    for row in compared:
+        alone, peer = found[row["sequence"], row["scale"], ALONE], peers[row["sequence"]]
+        gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
+        steadier = [row["flicker"] / other["flicker"] for other in (alone, peer)]
+        masks = {name: row[name] - alone[name] for name in MASKS if name in row}
+        worst = min(masks, key=lambda name: masks[name])
+        body.append([
+            row["sequence"], _role(row["sequence"]), f"x{row['scale']}", f"{gain:+.2f}", f"{over_peer:+.2f}",
+            *(f"{ratio:.2f}" for ratio in steadier), f"{masks[worst]:+.2f} ({worst})",
+        ])  # fmt: skip
+        missed += [f"{row['sequence']} x{row['scale']}: {text}" for text in _missed(row, alone, peer, masks[worst])]
+    head = ["sequence", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
+    head += ["flicker, of single frames'", "of OIDN's", "least gain in a mask, dB"]
+    lines = [results.markdown(head, body)]
+    for scale in SCALES:
+        rows_of = [row for row in compared if row["scale"] == scale]
+        if not rows_of:
+            continue
+        gains = [row["psnr"] - found[row["sequence"], scale, ALONE]["psnr"] for row in rows_of]
+        over = [row["psnr"] - peers[row["sequence"]]["psnr"] for row in rows_of]
+        lines.append(
+            f"- x{scale}, {len(rows_of)} sequences: {np.mean(gains):+.2f} dB over single frames (better on "
+            f"{sum(gain > 0 for gain in gains)}), {np.mean(over):+.2f} dB over prefiltered OIDN (better on "
+            f"{sum(gain > 0 for gain in over)})."
+        )
+    lines.append(f"- Targets missed: {'; '.join(missed) or 'none'}.\n")
+    return "\n".join(lines)
+
+
+def _role(sequence: str) -> str:
+    return "chosen by" if sequence in DEVELOPMENT else "fresh"
+
+
+def _missed(row: Row, alone: Row, peer: Row, worst: float) -> list[str]:
+    """Which targets a sequence misses."""
+    gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
+    name, missed = row["sequence"], []
+    least = GAIN if name in MOVING_CAMERA else STATIC_GAIN if name in STATIC_CAMERA else 0.0
+    if gain < least:
+        missed.append(f"{gain:+.2f} dB over single frames, not {least:+.1f}")
+    if name in MOVING_CAMERA:
+        if over_peer < PEER_GAIN:
+            missed.append(f"{over_peer:+.2f} dB over OIDN, not {PEER_GAIN:+.1f}")
+        shares = [row["flicker"] / other["flicker"] for other in (alone, peer)]
+        if max(shares) > FLICKER:
+            missed.append(f"{shares[0]:.2f} of single frames' and {shares[1]:.2f} of OIDN's flicker, not {FLICKER}")
+    if worst < -LOSS:
+        missed.append(f"{worst:+.2f} dB in a mask")
+    return missed
+
+
+def details(rows: Rows[Row]) -> str:
+    """All measures of all methods."""
+    body = [
+        [
+            row["sequence"],
+            f"x{row['scale']}" if row["scale"] > 1 else "",
+            row["method"],
+            *(f"{row[name]:.2f}" if name in row else "" for name in ("psnr", "worst")),
+            _figures(row.get("relmse")),
+            *(f"{255 * row[name]:.2f}" if name in row else "" for name in ("flicker", "blotches")),
+            f"{row['tpsnr']:.2f}" if "tpsnr" in row else "",
+            _figures(row["ewarp"]),
+            *(f"{row[name]:.2f}" if name in row else "" for name in MASKS),
+        ]
+        for row in rows
+    ]
+    head = ["sequence", "scale", "method", "PSNR", "worst frame", "RelMSE", "flicker", "blotches", "tPSNR", "E_warp"]
+    return results.markdown([*head, *MASKS], body)
+
+
+def _figures(value: float | None) -> str:
+    """A small number with three significant digits, without an exponent."""
+    return "" if value is None else np.format_float_positional(value, precision=3, fractional=False, trim="-")
+
+
+def strip(path: Path, shown: dict[str, Array], frames: list[int], crop: tuple[slice, slice], row: int) -> None:
+    """Write a PNG: a detail of some frames, and below it an image row over time.
+
+    Args:
+        shown: title -> sRGB (frames, h, w, 3).
+        frames: indices of the frames.
+        crop: rows and columns of the detail.
+        row: the image row.
+    """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from PIL import Image
+
+    height = (crop[0].stop - crop[0].start) / (crop[1].stop - crop[1].start)
+    ratios = [height] * len(frames) + [0.3]
+    width = 2.2
+    size = (width * len(shown), width * (sum(ratios) + 0.35))
+    figure, grid = plt.subplots(len(ratios), len(shown), figsize=size, height_ratios=ratios, layout="constrained")
+    for column, (title, images) in zip(grid.T, shown.items(), strict=True):
+        column[0].set_title(title, fontsize=9)
+        for axis, frame in zip(column, frames, strict=False):
+            axis.imshow(np.clip(images[frame][crop], 0, 1), interpolation="nearest", aspect="auto")
+        column[-1].imshow(np.clip(images[:, row, crop[1]], 0, 1), interpolation="nearest", aspect="auto")
+    labels = [*(f"frame {frame + 1}" for frame in frames), "row, over time"]
+    for axis, label in zip(grid[:, 0], labels, strict=True):
+        axis.set_ylabel(label, fontsize=8)
+    for axis in grid.flat:
+        axis.set(xticks=[], yticks=[])
+    rendered = io.BytesIO()
+    figure.savefig(rendered, dpi=100)
+    with replacing(path, overwrite=True) as temporary:
+        Image.open(rendered).convert("RGB").quantize(96).save(temporary)  # a palette needs a third of the bytes
+
+
+def film(path: Path, shown: dict[str, Array], crop: tuple[slice, slice]) -> None:
+    """Write an animated PNG of details side by side, which plays forwards and backwards."""
+    from PIL import Image, ImageDraw
+
+    wide = [np.concatenate([np.clip(images[(slice(None), *crop)], 0, 1)], axis=2) for images in shown.values()]
+    frames = []
+    for t in [*range(len(wide[0])), *range(len(wide[0]) - 2, 0, -1)]:
+        joined = np.concatenate([np.pad(each[t], [(12, 0), (0, 2), (0, 0)]) for each in wide], axis=1)
+        picture = Image.fromarray((joined * 255 + 0.5).astype(np.uint8))
+        for i, title in enumerate(shown):
+            ImageDraw.Draw(picture).text((i * (wide[0].shape[2] + 2) + 3, 0), title, fill="white")
+        frames.append(picture.quantize(96))
+    with replacing(path, overwrite=True) as temporary:
+        frames[0].save(temporary, format="PNG", save_all=True, append_images=frames[1:], duration=120, loop=0)

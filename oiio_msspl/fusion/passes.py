@@ -35,9 +35,9 @@ BAND_ROWS = 128
 #: more of them are needed.
 STEPS = {2: (1, 3), 4: (1, 2), 8: (1, 2)}
 #: Pixels that differ by this much have 1/e of the weight in an average: albedo, normal, logarithm of the fused beauty.
-SPREAD = {ALBEDO: 0.3, NORMAL: 0.5, RGB: 1.0}
+SPREAD = {ALBEDO: 0.2, NORMAL: 0.4, RGB: 0.5}
 #: Pixels of the HRLS choose among fits around them with the spread divided by this.
-SHARPER = 2.0
+SHARPER = 1.4
 #: Keeps a fit from following noise: variance that is added to the guide, relative to its mean square.
 RIDGE = 0.03
 #: Variance of the logarithm of the fused beauty that counts as flat where albedo and normal are smoothed.
@@ -234,7 +234,8 @@ class _Band:
         guides += [_smoothed(_planes(features[name]), log) / SPREAD[name] for name in features]
         full = np.concatenate(guides, dtype=np.float32)
         low = _downsampled(full, self._scale)
-        self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
     def fuse(

@@ -10,7 +10,7 @@ proportion to their light, so their sum is the beauty to the last bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -19,7 +19,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, box_downsample, mean_around, planes_of, upsample_linear
+from oiio_msspl.arrays import Array, box_downsample, planes_of, upsample_linear
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -31,14 +31,21 @@ from oiio_msspl.parallel import for_row_blocks
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
-#: A fit spans so many LRHS pixels to each side: at x2 a pixel has fewer samples, so more of them are needed.
-RADIUS = {2: 3, 4: 2, 8: 2}
-#: The coefficients of fits that overlap are averaged over so many LRHS pixels to each side.
-SMOOTHING = 1
-#: Keeps a fit from following noise: variance that is added to each guide, relative to its mean square.
+#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. At x2 a pixel has fewer samples, so
+#: more of them are needed.
+STEPS = {2: (1, 3), 4: (1, 2), 8: (1, 2)}
+#: Pixels that differ by this much have 1/e of the weight in an average: albedo, normal, logarithm of the fused beauty.
+SPREAD = {ALBEDO: 0.2, NORMAL: 0.4, RGB: 0.5}
+#: Pixels of the HRLS choose among fits around them with the spread divided by this.
+SHARPER = 1.4
+#: Keeps a fit from following noise: variance that is added to the guide, relative to its mean square.
 RIDGE = 0.03
+#: Variance of the logarithm of the fused beauty that counts as flat where albedo and normal are smoothed.
+FLAT = 0.001
+#: Light below this share of the frame's median counts as equal.
+DARK = 0.3
 #: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
-FIREFLY = 8.0
+FIREFLY = 4.0
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
 #: What known layers leave of the beauty counts as rounding below this share of it.
@@ -94,9 +101,11 @@ def fuse_passes(
     steps = pass_steps(alignment, sets)
     done = steps - pass_steps(alignment, jobs)
     tell(done, steps)
+    lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
+    dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes):
         for core in _bands(alignment) if jobs else []:
-            band = _Band(hr, rgb, alignment, core)
+            band = _Band(hr, rgb, alignment, core, dark)
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
                 made = band.fuse(job, lr, hr, pixels, lights)
@@ -207,26 +216,27 @@ def _same_layers(lr: MappedRender, layers: AdditiveSet) -> AdditiveSet | None:
 class _Band:
     """Some rows of the frame, with what their layers are fitted to."""
 
-    def __init__(self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window) -> None:
+    def __init__(self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window, dark: float) -> None:
+        """``dark``: light that counts as equal to none in logarithms."""
         self._alignment, self._core, self._scale = alignment, core, alignment.scale
-        self._radius = RADIUS[alignment.scale]
-        reach = self._radius + SMOOTHING + 1
+        reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
         self._area = area.intersect(alignment.grid)
+        self._core_rows = slice(core.y0 - self._area.y0, core.y1 - self._area.y0)
         self._hrls_area = in_hrls_pixels(self._area, alignment.scale)
         window = alignment.hr_data_window
         rows, columns = mirrored_pixels(self._hrls_area, window)
-        beauty = rgb[rows - window.y0].take(columns - window.x0, axis=1)
+        self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
+        self._low_beauty = _downsampled(self._beauty, self._scale)
+        log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + dark)
         features = read_features(hr, self._hrls_area, window, [ALBEDO, NORMAL])
-        guides = [beauty, *([features[ALBEDO]] if ALBEDO in features else [])]
-        #: Guides by channel of colour: the same channel of beauty and albedo, and the normal. (3, guides, h, w).
-        normal = [features[NORMAL][..., i] for i in range(3)] if NORMAL in features else []
-        self._guides = np.stack([[*(guide[..., c] for guide in guides), *normal] for c in range(3)])
-        self._beauty = planes_of(beauty)
-        self._low_beauty = planes_of(box_downsample(beauty, self._scale))
-        low = np.stack([planes_of(box_downsample(np.moveaxis(g, 0, -1), self._scale)) for g in self._guides])
+        guides = [log[None] / SPREAD[RGB]]
+        guides += [_smoothed(planes_of(features[name]), log) / SPREAD[name] for name in features]
+        full = np.concatenate(guides, dtype=np.float32)
+        low = _downsampled(full, self._scale)
         with np.errstate(over="ignore", invalid="ignore"):
-            self._fit = _Fit(low, self._radius)
+            self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
+        self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
     def fuse(
         self,
@@ -247,7 +257,7 @@ class _Band:
         Returns:
             The light of each layer.
         """
-        rows = slice((self._core.y0 - self._area.y0) * self._scale, (self._core.y1 - self._area.y0) * self._scale)
+        rows = slice(self._core_rows.start * self._scale, self._core_rows.stop * self._scale)
         lights = {layer: _total(earlier, parts) for layer, parts in job.known.items()}
         colours = self._colours(job, hr)
         if job.fitted:
@@ -274,9 +284,7 @@ class _Band:
     ) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that are fitted."""
         noisy = self._average(job, lr, hr)
-        core_rows = slice(self._core.y0 - self._area.y0, self._core.y1 - self._area.y0)
-        scale = self._scale
-        guides = self._guides[:, :, core_rows.start * scale : core_rows.stop * scale]
+        beauty = self._beauty[:, self._core_rows.start * self._scale : self._core_rows.stop * self._scale]
         fitted = np.empty((len(noisy), *light.shape), np.float32)
         flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *light.shape[1:])
 
@@ -287,14 +295,12 @@ class _Band:
 
         def fit_planes(planes: slice) -> None:
             for i in range(planes.start, planes.stop):
-                coefficients = self._fit.coefficients(flat_noisy[i], i % 3)
-                *slopes, offset = (upsample_linear(plane, scale, core_rows) for plane in coefficients)
-                flat_fitted[i] = offset
-                for guide, slope in zip(guides[i % 3], slopes, strict=True):
-                    flat_fitted[i] += guide * slope
+                slope, offset = self._fit.line(flat_noisy[i], i % 3)
+                np.multiply(self._nearby.mean(slope), beauty[i % 3], out=flat_fitted[i])
+                flat_fitted[i] += self._nearby.mean(offset)
                 # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
                 low, high = -max_3x3(-flat_noisy[i]), max_3x3(flat_noisy[i])
-                bounds = (upsample_linear(plane, scale, core_rows) for plane in (low, high))
+                bounds = (upsample_linear(plane, self._scale, self._core_rows) for plane in (low, high))
                 np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
 
         for_row_blocks(fit, len(flat_noisy), light[0].size)
@@ -352,66 +358,108 @@ class _Band:
 
 
 class _Fit:
-    """Linear fits around every low-resolution pixel: layer = sum over guides of a_k guide_k + b."""
+    """Lines ``layer = slope beauty + offset`` around every low-resolution pixel, fitted to pixels that look alike."""
 
-    def __init__(self, guides: Array, radius: int) -> None:
-        """``guides``: (3, guides, h, w)."""
-        self._guides, self._radius = guides, radius
-        self._means = np.stack([[mean_around(g, radius) for g in channel] for channel in guides])
-        count = guides.shape[1]
-        self._factors = []
-        for c in range(3):
-            matrix = [
-                [
-                    mean_around(guides[c, i] * guides[c, j], radius) - self._means[c, i] * self._means[c, j]
-                    for j in range(i + 1)
-                ]
-                for i in range(count)
-            ]
-            for i in range(count):
-                matrix[i][i] += RIDGE * (np.square(self._means[c, i]) + np.maximum(matrix[i][i], 0)) + 1e-7
-            self._factors.append(_cholesky(matrix))
+    def __init__(self, beauty: Array, guides: Array, steps: Sequence[int]) -> None:
+        """``beauty``: (3, h, w). ``guides``: (guides, h, w), in units of their spread."""
+        self._beauty, self._steps = beauty, steps
+        self._kernels = [_kernel(guides, step) for step in steps]
+        self._means = np.stack([self._mean(plane) for plane in beauty])
+        squares = np.stack([self._mean(plane * plane) for plane in beauty])
+        variances = np.maximum(squares - self._means**2, 0)
+        self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
 
-    def coefficients(self, layer: Array, channel: int) -> list[Array]:
-        """a_k of each guide, and b, averaged over overlapping fits: planes (h, w)."""
-        guides, means, factor = self._guides[channel], self._means[channel], self._factors[channel]
-        mean = mean_around(layer, self._radius)
-        covariances = [mean_around(layer * g, self._radius) - mean * m for g, m in zip(guides, means, strict=True)]
-        slopes = _solve(factor, covariances)
-        offset = _minus_products(mean, slopes, means)
-        return [mean_around(plane, SMOOTHING) for plane in (*slopes, offset)]
+    def line(self, layer: Array, channel: int) -> tuple[Array, Array]:
+        """Slope and offset (h, w) of a layer in a channel."""
+        mean, guide = self._mean(layer), self._means[channel]
+        slope = (self._mean(layer * self._beauty[channel]) - mean * guide) / self._variances[channel]
+        return slope, mean - slope * guide
+
+    def _mean(self, plane: Array) -> Array:
+        """Mean over pixels around that look alike."""
+        for kernel, step in zip(self._kernels, self._steps, strict=True):
+            padded, product = np.pad(plane, 2 * step), np.empty_like(plane)
+            plane = np.zeros_like(plane)
+            for weight, around in zip(kernel, _around(padded, step), strict=True):
+                plane += np.multiply(weight, around, out=product)
+        return plane
 
 
-def _cholesky(matrix: list[list[Array]]) -> list[list[Array]]:
-    """The Cholesky factor of a symmetric matrix of planes; the lower triangle of both is used."""
-    factor: list[list[Array]] = []
-    for i, row in enumerate(matrix):
-        new: list[Array] = []
-        for j in range(i):
-            new.append(_minus_products(row[j], new, factor[j]) / factor[j][j])
-        # Rounding can make a pivot negative where two guides are the same.
-        new.append(np.sqrt(np.maximum(_minus_products(row[i], new, new), np.float32(1e-8))))
-        factor.append(new)
-    return factor
+def _kernel(guides: Array, step: int) -> Array:
+    """Weights (25, h, w) of the pixels of :func:`_around`, which sum to 1. Pixels outside weigh nothing."""
+    padded = np.pad(guides, ((0, 0), (2 * step, 2 * step), (2 * step, 2 * step)), constant_values=1e9)
+    offsets = [(y * y + x * x) / 4 for y in range(-2, 3) for x in range(-2, 3)]
+    weights = np.stack(
+        [
+            np.exp(-np.square(around - guides).sum(axis=0) - np.float32(offset / 2))
+            for around, offset in zip(_around(padded, step), offsets, strict=True)
+        ]
+    )
+    weights /= weights.sum(axis=0)
+    return weights
 
 
-def _solve(factor: list[list[Array]], values: list[Array]) -> list[Array]:
-    """Solve ``L L^T x = values`` for planes."""
-    half: list[Array] = []
-    for row, value in zip(factor, values, strict=True):
-        half.append(_minus_products(value, row, half) / row[-1])
-    result: list[Array] = []
-    for i in reversed(range(len(factor))):
-        column = [row[i] for row in factor[i + 1 :]]
-        result.insert(0, _minus_products(half[i], column, result) / factor[i][i])
+def _around(padded: Array, step: int) -> Iterator[Array]:
+    """5 x 5 views of an image (..., h, w) that is padded by two steps, each shifted by some steps."""
+    height, width = (side - 4 * step for side in padded.shape[-2:])
+    for y in range(0, 5 * step, step):
+        for x in range(0, 5 * step, step):
+            yield padded[..., y : y + height, x : x + width]
+
+
+class _Nearby:
+    """Interpolates at full resolution among the four low-resolution pixels around that look most alike."""
+
+    def __init__(self, low: Array, full: Array, scale: int, rows: slice) -> None:
+        """``low``, ``full``: guides (guides, h, w) in units of their spread. ``rows``: of ``low``, to interpolate."""
+        self._rows, self._scale = rows, scale
+        height, width = rows.stop - rows.start, low.shape[2]
+        self._weights = np.empty((scale, scale, 4, height, width), np.float32)
+        full = full[:, rows.start * scale : rows.stop * scale]
+        for y, x in np.ndindex(scale, scale):
+            weights, here = self._weights[y, x], full[:, y::scale, x::scale]
+            around = zip(self._corners(low, y, x), _bilinear(y, x, scale), strict=True)
+            for weight, (there, share) in zip(weights, around, strict=True):
+                distance = np.square(there - here).sum(axis=0) * np.float32(SHARPER**2)
+                weight[:] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(share)
+            weights /= weights.sum(axis=0)
+
+    def mean(self, plane: Array) -> Array:
+        """A plane (h, w) at full resolution, its chosen rows."""
+        height, width = self._weights.shape[-2:]
+        result = np.empty((height * self._scale, width * self._scale), np.float32)
+        for y, x in np.ndindex(self._scale, self._scale):
+            corners = zip(self._weights[y, x], self._corners(plane[None], y, x), strict=True)
+            result[y :: self._scale, x :: self._scale] = sum(weight * corner[0] for weight, corner in corners)
+        return result
+
+    def _corners(self, planes: Array, y: int, x: int) -> list[Array]:
+        """The four pixels of ``planes`` (n, h, w) around the pixel in row ``y`` and column ``x`` of each pixel."""
+        rows = slice(max(self._rows.start - 1, 0), self._rows.stop + 1)
+        top = 1 - (self._rows.start - rows.start)
+        bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
+        padded = np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
+        height, width = self._weights.shape[-2:]
+        down, right = (2 if 2 * i + 1 > self._scale else 0 for i in (y, x))
+        return [padded[:, i : i + height, j : j + width] for i in (1, down) for j in (1, right)]
+
+
+def _bilinear(y: int, x: int, scale: int) -> list[float]:
+    """The weights of the corners of :meth:`_Nearby.mean` in linear interpolation."""
+    down, right = (abs((i + 0.5) / scale - 0.5) for i in (y, x))
+    return [i * j for i in (1 - down, down) for j in (1 - right, right)]
+
+
+def _smoothed(planes: Array, log: Array) -> Array:
+    """Planes (n, h, w) without noise: a guided filter (He et al. 2010) over 3 x 3 pixels, guided by the beauty."""
+    mean = _blurred(log)
+    variance = _blurred(log * log) - mean * mean + np.float32(FLAT)
+    result = np.empty_like(planes)
+    for plane, out in zip(planes, result, strict=True):
+        average = _blurred(plane)
+        slope = (_blurred(plane * log) - average * mean) / variance
+        np.add(average, slope * (log - mean), out=out)
     return result
-
-
-def _minus_products(value: Array, first: Sequence[Array], second: Sequence[Array]) -> Array:
-    """``value`` minus the products of the planes of two lists; the longer list's other planes are not used."""
-    for a, b in zip(first, second, strict=False):
-        value = value - a * b
-    return value
 
 
 def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer]) -> Array:
@@ -428,3 +476,18 @@ def _make_sum(layers: Array, beauty: Array) -> None:
     total = layers.sum(axis=0)
     lit = total > 0
     layers *= np.where(lit, beauty / np.where(lit, total, 1), 0)
+
+
+def _blurred(plane: Array) -> Array:
+    """Mean over 3 x 3 pixels with the weights 1, 2, 1 in rows and in columns."""
+    for axis in (0, 1):
+        padded = np.pad(plane, [(1, 1) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
+        before, after = (padded[i : i + len(plane)] if axis == 0 else padded[:, i : i + plane.shape[1]] for i in (0, 2))
+        plane = (before + after + 2 * plane) / 4
+    return plane
+
+
+
+def _downsampled(planes: Array, scale: int) -> Array:
+    """Planes (n, h, w), averaged over ``scale`` x ``scale`` pixels."""
+    return planes_of(box_downsample(np.moveaxis(planes, 0, -1), scale))

@@ -483,7 +483,8 @@ def _blurred(plane: Array) -> Array:
     for axis in (0, 1):
         padded = np.pad(plane, [(1, 1) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
         before, after = (padded[i : i + len(plane)] if axis == 0 else padded[:, i : i + plane.shape[1]] for i in (0, 2))
-        plane = (before + after + np.float32(2) * plane) / np.float32(4)
+        total: Array = before + after + 2 * plane
+        plane = total / np.float32(4)
     return plane
 
 

@@ -56,6 +56,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="the sequences")
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
     parser.add_argument("--model", default="joint")
+    parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated PNG")
     results.add_option(parser)
@@ -84,8 +85,8 @@ def run(args: argparse.Namespace) -> None:
         raise InputError(f"{args.folder}: holds no sequences; make them with python -m benchmarks.render.sequences")
     rows: list[Row] = []
     for index, name in enumerate(names):
-        sequence = load(args.folder / name)
-        made = list(all_methods(sequence, args.model))
+        sequence = load(args.folder / name, args.motion_format)
+        made = list(all_methods(sequence, args.model, args.motion_format))
         of_sequence = list(measure(sequence, made))
         print(layout(of_sequence), flush=True)
         rows += of_sequence

@@ -35,24 +35,26 @@ class Made:
     """How the motion is known; empty for single frames."""
 
 
-def all_methods(sequence: Sequence, model: str) -> Iterator[Made]:
+def all_methods(sequence: Sequence, model: str, motion_format: str | None = None) -> Iterator[Made]:
     """Each method on a sequence.
 
     OIDN denoises renders with the samples of both renders together. Its frames are averaged exactly as ours are. The
-    test of the light gets the luminance of the same LRHS and HRLS.
+    test of the light gets the luminance of the same LRHS and HRLS. ``motion_format`` is that of `msspl-fuse`.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
     best = np.stack([oidn_prefiltered(render) for render in full])
     yield Made(OIDN, 1, np.stack([oidn(render) for render in full]))
     yield Made(OIDN_BEST, 1, best)
     for scale in SCALES:
-        yield from _by_scale(sequence, model, scale, best)
+        yield from _by_scale(sequence, model, scale, best, TemporalOptions(motion_format=motion_format))
 
 
-def _by_scale(sequence: Sequence, model: str, scale: int, peer: Array) -> Iterator[Made]:
+def _by_scale(
+    sequence: Sequence, model: str, scale: int, peer: Array, options: TemporalOptions
+) -> Iterator[Made]:
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
-    temporal = plan_temporal(shot, InputOptions(), TemporalOptions())
+    temporal = plan_temporal(shot, InputOptions(), options)
     motion = f"{temporal.motion.kind}: {temporal.text}" if temporal.motion else temporal.text
     # More threads only wait for each other: the pictures are small.
     stages = Stages(model=model, threads=1, temporal=temporal)

@@ -54,8 +54,8 @@ class Sequence:
         return f"{self.folder.parent.name}/{self.folder.name}"
 
 
-def load(folder: Path) -> Sequence:
-    """Read a folder ``SCENE/KIND``.
+def load(folder: Path, motion_format: str | None = None) -> Sequence:
+    """Read a folder ``SCENE/KIND``. ``motion_format`` is that of `msspl-fuse`.
 
     Raises:
         InputError: files are missing.
@@ -71,7 +71,7 @@ def load(folder: Path) -> Sequence:
               for half in "ab"]  # fmt: skip
     truth = tuple(np.broadcast_to(half, (len(numbers), *half.shape[1:])) for half in halves)
     marked = [_channels(folder / f"mask.{n:04d}.exr") for n in numbers]
-    back, forth = _motion(folder, numbers, marked)
+    back, forth = _motion(folder, numbers, marked, motion_format)
     seen = [_returns(forth[t], back[t + 1]) for t in range(len(numbers) - 1)]
     seen_before = [_returns(back[t + 1], forth[t]) for t in range(len(numbers) - 1)]
     everywhere = np.ones((1, *seen[0].shape), bool)
@@ -96,13 +96,15 @@ def _channels(path: Path) -> dict[str, Array]:
     return dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), -1, 0), strict=True))
 
 
-def _motion(folder: Path, numbers: list[int], marked: list[dict[str, Array]]) -> tuple[list[Array], list[Array]]:
+def _motion(
+    folder: Path, numbers: list[int], marked: list[dict[str, Array]], motion_format: str | None
+) -> tuple[list[Array], list[Array]]:
     """Vectors (h, w, 2) from each frame to the previous and the next one: exact ones, or the renderer's."""
     if MOTION[0] in marked[0]:
         stored = [np.stack([each[name] for name in MOTION], axis=-1) for each in marked]
         return [each[..., :2] for each in stored], [each[..., 2:] for each in stored]
     frames = [MotionFrame(map_render(open_exr(folder / f"hr.{n:04d}.exr"))) for n in numbers]
-    source = find_motion(frames[0].hr, frames[1].hr)
+    source = find_motion(frames[0].hr, frames[1].hr, motion_format, required=True)
     back = [source.read(here, there, -1)[0] for there, here in itertools.pairwise(frames)]
     forth = [source.read(here, there, 1)[0] for here, there in itertools.pairwise(frames)]
     return [np.zeros_like(back[0]), *back], [*forth, np.zeros_like(forth[0])]

@@ -39,13 +39,13 @@ def test_installed_programs_are_on_the_path():
 SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --model --device --max-memory --output --layout --layers --passes --error-layer "
-        "--overwrite --json --frames --skip-existing --help --help-all",
+        "--overwrite --json --frames --temporal --skip-existing --help --help-all",
         17,
     ),
     "msspl_render": (
-        "--view-layer --blender --scale --lr-spp --hr-spp --components --model --device --output --layout --passes "
+        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --model --device --output --layout --passes "
         "--error-layer --compare "
-        "--overwrite --json --frames --skip-existing --help --help-all",
+        "--overwrite --json --frames --temporal --skip-existing --help --help-all",
         6,
     ),
 }

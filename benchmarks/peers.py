@@ -11,6 +11,7 @@ from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.arrays import Array, box_downsample, repair
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.fusion.spread import STRIDE, join, without_grid
 from oiio_msspl.fusion.tile_features import read_features
 from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders, useful_lrhs_aovs
@@ -24,6 +25,20 @@ def oidn(source: ReadableRender, quality: str = "high") -> Array:
 def oidn_prefiltered(source: ReadableRender) -> Array:
     """OIDN as its documentation recommends it: the albedo and the normal are denoised first."""
     return denoise_prefiltered(**_inputs(source))
+
+
+def oidn_split(source: ReadableRender) -> Array:
+    """:func:`oidn_prefiltered` on every second pixel, put together as :mod:`oiio_msspl.fusion.spread` does."""
+    inputs = _inputs(source)
+    exposure = find_exposure(inputs["color"])
+    places = [(slice(y, None, STRIDE), slice(x, None, STRIDE)) for y in range(STRIDE) for x in range(STRIDE)]
+    pictures = (
+        denoise_prefiltered(**{name: np.ascontiguousarray(image[place]) for name, image in inputs.items()})
+        for place in places
+    )
+    height, width = inputs["color"].shape[:2]
+    joined = join(zip(places, pictures, strict=True), (height, width))
+    return decode_radiance(without_grid(encode_radiance(joined, exposure)), exposure)
 
 
 def _inputs(source: ReadableRender) -> dict[str, Array]:

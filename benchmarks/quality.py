@@ -16,7 +16,9 @@ Methods that get an LRHS and an HRLS, each with half of the samples as in the pa
 
 Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), "full resolution" and
 "OIDN, same samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
-:func:`benchmarks.oidn.denoise_prefiltered`. All others are OIDN's plain call with the quality "high".
+:func:`benchmarks.oidn.denoise_prefiltered`. "OIDN prefiltered and split" is that on every second pixel, put together as
+``joint-x2-spread`` does (:mod:`oiio_msspl.fusion.spread`); no tool offers it. All others are OIDN's plain call with the
+quality "high".
 """
 
 from __future__ import annotations
@@ -30,7 +32,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import results, scenes
-from benchmarks.peers import match_local_means, oidn, oidn_on_average, oidn_prefiltered
+from benchmarks.peers import match_local_means, oidn, oidn_on_average, oidn_prefiltered, oidn_split
 from benchmarks.results import MEAN, Row
 from benchmarks.scenes import NOISY_REFERENCE, beauty
 from oiio_msspl import fuse
@@ -38,8 +40,8 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.colour import srgb
 from oiio_msspl.compare import scores, upsample_bicubic
 from oiio_msspl.exr.render import ReadableRender
-from oiio_msspl.model.catalogue import find_model, shipped_models
-from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.catalogue import load_model, shipped_models
+from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.session import Session
 
 #: Average spp. The HRLS and the LRHS have half of it each, as in the paper's tables.
@@ -74,6 +76,7 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
     yield "full resolution", lambda: beauty(full)
     yield "OIDN, same samples", lambda: oidn(full)
     yield "OIDN prefiltered, same samples", lambda: oidn_prefiltered(full)
+    yield "OIDN prefiltered and split, same samples", lambda: oidn_split(full)
     for scale in SCALES:
         lr, nearest = scene.lrhs(scale, spp // 2), scene.nearest(scale, spp // 2)
         denoised_low = functools.cache(functools.partial(oidn, lr))
@@ -90,7 +93,7 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
         )
         for session in sessions:
             if session.contract.scale == scale:
-                name = session.contract.name
+                name = session.name
                 yield name, functools.partial(fused, session, lr, hr)
                 if nearest is not None:
                     yield f"{name}, nearest", functools.partial(fused, session, nearest, hr)
@@ -102,17 +105,17 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
         yield f"OIDN on the HRLS, {division}", functools.partial(oidn, hr_more)
         for session in sessions:
             lr = scene.lrhs(session.contract.scale, share * less)
-            yield f"{session.contract.name}, {division}", functools.partial(fused, session, lr, hr_more)
+            yield f"{session.name}, {division}", functools.partial(fused, session, lr, hr_more)
 
 
 def load_models(names: Sequence[str], pattern: str) -> list[Session]:
     """Sessions of the models for which :func:`methods` has a name that matches the pattern."""
     endings = ("", ", nearest", *(f", {more}:{less}" for more, less in UNEVEN))
-    paths = {path: Contract.of_file(path).name for path in (find_model(0, name) for name in names)}
+    sessions = [load_model(0, name) for name in names]
     return [
-        Session(path)
-        for path, name in paths.items()
-        if any(fnmatch.fnmatchcase(name + ending, pattern) for ending in endings)
+        session
+        for session in sessions
+        if any(fnmatch.fnmatchcase(session.name + ending, pattern) for ending in endings)
     ]
 
 

@@ -72,11 +72,14 @@ Found = Mapping[Hashable, Row]
 SPREAD_NOISE = {
     "HRLS": "HRLS alone",
     "joint-x2": "`joint-x2`",
-    "paper-x2": "`paper-x2`, which `auto` takes",
+    "joint-x2-spread": "`joint-x2-spread`, which `auto` takes",
+    "joint-x4-spread": "`joint-x4-spread`",
+    "paper-x2": "`paper-x2`",
     "OIDN on the HRLS": "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS": "OIDN on the HRLS, prefiltered",
     "OIDN, same samples": "OIDN at full resolution",
     "OIDN prefiltered, same samples": "OIDN at full resolution, prefiltered",
+    "OIDN prefiltered and split, same samples": "the same on every second pixel, as `joint-x2-spread` does",
 }
 
 

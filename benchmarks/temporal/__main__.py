@@ -107,7 +107,7 @@ def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None
     if args.picture:
         strip(args.picture, shown, FRAMES, CROP, ROW)
     if args.film:
-        film(args.film, shown, CROP)
+        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, CROP)
 
 
 if __name__ == "__main__":

@@ -49,9 +49,7 @@ def all_methods(sequence: Sequence, model: str, motion_format: str | None = None
         yield from _by_scale(sequence, model, scale, best, TemporalOptions(motion_format=motion_format))
 
 
-def _by_scale(
-    sequence: Sequence, model: str, scale: int, peer: Array, options: TemporalOptions
-) -> Iterator[Made]:
+def _by_scale(sequence: Sequence, model: str, scale: int, peer: Array, options: TemporalOptions) -> Iterator[Made]:
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     temporal = plan_temporal(shot, InputOptions(), options)

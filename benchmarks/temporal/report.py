@@ -46,12 +46,13 @@ def summary(rows: Rows[Row]) -> str:
         gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
         steadier = [row["flicker"] / other["flicker"] for other in (alone, peer)]
         masks = {name: row[name] - alone[name] for name in MASKS if name in row}
-        worst = min(masks, key=lambda name: masks[name])
+        worst = min(masks, key=lambda name: masks[name], default="")
         body.append([
             row["sequence"], _role(row["sequence"]), f"x{row['scale']}", f"{gain:+.2f}", f"{over_peer:+.2f}",
-            *(f"{ratio:.2f}" for ratio in steadier), f"{masks[worst]:+.2f} ({worst})",
+            *(f"{ratio:.2f}" for ratio in steadier), f"{masks[worst]:+.2f} ({worst})" if worst else "",
         ])  # fmt: skip
-        missed += [f"{row['sequence']} x{row['scale']}: {text}" for text in _missed(row, alone, peer, masks[worst])]
+        least = masks.get(worst, 0.0)
+        missed += [f"{row['sequence']} x{row['scale']}: {text}" for text in _missed(row, alone, peer, least)]
     head = ["sequence", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
     head += ["flicker, of single frames'", "of OIDN's", "least gain in a mask, dB"]
     lines = [results.markdown(head, body)]
@@ -164,6 +165,6 @@ def film(path: Path, shown: dict[str, Array], crop: tuple[slice, slice]) -> None
         picture = Image.fromarray((joined * 255 + 0.5).astype(np.uint8))
         for i, title in enumerate(shown):
             ImageDraw.Draw(picture).text((i * (wide[0].shape[2] + 2) + 3, 0), title, fill="white")
-        frames.append(picture.quantize(96))
+        frames.append(picture.quantize(32, dither=Image.Dither.NONE))
     with replacing(path, overwrite=True) as temporary:
         frames[0].save(temporary, format="PNG", save_all=True, append_images=frames[1:], duration=120, loop=0)

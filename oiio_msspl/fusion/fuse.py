@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -26,6 +26,7 @@ from oiio_msspl.fusion.guards import (
 )
 from oiio_msspl.fusion.pair_checks import BRIGHTEST, HrlsAverages, check_pair
 from oiio_msspl.fusion.passes import FusedPasses
+from oiio_msspl.fusion.spread import Place, join, split, without_grid
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
     MAX_MEMORY,
@@ -117,7 +118,7 @@ def fuse(
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
         frame = _blank_frame(alignment, pair.exposure, error=error)
-        tiles = plan_tiles(pair.grid, session.contract)
+        tiles = plan_tiles(pair.grid, session.contract, session.stride)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
             # The next tile is read and encoded while the network works on this one.
@@ -136,18 +137,24 @@ def fuse(
 
 def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> int:
     """The smallest ``max_memory`` with which a pair can be fused, from its headers."""
-    grid = aligned_grid(alignment.grid, session.contract.alignment)
+    grid = _grid(alignment, session)
     # Of the features that the LRHS may have; it is not read yet. Alpha has 1 channel, every other one 3.
     lrhs_bytes = grid.width * grid.height * (3 * (1 + len(session.lrhs_aovs)) + 1) * 4
     frame_bytes = result_bytes(alignment, error=error) + lrhs_bytes
     # The tiles of larger frames are as large. A damaged header may claim millions of tiles.
     part = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + 16384, grid.y0 + 16384))
-    return memory_for_tiles(session.contract, plan_tiles(part, session.contract), frame_bytes)
+    tiles = plan_tiles(part, session.contract, session.stride)
+    return memory_for_tiles(session.contract, tiles, frame_bytes, session.stride)
 
 
 def tile_count(alignment: Alignment, session: Session) -> int:
     """The number of tiles that a pair is fused in."""
-    return len(plan_tiles(aligned_grid(alignment.grid, session.contract.alignment), session.contract))
+    return len(plan_tiles(_grid(alignment, session), session.contract, session.stride))
+
+
+def _grid(alignment: Alignment, session: Session) -> Window:
+    """The LRHS pixels that the network reads: the alignment's grid, extended to a size that the network takes."""
+    return aligned_grid(alignment.grid, session.contract.alignment * session.stride)
 
 
 def result_bytes(alignment: Alignment, *, error: bool) -> int:
@@ -177,13 +184,13 @@ class _FrameMeans:
 
 
 @dataclass
-class _PreparedTile:
-    """A tile that is ready for the network."""
+class _Picture:
+    """What the network reads at once: a tile, or every second pixel of one (:mod:`oiio_msspl.fusion.spread`)."""
 
+    place: Place
+    """Its pixels in the tile."""
     pair: TilePair
     """Without the features that the network input replaces."""
-    empty: Mask | None
-    """See :meth:`oiio_msspl.fusion.guards.EmptyRegions.mask`."""
     lrhs_aovs: Images
     lrhs: Array | None = None
     """Network input, encoded; None for a tile that is empty everywhere."""
@@ -194,12 +201,25 @@ class _PreparedTile:
     """There is no noise to remove: the HRLS is the result."""
 
 
+@dataclass
+class _PreparedTile:
+    """A tile that is ready for the network."""
+
+    area: Window
+    """The tile's area in HRLS pixels."""
+    target: Window
+    """The part of the HRLS's data window that the tile contributes."""
+    empty: Mask | None
+    """See :meth:`oiio_msspl.fusion.guards.EmptyRegions.mask`."""
+    pictures: list[_Picture]
+
+
 class _Pair:
     """The LRHS in memory, and the HRLS that is read tile by tile."""
 
     def __init__(self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session) -> None:
         self._lr, self._hr, self._alignment, self._session = lr, hr, alignment, session
-        self.grid = aligned_grid(alignment.grid, session.contract.alignment)
+        self.grid = _grid(alignment, session)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         features = [RGB, *session.lrhs_aovs, "alpha"]
         self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_counts)
@@ -228,18 +248,28 @@ class _Pair:
         pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
         self._averages.add(pair)
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
-        lrhs_aovs, hrls = self._lrhs_aovs(pair), pair.hrls
+        lit = empty is None or not empty.all()
+        pictures = [self._prepare_picture(place, part, lit=lit) for place, part in self._pictures(pair)]
+        return _PreparedTile(pair.hrls_area, pair.hrls_target, empty, pictures)
+
+    def _pictures(self, pair: TilePair) -> Iterable[tuple[Place, TilePair]]:
+        """What the network reads at once of a tile."""
+        return split(pair) if self._session.stride > 1 else [((slice(None), slice(None)), pair)]
+
+    def _prepare_picture(self, place: Place, pair: TilePair, *, lit: bool) -> _Picture:
+        """Dim fireflies and encode the features, unless no pixel is ``lit``."""
+        contract, hrls = self._session.contract, pair.hrls
         # Copies, because views would keep the memory of all features.
         for_alpha = [name for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls]
         needed_for_alpha = {name: hrls[name].copy("K") for name in for_alpha}
-        prepared = _PreparedTile(replace(pair, hrls=needed_for_alpha), empty, lrhs_aovs)
-        if empty is None or not empty.all():
+        picture = _Picture(place, replace(pair, hrls=needed_for_alpha), self._lrhs_aovs(pair))
+        if lit:
             lrhs_rgb, hrls = dim_fireflies(pair)
-            prepared.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
-            prepared.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
-            prepared.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
-            prepared.noise_free = is_noise_free(pair, prepared.lrhs, hrls[RGB], self.exposure)
-        return prepared
+            picture.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
+            picture.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
+            picture.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
+            picture.noise_free = is_noise_free(pair, picture.lrhs, hrls[RGB], self.exposure)
+        return picture
 
     def sample_means(self) -> _FrameMeans:
         """Decide how to average both renders, from a sample of the frame, so that neighbouring tiles agree."""
@@ -249,14 +279,16 @@ class _Pair:
         rgb, alpha = [], []
         for band in sample_bands(self._alignment.grid, contract.scale):
             features, counts = [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts()
-            pair = read_tile(Tile(band, band), self._lrhs, self.grid, self._hr, self._alignment, features, counts)
-            lrhs_rgb, hrls = dim_fireflies(pair)
-            lrhs_aovs = self._lrhs_aovs(pair)
-            lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure)
-            rgb.append((lrhs, encode_features(hrls, contract.features, self.exposure), lrhs_aovs))
-            if "alpha" in pair.lrhs and "alpha" in pair.hrls:
-                lrhs_alpha, hrls_alpha = encode_alpha(pair, contract)
-                alpha.append((lrhs_alpha[..., : lrhs.shape[-1]], hrls_alpha, lrhs_aovs))
+            band = aligned_grid(band, self._session.stride)
+            tile = read_tile(Tile(band, band), self._lrhs, self.grid, self._hr, self._alignment, features, counts)
+            for _, pair in self._pictures(tile):
+                lrhs_rgb, hrls = dim_fireflies(pair)
+                lrhs_aovs = self._lrhs_aovs(pair)
+                lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure)
+                rgb.append((lrhs, encode_features(hrls, contract.features, self.exposure), lrhs_aovs))
+                if "alpha" in pair.lrhs and "alpha" in pair.hrls:
+                    lrhs_alpha, hrls_alpha = encode_alpha(pair, contract)
+                    alpha.append((lrhs_alpha[..., : lrhs.shape[-1]], hrls_alpha, lrhs_aovs))
         return _FrameMeans(mean_settings(rgb), mean_settings(alpha) if alpha else None)
 
     def _lrhs_aovs(self, pair: TilePair) -> Images:
@@ -274,33 +306,52 @@ class _Pair:
 
 def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: _FrameMeans) -> None:
     """Run the network on a tile and write its core into the frame."""
-    pair, empty = tile.pair, tile.empty
-    target = pair.hrls_target.slices(frame.alignment.hr_data_window)
-    core = pair.hrls_target.slices(pair.hrls_area)
-    if tile.lrhs is not None and tile.hrls is not None:
-        encoded_error: Array | None
-        if tile.noise_free:
-            encoded, encoded_error = tile.hrls[..., :3], np.zeros_like(tile.hrls[..., :1])
-        else:
-            encoded, encoded_error = session.run(
-                tile.lrhs, tile.hrls, lrhs_aovs=tile.lrhs_aovs, mean=means.rgb, error=frame.error is not None
-            )
-        check_finite(session, encoded, encoded_error)
+    empty = tile.empty
+    size = (tile.area.height, tile.area.width)
+    target = tile.target.slices(frame.alignment.hr_data_window)
+    core = tile.target.slices(tile.area)
+    if tile.pictures[0].hrls is not None:
+        fused = [_fuse_picture(picture, session, means, error=frame.error is not None) for picture in tile.pictures]
+        places = [picture.place for picture in tile.pictures]
+        encoded = join(zip(places, (image for image, _ in fused), strict=True), size)
+        if session.stride > 1:
+            encoded = without_grid(encoded)
         rgb = frame.rgb[target]
         decode_radiance(encoded[core], frame.exposure, rgb)
-        if tile.lights is not None:
-            np.maximum(rgb, tile.lights[core], out=rgb)
+        lights = [(picture.place, picture.lights) for picture in tile.pictures]
+        if any(image is not None for _, image in lights):
+            dark = np.zeros_like(tile.pictures[0].hrls[..., :3])
+            whole = join(((place, dark if image is None else image) for place, image in lights), size)
+            np.maximum(rgb, whole[core], out=rgb)
         if empty is not None:
             rgb *= ~empty[core]
-        if frame.error is not None and encoded_error is not None:
-            error = _scene_linear_error(encoded, encoded_error, frame.exposure)
+        errors = [image for _, image in fused if image is not None]
+        if frame.error is not None and errors:
+            error = _scene_linear_error(encoded, join(zip(places, errors, strict=True), size), frame.exposure)
             if empty is not None:
                 error *= ~empty
             frame.error[target] = error[core]
-    if "alpha" in pair.hrls:
+    if "alpha" in tile.pictures[0].pair.hrls:
         if frame.alpha is None:
             frame.alpha = np.empty((*frame.rgb.shape[:2], 1), dtype=np.float32)
-        frame.alpha[target] = fuse_alpha(pair, session, tile.lrhs_aovs, means.alpha)[core]
+        alpha = ((p.place, fuse_alpha(p.pair, session, p.lrhs_aovs, means.alpha)) for p in tile.pictures)
+        frame.alpha[target] = join(alpha, size)[core]
+
+
+def _fuse_picture(
+    picture: _Picture, session: Session, means: _FrameMeans, *, error: bool
+) -> tuple[Array, Array | None]:
+    """Fused colour (h, w, 3), log-encoded, and its expected error (h, w, 1) if asked for."""
+    assert picture.lrhs is not None and picture.hrls is not None
+    encoded_error: Array | None
+    if picture.noise_free:
+        encoded, encoded_error = picture.hrls[..., :3], np.zeros_like(picture.hrls[..., :1])
+    else:
+        encoded, encoded_error = session.run(
+            picture.lrhs, picture.hrls, lrhs_aovs=picture.lrhs_aovs, mean=means.rgb, error=error
+        )
+    check_finite(session, encoded, encoded_error)
+    return encoded, encoded_error
 
 
 def _scene_linear_error(encoded: Array, error: Array, exposure: float) -> Array:

@@ -26,6 +26,9 @@ STRIPS_SHARE = 1 / 6
 #: Memory of a tile. It is as large as ``MAX_MEMORY`` allows beside an 8K frame. Other tiles give other pixels, so this
 #: does not depend on what the user allows.
 TILE_MEMORY = 1872 << 20
+#: Further memory for each HRLS pixel of a tile that is split into pictures (:mod:`oiio_msspl.fusion.spread`): its
+#: features before and after they are split, of this tile and the next one.
+SPLIT_BYTES = 320
 #: Bands of rows that :func:`sample_bands` spreads over a frame.
 SAMPLE_BANDS = 8
 
@@ -46,16 +49,19 @@ def aligned_grid(grid: Window, alignment: int) -> Window:
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
 
-def plan_tiles(grid: Window, contract: Contract) -> list[Tile]:
+def plan_tiles(grid: Window, contract: Contract, stride: int = 1) -> list[Tile]:
     """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
     There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
     The offsets of all tiles are multiples of the model's tile alignment, so that a network that works on blocks of
     pixels divides a tile as it divides the frame.
+
+    Args:
+        stride: :attr:`oiio_msspl.model.session.Session.stride` of the model.
     """
-    alignment = contract.tile_alignment
-    overlap = -(-contract.overlap // alignment) * alignment
-    largest = TILE_MEMORY // (contract.bytes_per_pixel * contract.scale**2)
+    alignment = contract.tile_alignment * stride
+    overlap = -(-contract.overlap * stride // alignment) * alignment
+    largest = TILE_MEMORY // (_bytes_per_pixel(contract, stride) * contract.scale**2)
     # The fewest pixels that are computed, in the fewest tiles; where even the smallest tile is too large, that one.
     columns, rows = min(
         itertools.product(_splits(grid.x0, grid.x1, overlap, alignment), _splits(grid.y0, grid.y1, overlap, alignment)),
@@ -83,6 +89,11 @@ def sample_bands(grid: Window, scale: int) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, top + rows) for top in tops]
 
 
+def _bytes_per_pixel(contract: Contract, stride: int) -> int:
+    """Peak memory of a tile for each of its HRLS pixels. The network sees one of stride^2 pixels at a time."""
+    return contract.bytes_per_pixel if stride == 1 else contract.bytes_per_pixel // stride**2 + SPLIT_BYTES
+
+
 def check_memory(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, max_memory: int) -> None:
     """Check that the largest of the tiles fits into memory.
 
@@ -96,10 +107,11 @@ def check_memory(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, ma
     require_memory(memory_for_tiles(contract, tiles, frame_bytes), contract, max_memory)
 
 
-def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int) -> int:
-    """Memory with which a frame can be fused in these tiles; ``frame_bytes`` as for :func:`check_memory`."""
+def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, stride: int = 1) -> int:
+    """Memory with which a frame can be fused in these tiles; ``frame_bytes`` as for :func:`check_memory`, ``stride`` as
+    for :func:`plan_tiles`."""
     pixels = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
-    return FIXED_MEMORY + frame_bytes + pixels * contract.bytes_per_pixel
+    return FIXED_MEMORY + frame_bytes + pixels * _bytes_per_pixel(contract, stride)
 
 
 def require_memory(needed: int, contract: Contract, max_memory: int, hint: str = "") -> None:

@@ -139,7 +139,7 @@ def _most_workers_on_a_machine(client: Client) -> int:
 
 
 @lru_cache(maxsize=2)
-def _sessions(run: str) -> dict[Path, Session]:
+def _sessions(run: str) -> dict[tuple[int, str | None], Session]:
     """The models that this worker has loaded for a run. A later run gets its own: a file may have been replaced."""
     return {}
 

@@ -32,7 +32,7 @@ from oiio_msspl.jobs.views import (
     fuse_other_views,
     steps_of,
 )
-from oiio_msspl.model.catalogue import DEFAULT_FAMILY, find_model
+from oiio_msspl.model.catalogue import DEFAULT_FAMILY, load_model
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import in_background, limit_threads
 
@@ -122,7 +122,7 @@ def fuse_files(
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
     family = resolve_auto(lr, hr, model) if fits else model or DEFAULT_FAMILY
-    session = Session(find_model(align(lr, hr).scale, family), device, threads)
+    session = load_model(align(lr, hr).scale, family, device, threads)
     check_frame_memory(lr, hr, session, write, max_memory)
     opened = time.perf_counter()
 

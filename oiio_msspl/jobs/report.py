@@ -115,7 +115,7 @@ def report_on(
         lr=lr,
         hr=hr,
         scale=fused.alignment.scale,
-        model=session.contract.name,
+        model=session.name,
         provider=session.provider,
         convolutions=session.convolutions,
         output=output,

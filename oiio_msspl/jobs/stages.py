@@ -25,7 +25,7 @@ from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import FusedAlone, Temporal
 from oiio_msspl.jobs.views import OtherViews, check_passes, find_other_views, fuse_frame_passes, fuse_other_views
-from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 
 
@@ -66,8 +66,8 @@ class Stages:
     update: bool = False
     temporal: Temporal = field(default_factory=Temporal)
     """Which neighbours each frame is fused with."""
-    sessions: dict[Path, Session] = field(default_factory=dict)
-    """Models that are loaded, by file."""
+    sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
+    """Models that are loaded, by scale and ``model``."""
 
     def run(self, frame: Frame) -> FrameReport:
         """Take a frame through all stages, one after the other, without its neighbours.
@@ -129,12 +129,13 @@ class Stages:
         Raises:
             InputError: there is no such model, or it does not predict the error that is asked for.
         """
-        path = find_model(align(loaded.lr_pixels, loaded.hr_pixels).scale, self.model)
-        if path not in self.sessions:
-            self.sessions[path] = Session(path, self.device, self.threads)
+        scale = align(loaded.lr_pixels, loaded.hr_pixels).scale
+        session = self.sessions.get((scale, self.model))
+        if session is None:
+            session = self.sessions[scale, self.model] = load_model(scale, self.model, self.device, self.threads)
         if self.write_options.error_layer:
-            self.sessions[path].require_error()
-        return self.sessions[path]
+            session.require_error()
+        return session
 
     def fuse(self, loaded: LoadedFrame, session: Session) -> FusedAlone:
         """Fuse the beauty of a pair.

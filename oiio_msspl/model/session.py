@@ -21,6 +21,9 @@ from oiio_msspl.model.runtime import CPU, convolutions, load_network
 
 log = logging.getLogger(__name__)
 
+#: Ending of the name of a model that fuses pairs whose noise the pixel filter has spread.
+SPREAD = "-spread"
+
 
 def make_denoiser(mode: str, threads: int = 0, device: str = "cpu") -> MeanDenoiser | None:
     """The denoiser that runs before a model, for its contract's ``denoiser``."""
@@ -35,13 +38,14 @@ class Session:
             there is one.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
+        spread: the model fuses pairs whose noise the pixel filter has spread.
 
     Raises:
         InputError: no model; no contract; a device that this onnxruntime was not built for or that cannot start; or a
             model whose convolutions would stay on the CPU though the device has operators for them.
     """
 
-    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0) -> None:
+    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, spread: bool = False) -> None:
         require_device(device)
         file = file_for(Path(path), device)
         self._session = load_network(file, threads, providers(device))
@@ -52,6 +56,8 @@ class Session:
                 "that it needs, which the lines above name; use --device cpu meanwhile"
             )
         self.contract = Contract.of_network(self._session, path)
+        self.stride = 2 if spread else 1
+        """Distance of the HRLS pixels that the model reads together, see :mod:`oiio_msspl.fusion.spread`."""
         self._denoiser = make_denoiser(self.contract.denoiser, threads, device)
         self._outputs = [output.name for output in self._session.get_outputs()]
         inputs = sorted(each.name for each in self._session.get_inputs())
@@ -77,7 +83,12 @@ class Session:
             if device in COMPLETE:
                 raise InputError(f"--device {device}: {message}")
             log.warning(message)
-        log.info("model %s (%s), convolutions: %s", self.contract.name, file, self.convolutions or "unknown")
+        log.info("model %s (%s), convolutions: %s", self.name, file, self.convolutions or "unknown")
+
+    @property
+    def name(self) -> str:
+        """The model's name, as ``--model`` takes it."""
+        return f"{self.contract.name}{SPREAD}" if self.stride > 1 else self.contract.name
 
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""

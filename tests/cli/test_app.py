@@ -40,12 +40,12 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --model --device --max-memory --output --layout --layers --passes --error-layer "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all",
-        17,
+        19,
     ),
     "msspl_render": (
-        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --model --device --output --layout --passes "
-        "--error-layer --compare "
-        "--overwrite --json --frames --temporal --skip-existing --help --help-all",
+        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --model --device --output --layout "
+        "--passes --error-layer --compare "
+        "--overwrite --json --frames --skip-existing --help --help-all",
         6,
     ),
 }

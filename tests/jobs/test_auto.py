@@ -18,12 +18,12 @@ def write_pair(folder, name, sigma):
         write_exr(folder / render / f"{name}.exr", rgb(image if sigma is None else spread(image, sigma)))
 
 
-@pytest.mark.parametrize(("sigma", "family"), [(None, "joint"), (0.5, "paper")])
+@pytest.mark.parametrize(("sigma", "family"), [(None, "joint"), (0.5, "joint-spread")])
 def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, family):
     write_pair(tmp_path, "a", sigma)
     report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "out.exr")
-    assert report.model == f"{family}-x4"
-    assert any("spread the noise" in note for note in report.as_dict()["notes"]) == (family == "paper")
+    assert report.model == {"joint": "joint-x4", "joint-spread": "joint-x4-spread"}[family]
+    assert any("spread the noise" in note for note in report.as_dict()["notes"]) == (family == "joint-spread")
     report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "named.exr", model="pyramid")
     assert report.model == "pyramid-x4"
 
@@ -38,12 +38,12 @@ def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_pa
     for frames in ([1, 2], None):
         report = fuse_shot(*pair, frames=frames, skip_existing=True)
     assert [result.status for _, result in sorted(report.results.items())] == ["failed", "skipped", "fused"]
-    assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "paper-x4"
-    assert "so --model auto takes paper" in caplog.text
+    assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "joint-x4-spread"
+    assert "so --model auto takes joint-spread" in caplog.text
     assert fuse_shot(*pair[:2], tmp_path / "chunk", frames=[3]).exit_code == 0
-    assert open_exr(tmp_path / "chunk/a.0003.exr").metadata["msspl/model"] == "paper-x4"
+    assert open_exr(tmp_path / "chunk/a.0003.exr").metadata["msspl/model"] == "joint-x4-spread"
     monkeypatch.setattr("oiio_msspl.jobs.shot.model_of_shot", lambda *arguments: pytest.fail("reads a pair"))
     assert fuse_shot(*pair, frames=[2, 3], skip_existing=True).results[2].status == "skipped"
     monkeypatch.undo()
     action = make_job(*pair).template["steps"][0]["script"]["actions"]["onRun"]
-    assert action["args"][-2:] == ["--model", "paper"]
+    assert action["args"][-2:] == ["--model", "joint-spread"]

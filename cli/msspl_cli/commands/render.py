@@ -297,11 +297,9 @@ def _make_fuser(
     from msspl_cli.rendered_shot import RenderedShot
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
-    from oiio_msspl.model.catalogue import find_model
-    from oiio_msspl.model.session import Session
+    from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, load_model
 
-    path = find_model(scale, model)
-    session = Session(path, device, threads)
+    session = load_model(scale, model, device, threads)
     if write.error_layer:
         session.require_error()
     stages = Stages(
@@ -311,7 +309,7 @@ def _make_fuser(
         threads=threads,
         max_memory=max_memory,
         overwrite=overwrite,
-        sessions={path: session},
+        sessions={(scale, DEFAULT_FAMILY if model == AUTO else model): session},
     )
     frames = [Frame(number or 0, None, None, target.absolute()) for number, target in shot]
     return RenderedShot(stages, frames, [each for each in frames if each.output in wanted], temporal, keep=keep)

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs whose noise the pixel filter has spread."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl import Render, fuse
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.colour import srgb
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion import tiling
+from oiio_msspl.fusion.fuse import tile_count
+from oiio_msspl.fusion.spread import join, split, without_grid
+from oiio_msspl.fusion.tile_features import TilePair
+from oiio_msspl.model.catalogue import load_model
+from tests.conftest import noisy, picture
+from tests.fusion.test_noise import spread
+
+SCALES = (2, 4, 8)
+
+
+@pytest.fixture(scope="module", params=SCALES)
+def session(request):
+    return load_model(request.param, "joint-spread")
+
+
+def psnr(image, reference):
+    return -10 * np.log10(np.mean((srgb(image) - srgb(reference)) ** 2))
+
+
+def spread_pair(clean, scale, **layers):
+    low, high = noisy(box_downsample(clean, scale), scale**2, seed=1), noisy(clean, 1)
+    return Render.from_arrays("lr", rgb=spread(low, 0.5)), Render.from_arrays("hr", rgb=spread(high, 0.5), **layers)
+
+
+@pytest.mark.parametrize("scale", SCALES)
+def test_pictures_lie_over_their_lrhs_and_join_to_the_tile(scale):
+    """On a ramp, each LRHS pixel is the mean of its HRLS pixels, wherever the picture's pixels are."""
+    y, x = np.mgrid[: 8 * scale, : 12 * scale].astype(np.float32)
+    high = np.stack([y, x, 3 * y - x], axis=-1)
+    low, whole = box_downsample(high, scale), (slice(0, 8), slice(0, 12))
+    window = Window(0, 0, 12, 8)
+    pair = TilePair({"rgb": low}, {"rgb": high}, scale, window, window, window, whole, whole)
+    pictures = list(split(pair))
+    for _, picture_of in pictures:
+        assert picture_of.inside == (slice(0, 4), slice(0, 6))
+        np.testing.assert_allclose(picture_of.lrhs["rgb"], box_downsample(picture_of.hrls["rgb"], scale), rtol=1e-5)
+    joined = join(((place, picture_of.hrls["rgb"]) for place, picture_of in pictures), high.shape[:2])
+    np.testing.assert_array_equal(joined, high)
+
+
+def test_a_grid_goes_and_an_edge_stays():
+    image = np.full((16, 20, 3), 0.4, np.float32)
+    image[:, 10:] = 0.9
+    grid = np.zeros_like(image)
+    grid[::2, ::2], grid[1::2, 1::2] = 0.02, -0.02
+    smooth = without_grid(image + grid)
+    assert np.abs(smooth - image)[1:-1, 1:-1].max() < 0.005
+    assert np.abs(without_grid(image) - image).max() < 1e-5
+
+
+def test_spread_noise_is_removed(session):
+    """The same network leaves most of it in, if it reads neighbouring pixels."""
+    clean = picture(256, 384)
+    pair = spread_pair(clean, session.contract.scale)
+    whole = load_model(session.contract.scale, "joint")
+    reference = spread(clean, 0.5)
+    assert psnr(fuse(*pair, session).rgb, reference) > psnr(fuse(*pair, whole).rgb, reference) + 3
+
+
+@pytest.mark.parametrize(("height", "width"), [(53, 125), (48, 100)])
+def test_any_size_alpha_and_error(session, height, width):
+    scale = session.contract.scale
+    size = (-(-height // scale), -(-width // scale))
+    low, high = np.full((*size, 3), 0.5, np.float32), np.full((height, width, 3), 0.5, np.float32)
+    alpha = np.ones((height, width, 1), np.float32)
+    alpha[:, : width // 2] = 0
+    lr_alpha = np.ones((*size, 1), np.float32)
+    lr_alpha[:, : size[1] // 2] = 0
+    high[::3, ::3] = 0.8
+    lr, hr = Render.from_arrays("lr", rgb=low, alpha=lr_alpha), Render.from_arrays("hr", rgb=high, alpha=alpha)
+    fused = fuse(lr, hr, session, error=True)
+    assert fused.rgb.shape == (height, width, 3) and fused.alpha.shape == fused.error.shape == (height, width, 1)
+    assert np.isfinite(fused.rgb).all() and fused.rgb.min() > 0.4 and fused.rgb.max() < 0.9
+    left, right = fused.alpha[:, : width // 2 - 4 * scale], fused.alpha[:, width // 2 + 4 * scale :]
+    assert np.all(left == 0) and np.all(right == 1)
+    assert (fused.error > 0).any()
+
+
+def test_tiles_give_nearly_the_same_as_a_whole_frame(monkeypatch):
+    session = load_model(2, "joint-spread")
+    pair = spread_pair(picture(512, 768), 2)
+    whole = fuse(*pair, session)
+    monkeypatch.setattr(tiling, "TILE_MEMORY", 280 << 20)
+    assert tile_count(whole.alignment, session) > 1
+    tiled = fuse(*pair, session)
+    assert tiled.tiles > 1
+    assert np.abs(srgb(tiled.rgb) - srgb(whole.rgb)).max() < 0.02
+
+
+def test_empty_pixels_stay_black(session):
+    clean = picture(128, 128)
+    clean[:, :64] = 0
+    fused = fuse(*spread_pair(clean, session.contract.scale), session)
+    assert np.all(fused.rgb[:, : 64 - 3 * session.contract.scale] == 0)
+    assert fused.rgb[:, 70:].mean() > 0.01

@@ -20,7 +20,7 @@ import numpy as np
 from benchmarks import results
 from benchmarks.results import Row
 from benchmarks.scenes import beauty
-from benchmarks.temporal.measures import flicker, psnr, relmse, warp_error
+from benchmarks.temporal.measures import flicker, jod, psnr, relmse, warp_error
 from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
 from benchmarks.temporal.report import REFERENCE, film, layout, strip, summary
 from benchmarks.temporal.sequence import Sequence, load
@@ -34,7 +34,7 @@ KEYS = ("sequence", "scale", "method")
 DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(56, 168), slice(80, 240)), 112
 
 
-def measure(sequence: Sequence, made: list[Made]) -> Iterator[Row]:
+def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> Iterator[Row]:
     """A row for each method, and one for the reference."""
     truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
     for method in made:
@@ -43,6 +43,8 @@ def measure(sequence: Sequence, made: list[Made]) -> Iterator[Row]:
         row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
         row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
         row |= {"relmse": relmse(method.images, sequence.truth), **flicker(images, truth)}
+        if with_jod:
+            row["jod"] = jod(images, truth)
         row["ewarp"] = warp_error(images, images, sequence.vectors, sequence.seen)
         row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
         yield row | {"motion": method.motion}
@@ -57,6 +59,7 @@ def main() -> int:
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
     parser.add_argument("--model", default="joint")
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
+    parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated PNG")
     results.add_option(parser)
@@ -87,7 +90,7 @@ def run(args: argparse.Namespace) -> None:
     for index, name in enumerate(names):
         sequence = load(args.folder / name, args.motion_format)
         made = list(all_methods(sequence, args.model, args.motion_format))
-        of_sequence = list(measure(sequence, made))
+        of_sequence = list(measure(sequence, made, with_jod=args.jod))
         print(layout(of_sequence), flush=True)
         rows += of_sequence
         if args.table:

@@ -53,6 +53,23 @@ def psnr(image: Array, truth: tuple[Array, Array], mask: Mask | None = None) -> 
     return decibels(_mean(products if mask is None else products[mask]))
 
 
+def jod(images: Array, truth: tuple[Array, Array]) -> float:
+    """Visible difference of a film from the mean of both references, in JOD (Mantiuk et al. 2021, FovVideoVDP).
+
+    10 is no difference; one less is seen by 75 % of the viewers. The film has 24 frames a second, on a display of
+    1920 x 1080 pixels that is looked at from 60 cm.
+
+    Args:
+        images, truth: (frames, h, w, 3), sRGB values, at least two frames.
+    """
+    import pyfvvdp
+
+    metric = pyfvvdp.fvvdp(display_name="standard_fhd", heatmap=None)
+    shown, wanted = (np.clip(film, 0, 1).astype(np.float32) for film in (images, (truth[0] + truth[1]) / 2))
+    value, _ = metric.predict(shown, wanted, dim_order="FHWC", frames_per_second=24)
+    return float(value)
+
+
 def relmse(image: Array, truth: tuple[Array, Array]) -> float:
     """RelMSE of linear values, against two references. The divisor keeps a little of their noise."""
     factor, offset = RELMSE_BCR

@@ -103,13 +103,25 @@ def details(rows: Rows[Row]) -> str:
             *(f"{row[name]:.2f}" if name in row else "" for name in ("psnr", "worst")),
             _figures(row.get("relmse")),
             *(f"{255 * row[name]:.2f}" if name in row else "" for name in ("flicker", "blotches")),
-            f"{row['tpsnr']:.2f}" if "tpsnr" in row else "",
+            *(f"{row[name]:.2f}" if name in row else "" for name in ("tpsnr", "jod")),
             _figures(row["ewarp"]),
             *(f"{row[name]:.2f}" if name in row else "" for name in MASKS),
         ]
         for row in rows
     ]
-    head = ["sequence", "scale", "method", "PSNR", "worst frame", "RelMSE", "flicker", "blotches", "tPSNR", "E_warp"]
+    head = [
+        "sequence",
+        "scale",
+        "method",
+        "PSNR",
+        "worst frame",
+        "RelMSE",
+        "flicker",
+        "blotches",
+        "tPSNR",
+        "JOD",
+        "E_warp",
+    ]
     return results.markdown([*head, *MASKS], body)
 
 

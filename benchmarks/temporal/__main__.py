@@ -30,8 +30,9 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
 
 KEYS = ("sequence", "scale", "method")
-#: What is drawn: scale, frames, rows and columns, and the row that is shown over time.
+#: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
 DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(56, 168), slice(80, 240)), 112
+FILM = (slice(80, 144), slice(112, 208))
 
 
 def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> Iterator[Row]:
@@ -110,7 +111,7 @@ def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None
     if args.picture:
         strip(args.picture, shown, FRAMES, CROP, ROW)
     if args.film:
-        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, CROP)
+        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, FILM)
 
 
 if __name__ == "__main__":

@@ -109,20 +109,8 @@ def details(rows: Rows[Row]) -> str:
         ]
         for row in rows
     ]
-    head = [
-        "sequence",
-        "scale",
-        "method",
-        "PSNR",
-        "worst frame",
-        "RelMSE",
-        "flicker",
-        "blotches",
-        "tPSNR",
-        "JOD",
-        "E_warp",
-    ]
-    return results.markdown([*head, *MASKS], body)
+    head = ["sequence", "scale", "method", "PSNR", "worst frame", "RelMSE", "flicker", "blotches", "tPSNR", "JOD"]
+    return results.markdown([*head, "E_warp", *MASKS], body)
 
 
 def _figures(value: float | None) -> str:

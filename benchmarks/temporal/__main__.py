@@ -32,7 +32,7 @@ from oiio_msspl.exr.atomic import check_target
 KEYS = ("sequence", "scale", "method")
 #: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
 DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(56, 168), slice(80, 240)), 112
-FILM = (slice(80, 144), slice(112, 208))
+FILM = (slice(84, 140), slice(116, 204))
 
 
 def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> Iterator[Row]:

@@ -165,6 +165,6 @@ def film(path: Path, shown: dict[str, Array], crop: tuple[slice, slice]) -> None
         picture = Image.fromarray((joined * 255 + 0.5).astype(np.uint8))
         for i, title in enumerate(shown):
             ImageDraw.Draw(picture).text((i * (wide[0].shape[2] + 2) + 3, 0), title, fill="white")
-        frames.append(picture.quantize(32, dither=Image.Dither.NONE))
+        frames.append(picture.quantize(24, dither=Image.Dither.NONE))
     with replacing(path, overwrite=True) as temporary:
         frames[0].save(temporary, format="PNG", save_all=True, append_images=frames[1:], duration=120, loop=0)

@@ -16,7 +16,6 @@ import time
 import zlib
 from pathlib import Path
 
-import bpy
 import numpy as np
 import OpenImageIO as oiio
 
@@ -31,6 +30,8 @@ def material(
     name: str, kind: str, scale: float, colours: tuple[tuple[float, ...], tuple[float, ...]], roughness: float
 ):
     """A procedural texture of two colours."""
+    import bpy
+
     made = bpy.data.materials.new(name)
     made.use_nodes = True
     nodes, links = made.node_tree.nodes, made.node_tree.links
@@ -49,6 +50,8 @@ def material(
 
 def build() -> None:
     """Make the room. The cube that moves has the pass index 1."""
+    import bpy
+
     bpy.ops.wm.read_factory_settings(use_empty=True)
     bpy.context.preferences.edit.keyframe_new_interpolation_type = "LINEAR"
     scene = bpy.context.scene
@@ -92,6 +95,8 @@ def build() -> None:
 
 def set_up(threads: int) -> None:
     """Settings that all files share."""
+    import bpy
+
     scene = bpy.context.scene
     scene.render.engine = "CYCLES"
     settings, output = scene.cycles, scene.render
@@ -130,6 +135,8 @@ def main() -> None:
     parser.add_argument("out", type=Path)
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
+    import bpy
+
     folder = (args.out / "cycles" / "slide").absolute()
     build()
     set_up(args.threads)

@@ -30,7 +30,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from statistics import median
@@ -172,8 +172,8 @@ def timed(function: Callable[[], Array]) -> tuple[Array, float]:
     return result, median(times)
 
 
-def measure(folder: Path, scale: int, spp: int, model: str) -> list[Row]:
-    """One scene: rows for each set and method."""
+def measure(folder: Path, scale: int, spp: int, model: str, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
+    """One scene: rows for each set and method, without those whose `KEYS` are known."""
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     other = folder / f"hr_{2 * spp}spp.exr"
@@ -185,9 +185,11 @@ def measure(folder: Path, scale: int, spp: int, model: str) -> list[Row]:
     for layers in hr.additive_sets:
         clean = layers_of(reference, layers_like(reference, layers))
         for name, function in methods(lr, hr, beauty, layers, ordinary):
-            result, seconds = timed(function)
             title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
+            if tuple(key.values()) in known:
+                continue
+            result, seconds = timed(function)
             total, *each = scores(result, clean, [layer.name for layer in layers.layers])
             seconds = 0.0 if name == "HRLS" else seconds / oidn_seconds
             rows += [key | total | {"time": seconds}, *(key | row for row in each)]
@@ -256,9 +258,9 @@ def main() -> None:
         for spp in SPP:
             for scale in SCALES:
                 known = {tuple(row[k] for k in KEYS) for row in rows}
-                new = measure(file.parent, scale, spp, args.model)
                 # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += [row for row in new if tuple(row[k] for k in KEYS) not in known]
+                rows += measure(file.parent, scale, spp, args.model, known)
+                print(f"{file.parent.name}, x{scale}, {2 * spp} spp", flush=True)
     rows += means(rows)
     print(layout(rows))
     if args.table:

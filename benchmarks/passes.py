@@ -2,7 +2,7 @@
 """Accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m benchmarks.passes PASSES --table benchmarks/results/passes.csv
-    python -m benchmarks.passes PASSES --picture docs/images/passes.png
+    python -m benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
 
 PASSES is made by :mod:`benchmarks.render.passes` and ``datagen.cycles.passes``. The methods, all but the first two with
 the albedo and the normal:
@@ -49,7 +49,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array
 from oiio_msspl.colour import srgb
-from oiio_msspl.exr.preview import write_png
+from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.passes import fuse_passes
@@ -135,15 +135,19 @@ def regraded(layers: Array) -> Array:
 
 
 def picture(folder: Path, output: Path, model: str) -> None:
-    """The light groups of a scene as rendered, fused and as they should be; below them the regraded beauty."""
+    """Write a WebP: the light groups of a scene as rendered, fused and as they should be; below them the regraded
+    beauty."""
+    from PIL import Image
+
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in ("lr_x4_32spp", "hr_2spp", "ref"))
     beauty = fuse(lr, hr, Session(find_model(4, model))).rgb
     layers = hr.additive_sets[0]
     made = dict(methods(lr, hr, beauty, layers))
     columns = [made["HRLS"](), made["msspl"](), layers_of(reference, reference.additive_sets[0])]
-    columns = [column[:, :, 100:292] for column in columns]  # a PNG of noise is large
-    rows = [np.concatenate([srgb(column[i]) for column in columns], axis=1) for i in range(2)]
-    write_png(output, np.concatenate([*rows, np.concatenate([srgb(regraded(c)) for c in columns], axis=1)], axis=0))
+    rows = [*zip(*columns, strict=True), tuple(regraded(column) for column in columns)]
+    shown = np.concatenate([np.concatenate([srgb(image) for image in row], axis=1) for row in rows], axis=0)
+    with replacing(output, overwrite=True) as temporary:
+        Image.fromarray((shown * 255 + 0.5).astype(np.uint8)).save(temporary, format="WEBP", quality=80)
 
 
 def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
@@ -246,25 +250,33 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--model", default="joint")
-    parser.add_argument("--picture", type=Path, metavar="FILE.png", help="write a picture instead")
-    parser.add_argument("--scene", default="lamp", help="of the picture")
+    parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
+    parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     results.add_option(parser)
     args = parser.parse_args()
+    scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
     if args.picture:
-        picture(args.passes / args.scene, args.picture, args.model)
+        picture(args.passes / scenes[0], args.picture, args.model)
         return
     rows: list[Row] = []
-    for file in sorted(args.passes.glob("*/ref.exr")):
+    for scene in scenes:
         for spp in SPP:
             for scale in SCALES:
                 known = {tuple(row[k] for k in KEYS) for row in rows}
                 # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += measure(file.parent, scale, spp, args.model, known)
-                print(f"{file.parent.name}, x{scale}, {2 * spp} spp", flush=True)
-    rows += means(rows)
-    print(layout(rows))
-    if args.table:
-        results.write(args.table, rows)
+                rows += measure(args.passes / scene, scale, spp, args.model, known)
+                print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
+        if args.table:
+            add(args.table, rows)
+    print(layout(means(rows)))
+
+
+def add(table: Path, rows: list[Row]) -> None:
+    """Put rows of scenes into a table, whose means are computed anew."""
+    old = [row for row in results.read(table) if row["scene"] != MEAN] if table.exists() else []
+    keys = (*KEYS, "layer")
+    together = list((results.index(old, *keys) | results.index(rows, *keys)).values())
+    results.write(table, together + means(together))
 
 
 if __name__ == "__main__":

@@ -50,9 +50,10 @@ def measure_stages(folder: Path, device: str, threads: int) -> dict[str, Any]:
         moments = [time.perf_counter()]
         ready = stages.read(frame)
         moments.append(time.perf_counter())
-        report, fused = stages.fuse(ready, stages.session(ready))
+        alone = stages.fuse(ready, stages.session(ready))
+        report = stages.complete(alone, alone.fused)
         moments.append(time.perf_counter())
-        stages.write(report, fused)
+        stages.write(report, alone.fused)
         moments.append(time.perf_counter())
         for stage, (before, after) in zip(seconds, pairwise(moments), strict=True):
             seconds[stage] += after - before

@@ -31,8 +31,7 @@ from oiio_msspl.exr.atomic import check_target
 
 KEYS = ("sequence", "scale", "method")
 #: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
-DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(56, 168), slice(80, 240)), 112
-FILM = (slice(84, 140), slice(116, 204))
+DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(104, 216), slice(90, 250)), 160
 
 
 def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> Iterator[Row]:
@@ -62,7 +61,7 @@ def main() -> int:
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
-    parser.add_argument("--film", type=Path, help="draw an animated PNG")
+    parser.add_argument("--film", type=Path, help="draw an animated WebP")
     results.add_option(parser)
     args = parser.parse_args()
     try:
@@ -111,7 +110,7 @@ def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None
     if args.picture:
         strip(args.picture, shown, FRAMES, CROP, ROW)
     if args.film:
-        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, FILM)
+        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, CROP)
 
 
 if __name__ == "__main__":

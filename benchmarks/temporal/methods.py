@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,10 +12,14 @@ from benchmarks.peers import oidn, oidn_prefiltered
 from benchmarks.temporal.sequence import Sequence
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.arrays import Array
+from oiio_msspl.errors import InputError
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.render_average import RenderPair, average_renders
+from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Frame, find_shot
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import FrameWindow, FusedAlone, TemporalOptions, plan_temporal
+from oiio_msspl.jobs.stages import LoadedFrame, Stages
+from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, plan_temporal
 
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
 OIDN, OIDN_BEST, OIDN_NEIGHBOURS = "OIDN", "OIDN prefiltered", "OIDN prefiltered, with neighbours"
@@ -38,39 +42,66 @@ class Made:
 def all_methods(sequence: Sequence, model: str, motion_format: str | None = None) -> Iterator[Made]:
     """Each method on a sequence.
 
-    OIDN denoises renders with the samples of both renders together. Its frames are averaged exactly as ours are. The
-    test of the light gets the luminance of the same LRHS and HRLS. ``motion_format`` is that of `msspl-fuse`.
+    OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
+    are averaged exactly as ours are. The test of the light gets the same LRHS. ``motion_format`` is that of
+    `msspl-fuse`.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
-    best = np.stack([oidn_prefiltered(render) for render in full])
     yield Made(OIDN, 1, np.stack([oidn(render) for render in full]))
-    yield Made(OIDN_BEST, 1, best)
+    yield Made(OIDN_BEST, 1, np.stack([oidn_prefiltered(render) for render in full]))
     for scale in SCALES:
-        yield from _by_scale(sequence, model, scale, best, TemporalOptions(motion_format=motion_format))
+        yield from _by_scale(sequence, model, scale, TemporalOptions(motion_format=motion_format))
 
 
-def _by_scale(sequence: Sequence, model: str, scale: int, peer: Array, options: TemporalOptions) -> Iterator[Made]:
+def _by_scale(sequence: Sequence, model: str, scale: int, options: TemporalOptions) -> Iterator[Made]:
+    """Our frames alone and with neighbours, and OIDN's with neighbours."""
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     temporal = plan_temporal(shot, InputOptions(), options)
     motion = f"{temporal.motion.kind}: {temporal.text}" if temporal.motion else temporal.text
     # More threads only wait for each other: the pictures are small.
     stages = Stages(model=model, threads=1, temporal=temporal)
-    frames = []
-    for frame in shot.frames:
-        loaded = stages.read(frame)
-        frames.append(stages.fuse(loaded, stages.session(loaded)))
-    ours = np.stack([each.fused.rgb for each in frames])
-    yield Made(ALONE, scale, ours)
-    for method, images in ((NEIGHBOURS, ours), (OIDN_NEIGHBOURS, peer)):
-        window = FrameWindow(temporal, shot.frames)
-        yield Made(method, scale, np.stack(list(_averaged(window, shot.frames, frames, images))), motion)
+
+    def ours(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
+        return stages.fuse(loaded, stages.session(loaded), neighbours)
+
+    def with_full(frame: Frame) -> LoadedFrame:
+        """A frame whose HRLS has the pixels of the full render, and its own motion vectors."""
+        full = map_render(open_exr(folder / f"full.{frame.number:04d}.exr"))
+        return replace(stages.read(frame), hr_pixels=full.load())
+
+    def theirs(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
+        averaged = average_renders(RenderPair(loaded.lr_pixels, loaded.hr_pixels), *neighbours)
+        pair = RenderPair(averaged.lr, averaged.hr)
+        fused = FusedFrame(oidn_prefiltered(averaged.hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
+        return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
+
+    yield Made(ALONE, scale, _frames(stages.read, Temporal(), shot.frames, ours))
+    yield Made(NEIGHBOURS, scale, _frames(stages.read, temporal, shot.frames, ours), motion)
+    yield Made(OIDN_NEIGHBOURS, scale, _frames(with_full, temporal, shot.frames, theirs), motion)
 
 
-def _averaged(window: FrameWindow, frames: list[Frame], alone: list[FusedAlone], images: Array) -> Iterator[Array]:
-    """Images of frames, averaged with their neighbours."""
-    for frame, each, image in zip(frames, alone, images, strict=True):
-        ready = window.add(frame.number, replace(each, fused=replace(each.fused, rgb=image)))
-        for done, _ in ready:
-            yield window.accumulate(done.number).rgb
+def _frames(
+    read: Callable[[Frame], LoadedFrame],
+    temporal: Temporal,
+    frames: list[Frame],
+    fuse: Callable[[LoadedFrame, Neighbours], FusedAlone],
+) -> Array:
+    """Images of all frames.
+
+    Raises:
+        MssplError: a frame can't be fused.
+        InputError: a neighbour is not averaged.
+    """
+    window = FrameWindow(temporal, frames, fuse)
+    images = []
+    for frame in window.order():
+        for done, outcome in window.add(frame.number, read(frame)):
+            if isinstance(outcome, Exception):
+                raise outcome
+            fused = window.accumulate(done.number)
+            if left_out := [text for text in fused.warnings if "is not averaged" in text]:
+                raise InputError(f"{done.hr}: {left_out[0]}")
+            images.append(fused.rgb)
         window.release()
+    return np.stack(images)

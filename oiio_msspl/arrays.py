@@ -3,9 +3,10 @@
 
 from __future__ import annotations
 
+import tempfile
 from collections.abc import Callable
 from functools import reduce
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,6 +17,27 @@ Array = NDArray[np.float32]
 
 #: Largest finite values of half and of float.
 HALF_MAX, FLOAT_MAX = 65504.0, float(np.finfo(np.float32).max)
+#: Images of more pixels that wait for others are kept in temporary files.
+MOST_PIXELS = 1_000_000
+
+T = TypeVar("T", bound=np.generic)
+
+
+def blank(shape: tuple[int, ...], dtype: type[T] | np.dtype[T] = np.float32) -> NDArray[T]:  # type: ignore[assignment]
+    """An image (h, w, ...) that is to be filled: in memory, or in a temporary file if it has many pixels."""
+    if shape[0] * shape[1] <= MOST_PIXELS:
+        return np.empty(shape, dtype)
+    with tempfile.TemporaryFile(prefix="msspl-") as file:
+        return np.memmap(file, dtype, "w+", shape=shape)
+
+
+def kept(values: NDArray[T]) -> NDArray[T]:
+    """An image that waits for others: itself, or a copy in a temporary file if it has many pixels."""
+    if values.shape[0] * values.shape[1] <= MOST_PIXELS:
+        return values
+    on_disk = blank(values.shape, values.dtype)
+    on_disk[:] = values
+    return on_disk
 
 
 def map_rows(function: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:

@@ -165,7 +165,7 @@ Temporal = Annotated[
     typer.Option(
         "--temporal",
         metavar="N",
-        help="Average each frame with N frames before and after it, along their motion; or off. auto: 2 where motion "
+        help="Average each frame with N frames before and after it, along their motion; or off. auto: 4 where motion "
         "is known.",
         rich_help_panel=SHOT,
     ),

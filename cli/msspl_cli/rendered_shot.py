@@ -10,10 +10,11 @@ from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.fusion.motion import VECTORS, MotionSource
+from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import map_pair, resolve_auto
 from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import AUTO, FrameWindow, FusedAlone, Temporal, TemporalOptions
+from oiio_msspl.jobs.stages import LoadedFrame, Stages
+from oiio_msspl.jobs.temporal import AUTO, Temporal, TemporalOptions, shares
 from oiio_msspl.model.catalogue import AUTO as AUTO_MODEL
 from oiio_msspl.parallel import limit_threads
 
@@ -51,6 +52,8 @@ class RenderedShot:
     ) -> None:
         self._stages, self._shot, self._wanted, self._keep = stages, shot, list(wanted), keep
         self._required = options.frames != AUTO
+        #: Number of the frame that an error is about.
+        self._at_work = 0
         #: Renders on the disk, by frame number.
         self._renders: dict[int, Frame] = {}
         #: Warnings about the frames that are written.
@@ -58,14 +61,14 @@ class RenderedShot:
         frames = {frame.number: frame for frame in shot}
         length = f"{options.count} frame{'s' if options.count > 1 else ''}"
         text = f"with {length} before and after each, along the motion vectors of Cycles"
-        self._plan(Temporal(options.count, None, frames, text if options.count else ""))
+        self._plan(Temporal(*shares(options.count, VECTORS), None, frames, text if options.count else ""))
         if options.count and not any(number + 1 in frames for number in frames):
             self.fuse_alone("no two frames follow each other")
 
     def _plan(self, temporal: Temporal) -> None:
         self._temporal = temporal
         self._stages = replace(self._stages, temporal=temporal)
-        self._window = FrameWindow(temporal, self._wanted)
+        self._window = FrameWindow(temporal, self._wanted, self._fuse_frame)
         self.order = self._window.order()
         """The frames to render: those that are to be written, and their neighbours."""
         self._next = iter(self.order)
@@ -100,21 +103,21 @@ class RenderedShot:
             InputError, MssplError: a frame can't be fused. The message names it if there are several.
         """
         frame = replace(next(self._next), lr=lr, hr=hr)
-        number = frame.number
+        self._at_work = frame.number
         try:
             with limit_threads(self._stages.threads):
                 if self._stages.model == AUTO_MODEL:  # all frames get the model that suits the first pair
                     family = resolve_auto(*map_pair(lr, hr, self._stages.inputs), AUTO_MODEL)
                     self._stages = replace(self._stages, model=family)
-                alone = self._fuse_alone(frame)
-                for ready, outcome in self._window.add(number, alone):
-                    number = ready.number
+                loaded = self._read(frame)
+                for ready, outcome in self._window.add(frame.number, loaded):
+                    self._at_work = ready.number
                     assert isinstance(outcome, FusedAlone)
                     self._write(ready, outcome)
         except MssplError as error:
             if len(self._shot) == 1:
                 raise
-            raise type(error)(f"frame {number}: {error}") from error
+            raise type(error)(f"frame {self._at_work}: {error}") from error
         self._release()
 
     def waits(self, output: Path) -> bool:
@@ -125,15 +128,19 @@ class RenderedShot:
         """Warnings about a frame that is written."""
         return self._warnings.get(output, [])
 
-    def _fuse_alone(self, frame: Frame) -> FusedAlone:
+    def _read(self, frame: Frame) -> LoadedFrame:
         loaded = self._stages.read(frame)
         self._renders[frame.number] = frame
         if self._temporal.count and self._temporal.motion is None:
             # The format need not be verified: Blender is known, and motion blur is off.
             motion = MotionSource(VECTORS, self.text, loaded.hr.motion.fields)
             self._temporal = replace(self._temporal, motion=motion)
-            self._window = FrameWindow(self._temporal, self._wanted)
-        return self._stages.fuse(loaded, self._stages.session(loaded))
+            self._window = FrameWindow(self._temporal, self._wanted, self._fuse_frame)
+        return loaded
+
+    def _fuse_frame(self, loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
+        self._at_work = loaded.frame.number
+        return self._stages.fuse(loaded, self._stages.session(loaded), neighbours)
 
     def _write(self, frame: Frame, alone: FusedAlone) -> None:
         fused = self._window.accumulate(frame.number)

@@ -4,10 +4,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.colour import REC709, ColourSpace, conversion, srgb
@@ -15,6 +17,8 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
+
+Pixels = NDArray[np.uint8]
 
 #: Pinned: OpenColorIO's "-latest" configurations change their default view between releases.
 OCIO_CONFIG = "ocio://cg-config-v2.2.0_aces-v1.3_ocio-v2.4"
@@ -88,7 +92,7 @@ def write_preview(
 
     to_rec709 = None if space == REC709 else conversion(space, REC709).T.astype(np.float32)
 
-    def rows(start: int, stop: int) -> Array:
+    def rows(start: int, stop: int) -> Pixels:
         y0 = display_window.y0
         strip = Window(display_window.x0, y0 + start, display_window.x1, y0 + stop)
         linear = np.zeros((strip.height, strip.width, 3), dtype=np.float32)
@@ -97,7 +101,7 @@ def write_preview(
             linear[rendered.slices(strip)] = rgb[rendered.slices(data_window)]
         if to_rec709 is not None:
             linear = linear @ to_rec709
-        return srgb(linear) if view is None else _through_ocio(linear, view)
+        return _srgb_pixels(linear) if view is None else _to_8_bits(_through_ocio(linear, view))
 
     _write_png(path, display_window.width, display_window.height, rows, overwrite)
 
@@ -114,10 +118,27 @@ def write_png(path: Path, display: Array, *, overwrite: bool = False) -> None:
         InputError: ``path`` exists.
         MssplError: the file can't be written.
     """
-    _write_png(path, display.shape[1], display.shape[0], lambda start, stop: display[start:stop], overwrite)
+    _write_png(path, display.shape[1], display.shape[0], lambda start, stop: _to_8_bits(display[start:stop]), overwrite)
 
 
-def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], Array], overwrite: bool) -> None:
+def _to_8_bits(display: Array) -> Pixels:
+    """Display values as they are stored, clipped to [0, 1]."""
+    return (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8)
+
+
+def _srgb_pixels(linear: Array) -> Pixels:
+    """Linear values through the sRGB curve, by a table of all half floats: six times as fast as to compute it. One
+    value in a hundred is rounded to the other side."""
+    return _srgb_table().take(np.clip(linear, 0, 1).astype(np.float16).view(np.uint16))
+
+
+@lru_cache(maxsize=1)
+def _srgb_table() -> Pixels:
+    halves = np.arange(1 << 16, dtype=np.uint16).view(np.float16).astype(np.float32)
+    return _to_8_bits(srgb(np.nan_to_num(halves, posinf=1, neginf=0)))
+
+
+def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], Pixels], overwrite: bool) -> None:
     """Write the rows that ``rows(start, stop)`` gives, a strip at a time: a large frame needs no second copy."""
     with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
@@ -131,8 +152,7 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], A
         ok = writer.open(str(temporary), spec)
         for start in range(0, height, ROWS_PER_STRIP):
             stop = min(start + ROWS_PER_STRIP, height)
-            pixels = (np.clip(rows(start, stop), 0, 1) * 255 + 0.5).astype(np.uint8)
-            ok = ok and writer.write_scanlines(start, stop, 0, np.ascontiguousarray(pixels))
+            ok = ok and writer.write_scanlines(start, stop, 0, np.ascontiguousarray(rows(start, stop)))
         ok = writer.close() and ok
         if not ok:
             raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")

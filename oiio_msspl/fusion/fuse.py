@@ -314,7 +314,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
         fused = [_fuse_picture(picture, session, means, error=frame.error is not None) for picture in tile.pictures]
         places = [picture.place for picture in tile.pictures]
         encoded = join(zip(places, (image for image, _ in fused), strict=True), size)
-        if session.stride > 1:
+        if session.stride > 1 and not all(picture.noise_free for picture in tile.pictures):
             encoded = without_grid(encoded)
         rgb = frame.rgb[target]
         decode_radiance(encoded[core], frame.exposure, rgb)

@@ -101,7 +101,7 @@ def _doubtful_zeros(render: MappedRender, vectors: Array, known: Mask) -> Mask:
     """
     still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
     surface = known
-    if NORMAL in render.features:
+    if still.any() and NORMAL in render.features:
         normal = render.read(render.data_window, [NORMAL])[NORMAL]
         surface = known & (normal != 0).any(axis=-1)
     count = np.count_nonzero(surface)

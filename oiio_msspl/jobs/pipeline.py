@@ -13,10 +13,10 @@ from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import FrameWindow, FusedAlone
+from oiio_msspl.jobs.stages import LoadedFrame, Stages
 
 
 def run_pipeline(
@@ -39,9 +39,7 @@ def run_pipeline(
     """
     writing: tuple[Frame, FrameReport, Future[None]] | None = None
 
-    def record_failure(frame: Frame, error: BaseException) -> None:
-        if not isinstance(error, Exception):
-            raise error
+    def record_failure(frame: Frame, error: Exception) -> None:
         # The error says that the EXR appeared while it was computed.
         record(frame, None if stages.skips(frame) else error)
 
@@ -54,15 +52,24 @@ def run_pipeline(
         error = written.exception()
         if error is None:
             record(frame, report.as_dict())
-        else:
+        elif isinstance(error, Exception):
             record_failure(frame, error)
+        else:
+            raise error
         # Reset last: a signal may interrupt the lines above, and the frame is then recorded on the way out.
         writing = None
 
-    def finish(frame: Frame, outcome: FusedAlone | BaseException) -> None:
+    def fuse(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone | Exception:
+        session = stages.session(loaded)
+        try:
+            return stages.fuse(loaded, session, neighbours)
+        except Exception as error:
+            return error
+
+    def finish(frame: Frame, outcome: FusedAlone | Exception) -> None:
         """Complete a frame that is fused, and hand it over to the writer; or record why it could not be."""
         nonlocal writing
-        error = outcome if isinstance(outcome, BaseException) else None
+        error = outcome if isinstance(outcome, Exception) else None
         if error is None and stages.temporal.count and stages.skips(frame):
             error = InputError("another run has fused it")
         if isinstance(outcome, FusedAlone) and error is None:
@@ -81,7 +88,7 @@ def run_pipeline(
         writing = frame, report, written
         writer.submit(_write, stages, report, fused, written)
 
-    window = FrameWindow(stages.temporal, frames)
+    window = FrameWindow(stages.temporal, frames, fuse)
     order = window.order()
     with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
         reads = [reader.submit(stages.read, frame) for frame in order[:1]]
@@ -89,22 +96,16 @@ def run_pipeline(
             for index, frame in enumerate(order):
                 reading = reads.pop()
                 reads += [reader.submit(stages.read, following) for following in order[index + 1 : index + 2]]
-                outcome: FusedAlone | BaseException | None = reading.exception()
-                if outcome is None and not stages.temporal.count and stages.skips(frame):
-                    outcome = InputError("another run has fused it")  # is recorded as skipped
-                elif outcome is None:
-                    session = stages.session(reading.result())
-                    try:
-                        outcome = stages.fuse(reading.result(), session)
-                    except Exception as caught:
-                        outcome = caught
-                if not isinstance(outcome, FusedAlone | Exception):
-                    raise outcome
-                for ready, result in window.add(frame.number, outcome):
+                problem = reading.exception()
+                if problem is None and not stages.temporal.count and stages.skips(frame):
+                    problem = InputError("another run has fused it")  # is recorded as skipped
+                if not isinstance(problem, Exception | None):
+                    raise problem
+                for ready, result in window.add(frame.number, problem or reading.result()):
                     finish(ready, result)
                     save()
                 window.release()
-                del reading, outcome  # frees the frame's pixels before those of the next frame arrive
+                del reading  # frees the frame's pixels before those of the next frame arrive
         finally:
             for reading in reads:
                 reading.cancel()

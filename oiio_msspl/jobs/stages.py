@@ -10,7 +10,7 @@ import time
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
@@ -18,12 +18,14 @@ from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.jobs.frame import check_frame_memory, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
 from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.temporal import FusedAlone, Temporal
+from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.jobs.views import OtherViews, check_passes, find_other_views, fuse_frame_passes, fuse_other_views
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
@@ -113,15 +115,21 @@ class Stages:
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
-        if 2 * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= self._left_for_pixels(lr, hr):
+        if self._fits(lr, hr):
             return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start, others)
         return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
 
-    def _left_for_pixels(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Memory that is left beside a tile, two results and the neighbours."""
+    def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:
+        """Whether the pixels of all frames that are held fit into memory, beside a tile and two results."""
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
-        others = self.temporal.memory(hr.data_window)
-        return self.max_memory - FIXED_MEMORY - TILE_MEMORY - 2 * result_bytes - _pixel_bytes(lr) - others
+        other = FIXED_MEMORY + TILE_MEMORY + 2 * result_bytes + _pixel_bytes(lr)
+        other += self.temporal.memory(hr.data_window, _channels(hr))
+        return self._frames_held * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= self.max_memory - other
+
+    @property
+    def _frames_held(self) -> int:
+        """Frames whose pixels are in memory: the one that is fused, its neighbours, and the next one to come."""
+        return 2 * self.temporal.renders + 2
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -137,24 +145,28 @@ class Stages:
             session.require_error()
         return session
 
-    def fuse(self, loaded: LoadedFrame, session: Session) -> FusedAlone:
+    def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours = ((), ())) -> FusedAlone:
         """Fuse the beauty of a pair.
+
+        Args:
+            loaded: the pair.
+            session: a model for its scale.
+            neighbours: frames before and after it, whose renders are averaged with its own before.
 
         Raises:
             InputError: the pair does not fit into memory, or pixels can't be decoded.
             MssplError: the network failed.
         """
         start = time.perf_counter()
-        held = self._held_bytes(loaded)
+        held = self._held_bytes(loaded, session)
         check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, held)
-        fused = fuse(
-            loaded.lr_pixels,
-            loaded.hr_pixels,
-            session,
-            error=self.write_options.error_layer,
-            max_memory=self.max_memory,
-            held=held,
-        )
+        pair, frames = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None
+        if any(neighbours):
+            averaged = average_renders(pair, *neighbours, _features_read(session))
+            pair, frames = RenderPair(averaged.lr, averaged.hr), averaged.frames
+        error = self.write_options.error_layer
+        fused = fuse(pair.lr, pair.hr, session, error=error, max_memory=self.max_memory, held=held)
+        fused.frames = frames
         # The pixels in memory are not needed any more. A neighbour may need the frame for a while.
         alone = replace(loaded, lr_pixels=loaded.lr, hr_pixels=loaded.hr)
         return FusedAlone(alone, session, fused, time.perf_counter() - start)
@@ -173,7 +185,7 @@ class Stages:
             InputError, MssplError: see :meth:`fuse`.
         """
         start = time.perf_counter()
-        loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded)
+        loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded, alone.session)
         fused.replaced, reports = fuse_other_views(
             loaded.others, session, self.write_options, self.max_memory, held=held
         )
@@ -185,13 +197,14 @@ class Stages:
         report.seconds = {"read": loaded.seconds, "fuse": seconds, "network": report.network_seconds}
         return report
 
-    def _held_bytes(self, loaded: LoadedFrame) -> int:
+    def _held_bytes(self, loaded: LoadedFrame, session: Session) -> int:
         """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
         result_channels = 5 if self.write_options.error_layer else 4
         held = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
-        if 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr)) <= self._left_for_pixels(loaded.lr, loaded.hr):
-            held += 2 * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
-        return held + self.temporal.memory(loaded.hr.data_window)
+        if self._fits(loaded.lr, loaded.hr):
+            held += self._frames_held * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+        read = sum(HRLS_FEATURES.get(name, 1) for name in _features_read(session))
+        return held + self.temporal.memory(loaded.hr.data_window, min(_channels(loaded.hr), read))
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
         """Write preview and EXR.
@@ -228,7 +241,16 @@ def is_left_over(png: Path) -> bool:
     return png.is_file() and is_our_preview(png)
 
 
+def _features_read(session: Session) -> list[str]:
+    """The features that a model reads of either render, and those that tell it what they show."""
+    return list(dict.fromkeys([*session.contract.features, *session.lrhs_aovs, ALBEDO, NORMAL, "alpha"]))
+
+
+def _channels(render: MappedRender) -> int:
+    """Channels of a render's features."""
+    return sum(HRLS_FEATURES[name] for name in render.features) + (render.alpha is not None)
+
+
 def _pixel_bytes(render: MappedRender) -> int:
     """Bytes of a render's features in memory."""
-    channels = sum(HRLS_FEATURES[name] for name in render.features) + (render.alpha is not None)
-    return render.data_window.width * render.data_window.height * channels * 4
+    return render.data_window.width * render.data_window.height * _channels(render) * 4

@@ -45,7 +45,7 @@ SHOWN = {
     "msspl_render": (
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --model --device --output --layout "
         "--passes --error-layer --compare "
-        "--overwrite --json --frames --skip-existing --help --help-all",
+        "--overwrite --json --frames --temporal --skip-existing --help --help-all",
         6,
     ),
 }

@@ -191,7 +191,7 @@ def moving(tmp_path_factory, bilinear_models):
 
 @posix
 def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model, moving, monkeypatch):
-    """The frames are those of fuse_shot on the same files. At most four pairs are on the disk, and a frame that is
+    """The frames are those of fuse_shot on the same files. At most six pairs are on the disk, and a frame that is
     rendered again for a resumed shot is not written."""
     for name in ("LR", "HR"):
         monkeypatch.setenv(name, f"{moving}/{name.lower()}/{name.lower()}.{{}}.exr")
@@ -204,7 +204,7 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
     assert pixels(folder / "out") == pixels(moving / "whole") != pixels(moving / "alone")
     rendered = [tuple(map(int, line.split())) for line in (folder / "log").read_text().splitlines()]
     assert [number for number, _ in rendered] == list(range(1001, 1008))
-    assert max(files for _, files in rendered) == 8
+    assert max(files for _, files in rendered) == 12
 
     (folder / "log").unlink()
     for number in (1001, 1002):
@@ -213,8 +213,10 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
     shutil.copy(os.environ["ORIGINAL"], model)
     code, out, err, _ = run(*shot, "--skip-existing", code=ASKS)
     assert (code, err) == (0, "")
-    assert "Fused with 2 frames before and after each, along the motion vectors of Cycles" in out
-    assert [line.split()[0] for line in (folder / "log").read_text().splitlines()] == ["1001", "1002", "1003", "1004"]
+    assert "Fused with 4 frames before and after each, along the motion vectors of Cycles" in out
+    assert [line.split()[0] for line in (folder / "log").read_text().splitlines()] == [
+        str(number) for number in range(1001, 1007)
+    ]
     written = pixels(folder / "out")
     assert written.pop("hr.1003.exr") == pixels(moving / "hr")["hr.1003.exr"]
     assert written.items() < pixels(moving / "whole").items()

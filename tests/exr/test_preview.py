@@ -7,6 +7,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.preview import check_view, is_our_preview, write_png, write_preview
 from oiio_msspl.exr.render import Window
@@ -32,6 +33,14 @@ def test_the_preview_has_the_srgb_curve(tmp_path):
     window = Window(0, 0, 4, 4)
     write_preview(tmp_path / "a.png", rgb, window, window)
     assert (png(tmp_path / "a.png") == round(255 * (1.055 * 0.5 ** (1 / 2.4) - 0.055))).all()
+
+
+def test_every_value_is_at_most_one_step_from_the_curve(tmp_path):
+    rgb = np.linspace(0, 1.2, 64 * 64 * 3, dtype=np.float32).reshape(64, 64, 3)
+    window = Window(0, 0, 64, 64)
+    write_preview(tmp_path / "a.png", rgb, window, window)
+    steps = png(tmp_path / "a.png").astype(int) - np.rint(srgb(rgb) * 255)
+    assert abs(steps).max() <= 1 and np.count_nonzero(steps) < 0.02 * steps.size
 
 
 def test_display_values_are_written_as_they_are_and_clipped(tmp_path):

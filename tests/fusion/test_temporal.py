@@ -7,10 +7,11 @@ import pytest
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Render, Window
-from oiio_msspl.fusion import temporal
+from oiio_msspl.fusion import light
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.temporal import Step, accumulate
+from oiio_msspl.fusion.temporal import accumulate
+from oiio_msspl.fusion.warp import Step
 
 HEIGHT, WIDTH, SCALE = 96, 128, 4
 #: Deviation of the error of a fused frame, as a share of its light, and of a sample's noise.
@@ -162,7 +163,7 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
     frames[2].rgb *= dark
 
     def result(rows):
-        monkeypatch.setattr(temporal, "BAND_ROWS", rows)
+        monkeypatch.setattr(light, "BAND_ROWS", rows)
         return accumulate(frames[1], [moved(frames[0], -0.7, 0.4)], [moved(frames[2], 0.7, -3.3)])
 
     whole, parts = result(1024), result(16)

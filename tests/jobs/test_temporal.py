@@ -14,9 +14,11 @@ from oiio_msspl import InputError, fuse_shot, map_render, open_exr
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.motion import FLOW, VECTORS
 from oiio_msspl.jobs import stages
+from oiio_msspl.jobs.frame_window import FrameWindow
 from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.temporal import FrameWindow, Temporal, TemporalOptions
+from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, shares
 from tests.conftest import downsample, noisy, rgb, write_exr
 from tests.moving_plane import positions, standing, texture, truck, vectors
 from tests.shots import contents
@@ -65,7 +67,7 @@ def beauty(path):
 
 
 def test_vectors_are_verified_and_frames_are_cleaner(shot, whole, bilinear_models):
-    assert "with 2 frames before and after each: motion vectors of motionFore" in whole.temporal
+    assert "with 4 frames before and after each: motion vectors of motionFore" in whole.temporal
     run(shot, bilinear_models[4], "alone", "off")
     gains = []
     for t in range(2, COUNT - 2):
@@ -142,6 +144,23 @@ def test_a_frame_without_usable_neighbours_is_the_single_frame_bit_for_bit(tmp_p
     assert any(text.startswith("frame 1007 is not averaged: ") for text in report.results[1008].warnings)
 
 
+@pytest.mark.parametrize("in_memory", [True, False])
+def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models, monkeypatch, in_memory):
+    folder = make_moving_shot(tmp_path, count=4)
+    damaged = folder / "hr/hr.1003.exr"
+    damaged.write_bytes(damaged.read_bytes()[:-2000])
+    monkeypatch.setattr(stages.Stages, "_fits", lambda self, lr, hr: in_memory)
+    report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
+    assert [report.results[n].status for n in range(1001, 1005)] == ["fused", "fused", "failed", "fused"]
+    assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)
+
+
+@pytest.mark.parametrize(("count", "averaged"), [(1, (0, 1)), (2, (1, 1)), (3, (1, 2)), (4, (2, 2))])
+def test_renders_and_fused_frames_share_the_neighbours(count, averaged):
+    assert shares(count, VECTORS) == averaged
+    assert shares(count, FLOW) == (0, count)  # flow is computed on fused frames
+
+
 def test_without_known_motion_frames_stay_alone(tmp_path, bilinear_models):
     folder = make_moving_shot(tmp_path, layers=(), count=3)
     # Without OpenCV there is no source of motion at all; with it, auto does not take computed motion either.
@@ -183,51 +202,55 @@ def test_neighbours_that_are_asked_for_and_cannot_be_are_an_error(tmp_path, bili
 
 
 def test_update_fuses_a_frame_again_whose_neighbour_is_newer(tmp_path, bilinear_models):
-    folder = make_moving_shot(tmp_path, count=7)
+    folder = make_moving_shot(tmp_path, count=8)
     run(folder, bilinear_models[4], "out")
-    later = (folder / "out/hr.1007.exr").stat().st_mtime + 9
+    later = (folder / "out/hr.1008.exr").stat().st_mtime + 9
     os.utime(folder / "hr/hr.1002.exr", (later, later))
     report = run(folder, bilinear_models[4], "out", update=True)
     fused = [n for n, result in report.results.items() if result.status == "fused"]
-    assert fused == [1001, 1002, 1003, 1004]
+    assert fused == [1001, 1002, 1003, 1004, 1005, 1006]
 
 
 def test_frames_are_fused_once_and_kept_as_long_as_needed(shot, bilinear_models, monkeypatch):
-    fused, most = [], 0
+    fused, most, most_renders = [], 0, 0
     real, release = stages.Stages.fuse, FrameWindow.release
 
-    def count(self, loaded, session):
+    def count(self, loaded, session, neighbours):
         fused.append(loaded.frame.number)
-        return real(self, loaded, session)
+        return real(self, loaded, session, neighbours)
 
     def watch(self):
-        nonlocal most
+        nonlocal most, most_renders
         release(self)
-        most = max(most, len(self._done))
+        most, most_renders = max(most, len(self._fused)), max(most_renders, len(self._loaded))
 
     monkeypatch.setattr(stages.Stages, "fuse", count)
     monkeypatch.setattr(FrameWindow, "release", watch)
     run(shot, bilinear_models[4], "once")
-    assert fused == list(range(FIRST, FIRST + COUNT)) and most == 4
+    assert fused == list(range(FIRST, FIRST + COUNT)) and (most, most_renders) == (4, 4)
 
 
 def test_the_order_of_a_part_begins_with_its_neighbours():
     frames = {n: Frame(n, None, None, None) for n in (1, 2, 3, 5, 6, 7, 8, 9)}
-    temporal = Temporal(2, None, frames)
-    assert [frame.number for frame in FrameWindow(temporal, [frames[7]]).order()] == [5, 6, 7, 8, 9]
-    assert [frame.number for frame in FrameWindow(temporal, [frames[3]]).order()] == [1, 2, 3]
+    temporal = Temporal(1, 1, None, frames)
+
+    def order(number):
+        return [frame.number for frame in FrameWindow(temporal, [frames[number]], lambda *_: None).order()]
+
+    assert order(7) == [5, 6, 7, 8, 9] and order(3) == [1, 2, 3]
     assert temporal.missing(3) == [4] and temporal.missing(6) == [4] and temporal.missing(1) == []
 
 
 def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monkeypatch):
-    monkeypatch.setattr("oiio_msspl.jobs.temporal.MOST_PIXELS", 100)
+    monkeypatch.setattr("oiio_msspl.arrays.MOST_PIXELS", 100)
     run(shot, bilinear_models[4], "on disk")
     assert contents(shot / "on disk") == contents(shot / "whole")
     window = Window(0, 0, 4096, 2160)
     monkeypatch.undo()
-    temporal = Temporal(2)
-    assert temporal.memory(window) < temporal.memory(Window(0, 0, 2560, 1920)) < 1 << 30
-    assert Temporal().memory(window) == 0
+    temporal = Temporal(2, 2)
+    assert temporal.memory(window, 12) < 1 << 30
+    assert temporal.memory(Window(0, 0, 1920, 1080), 12) < 1 << 29
+    assert Temporal().memory(window, 12) == 0
 
 
 def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):
@@ -240,4 +263,4 @@ def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):
         (layer,) = [layer for layer in layers_of(file) if layer.name == "frames"]
         counts[name] = file.read(list(layer.channels.values()), map_render(file, features=()).data_window)
     assert (counts["ones/hr.1001"] == 1).all()
-    assert 1 < np.median(counts["counted/hr.1001"]) <= 3 < np.median(counts["counted/hr.1003"]) <= 5
+    assert 1 < np.median(counts["counted/hr.1001"]) <= 5 < np.median(counts["counted/hr.1003"]) <= 9

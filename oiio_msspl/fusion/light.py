@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Has the light of a frame's neighbour changed?
+
+Both renders of a frame, `L` and `H`, are compared with those of a neighbour at the LRHS's resolution. They have
+independent noise, so the mean of the product of the two differences is the squared change of the light without the
+noise of the renders. (Zheng et al. 2021 estimate errors from two independent buffers in the same way.)
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from oiio_msspl.arrays import Array, box_downsample, mean_around, upsample_linear
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.tile_features import mirrored_pixels
+
+#: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
+#: shadow, the large one a faint change of all the light.
+RADII = (14, 28)
+#: The error that a fused frame has itself: the variance of the noise of this many HRLS pixels, averaged.
+PIXELS_AVERAGED = 80.0
+#: How many standard deviations of its own noise are subtracted from an estimated change.
+DOUBT = 0.5
+#: Differences relative to the local brightness are limited to this, because a firefly says nothing of the light.
+LARGEST_DIFFERENCE = 3.0
+#: The local brightness is at least this share of the frame's.
+DARKEST = 0.02
+#: Relative squared difference below which two frames are equal.
+EQUAL = 1e-4
+#: Rows of the frame that are averaged at a time, which bounds memory; a multiple of every scale.
+BAND_ROWS = 512
+
+
+def bands(alignment: Alignment) -> Iterator[tuple[Window, Window]]:
+    """Rows of the data window, and the area around them that decides on them."""
+    window, scale = alignment.hr_data_window, alignment.scale
+    halo = -(-max(RADII) // scale) * scale + 2 * scale
+    for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, BAND_ROWS):
+        core = Window(window.x0, max(top, window.y0), window.x1, min(top + BAND_ROWS, window.y1))
+        area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + BAND_ROWS + halo, window.y1))
+        yield core, area
+
+
+def rows_in_bands(height: int) -> int:
+    """The most rows of an area of :func:`bands`, in a data window of this height."""
+    return min(height, BAND_ROWS + 4 * max(RADII))
+
+
+def grid_rows(alignment: Alignment, area: Window) -> slice:
+    """The rows of the grid that an area of the data window covers."""
+    grid, scale = alignment.grid, alignment.scale
+    return slice(area.y0 // scale - grid.y0, -(-area.y1 // scale) - grid.y0)
+
+
+def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
+    """A plane (h, w) over ``area`` at the LRHS's resolution, over the width of the grid."""
+    whole = _whole_pixels(alignment, area)
+    if whole != area:
+        rows, columns = mirrored_pixels(whole, area)
+        plane = plane[rows - area.y0].take(columns - area.x0, axis=1)
+    return box_downsample(plane, alignment.scale)
+
+
+def from_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
+    """A plane over :func:`grid_rows` of ``area`` at full resolution, (h, w) over ``area``."""
+    whole = _whole_pixels(alignment, area)
+    return upsample_linear(plane, alignment.scale, slice(0, len(plane)))[area.slices(whole)]
+
+
+def _whole_pixels(alignment: Alignment, area: Window) -> Window:
+    """An area, widened to whole LRHS pixels over the width of the grid."""
+    grid, scale = alignment.grid, alignment.scale
+    return Window(grid.x0 * scale, area.y0 // scale * scale, grid.x1 * scale, -(-area.y1 // scale) * scale)
+
+
+class Light:
+    """The light of a frame, as both of its renders show it.
+
+    Args:
+        alignment: of the frame.
+        lrhs, hrls: luminance of both renders (h, w) over the grid.
+        picture: luminance (h, w) over the grid by which differences are relative.
+    """
+
+    def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
+        self._alignment = alignment
+        floor = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
+        self._brightness = mean_around(picture, 1) + np.float32(floor)
+        self._renders = lrhs, hrls
+        low, high = (render / self._brightness for render in self._renders)
+        noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
+        scale = alignment.scale
+        #: For each radius in LRHS pixels: the variance of the mean of both renders.
+        self._noise = {reach: _wide_mean(noise, reach) for reach in (max(1, round(r / scale)) for r in RADII)}
+
+    def trust(self, lrhs: Array, hrls: Array, area: Window) -> Array:
+        """How much a neighbour counts, from 0 to 1, (h, w) over :func:`grid_rows` of ``area``.
+
+        Args:
+            lrhs, hrls: luminance of the neighbour's renders, (h, w) over the same rows. For a fused neighbour, its
+                luminance is both.
+        """
+        rows = grid_rows(self._alignment, area)
+        brightness = self._brightness[rows]
+        differences = [
+            np.clip((render[rows] - other) / brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
+            for render, other in zip(self._renders, (lrhs, hrls), strict=True)
+        ]
+        product = differences[0] * differences[1]
+        trust = np.ones_like(product)
+        for reach, variance in self._noise.items():
+            noise = variance[rows]
+            own_error = noise * np.float32(self._alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
+            uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
+            change = np.maximum(_wide_mean(product, reach) - uncertainty - own_error, 0)
+            np.minimum(trust, own_error / (own_error + change), out=trust)
+        return trust
+
+
+def _wide_mean(plane: Array, radius: int) -> Array:
+    """Mean over the pixels up to ``radius`` rows and columns away that exist, in a time that does not depend on it."""
+    for axis in (0, 1):
+        size = plane.shape[axis]
+        sums = np.insert(np.cumsum(plane, axis=axis, dtype=np.float64), 0, 0, axis=axis)
+        start, stop = (np.clip(np.arange(size) + offset, 0, size) for offset in (-radius, radius + 1))
+        count = stop - start
+        total = sums.take(stop, axis) - sums.take(start, axis)
+        plane = (total / (count[:, None] if axis == 0 else count)).astype(np.float32)
+    return plane

@@ -1,0 +1,189 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Follows surfaces from frame to frame along motion vectors, and fetches pixels where they are."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, Generic, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.arrays import Array
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.parallel import for_row_blocks
+
+Mask = NDArray[np.bool_]
+
+#: A vector and the way back may differ by this, in HRLS pixels.
+ROUND_TRIP = 1.0
+#: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer ones blur with every frame.
+SHARPNESS = -1.0
+
+
+class Placed(Protocol):
+    """A frame whose place in the picture is known."""
+
+    @property
+    def alignment(self) -> Alignment:
+        """How its pair lies over each other."""
+
+
+F = TypeVar("F", bound=Placed, covariant=True)
+
+
+@dataclass(frozen=True)
+class Step(Generic[F]):
+    """From a frame to the next one, forwards or backwards in time."""
+
+    frame: F
+    """The frame that it leads to."""
+    vectors: Array | None
+    """(h, w, 2) over the data window of the frame that it starts from: where the surface of a pixel is, in HRLS pixels
+    from there, as (x, y) with y downwards. None: it stays."""
+    valid: Mask | None
+    """(h, w): which of them can be believed; None if all can."""
+    back: Array | None
+    """(h, w, 2) over the data window of ``frame``: the way back."""
+    back_valid: Mask | None
+
+
+class Path:
+    """Where the surfaces of a frame are in another one, followed from frame to frame."""
+
+    def __init__(self, area: Window, window: Window) -> None:
+        """``area``: the pixels that are followed, in a frame whose data window is ``window``."""
+        self._area, self._area_window = area, window
+        #: Positions (h, w) in pixels, and None for "at the pixel itself".
+        self.x: Array | None = None
+        self.y: Array | None = None
+        self.valid: Mask = np.ones((area.height, area.width), bool)
+        self._last = window
+
+    def follow(self, step: Step[Placed]) -> None:
+        """Go on to the next frame."""
+        start, end = self._last, step.frame.alignment.hr_data_window
+        valid = self.valid.copy()
+        moves = step.vectors is not None
+        # A complex number is gathered in half the time of two real ones.
+        vectors, back = (None if v is None else _as_complex(v) for v in (step.vectors, step.back))
+        x, y = (np.empty(valid.shape, np.float32) for _ in range(2)) if moves or start != end else (self.x, self.y)
+
+        first = self.x is None and start == self._area_window
+
+        def work(rows: slice) -> None:
+            from_x, from_y = self.positions(rows)
+            to_x, to_y = from_x, from_y
+            good = valid[rows]
+            at = None if first else nearest(from_x, from_y, start)
+            if step.valid is not None:
+                good &= self._at_pixels(step.valid, rows) if at is None else step.valid.reshape(-1).take(at)
+            if vectors is not None:
+                vector = self._at_pixels(vectors, rows) if at is None else vectors.reshape(-1).take(at)
+                good &= np.isfinite(vector)
+                to_x = np.where(good, from_x + vector.real, from_x)
+                to_y = np.where(good, from_y + vector.imag, from_y)
+            good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
+            if (vectors is not None and back is not None) or step.back_valid is not None:
+                there = nearest(to_x, to_y, end)
+                if vectors is not None and back is not None:
+                    home = vector + back.reshape(-1).take(there)
+                    good &= np.square(home.real) + np.square(home.imag) < ROUND_TRIP**2  # false for NaN, too
+                if step.back_valid is not None:
+                    good &= step.back_valid.reshape(-1).take(there)
+            if x is not None and y is not None and (moves or start != end):
+                x[rows], y[rows] = to_x, to_y
+
+        for_row_blocks(work, len(valid), valid.shape[1])
+        self.x, self.y, self.valid, self._last = x, y, valid, end
+
+    def _at_pixels(self, values: NDArray[Any], rows: slice) -> NDArray[Any]:
+        """Values over the data window, at these rows of the area."""
+        area, window = self._area, self._area_window
+        part = Window(area.x0, area.y0 + rows.start, area.x1, area.y0 + min(rows.stop, area.height))
+        return np.asarray(values[part.slices(window)])
+
+    def positions(self, rows: slice) -> tuple[Array, Array]:
+        """Positions of some rows, (n, w) each."""
+        if self.x is not None and self.y is not None:
+            return self.x[rows], self.y[rows]
+        area = self._area
+        x = np.arange(area.x0, area.x1, dtype=np.float32)
+        y = np.arange(area.y0 + rows.start, area.y0 + rows.stop, dtype=np.float32)[:, None]
+        x, y = np.broadcast_arrays(x, y)
+        return x, y
+
+    def place_in(self, window: Window) -> Window:
+        """The rows of a window that lie around the positions, as far as cubic interpolation reaches."""
+        if self.y is None:
+            return self._area
+        low, high = int(np.floor(self.y.min())) - 2, int(np.ceil(self.y.max())) + 3
+        top = min(max(low, window.y0), window.y1 - 1)
+        return Window(window.x0, top, window.x1, max(min(high, window.y1), top + 1))
+
+
+def _as_complex(vectors: Array) -> NDArray[np.complex64]:
+    """(h, w, 2) as (h, w): x + i y."""
+    return np.ascontiguousarray(vectors, np.float32).view(np.complex64)[..., 0]
+
+
+def nearest(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
+    """Flat indices of the nearest pixels of a window."""
+    column = np.clip(np.rint(x - window.x0), 0, window.width - 1).astype(np.intp)
+    row = np.clip(np.rint(y - window.y0), 0, window.height - 1).astype(np.intp)
+    return row * window.width + column
+
+
+def sample(planes: Array, positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]) -> Array:
+    """Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
+
+    Args:
+        planes: (c, h, w).
+        positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of ``planes``.
+        size: height and width of the result.
+
+    Returns:
+        (c, *size)
+    """
+    padded = np.pad(planes, [(0, 0), (2, 2), (2, 2)], mode="edge").reshape(len(planes), -1)
+    rows_in, columns_in = planes.shape[1:]
+    stride = columns_in + 4
+    height, width = size
+    result = np.empty((len(planes), height, width), np.float32)
+
+    def work(rows: slice) -> None:
+        x, y = positions(rows)
+        x = np.clip(x, -1, columns_in - 0.01)
+        y = np.clip(y, -1, rows_in - 0.01)
+        left, top = np.floor(x), np.floor(y)
+        first = (top.astype(np.intp) + 2) * stride + left.astype(np.intp) + 2
+        across, down = _keys(x - left), _keys(y - top)
+        for plane, out in zip(padded, result, strict=True):
+            total, values = np.zeros(x.shape, np.float32), np.empty(x.shape, np.float32)
+            low, high = np.full(x.shape, np.inf, np.float32), np.full(x.shape, -np.inf, np.float32)
+            for dy, weight_y in zip(range(-1, 3), down, strict=True):
+                row = np.zeros_like(total)
+                for dx, weight_x in zip(range(-1, 3), across, strict=True):
+                    # "wrap" makes NumPy write straight into `values`; no index needs it.
+                    plane.take(first + (dy * stride + dx), out=values, mode="wrap")
+                    if {dx, dy} <= {0, 1}:
+                        np.minimum(low, values, out=low)
+                        np.maximum(high, values, out=high)
+                    values *= weight_x
+                    row += values
+                row *= weight_y
+                total += row
+            np.clip(total, low, high, out=out[rows])
+
+    for_row_blocks(work, height, width)
+    return result
+
+
+def _keys(t: Array) -> list[Array]:
+    """Weights of the four pixels around a position that lies ``t`` beyond the second one (Keys 1981)."""
+    a = np.float32(SHARPNESS)
+    near = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (t, 1 - t)]
+    far = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + t, 2 - t)]
+    return [far[0], near[0], near[1], far[1]]

@@ -1,0 +1,237 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Keeps the frames of a shot until those are complete that need them: what waits for what, and in which order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, TypeVar
+
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import Array, kept
+from oiio_msspl.errors import InputError, explain
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.motion import MotionFrame
+from oiio_msspl.fusion.render_average import RenderPair, shared_noise
+from oiio_msspl.fusion.temporal import accumulate
+from oiio_msspl.fusion.warp import Mask, Placed, Step
+from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.temporal import Temporal
+from oiio_msspl.model.session import Session
+
+if TYPE_CHECKING:
+    from oiio_msspl.jobs.stages import LoadedFrame
+
+F = TypeVar("F", bound=Placed)
+T = TypeVar("T")
+
+#: Frames have the same noise above this correlation. Independent ones stay below 0.1.
+SAME_NOISE = 0.5
+SAME_SEED = "have the same noise, which no average removes; let the renderer change its seed from frame to frame"
+
+#: The ways to the neighbours whose renders are averaged: those before a frame, and those after it.
+Neighbours = tuple[Sequence[Step[RenderPair]], Sequence[Step[RenderPair]]]
+
+
+@dataclass(frozen=True)
+class FusedAlone:
+    """A frame that is fused, and not yet averaged with fused neighbours."""
+
+    loaded: LoadedFrame
+    session: Session
+    fused: FusedFrame
+    seconds: float
+    """Wall time of fusing."""
+
+
+class FrameWindow:
+    """Fuses each frame as soon as the renders of its neighbours are there, and keeps it as long as it is needed.
+
+    Args:
+        temporal: which frames need which.
+        frames: what is to be written.
+        fuse: fuses a frame whose renders are averaged with those of these neighbours; it may return what went wrong.
+    """
+
+    def __init__(
+        self,
+        temporal: Temporal,
+        frames: Sequence[Frame],
+        fuse: Callable[[LoadedFrame, Neighbours], FusedAlone | Exception],
+    ) -> None:
+        self._temporal, self._fuse = temporal, fuse
+        self._wanted = {frame.number: frame for frame in frames}
+        results = {n for each in self._wanted for n in temporal.neighbours(each, temporal.results)}
+        #: The frames that are still to be fused, in order.
+        self._unfused = sorted(results | self._wanted.keys()) if temporal.count else list(self._wanted)
+        self._loaded: dict[int, LoadedFrame | Exception] = {}
+        self._fused: dict[int, FusedAlone | Exception] = {}
+        self._pairs: dict[int, RenderPair] = {}
+        self._vectors: dict[tuple[int, int], tuple[Array | None, Mask | None]] = {}
+        self._warnings: dict[int, list[str]] = {}
+
+    def order(self) -> list[Frame]:
+        """The frames to read, in this order: what is to be written, and what that depends on."""
+        if not self._temporal.count:
+            return list(self._wanted.values())
+        needed = sorted({each for n in self._wanted for each in (n, *self._temporal.neighbours(n))})
+        return [self._wanted.get(n) or self._temporal.frames[n] for n in needed]
+
+    def add(self, number: int, outcome: LoadedFrame | Exception) -> list[tuple[Frame, FusedAlone | Exception]]:
+        """Take a frame that is read, or the reason why it could not be. Fuse those that have all they need now.
+
+        Returns:
+            The frames to write that have all their neighbours now, in order.
+        """
+        self._loaded[number] = outcome
+        for n in list(self._unfused):
+            if all(each in self._loaded for each in (n, *self._temporal.neighbours(n, self._temporal.renders))):
+                self._unfused.remove(n)
+                self._fused[n] = self._fuse_frame(n)
+                self._release_renders()
+        ready = [
+            (frame, self._fused[n])
+            for n, frame in self._wanted.items()
+            if all(each in self._fused for each in (n, *self._temporal.neighbours(n, self._temporal.results)))
+        ]
+        for frame, _ in ready:
+            del self._wanted[frame.number]
+        return ready
+
+    def accumulate(self, number: int) -> FusedFrame:
+        """A frame averaged with its fused neighbours. Neighbours that are missing or broken are named in its
+        warnings."""
+        fused = self._fused[number]
+        assert isinstance(fused, FusedAlone)
+        if not self._temporal.count:
+            return fused.fused
+        warnings = self._warnings[number]
+        before, after = (self._steps(number, step, self._fused, _fused_frame, warnings) for step in (-1, 1))
+        warnings = list(dict.fromkeys([*fused.fused.warnings, *warnings]))
+        if not before and not after:
+            return replace(fused.fused, warnings=warnings)
+        result = accumulate(fused.fused, before, after)
+        return replace(fused.fused, rgb=result.rgb, alpha=result.alpha, frames=result.frames, warnings=warnings)
+
+    def release(self) -> None:
+        """Forget the frames that no other one needs any more."""
+        results = self._temporal.results
+        needed = {each for n in self._wanted for each in (n, *self._temporal.neighbours(n, results))}
+        self._fused = {n: outcome for n, outcome in self._fused.items() if n in needed}
+        self._release_renders()
+        known = self._loaded.keys() | self._fused.keys()
+        self._vectors = {(a, b): found for (a, b), found in self._vectors.items() if a in known and b in known}
+
+    def _release_renders(self) -> None:
+        """Forget the renders that no frame needs that is still to be fused."""
+        renders = self._temporal.renders
+        needed = {each for n in self._unfused for each in (n, *self._temporal.neighbours(n, renders))}
+        self._loaded = {n: outcome for n, outcome in self._loaded.items() if n in needed}
+        self._pairs = {n: pair for n, pair in self._pairs.items() if n in needed}
+
+    def _fuse_frame(self, number: int) -> FusedAlone | Exception:
+        loaded = self._loaded[number]
+        if isinstance(loaded, Exception):
+            return loaded
+        missing = self._temporal.missing(number)
+        warnings = [f"frame {each} is missing, so fewer neighbours are averaged" for each in missing]
+        self._warnings[number] = warnings
+        steps: list[Sequence[Step[RenderPair]]] = [(), ()]
+        if self._temporal.renders:
+            steps = [self._steps(number, step, self._loaded, self._pair, warnings) for step in (-1, 1)]
+        outcome = self._fuse(loaded, (steps[0], steps[1]))
+        if isinstance(outcome, FusedAlone) and self._temporal.results:
+            fused = outcome.fused
+            fused.rgb, fused.alpha = kept(fused.rgb), None if fused.alpha is None else kept(fused.alpha)
+        return outcome
+
+    def _pair(self, loaded: LoadedFrame) -> tuple[LoadedFrame, RenderPair]:
+        number = loaded.frame.number
+        if number not in self._pairs:
+            self._pairs[number] = RenderPair(loaded.lr_pixels, loaded.hr_pixels)
+        return loaded, self._pairs[number]
+
+    def _steps(
+        self,
+        number: int,
+        step: int,
+        outcomes: Mapping[int, T | Exception],
+        placed: Callable[[T], tuple[LoadedFrame, F]],
+        warnings: list[str],
+    ) -> list[Step[F]]:
+        """The way from a frame to its neighbours on one side, up to the first that can't be used.
+
+        Args:
+            number: of the frame.
+            step: -1 for the frames before it, 1 for those after it.
+            outcomes: the frames as they are averaged: their renders, or fused.
+            placed: a frame's files, and its pixels.
+            warnings: gets what is wrong with a neighbour.
+        """
+        steps: list[Step[F]] = []
+        here = self._placed(outcomes[number], placed)
+        count = self._temporal.renders if outcomes is self._loaded else self._temporal.results
+        neighbours = [n for n in self._temporal.neighbours(number, count) if (n - number) * step > 0]
+        for n in neighbours[::step]:
+            try:
+                there = self._placed(outcomes[n], placed)
+                _check_alike(here, there)
+                if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
+                    # This also reads all pixels, so a damaged file is found before it is averaged.
+                    correlation = shared_noise(here[1], there[1])
+                    if abs(n - number) == 1 and correlation > SAME_NOISE:
+                        warnings.append(f"frames {number} and {n} {SAME_SEED}")
+                (vectors, valid), (back, back_valid) = (
+                    self._read_vectors(start, end) for start, end in ((n - step, n), (n, n - step))
+                )
+            except Exception as error:
+                warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
+                break
+            steps.append(Step(there[1], vectors, valid, back, back_valid))
+        return steps
+
+    def _placed(self, outcome: T | Exception, placed: Callable[[T], tuple[LoadedFrame, F]]) -> tuple[LoadedFrame, F]:
+        if isinstance(outcome, Exception):
+            raise outcome
+        return placed(outcome)
+
+    def _read_vectors(self, start: int, end: int) -> tuple[Array | None, Mask | None]:
+        """Motion from one frame to the next or the previous one."""
+        if (start, end) not in self._vectors:
+            assert self._temporal.motion is not None
+            frame, neighbour = (self._motion_frame(n) for n in (start, end))
+            vectors, valid = self._temporal.motion.read(frame, neighbour, end - start)
+            self._vectors[start, end] = kept(vectors) if vectors.any() else None, None if valid.all() else kept(valid)
+        return self._vectors[start, end]
+
+    def _motion_frame(self, number: int) -> MotionFrame:
+        fused, loaded = self._fused.get(number), self._loaded.get(number)
+        if isinstance(fused, FusedAlone):
+            return MotionFrame(fused.loaded.hr, fused.fused.rgb)
+        assert loaded is not None and not isinstance(loaded, Exception)
+        return MotionFrame(loaded.hr)
+
+
+def _fused_frame(alone: FusedAlone) -> tuple[LoadedFrame, FusedFrame]:
+    return alone.loaded, alone.fused
+
+
+def _check_alike(frame: tuple[LoadedFrame, Placed], neighbour: tuple[LoadedFrame, Placed]) -> None:
+    """Whether two frames can be averaged.
+
+    Raises:
+        InputError: they can't.
+    """
+    (one, own), (other, its) = frame, neighbour
+    if own.alignment.scale != its.alignment.scale:
+        raise InputError(f"its pair is x{its.alignment.scale}")
+    if one.hr.display_window.size != other.hr.display_window.size:
+        raise InputError(f"its size is {other.hr.display_window.size}")
+    for name in ("lr", "hr"):
+        lacking = _features(getattr(one, name)) - _features(getattr(other, name))
+        if isinstance(its, RenderPair) and lacking:
+            raise InputError(f"its {'LRHS' if name == 'lr' else 'HRLS'} lacks {', '.join(sorted(lacking))}")
+
+
+def _features(render: MappedRender) -> set[str]:
+    return {*render.features, *(["alpha"] if render.alpha else [])}

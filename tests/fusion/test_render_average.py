@@ -1,0 +1,180 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Renders are averaged with those of neighbours where these show the same surface in the same light, nowhere else."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.fusion import light
+from oiio_msspl.fusion.render_average import RenderPair, average_renders, shared_noise
+from oiio_msspl.fusion.warp import Step
+
+HEIGHT, WIDTH, SCALE, NOISE = 96, 128, 4, 0.5
+
+
+def texture(shift=0.0):
+    """A smooth picture (h, w, 3), moved to the right by ``shift`` pixels."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    x = x - shift
+    grey = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 7) + 0.1 * np.sin((x + y) / 11)
+    return (grey[..., None] * (1.0, 0.8, 0.6)).astype(np.float32)
+
+
+def pair_of(truth, seed, **more):
+    """A pair of a picture, with independent noise, and an albedo that is the picture."""
+    rng = np.random.default_rng(seed)
+    noise = [1 + rng.normal(0, NOISE / k, truth[::k, ::k].shape).astype(np.float32) for k in (1, SCALE)]
+    hr = Render.from_arrays("hr", rgb=truth * noise[0], albedo=truth.copy(), **more)
+    return RenderPair(Render.from_arrays("lr", rgb=box_downsample(truth, SCALE) * noise[1]), hr)
+
+
+def rms(image, truth, part=slice(None)):
+    return float(np.sqrt(np.mean(np.square(image - truth)[part])))
+
+
+def still(pair):
+    return Step(pair, None, None, None, None)
+
+
+def moved(pair, x, y=0.0):
+    there = np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2))
+    return Step(pair, there, None, -there, None)
+
+
+def test_four_still_neighbours_halve_the_noise_of_both_renders():
+    truth = texture()
+    pairs = [pair_of(truth, seed) for seed in range(5)]
+    result = average_renders(pairs[2], [still(pairs[1]), still(pairs[0])], [still(pairs[3]), still(pairs[4])])
+    assert rms(result.hr.layers["rgb"], truth) < 0.5 * rms(pairs[2].hr.layers["rgb"], truth)
+    low = box_downsample(truth, SCALE)
+    assert rms(result.lr.layers["rgb"], low) < 0.5 * rms(pairs[2].lr.layers["rgb"], low)
+    assert np.allclose(result.hr.layers["albedo"], truth, rtol=1e-5)
+    assert np.median(result.frames) > 4
+
+
+def test_neighbours_are_found_where_their_surfaces_are():
+    pairs = {n: pair_of(texture(4 * n), n + 5) for n in (-2, -1, 0, 1, 2)}
+    before, after = ([moved(pairs[n], 4 * np.sign(n)) for n in numbers] for numbers in ((-1, -2), (1, 2)))
+    result = average_renders(pairs[0], before, after)
+    inside, low_inside = np.s_[:, 8:-8], np.s_[:, 3:-3]
+    assert rms(result.hr.layers["rgb"], texture(), inside) < 0.5 * rms(pairs[0].hr.layers["rgb"], texture(), inside)
+    low = box_downsample(texture(), SCALE)
+    assert rms(result.lr.layers["rgb"], low, low_inside) < 0.6 * rms(pairs[0].lr.layers["rgb"], low, low_inside)
+    assert np.allclose(result.hr.layers["albedo"][inside], texture()[inside], rtol=1e-5)
+
+
+def test_pixels_do_not_share_their_noise():
+    """A surface moves by a third of a pixel. Interpolated noise would be correlated from pixel to pixel."""
+    truth = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    pairs = [pair_of(truth, seed) for seed in range(3)]
+    result = average_renders(pairs[1], [moved(pairs[0], 0.3, 0.3)], [moved(pairs[2], -0.3, -0.3)])
+    noise = result.hr.layers["rgb"][..., 0] - 0.5
+    assert abs(np.corrcoef(noise[:, 1:].ravel(), noise[:, :-1].ravel())[0, 1]) < 0.05
+    assert noise.std() < 0.65 * (pairs[1].hr.layers["rgb"][..., 0] - 0.5).std()
+
+
+def test_what_no_neighbour_shows_keeps_every_bit():
+    pair = pair_of(texture(), 1)
+    hidden = Step(pair_of(texture(), 2), None, np.zeros((HEIGHT, WIDTH), bool), None, None)
+    lost = moved(pair_of(texture(), 3), 5.0 * WIDTH)
+    result = average_renders(pair, [hidden], [lost])
+    for name in ("lr", "hr"):
+        for feature, values in getattr(pair, name).layers.items():
+            assert np.array_equal(getattr(result, name).layers[feature], values)
+    assert (result.frames == 1).all()
+
+
+@pytest.mark.parametrize("change", [0.0, 0.3, 2.0])
+def test_light_that_changes_is_not_averaged(change):
+    truth, other = texture(), texture()
+    other[:, WIDTH // 2 :] *= change
+    pairs = [pair_of(truth, 1), pair_of(other, 2), pair_of(other, 3)]
+    result = average_renders(pairs[0], [still(pairs[1])], [still(pairs[2])])
+    changed, same = np.s_[:, WIDTH // 2 + 8 :], np.s_[:, : WIDTH // 4]
+    own, made = (pair.hr.layers["rgb"] for pair in (pairs[0], result))
+    assert rms(made, truth, changed) < 1.1 * rms(own, truth, changed)
+    assert abs(np.mean((made - truth)[changed])) < 0.02
+    assert rms(made, truth, same) < 0.75 * rms(own, truth, same)
+
+
+def test_values_that_are_not_finite_do_not_count():
+    pairs = [pair_of(texture(), seed) for seed in range(2)]
+    pairs[1].hr.layers["rgb"][40:44, 60:64] = np.nan
+    pairs[1].hr.layers["albedo"][8, 8] = np.inf
+    pairs[1].lr.layers["rgb"][3, 5] = np.inf
+    pairs[0].hr.layers["rgb"][70, 70] = np.nan
+    result = average_renders(pairs[0], [still(pairs[1])], [])
+    own = pairs[0].hr.layers["rgb"]
+    assert np.array_equal(result.hr.layers["rgb"][40:44, 60:64], own[40:44, 60:64])
+    assert np.array_equal(result.hr.layers["albedo"][8, 8], texture()[8, 8])
+    assert np.array_equal(result.lr.layers["rgb"][3, 5], pairs[0].lr.layers["rgb"][3, 5])
+    bad = ~np.isfinite(result.hr.layers["rgb"]).all(axis=-1)
+    assert np.argwhere(bad).tolist() == [[70, 70]]
+
+
+def test_the_variance_of_a_mean_is_smaller():
+    variance = np.full((HEIGHT, WIDTH, 1), 0.25, np.float32)
+    pairs = [pair_of(texture(), seed, variance=variance) for seed in range(2)]
+    result = average_renders(pairs[0], [still(pairs[1])], [])
+    assert np.median(result.hr.layers["variance"]) < 0.14
+
+
+def test_neighbours_may_have_other_data_windows():
+    """Some renderers write only the rectangle that holds something, frame by frame."""
+    truth = texture()
+    whole = [pair_of(truth, seed) for seed in range(2)]
+    lr, hr = pair_of(truth[16:80, 32:96], 5).lr, pair_of(truth[16:80, 32:96], 5).hr
+    part = RenderPair(
+        Render(lr.layers, Window(8, 4, 24, 20), Window(0, 0, WIDTH // SCALE, HEIGHT // SCALE)),
+        Render(hr.layers, Window(32, 16, 96, 80), Window(0, 0, WIDTH, HEIGHT)),
+    )
+    result = average_renders(whole[0], [still(part)], []).hr.layers["rgb"]
+    outside = np.ones((HEIGHT, WIDTH), bool)
+    outside[16:80, 32:96] = False
+    own = whole[0].hr.layers["rgb"]
+    assert np.array_equal(result[outside], own[outside])
+    inside = np.s_[16:80, 32:96]
+    assert rms(result, truth, inside) < 0.8 * rms(own, truth, inside)
+    made = average_renders(part, [still(whole[0])], [])
+    assert rms(made.hr.layers["rgb"], truth[inside]) < 0.8 * rms(hr.layers["rgb"], truth[inside])
+    assert (made.hr.data_window, made.lr.data_window) == (part.hr.data_window, part.lr.data_window)
+
+
+def test_an_lrhs_that_was_rounded_is_averaged():
+    truth = np.full((HEIGHT + 1, WIDTH + 1, 3), 0.5, np.float32)
+    rng = np.random.default_rng(0)
+
+    def odd(size):
+        low, high = (0.5 * (1 + rng.normal(0, s, (*shape, 3))).astype(np.float32) for s, shape in zip(
+            (NOISE / SCALE, NOISE), (size, truth.shape[:2]), strict=True))  # fmt: skip
+        return RenderPair(Render.from_arrays(rgb=low), Render.from_arrays(rgb=high))
+
+    for size in ((24, 32), (25, 33)):
+        pairs = [odd(size) for _ in range(3)]
+        step = np.full((*truth.shape[:2], 2), 2.0, np.float32)
+        after = Step(pairs[2], step, None, -step, None)
+        result = average_renders(pairs[0], [still(pairs[1])], [after])
+        for name in ("lr", "hr"):
+            own, made = (getattr(pair, name).layers["rgb"] for pair in (pairs[0], result))
+            assert made.shape == own.shape and made.std() < 0.7 * own.std()
+
+
+def test_bands_of_rows_agree(monkeypatch):
+    pairs = [pair_of(texture(0.7 * seed), seed) for seed in range(3)]
+
+    def result(rows):
+        monkeypatch.setattr(light, "BAND_ROWS", rows)
+        fresh = [RenderPair(pair.lr, pair.hr) for pair in pairs]
+        return average_renders(fresh[1], [moved(fresh[0], -0.7, 0.4)], [moved(fresh[2], 0.7, -3.3)])
+
+    whole, parts = result(1024), result(16)
+    assert np.allclose(whole.hr.layers["rgb"], parts.hr.layers["rgb"], rtol=1e-5)
+    assert np.allclose(whole.lr.layers["rgb"], parts.lr.layers["rgb"], rtol=1e-5)
+    assert np.allclose(whole.frames, parts.frames, rtol=1e-5)
+
+
+def test_frames_with_one_seed_share_their_noise():
+    pairs = [pair_of(texture(), seed) for seed in (1, 1, 2)]
+    assert shared_noise(pairs[0], pairs[1]) > 0.9
+    assert abs(shared_noise(pairs[0], pairs[2])) < 0.2

@@ -13,6 +13,7 @@ from benchmarks import results
 from benchmarks.results import Row
 from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, SCALES
 from benchmarks.temporal.sequence import MASKS
+from benchmarks.versus import cell, with_interval
 from oiio_msspl.arrays import Array
 from oiio_msspl.exr.atomic import replacing
 
@@ -66,12 +67,16 @@ def summary(rows: Rows[Row]) -> str:
         gains = [row["psnr"] - found[row["sequence"], scale, ALONE]["psnr"] for row in rows_of]
         over = [row["psnr"] - peers[row["sequence"]]["psnr"] for row in rows_of]
         lines.append(
-            f"- x{scale}, {len(rows_of)} sequences: {np.mean(gains):+.2f} dB over single frames (better on "
-            f"{sum(gain > 0 for gain in gains)}), {np.mean(over):+.2f} dB over prefiltered OIDN (better on "
+            f"- x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: {_mean(gains)} dB over single frames "
+            f"(better on {sum(gain > 0 for gain in gains)}), {_mean(over)} dB over prefiltered OIDN (better on "
             f"{sum(gain > 0 for gain in over)})."
         )
     lines.append(f"- Targets missed: {'; '.join(missed) or 'none'}.\n")
     return "\n".join(lines)
+
+
+def _mean(gains: Rows[float]) -> str:
+    return cell(with_interval(np.array(gains)), "+.2f")
 
 
 def _role(sequence: str) -> str:

@@ -9,16 +9,9 @@ from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion import light
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, shared_noise
 from oiio_msspl.fusion.warp import Step
+from tests.fusion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
 
-HEIGHT, WIDTH, SCALE, NOISE = 96, 128, 4, 0.5
-
-
-def texture(shift=0.0):
-    """A smooth picture (h, w, 3), moved to the right by ``shift`` pixels."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
-    x = x - shift
-    grey = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 7) + 0.1 * np.sin((x + y) / 11)
-    return (grey[..., None] * (1.0, 0.8, 0.6)).astype(np.float32)
+NOISE = 0.5
 
 
 def pair_of(truth, seed, **more):
@@ -27,19 +20,6 @@ def pair_of(truth, seed, **more):
     noise = [1 + rng.normal(0, NOISE / k, truth[::k, ::k].shape).astype(np.float32) for k in (1, SCALE)]
     hr = Render.from_arrays("hr", rgb=truth * noise[0], albedo=truth.copy(), **more)
     return RenderPair(Render.from_arrays("lr", rgb=box_downsample(truth, SCALE) * noise[1]), hr)
-
-
-def rms(image, truth, part=slice(None)):
-    return float(np.sqrt(np.mean(np.square(image - truth)[part])))
-
-
-def still(pair):
-    return Step(pair, None, None, None, None)
-
-
-def moved(pair, x, y=0.0):
-    there = np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2))
-    return Step(pair, there, None, -there, None)
 
 
 def test_four_still_neighbours_halve_the_noise_of_both_renders():

@@ -12,18 +12,10 @@ from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.temporal import accumulate
 from oiio_msspl.fusion.warp import Step
+from tests.fusion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
 
-HEIGHT, WIDTH, SCALE = 96, 128, 4
 #: Deviation of the error of a fused frame, as a share of its light, and of a sample's noise.
 FUSED_ERROR, SAMPLE_NOISE = 0.03, 0.5
-
-
-def texture(shift=0.0):
-    """A smooth picture (h, w, 3), moved to the right by ``shift`` pixels."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
-    x = x - shift
-    grey = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 7) + 0.1 * np.sin((x + y) / 11)
-    return (grey[..., None] * (1.0, 0.8, 0.6)).astype(np.float32)
 
 
 def frame_of(truth, seed, alpha=None, error=FUSED_ERROR):
@@ -39,19 +31,6 @@ def frame_of(truth, seed, alpha=None, error=FUSED_ERROR):
     fused = FusedFrame(truth * (1 + blotches), alpha, None, alignment, 1.0, {})
     fused.lrhs_luminance, fused.hrls_luminance = luminance(lrhs), luminance(box_downsample(hrls, SCALE))
     return fused
-
-
-def rms(image, truth, part=slice(None)):
-    return float(np.sqrt(np.mean(np.square(image - truth)[part])))
-
-
-def still(frame):
-    return Step(frame, None, None, None, None)
-
-
-def moved(frame, x, y=0.0):
-    there = np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2))
-    return Step(frame, there, None, -there, None)
 
 
 def test_four_still_neighbours_halve_the_error():

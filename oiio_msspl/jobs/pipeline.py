@@ -17,6 +17,7 @@ from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
+from oiio_msspl.parallel import limit_threads
 
 
 def run_pipeline(
@@ -90,7 +91,11 @@ def run_pipeline(
 
     window = FrameWindow(stages.temporal, frames, fuse)
     order = window.order()
-    with ThreadPoolExecutor(1, "read") as reader, ThreadPoolExecutor(1, "write") as writer:
+    with (
+        limit_threads(stages.threads),
+        ThreadPoolExecutor(1, "read") as reader,
+        ThreadPoolExecutor(1, "write") as writer,
+    ):
         reads = [reader.submit(stages.read, frame) for frame in order[:1]]
         try:
             for index, frame in enumerate(order):

@@ -10,12 +10,12 @@ import time
 import numpy as np
 import pytest
 
-from oiio_msspl import InputError, fuse_shot, map_render, open_exr
+from oiio_msspl import InputError, fuse_shot, map_render, open_exr, parallel
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion import FLOW, VECTORS
-from oiio_msspl.jobs import stages
+from oiio_msspl.jobs import frame_window, stages
 from oiio_msspl.jobs.frame_window import FrameWindow
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, shares
@@ -228,6 +228,22 @@ def test_frames_are_fused_once_and_kept_as_long_as_needed(shot, bilinear_models,
     monkeypatch.setattr(FrameWindow, "release", watch)
     run(shot, bilinear_models[4], "once")
     assert fused == list(range(FIRST, FIRST + COUNT)) and (most, most_renders) == (4, 4)
+
+
+def test_averaging_uses_no_more_threads_than_allowed(shot, whole, bilinear_models, monkeypatch):
+    seen = []
+    averaging = {stages: "average_renders", frame_window: "accumulate"}
+    for module, name in averaging.items():
+        real = getattr(module, name)
+
+        def watch(*arguments, real=real):
+            seen.append(parallel._thread_limit.get())
+            return real(*arguments)
+
+        monkeypatch.setattr(module, name, watch)
+    run(shot, bilinear_models[4], "one thread", threads=1)
+    assert len(seen) == 2 * COUNT and set(seen) == {1}
+    assert contents(shot / "one thread") == contents(shot / "whole")
 
 
 def test_the_order_of_a_part_begins_with_its_neighbours():

@@ -31,6 +31,9 @@ SOFTWARE = "oiio_msspl"
 #: PNG filter "Sub": each byte minus that of the pixel to the left. To try all filters for each row would take longer
 #: than to compress the row.
 SUB_FILTER = 16
+#: Only runs of equal bytes are looked for. The filtered rows of a rendered picture repeat little else, so to search for
+#: more takes time, and the file becomes larger.
+RUNS_ONLY = "rle"
 
 
 def is_our_preview(path: Path) -> bool:
@@ -149,6 +152,7 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], P
         spec.attribute("Software", SOFTWARE)
         spec.attribute("png:compressionLevel", 1)
         spec.attribute("png:filter", SUB_FILTER)
+        spec.attribute("compression", RUNS_ONLY)
         ok = writer.open(str(temporary), spec)
         for start in range(0, height, ROWS_PER_STRIP):
             stop = min(start + ROWS_PER_STRIP, height)

@@ -47,6 +47,8 @@ FLAT = 0.001
 DARK = 0.3
 #: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
 FIREFLY = 4.0
+#: A render whose logarithm of light differs by this much from that of the fused beauty has 1/e of the weight.
+OTHER_LIGHT = 1.0
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
 #: What known layers leave of the beauty counts as rounding below this share of it.
@@ -219,7 +221,7 @@ class _Band:
 
     def __init__(self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window, dark: float) -> None:
         """``dark``: light that counts as equal to none in logarithms."""
-        self._alignment, self._core, self._scale = alignment, core, alignment.scale
+        self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, np.float32(dark)
         reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
         self._area = area.intersect(alignment.grid)
@@ -326,22 +328,38 @@ class _Band:
         window = self._alignment.hr_data_window
         render = with_layers(hr, job.layers)
         high = read_features(render, self._hrls_area, window, render.features)
-        renders = [{name: box_downsample(values, self._scale) for name, values in high.items()}]
+        total = self._dimmed(job, {name: box_downsample(values, self._scale) for name, values in high.items()})
         if job.lrhs is not None:
-            low = with_layers(lr, job.lrhs)
-            renders.append(read_lrhs(low, self._alignment, self._area, low.features, RepairCounts()))
-        total = np.zeros((len(job.layers.layers) + job.remainder, *self._low_beauty.shape), np.float32)
-        for pixels in renders:
-            layers = np.stack([planes_of(pixels[name]) for name in layer_keys(job.layers)])
-            if job.remainder:
-                rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
-                layers = np.concatenate([layers, rest[None]])
-            light = layers.sum(axis=(0, 1))
-            allowed = FIREFLY * max_3x3(self._low_beauty.sum(axis=0))
-            total += layers * np.minimum(1, allowed / np.maximum(light, 1e-20))
-        total /= np.float32(len(renders))
+            render = with_layers(lr, job.lrhs)
+            low = read_lrhs(render, self._alignment, self._area, render.features, RepairCounts())
+            layers = self._dimmed(job, low)
+            weight = self._likeness(layers.sum(axis=(0, 1)))
+            total += weight * layers
+            total /= 1 + weight
         known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
         return np.delete(total, known, axis=0) if known else total
+
+    def _dimmed(self, job: _Job, pixels: Mapping[str, Array]) -> Array:
+        """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. The remainder is the last
+        layer."""
+        layers = np.stack([planes_of(pixels[name]) for name in layer_keys(job.layers)])
+        if job.remainder:
+            rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
+            layers = np.concatenate([layers, rest[None]])
+        light = layers.sum(axis=(0, 1))
+        allowed = FIREFLY * max_3x3(self._low_beauty.sum(axis=0))
+        layers *= np.minimum(1, allowed / np.maximum(light, 1e-20))
+        return layers
+
+    def _likeness(self, light: Array) -> Array:
+        """The weight of an LRHS pixel (h, w) with this light: 1 where the fused beauty has as much.
+
+        The pixel filter of the LRHS is wider. Small lights and highlights lose light to the pixels around them, and so
+        do their layers.
+        """
+        beauty = self._low_beauty.sum(axis=0)
+        ratio = np.log((light + 3 * self._dark) / (beauty + 3 * self._dark))
+        return np.asarray(np.exp(-np.square(ratio / np.float32(OTHER_LIGHT))), np.float32)
 
     def _colours(self, job: _Job, hr: MappedRender) -> dict[AdditiveLayer, Array]:
         """The colour (3, h, w) that the light of each product that is fitted is multiplied by."""

@@ -15,7 +15,8 @@ from oiio_msspl.exr.render import Window
 
 #: Largest part of the beauty's light that may be wrong in a sum: what half floats round, and a few repaired pixels.
 TOLERANCE = 2e-3
-#: What a sum is compared on: so many strips of rows, evenly spaced. A quarter of a 1080p frame.
+#: What a sum is compared on: so many strips of rows, evenly spaced. A quarter of a 1080p frame. Files are mostly
+#: compressed in blocks of 16 rows, so each strip is one block.
 STRIPS, ROWS = 17, 16
 
 
@@ -102,7 +103,8 @@ def _strips(window: Window) -> list[int]:
     """First rows of the strips that are compared."""
     if window.height <= STRIPS * ROWS:
         return list(range(window.y0, window.y1, ROWS))
-    return [window.y0 + round(i * (window.height - ROWS) / (STRIPS - 1)) for i in range(STRIPS)]
+    last = (window.height - ROWS) // ROWS
+    return [window.y0 + round(i * last / (STRIPS - 1)) * ROWS for i in range(STRIPS)]
 
 
 def _window_of(render: MappedRender, part: int) -> Window:

@@ -8,7 +8,10 @@ import pytest
 from numpy.lib.stride_tricks import sliding_window_view
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
+from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.passes import fuse_passes
 from oiio_msspl.jobs import frame
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
@@ -313,3 +316,31 @@ def test_an_emitter_leaves_nothing_to_the_other_set(tmp_path, bilinear_models):
     for name in ("a", "b", "key"):
         assert not layer(out, name)[:, 88:].any()
     assert np.abs(layer(out, "a") + layer(out, "b") + layer(out, "glow") - layer(out)).max() <= 1e-5
+
+
+def test_an_lrhs_with_a_wide_filter_does_not_blur_small_lamps(tmp_path):
+    """Lamps are smaller than an LRHS pixel, whose filter reaches the pixels around."""
+    lamps = np.zeros((HEIGHT + 2, WIDTH + 2, 3), np.float32)
+    lamps[10::16, 10::16] = lamps[11::16, 10::16] = 30
+    layers = {"light_key": np.full_like(lamps, 0.5), "light_lamps": lamps}
+    narrow = {name: downsample(values, 4) for name, values in layers.items()}
+    tent = np.array([1, 2, 1], np.float32) / 4
+    padded = {name: np.pad(values, ((1, 1), (1, 1), (0, 0)), "edge") for name, values in narrow.items()}
+    windows = {name: sliding_window_view(values, (3, 3), (0, 1)) for name, values in padded.items()}
+    wide = {name: np.einsum("yxcij,i,j->yxc", values, tent, tent) for name, values in windows.items()}
+    files = {"hr": layers, "narrow": narrow, "wide": wide}
+    maps = {}
+    for file, images in files.items():
+        channels = rgb(sum(images.values())).copy()
+        for name, values in images.items():
+            channels |= rgb(values.astype(np.float32), f"{name}.")
+        maps[file] = map_render(open_exr(write_exr(tmp_path / f"{file}.exr", channels)))
+    beauty = sum(layers.values())
+    errors = {}
+    for low in ("narrow", "wide"):
+        lr, hr = maps[low], maps["hr"]
+        result = fuse_passes(lr, hr, beauty, align(lr, hr), hr.additive_sets).pixels
+        channels = {c.name: c for part in hr.file.parts for c in part.channels}
+        made = np.stack([result.get(channels[f"light_lamps.{c}"], 0, len(lamps)) for c in "RGB"], axis=-1)
+        errors[low] = np.sqrt(np.mean((made - lamps) ** 2))
+    assert errors["wide"] < 1.4 * errors["narrow"]

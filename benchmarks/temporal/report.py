@@ -60,17 +60,18 @@ def summary(rows: Rows[Row]) -> str:
     head = ["sequence", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
     head += ["flicker, of single frames'", "of OIDN's", "least gain in a mask, dB"]
     lines = [results.markdown(head, body)]
-    for scale in SCALES:
-        rows_of = [row for row in compared if row["scale"] == scale]
-        if not rows_of:
-            continue
-        gains = [row["psnr"] - found[row["sequence"], scale, ALONE]["psnr"] for row in rows_of]
-        over = [row["psnr"] - peers[row["sequence"]]["psnr"] for row in rows_of]
-        lines.append(
-            f"- x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: {_mean(gains)} dB over single frames "
-            f"(better on {sum(gain > 0 for gain in gains)}), {_mean(over)} dB over prefiltered OIDN (better on "
-            f"{sum(gain > 0 for gain in over)})."
-        )
+    for unit in ("psnr", "jod"):
+        for scale in SCALES:
+            rows_of = [row for row in compared if row["scale"] == scale and unit in row]
+            if not rows_of:
+                continue
+            gains = [row[unit] - found[row["sequence"], scale, ALONE][unit] for row in rows_of]
+            over = [row[unit] - peers[row["sequence"]][unit] for row in rows_of]
+            lines.append(
+                f"- {unit.upper()} at x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: {_mean(gains)} over "
+                f"single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over prefiltered OIDN "
+                f"(better on {sum(gain > 0 for gain in over)})."
+            )
     lines.append(f"- Targets missed: {'; '.join(missed) or 'none'}.\n")
     return "\n".join(lines)
 

@@ -131,12 +131,12 @@ def fuse_files(
     replaced, reports = fuse_other_views(others, session, write, max_memory, progress=progress)
     fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
     fused.replaced = replaced
-    fuse_frame_passes(lr, hr, fused, write, max_memory, progress)
+    fuse_frame_passes(lr, hr, fused, session, write, max_memory, progress)
+    session.release_memory()  # for the writer's cache
     computed = time.perf_counter()
 
     report = report_on(lr, hr, session, fused, output, preview_path)
     add_other_views(report, reports, others.passed_on)
-    del session  # its memory is for the writer's cache
     # Half of what is left: compression and the preview need memory, too.
     cache_bytes = max(0, max_memory - FIXED_MEMORY - fused.nbytes) // 2
     with limit_threads(threads), _frame_preview(report, fused, view_transform, overwrite=overwrite):

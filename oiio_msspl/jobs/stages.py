@@ -189,7 +189,7 @@ class Stages:
         fused.replaced, reports = fuse_other_views(
             loaded.others, session, self.write_options, self.max_memory, held=held
         )
-        fuse_frame_passes(loaded.lr, loaded.hr, fused, self.write_options, self.max_memory - held)
+        fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, self.max_memory - held)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
         add_other_views(report, reports, loaded.others.passed_on)

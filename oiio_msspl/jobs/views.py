@@ -130,7 +130,7 @@ def fuse_other_views(
     for view in others.views:
         fused = fuse(view.lr, view.hr, session, max_memory=max_memory, held=held, progress=progress)
         fused.replaced = replaced
-        fuse_frame_passes(view.lr, view.hr, fused, write, max_memory - held, progress)
+        fuse_frame_passes(view.lr, view.hr, fused, session, write, max_memory - held, progress)
         assert fused.replaced is not None
         _store(fused.replaced, view.hr, fused)
         reports.append(report_on(view.lr, view.hr, session, fused, view.hr.file.path, None))
@@ -177,6 +177,7 @@ def fuse_frame_passes(
     lr: MappedRender,
     hr: MappedRender,
     fused: FusedFrame,
+    session: Session,
     write: WriteOptions,
     max_memory: int,
     progress: Callable[[int, int], None] | None = None,
@@ -186,6 +187,7 @@ def fuse_frame_passes(
     Args:
         lr, hr: the pair, as files.
         fused: its fused beauty.
+        session: the model of the beauty. Its memory is used for the passes.
         write: ``passes`` says which.
         max_memory: bytes that the process should stay below.
         progress: called with (steps done, steps in all) of this part of the work.
@@ -195,6 +197,7 @@ def fuse_frame_passes(
     """
     sets = sets_to_fuse(hr, write)
     if sets:
+        session.release_memory()
         cache_bytes = max(0, int((max_memory - fused.nbytes) * STRIPS_SHARE))
         fused.passes = fuse_passes(lr, hr, fused.rgb, fused.alignment, sets, cache_bytes, fused.replaced, progress)
         fused.replaced = fused.passes.pixels

@@ -5,12 +5,14 @@ from __future__ import annotations
 
 import collections
 import contextlib
+import functools
 import io
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
@@ -58,6 +60,9 @@ def load_network(
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
+    # A model and the denoiser that runs before it take turns, so both use the same memory.
+    _share_memory()
+    options.add_session_config_entry("session.use_env_allocators", "1")
     # A memory pattern allocates one block for each tile size, which holds all buffers side by side. The arena reuses
     # buffers within a run: it needs less memory, and the system has no new pages to clear for each tile.
     options.enable_mem_pattern = False
@@ -74,6 +79,30 @@ def load_network(
         return onnxruntime.InferenceSession(str(path), options, providers=list(providers), enable_fallback=False)
     except Exception as error:
         raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
+
+
+@functools.cache
+def _share_memory() -> None:
+    """Make the arena from which all networks of this process take memory on the CPU."""
+    import onnxruntime
+
+    arena = onnxruntime.OrtArenaCfg({})  # its defaults
+    kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
+    place = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
+    onnxruntime.create_and_register_allocator(place, arena)
+
+
+def release_memory(network: onnxruntime.InferenceSession, feed: Mapping[str, Array]) -> None:
+    """Run a network on the CPU once more, and give the memory of all networks back to the system.
+
+    Args:
+        feed: inputs (1, channels, height, width), as small as the network takes.
+    """
+    import onnxruntime
+
+    options = onnxruntime.RunOptions()
+    options.add_run_config_entry("memory.enable_memory_arena_shrinkage", "cpu:0")
+    network.run(None, dict(feed), options)
 
 
 def _load_cuda() -> None:

@@ -17,7 +17,7 @@ from oiio_msspl.model.contract import NO_DENOISER, Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, useful_lrhs_aovs
-from oiio_msspl.model.runtime import CPU, convolutions, load_network
+from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
 
 log = logging.getLogger(__name__)
 
@@ -147,3 +147,12 @@ class Session:
         self.seconds += time.perf_counter() - start
         images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}
         return images["fused"], np.exp(images["log_error"]) if error else None
+
+    def release_memory(self) -> None:
+        """Give the memory of intermediate results on the CPU back to the system. The next run asks for it again."""
+        if self.provider != CPU:
+            return
+        contract, size = self.contract, self.contract.alignment
+        lrhs = np.zeros((1, len(contract.lrhs), size, size), np.float32)
+        hrls = np.zeros((1, len(contract.hrls), size * contract.scale, size * contract.scale), np.float32)
+        release_memory(self._session, {"lrhs": lrhs, "hrls": hrls})

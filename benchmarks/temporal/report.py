@@ -68,9 +68,9 @@ def summary(rows: Rows[Row]) -> str:
             gains = [row[unit] - found[row["sequence"], scale, ALONE][unit] for row in rows_of]
             over = [row[unit] - peers[row["sequence"]][unit] for row in rows_of]
             lines.append(
-                f"- {unit.upper()} at x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: {_mean(gains)} over "
-                f"single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over prefiltered OIDN "
-                f"(better on {sum(gain > 0 for gain in over)})."
+                f"- {unit.upper()} at x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: {_mean(gains)} "
+                f"over single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over prefiltered "
+                f"OIDN (better on {sum(gain > 0 for gain in over)})."
             )
     lines.append(f"- Targets missed: {'; '.join(missed) or 'none'}.\n")
     return "\n".join(lines)

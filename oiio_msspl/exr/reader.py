@@ -193,6 +193,8 @@ class ExrFile:
         planes = slice(positions[0], positions[-1] + 1) if adjacent else positions
         whole = part.data_window
         for y0, y1 in strip_rows(area.y0, area.y1, whole.y0, part.strip_height, whole.y1):
+            if not (cache.max_bytes or part.tile[1]):  # no other read needs the other rows
+                y0, y1 = max(y0, area.y0), min(y1, area.y1)
             key = StripKey(self.path, part.index, indices, y0, y1)
             strip = cache.get(key)
             if strip is None:

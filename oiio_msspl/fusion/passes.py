@@ -106,7 +106,7 @@ def fuse_passes(
     tell(done, steps)
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
-    with hr.cache_strips(cache_bytes):
+    with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
         for core in _bands(alignment) if jobs else []:
             band = _Band(hr, rgb, alignment, core, dark)
             lights: dict[AdditiveLayer, Array] = {}

@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CPU = "CPUExecutionProvider"
+#: The arena asks the system for blocks of this size after :func:`release_memory`. Buffers of all sizes share a large
+#: block, while small blocks fit few of them. The system only gives the pages that are written to.
+ARENA_BLOCK = 1 << 30
 #: An execution provider and its settings.
 Provider = tuple[str, dict[str, str]]
 
@@ -86,7 +89,7 @@ def _share_memory() -> None:
     """Make the arena from which all networks of this process take memory on the CPU."""
     import onnxruntime
 
-    arena = onnxruntime.OrtArenaCfg({})  # its defaults
+    arena = onnxruntime.OrtArenaCfg({"initial_growth_chunk_size_bytes": ARENA_BLOCK})
     kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
     place = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
     onnxruntime.create_and_register_allocator(place, arena)

@@ -21,6 +21,8 @@ from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_me
 
 log = logging.getLogger(__name__)
 
+#: LRHS pixels on a side that every network takes.
+SMALLEST = 16
 #: Ending of the name of a model that fuses pairs whose noise the pixel filter has spread.
 SPREAD = "-spread"
 
@@ -70,6 +72,8 @@ class Session:
         self.threads = threads
         self.seconds = 0.0
         """Time spent in :meth:`run` so far, including the denoiser."""
+        self._largest = 0
+        """LRHS pixels of the largest picture since :meth:`release_memory`."""
         counts = collections.Counter(convolutions(self._session))
         if self._denoiser is not None:
             counts.update(self._denoiser.convolutions)
@@ -127,6 +131,10 @@ class Session:
             MssplError: the model failed.
         """
         start = time.perf_counter()
+        pixels = lrhs.shape[0] * lrhs.shape[1]
+        if pixels > self._largest:
+            self.release_memory()  # it is divided for smaller pictures, and would be held beside that of this one
+            self._largest = pixels
         if self._denoiser is not None:
             if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
                 self._denoiser.fill(lrhs, hrls, lrhs_aovs, mean)
@@ -150,9 +158,11 @@ class Session:
 
     def release_memory(self) -> None:
         """Give the memory of intermediate results on the CPU back to the system. The next run asks for it again."""
+        self._largest = 0
         if self.provider != CPU:
             return
-        contract, size = self.contract, self.contract.alignment
+        contract = self.contract
+        size = -(-SMALLEST // contract.alignment) * contract.alignment
         lrhs = np.zeros((1, len(contract.lrhs), size, size), np.float32)
         hrls = np.zeros((1, len(contract.hrls), size * contract.scale, size * contract.scale), np.float32)
         release_memory(self._session, {"lrhs": lrhs, "hrls": hrls})

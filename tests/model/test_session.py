@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 import json
+import os
+import sys
 from dataclasses import fields
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -132,3 +135,15 @@ def test_a_network_with_other_inputs_or_outputs_is_refused(tmp_path, bilinear_mo
     onnx.save(model, tmp_path / "forged.onnx")
     with pytest.raises(InputError, match=r"forged\.onnx: its network has the inputs"):
         Session(tmp_path / "forged.onnx")
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_memory_is_given_back():
+    def resident():
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+
+    session = Session(find_model(2, "joint"))
+    session.run(np.zeros((192, 192, 3), np.float32), np.zeros((384, 384, 9), np.float32))
+    held = resident()
+    session.release_memory()
+    assert held - resident() > 100 << 20

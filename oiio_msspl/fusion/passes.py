@@ -221,7 +221,7 @@ class _Band:
 
     def __init__(self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window, dark: float) -> None:
         """``dark``: light that counts as equal to none in logarithms."""
-        self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, np.float32(dark)
+        self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, dark
         reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
         self._area = area.intersect(alignment.grid)
@@ -333,7 +333,7 @@ class _Band:
             render = with_layers(lr, job.lrhs)
             low = read_lrhs(render, self._alignment, self._area, render.features, RepairCounts())
             layers = self._dimmed(job, low)
-            weight = self._likeness(layers.sum(axis=(0, 1)))
+            weight = self._likeness(layers)
             total += weight * layers
             total /= 1 + weight
         known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
@@ -351,15 +351,15 @@ class _Band:
         layers *= np.minimum(1, allowed / np.maximum(light, 1e-20))
         return layers
 
-    def _likeness(self, light: Array) -> Array:
-        """The weight of an LRHS pixel (h, w) with this light: 1 where the fused beauty has as much.
+    def _likeness(self, layers: Array) -> Array:
+        """The weight (h, w) of the LRHS's layers (layers, 3, h, w): 1 where the fused beauty has as much light.
 
         The pixel filter of the LRHS is wider. Small lights and highlights lose light to the pixels around them, and so
         do their layers.
         """
-        beauty = self._low_beauty.sum(axis=0)
-        ratio = np.log((light + 3 * self._dark) / (beauty + 3 * self._dark))
-        return np.asarray(np.exp(-np.square(ratio / np.float32(OTHER_LIGHT))), np.float32)
+        lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
+        ours, fused = (np.log(light + 3 * self._dark) for light in lights)
+        return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
 
     def _colours(self, job: _Job, hr: MappedRender) -> dict[AdditiveLayer, Array]:
         """The colour (3, h, w) that the light of each product that is fitted is multiplied by."""

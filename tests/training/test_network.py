@@ -483,6 +483,7 @@ def test_pyramid_sees_an_even_picture_as_even(tiny_pyramid: PyramidFusion) -> No
     torch.testing.assert_close(tiny_pyramid(lrhs, hrls)[0], torch.full((1, 3, 64, 64), 0.3), atol=1e-5, rtol=0)
 
 
+@pytest.mark.slow
 def test_onnx_file_of_a_pyramid_agrees_with_it(
     tiny_pyramid: PyramidFusion, views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -4,7 +4,7 @@
 A layer is fitted, around every LRHS pixel, as a linear function of the fused beauty, which has little noise. Pixels
 count by how much they look alike in albedo and normal (first-order regression with cross-bilateral weights: Bitterli et
 al. 2016; the fit at low resolution: fast guided filter, He and Sun 2015). The function is then applied at full
-resolution. A fit needs averages of noisy layers only, so eight layers cost about as much as the beauty. What the fitted
+resolution. A fit needs averages of noisy layers only, so no network runs for the layers. What the fitted
 layers lack of the fused beauty is spread over them in proportion to their light, so their sum is the beauty to the last
 bits.
 """

@@ -45,9 +45,9 @@ from training.validation import ValidationPair
 #: Operators and file format that ONNX Runtime 1.14 and newer understand.
 OPSET, IR_VERSION = 18, 8
 
-#: Memory of a tile in bytes per HRLS pixel, measured with ``benchmarks.runtime`` and rounded up: of the network, and of
-#: the network and the denoiser before it, which keeps its buffers.
-MEMORY, MEMORY_WITH_DENOISER = 1000, 1900
+#: Memory of a tile in bytes per HRLS pixel, by network: the peak of a process that fuses a frame, without the frame
+#: itself, and with room for the rows that are decoded for the next tiles.
+MEMORY = {"paper": 1000, "pyramid": 850, "joint": 1580}
 
 #: Smaller tensors, such as biases, stay float32.
 HALF_ELEMENTS = 256
@@ -63,7 +63,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
         lrhs=channel_names(lrhs),
         hrls=channel_names(hrls),
         denoiser=denoiser,
-        bytes_per_pixel=MEMORY_WITH_DENOISER if denoiser else MEMORY,
+        bytes_per_pixel=MEMORY[state["architecture"]],
         name=name,
         scale=scale,
         alignment=alignment,

@@ -108,10 +108,10 @@ def fuse_passes(
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
         for core in _bands(alignment) if jobs else []:
-            band = _Band(hr, rgb, alignment, core, dark)
+            band = _Band(hr, rgb, alignment, core, dark, jobs)
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
-                made = band.fuse(job, lr, hr, pixels, lights)
+                made = band.fuse(job, lr, pixels, lights)
                 # Copies, because a layer alone would keep the memory of its whole set.
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1
@@ -219,7 +219,9 @@ def _same_layers(lr: MappedRender, layers: AdditiveSet) -> AdditiveSet | None:
 class _Band:
     """Some rows of the frame, with what their layers are fitted to."""
 
-    def __init__(self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window, dark: float) -> None:
+    def __init__(
+        self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window, dark: float, jobs: Sequence[_Job]
+    ) -> None:
         """``dark``: light that counts as equal to none in logarithms."""
         self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, dark
         reach = 2 * sum(STEPS[self._scale]) + 2
@@ -232,28 +234,54 @@ class _Band:
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
         self._low_beauty = _downsampled(self._beauty, self._scale)
         log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + dark)
-        features = read_features(hr, self._hrls_area, window, [ALBEDO, NORMAL])
+        features = self._read(hr, jobs)
         guides = [log[None] / SPREAD[RGB]]
-        guides += [_smoothed(planes_of(features[name]), log) / SPREAD[name] for name in features]
+        guides += [_smoothed(planes_of(features[n]), log) / SPREAD[n] for n in (ALBEDO, NORMAL) if n in features]
         full = np.concatenate(guides, dtype=np.float32)
         low = _downsampled(full, self._scale)
         with np.errstate(over="ignore", invalid="ignore"):
             self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
+    def _read(self, hr: MappedRender, jobs: Sequence[_Job]) -> dict[str, Array]:
+        """Read all layers of the HRLS that the band needs, at once, because a file decodes all of them together.
+
+        The light of each layer stays at low resolution, and the colours of products over the core.
+
+        Returns:
+            Albedo and normal (height, width, 3), as far as the HRLS has them.
+        """
+        formulas = {name: hr.features[name] for name in (RGB, ALBEDO, NORMAL) if name in hr.features}
+        factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
+        names = {factor: f"colour {i}" for i, factor in enumerate(factors)}
+        formulas |= {name: FeatureFormula((factor,)) for factor, name in names.items()}
+        for i, job in enumerate(jobs):
+            layers = with_layers(hr, job.layers).features
+            formulas |= {f"{i} {name}": formula for name, formula in layers.items() if name != RGB}
+        render = replace(hr, features=formulas, alpha=None)
+        features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
+        rows = slice(self._core_rows.start * self._scale, self._core_rows.stop * self._scale)
+        self._colours = {factor: planes_of(features.pop(name)[rows]) for factor, name in names.items()}
+        guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
+        low = {name: box_downsample(values, self._scale) for name, values in features.items()}
+        self._low_layers = {
+            job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
+            for i, job in enumerate(jobs)
+        }
+        return guides
+
     def fuse(
         self,
         job: _Job,
         lr: MappedRender,
-        hr: MappedRender,
         pixels: ReplacedChannels,
         earlier: Mapping[AdditiveLayer, Array],
     ) -> dict[AdditiveLayer, Array]:
         """Fuse the layers of one set and store them.
 
         Args:
-            job: the set.
-            lr, hr: the pair.
+            job: the set, one of those that the band was made for.
+            lr: the LRHS.
             pixels: gets the rows of the band.
             earlier: light (3, h, w) of layers of earlier sets.
 
@@ -262,13 +290,13 @@ class _Band:
         """
         rows = slice(self._core_rows.start * self._scale, self._core_rows.stop * self._scale)
         lights = {layer: _total(earlier, parts) for layer, parts in job.known.items()}
-        colours = self._colours(job, hr)
+        colours = {layer: self._colours[layer.factor] for layer in job.fitted if layer.factor is not None}
         if job.fitted:
             rest = self._beauty[:, rows]
             if lights:
                 rest = rest - _total(lights, lights)
                 rest[rest < ROUNDING * self._beauty[:, rows]] = 0
-            lights |= self._fitted(job, lr, hr, rest, colours)
+            lights |= self._fitted(job, lr, rest, colours)
         lights |= {layer: _total(lights, parts) for layer, parts in job.coarser.items()}
         window = self._alignment.hr_data_window
         core = in_hrls_pixels(self._core, self._scale)
@@ -283,10 +311,10 @@ class _Band:
         return lights
 
     def _fitted(
-        self, job: _Job, lr: MappedRender, hr: MappedRender, light: Array, colours: Mapping[AdditiveLayer, Array]
+        self, job: _Job, lr: MappedRender, light: Array, colours: Mapping[AdditiveLayer, Array]
     ) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that are fitted."""
-        noisy = self._average(job, lr, hr)
+        noisy = self._average(job, lr)
         beauty = self._beauty[:, self._core_rows.start * self._scale : self._core_rows.stop * self._scale]
         fitted = np.empty((len(noisy), *light.shape), np.float32)
         flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *light.shape[1:])
@@ -320,15 +348,12 @@ class _Band:
         _make_sum(fitted, light)
         return dict(zip(layers, fitted, strict=False))
 
-    def _average(self, job: _Job, lr: MappedRender, hr: MappedRender) -> Array:
+    def _average(self, job: _Job, lr: MappedRender) -> Array:
         """The mean of both renders' layers at low resolution, (layers, 3, h, w), of those that are fitted.
 
         The remainder is the last layer.
         """
-        window = self._alignment.hr_data_window
-        render = with_layers(hr, job.layers)
-        high = read_features(render, self._hrls_area, window, render.features)
-        total = self._dimmed(job, {name: box_downsample(values, self._scale) for name, values in high.items()})
+        total = self._dimmed(job, self._low_layers[job.layers])
         if job.lrhs is not None:
             render = with_layers(lr, job.lrhs)
             low = read_lrhs(render, self._alignment, self._area, render.features, RepairCounts())
@@ -360,20 +385,6 @@ class _Band:
         lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
         ours, fused = (np.log(light + 3 * self._dark) for light in lights)
         return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
-
-    def _colours(self, job: _Job, hr: MappedRender) -> dict[AdditiveLayer, Array]:
-        """The colour (3, h, w) that the light of each product that is fitted is multiplied by."""
-        colours: dict[AdditiveLayer, Array] = {}
-        by_channels: dict[object, Array] = {}
-        window = in_hrls_pixels(self._core, self._scale)
-        for layer in job.fitted:
-            if layer.factor is not None:
-                if layer.factor not in by_channels:
-                    render = replace(hr, features={"colour": FeatureFormula((layer.factor,))})
-                    colour = read_features(render, window, self._alignment.hr_data_window, ["colour"])["colour"]
-                    by_channels[layer.factor] = planes_of(colour)
-                colours[layer] = by_channels[layer.factor]
-        return colours
 
 
 class _Fit:

@@ -21,8 +21,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CPU = "CPUExecutionProvider"
-#: The arena asks the system for blocks of this size, the largest that ONNX Runtime accepts. Buffers of all sizes share a
-#: large block, while small blocks fit few of them. The system only gives the pages that are written to.
+#: The arena asks the system for blocks of this size, the largest that ONNX Runtime accepts. Buffers of all sizes share
+#: a large block, while small blocks fit few of them. The system only gives the pages that are written to.
 ARENA_BLOCK = 2047 << 20
 #: An execution provider and its settings.
 Provider = tuple[str, dict[str, str]]

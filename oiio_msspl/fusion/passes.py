@@ -229,6 +229,7 @@ class _Band:
         self._area = area.intersect(alignment.grid)
         self._core_rows = slice(core.y0 - self._area.y0, core.y1 - self._area.y0)
         self._hrls_area = in_hrls_pixels(self._area, alignment.scale)
+        self._hrls_rows = in_hrls_pixels(core, alignment.scale).slices(self._hrls_area)[0]
         window = alignment.hr_data_window
         rows, columns = mirrored_pixels(self._hrls_area, window)
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
@@ -260,8 +261,7 @@ class _Band:
             formulas |= {f"{i} {name}": formula for name, formula in layers.items() if name != RGB}
         render = replace(hr, features=formulas, alpha=None)
         features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
-        rows = slice(self._core_rows.start * self._scale, self._core_rows.stop * self._scale)
-        self._colours = {factor: planes_of(features.pop(name)[rows]) for factor, name in names.items()}
+        self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in names.items()}
         guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         low = {name: box_downsample(values, self._scale) for name, values in features.items()}
         self._low_layers = {
@@ -288,7 +288,7 @@ class _Band:
         Returns:
             The light of each layer.
         """
-        rows = slice(self._core_rows.start * self._scale, self._core_rows.stop * self._scale)
+        rows = self._hrls_rows
         lights = {layer: _total(earlier, parts) for layer, parts in job.known.items()}
         colours = {layer: self._colours[layer.factor] for layer in job.fitted if layer.factor is not None}
         if job.fitted:
@@ -315,7 +315,7 @@ class _Band:
     ) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that are fitted."""
         noisy = self._average(job, lr)
-        beauty = self._beauty[:, self._core_rows.start * self._scale : self._core_rows.stop * self._scale]
+        beauty = self._beauty[:, self._hrls_rows]
         fitted = np.empty((len(noisy), *light.shape), np.float32)
         flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *light.shape[1:])
 

@@ -3,7 +3,7 @@
 
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
-    python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --int8 VIEWS --overlap 64
+    python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --int8 VIEWS --overlap 32
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
 computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`).

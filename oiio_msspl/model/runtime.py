@@ -21,9 +21,6 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 CPU = "CPUExecutionProvider"
-#: The arena asks the system for blocks of this size, the largest that ONNX Runtime accepts. Buffers of all sizes share
-#: a large block, while small blocks fit few of them. The system only gives the pages that are written to.
-ARENA_BLOCK = 2047 << 20
 #: An execution provider and its settings.
 Provider = tuple[str, dict[str, str]]
 
@@ -71,9 +68,6 @@ def load_network(
     options.enable_mem_pattern = False
     # Threads that spin while they wait take cores from NumPy and Open Image Denoise.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
-    # Processors without VNNI add two products of 8 bits in 16 bits, which overflows. This lets them use other, slower
-    # instructions that do not; other processors ignore it.
-    options.add_session_config_entry("session.x64quantprecision", "1")
     options.add_session_config_entry("session.record_ep_graph_assignment_info", "1")  # for convolutions()
     if not optimise:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
@@ -89,7 +83,9 @@ def _share_memory() -> None:
     """Make the arena from which all networks of this process take memory on the CPU."""
     import onnxruntime
 
-    arena = onnxruntime.OrtArenaCfg({"initial_growth_chunk_size_bytes": ARENA_BLOCK})
+    # Each request that no free block fits gets a block of its own size. In larger blocks, weights of a network that is
+    # loaded later would lie beside intermediate results, and keep them from being given back.
+    arena = onnxruntime.OrtArenaCfg({"arena_extend_strategy": 1})
     kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
     place = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
     onnxruntime.create_and_register_allocator(place, arena)

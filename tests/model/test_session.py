@@ -143,7 +143,7 @@ def test_memory_is_given_back():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     session = Session(find_model(2, "joint"))
-    session.run(np.zeros((192, 192, 3), np.float32), np.zeros((384, 384, 9), np.float32))
+    session.run(np.zeros((384, 384, 3), np.float32), np.zeros((768, 768, 9), np.float32))
     held = resident()
     session.release_memory()
     assert held - resident() > 100 << 20

@@ -35,20 +35,22 @@ def layers(height, width, seed=0):
 
 def test_gptq_beats_rounding_to_the_nearest_step():
     random = torch.Generator().manual_seed(0)
-    mixing = torch.randn(24, 24, generator=random)
-    inputs = (torch.randn(4000, 24, generator=random) @ mixing).relu()
-    weights = torch.randn(5, 25, generator=random)
-    outputs = inputs @ weights[:, :24].T + weights[:, 24]
+    mixing = torch.randn(36, 36, generator=random)
+    inputs = (torch.randn(4000, 36, generator=random) @ mixing).relu()
+    weights = torch.randn(5, 37, generator=random)
+    outputs = inputs @ weights[:, :36].T + weights[:, 36]
 
     def error(chosen, step, bias):
         return float((inputs @ (chosen * step[:, None]).T + bias - outputs).square().mean())
 
     chosen, step, bias = gptq.gptq(inputs, outputs, weights)
     assert chosen.abs().max() <= 127
+    pairs = chosen.reshape(5, 2, 2, 9)
+    assert pairs.clamp_min(0).sum(2).max() <= 128
+    assert pairs.clamp_max(0).sum(2).min() >= -128
     torch.testing.assert_close(chosen, chosen.round())
-    step_of_weights = weights[:, :24].abs().amax(1) / 127
-    nearest = (weights[:, :24] / step_of_weights[:, None]).round()
-    assert error(chosen, step, bias) < 0.6 * error(nearest, step_of_weights, weights[:, 24])
+    nearest = (weights[:, :36] / step[:, None]).round()
+    assert error(chosen, step, bias) < 0.6 * error(nearest, step, weights[:, 36])
 
 
 def test_slices_are_distributed_for_the_least_noise():

@@ -38,6 +38,9 @@ OWN_RANGE = 0.75
 DAMPING = 1.0
 #: Largest absolute code of a weight.
 MAX_WEIGHT = 127
+#: Largest sum of the weights of one sign of a pair. ONNX Runtime multiplies the codes of two neighbouring input
+#: channels, and processors without VNNI instructions add both products in 16 bits. 255 times this fits.
+MAX_PAIR = 128
 #: Further code channels for each layer of the last level, for slices: rounding errors there go straight into the
 #: colour, mostly from a few channels. The large network's last level has fewer pixels, so it affords more.
 EXTRA_SLICES, EXTRA_SLICES_LARGE = 16, 32
@@ -228,8 +231,10 @@ def _patches(image: Tensor, pixels: Tensor) -> Tensor:
 def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Choose integer weights in [-MAX_WEIGHT, MAX_WEIGHT] and their steps, so that inputs give outputs.
 
+    Two input channels with even and odd number keep to ``MAX_PAIR``.
+
     Args:
-        inputs: (P, K).
+        inputs: (P, K), 3 x 3 pixels of each of an even number of channels.
         outputs: (P, O).
         weights: (O, K + 1), the original weights; bias last.
 
@@ -243,15 +248,22 @@ def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tens
     damping[count, count] = 1e-9
     original = weights.double()
     weights = torch.linalg.solve(power + damping, x.T @ outputs.double() / len(x) + damping @ original.T).T
+    pairs = torch.stack([weights, -weights])[:, :, :count].clamp_min(0).reshape(2, len(weights), -1, 2, 9).sum(dim=3)
     # Bounded, so that biases in steps fit into 32 bits
-    step = (weights[:, :count].abs().amax(dim=1) / MAX_WEIGHT).clamp_min(1e-8)
+    step = (pairs.amax(dim=(0, 2, 3)) / MAX_PAIR).maximum(weights[:, :count].abs().amax(dim=1) / MAX_WEIGHT)
+    step = step.clamp_min(1e-8)
     # Strong inputs first, while other weights can compensate for their error; the unrounded bias last
     order = torch.cat([power.diagonal()[:count].argsort(descending=True), torch.tensor([count])])
     inverse = torch.cholesky_inverse(torch.linalg.cholesky((power + damping)[order][:, order]))
     upper = torch.linalg.cholesky(inverse, upper=True)
     rest, chosen = weights[:, order].clone(), torch.zeros(len(weights), count, dtype=torch.double)
+    channel, pixel = torch.arange(count) // 9, torch.arange(count) % 9
+    beside = (channel ^ 1) * 9 + pixel
     for i in range(count):
-        chosen[:, order[i]] = (rest[:, i] / step).round().clamp(-MAX_WEIGHT, MAX_WEIGHT)
+        other = chosen[:, beside[order[i]]]
+        largest = (MAX_PAIR - other.clamp_min(0)).clamp_max(MAX_WEIGHT)
+        smallest = (-MAX_PAIR - other.clamp_max(0)).clamp_min(-MAX_WEIGHT)
+        chosen[:, order[i]] = (rest[:, i] / step).round().clamp(smallest, largest)
         error = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
         rest[:, i:] -= error[:, None] * upper[i, i:]
     return chosen.float(), step.float(), rest[:, count].float()

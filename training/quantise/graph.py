@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ONNX graph of a quantised U-Net. Tensor names are those of the files that ship.
 
-Only standard operators are used, because ONNX Runtime knows those that processors without VNNI compute wrongly, and
-replaces them (see :func:`oiio_msspl.model.runtime.load_network`). Its own operators, which read pixels with their
-channels side by side, are left as they are. Transposes around the standard ones, which it removes, are as fast.
+Only standard operators are used. ONNX Runtime's own ones read pixels with their channels side by side, but transposes
+around the standard ones, which it removes, are as fast.
 """
 
 from __future__ import annotations

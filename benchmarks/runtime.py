@@ -91,7 +91,7 @@ def peak_mb() -> float:
 
 
 def processor() -> str:
-    """The processor's name, and whether it has VNNI: 8-bit models are several times slower without it.
+    """The processor's name, and whether it has VNNI: 8-bit models are slower without it.
 
     On Linux Python does not know the name, so it comes from /proc/cpuinfo. Elsewhere, VNNI is not mentioned.
     """

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import contextvars
-import functools
 import os
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -89,17 +88,28 @@ def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
         work(rows)
 
 
-@functools.cache
-def _background_pool() -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(thread_name_prefix="background")
+def end_pools() -> None:
+    """Let the threads of this module end as soon as they have no more work.
+
+    A program calls this after a signal. An exception that a signal handler raises while a pool starts a thread leaves a
+    thread that Python does not know as one of a pool: at exit Python would wait for it forever.
+    """
+    for key in list(_pools):
+        _pools.pop(key).shutdown(wait=False)
 
 
-@functools.cache  # a process uses one or two different numbers of threads
+#: A pool for each number of threads that share rows, and one for work in the background.
+_pools: dict[int | str, ThreadPoolExecutor] = {}
+
+
 def _row_pool(count: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(count, thread_name_prefix="rows")
+    return _pools.get(count) or _pools.setdefault(count, ThreadPoolExecutor(count, thread_name_prefix="rows"))
+
+
+def _background_pool() -> ThreadPoolExecutor:
+    name = "background"
+    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(thread_name_prefix=name))
 
 
 if hasattr(os, "register_at_fork"):
-    # A child process has none of its parent's threads.
-    for pool in (_row_pool, _background_pool):
-        os.register_at_fork(after_in_child=pool.cache_clear)
+    os.register_at_fork(after_in_child=_pools.clear)  # a child process has none of its parent's threads

@@ -9,6 +9,7 @@ import sys
 import typer
 
 from oiio_msspl.errors import explain, printable
+from oiio_msspl.parallel import end_pools
 
 
 def run(app: typer.Typer) -> None:
@@ -22,6 +23,8 @@ def run(app: typer.Typer) -> None:
         message, code = explain(error)
         print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(code)
+    finally:
+        end_pools()
 
 
 def _exit_on_signals() -> None:

@@ -205,8 +205,32 @@ def test_a_signal_leaves_nothing_half_written(files, bilinear_models, name):
         process.stdout.readline()
         time.sleep(delay)
         process.send_signal(getattr(signal, name))
-        process.communicate()
+        process.communicate(timeout=60)
         assert sorted(p.name for p in files.iterdir()) == before
+
+
+def test_a_signal_that_interrupts_the_start_of_a_thread_does_not_keep_the_program_from_ending():
+    code = """
+import sys, threading, typer
+from msspl_cli.errors import run
+from oiio_msspl import parallel
+app = typer.Typer()
+start = threading.Thread.start
+
+def start_and_be_interrupted(thread):
+    start(thread)
+    sys.exit(143)
+
+@app.command()
+def work() -> None:
+    threading.Thread.start = start_and_be_interrupted
+    parallel.available_cores = lambda: 2  # with one there is no thread
+    parallel.in_background(lambda: print("done"))
+
+run(app)
+"""
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert (process.returncode, process.stdout) == (143, "done\n"), process.stderr
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")

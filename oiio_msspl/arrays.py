@@ -31,6 +31,35 @@ def blank(shape: tuple[int, ...], dtype: type[T] | np.dtype[T] = np.float32) -> 
         return np.memmap(file, dtype, "w+", shape=shape)
 
 
+def planes(like: Array, channels: int) -> Array:
+    """An image (h, w, channels), as high and wide as another, that is to be filled. Each channel is contiguous in
+    memory, as ONNX Runtime wants it."""
+    return np.empty((channels, *like.shape[:2]), np.float32).transpose(1, 2, 0)
+
+
+class ReusedMemory:
+    """Memory for images of which a few exist at a time. It is used again, because the system clears new memory, which
+    takes longer than to fill it."""
+
+    def __init__(self) -> None:
+        self._free: list[Array] = []
+
+    def planes(self, like: Array, channels: int) -> Array:
+        """An image as :func:`planes` makes it."""
+        height, width = like.shape[:2]
+        count = height * width * channels
+        memory = self._free.pop() if self._free else np.empty(0, np.float32)
+        if memory.size < count:
+            # Tiles at the border of a frame come first and are smaller. What is never filled takes no memory.
+            memory = np.empty(count + count // 2, np.float32)
+        return memory[:count].reshape(channels, height, width).transpose(1, 2, 0)
+
+    def release(self, image: Array) -> None:
+        """Take back the memory of an image of this object, which nobody uses any more."""
+        assert isinstance(image.base, np.ndarray)
+        self._free.append(image.base)
+
+
 def kept(values: NDArray[T]) -> NDArray[T]:
     """An image that waits for others: itself, or a copy in a temporary file if it has many pixels."""
     if values.shape[0] * values.shape[1] <= MOST_PIXELS:

@@ -89,6 +89,11 @@ def widest_type(channels: Sequence[Channel]) -> str:
     return "float" if any(c.type == "float" for c in channels) else "half"
 
 
+def stored_type(beauty: Sequence[Channel], options: WriteOptions) -> str:
+    """Pixel type in which the fused beauty is written: ``half`` or ``float``."""
+    return options.pixel_type or widest_type(beauty)
+
+
 def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequence[str]) -> frozenset[Channel]:
     """The channels of the HRLS that are neither replaced nor passed on.
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, widest_type
+from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
 from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, extra_spec, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -69,7 +69,7 @@ def write_fused(
         InputError: the layout can't hold these parts, a layer can't be read, or ``path`` exists.
         MssplError: the file can't be written. What stood at ``path`` is untouched.
     """
-    pixels = FusedPixels(rgb, alpha, extra, options.pixel_type or widest_type(beauty))
+    pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
     dropped = dropped_channels(source, beauty, options.layers)
     contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options, replaced)
     with replacing(path, overwrite=overwrite, stale=stale) as temporary:

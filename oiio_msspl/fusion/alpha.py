@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, planes
 from oiio_msspl.fusion.guards import check_finite, holds_around
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.contract import Contract
@@ -44,6 +44,7 @@ def encode_alpha(pair: TilePair, contract: Contract) -> tuple[Array, Array]:
     lrhs_alpha, hrls_alpha = (np.clip(render["alpha"], 0.0, 1.0) for render in (pair.lrhs, pair.hrls))
     grey = {name: values for name, values in pair.hrls.items() if name in (ALBEDO, NORMAL)}
     grey[RGB] = np.repeat(hrls_alpha, 3, axis=-1)
-    lrhs = encode_features({RGB: np.repeat(lrhs_alpha, 3, axis=-1)}, LRHS_FEATURES, 1.0, len(contract.lrhs))
-    hrls = encode_features(grey, contract.features, 1.0, len(contract.hrls))
+    lrhs, hrls = planes(lrhs_alpha, len(contract.lrhs)), planes(hrls_alpha, len(contract.hrls))
+    encode_features({RGB: np.repeat(lrhs_alpha, 3, axis=-1)}, LRHS_FEATURES, 1.0, lrhs)
+    encode_features(grey, contract.features, 1.0, hrls)
     return lrhs, hrls

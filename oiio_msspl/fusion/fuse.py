@@ -5,12 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import Array
-from oiio_msspl.colour import luminance
+from oiio_msspl.arrays import HALF_MAX, Array, ReusedMemory, planes
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -24,7 +25,7 @@ from oiio_msspl.fusion.guards import (
     is_noise_free,
     lights_above_ceiling,
 )
-from oiio_msspl.fusion.pair_checks import BRIGHTEST, HrlsAverages, check_pair
+from oiio_msspl.fusion.pair_checks import HrlsAverages, bounded_luminance, check_pair
 from oiio_msspl.fusion.passes import FusedPasses
 from oiio_msspl.fusion.spread import Place, join, split, without_grid
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
@@ -50,7 +51,7 @@ class FusedFrame:
     """The result, over the HRLS's data window."""
 
     rgb: Array
-    """(height, width, 3), scene linear, finite and >= 0."""
+    """(height, width, 3), scene linear, finite and >= 0: float32, or half where :func:`fuse` was asked for that."""
     alpha: Array | None
     """(height, width, 1) in [0, 1]; None if the HRLS has none."""
     error: Array | None
@@ -68,6 +69,8 @@ class FusedFrame:
     frames: Array | None = None
     """(height, width, 1): how many frames were averaged, see :class:`oiio_msspl.fusion.temporal.Accumulated`; None for
     a frame that was fused alone."""
+    clipped: int = 0
+    """Values of ``rgb`` that were too bright for half; 0 for float32."""
     negative: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
@@ -83,7 +86,7 @@ class FusedFrame:
     @property
     def nbytes(self) -> int:
         """Memory of colour, alpha (whether there is one or not) and, if asked for, error."""
-        return self.rgb.nbytes // 3 * (4 if self.error is None else 5)
+        return self.rgb.nbytes + self.rgb.size // 3 * (4 if self.error is None else 8)
 
 
 def fuse(
@@ -92,6 +95,7 @@ def fuse(
     session: Session,
     *,
     error: bool = False,
+    half: bool = False,
     max_memory: int = MAX_MEMORY,
     held: int = 0,
     progress: Callable[[int, int], None] | None = None,
@@ -102,6 +106,7 @@ def fuse(
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
+        half: keep the result as half floats, in half the memory, with what is too bright clipped to ``HALF_MAX``.
         max_memory: bytes that the whole process should stay below. The result does not depend on it.
         held: bytes that the caller holds beside this frame.
         progress: called with (tiles done, tiles in all).
@@ -117,17 +122,20 @@ def fuse(
     seconds = session.seconds
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session)
-        frame = _blank_frame(alignment, pair.exposure, error=error)
+        frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
         tiles = plan_tiles(pair.grid, session.contract, session.stride)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
             means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
             # The next tile is read and encoded while the network works on this one.
             for done, tile in enumerate(one_ahead(map(pair.prepare, tiles)), start=1):
                 _fuse_tile(tile, session, frame, means)
+                pair.release(tile)
                 if progress is not None:
                     progress(done, len(tiles))
-        frame.warnings += pair.check()
+        if len(tiles) > 1:
+            session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
+        frame.warnings += pair.check(frame.lrhs_luminance)
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     frame.tiles, frame.seconds = len(tiles), session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
@@ -169,10 +177,11 @@ def _check_model(session: Session, scale: int, error: bool) -> None:
         raise InputError(f"model {session.contract.name} is for x{session.contract.scale}, but this pair is x{scale}")
 
 
-def _blank_frame(alignment: Alignment, exposure: float, *, error: bool) -> FusedFrame:
+def _blank_frame(alignment: Alignment, exposure: float, *, error: bool, half: bool) -> FusedFrame:
     size = (alignment.hr_data_window.height, alignment.hr_data_window.width)
     errors = np.zeros((*size, 1), dtype=np.float32) if error else None
-    return FusedFrame(np.zeros((*size, 3), dtype=np.float32), None, errors, alignment, exposure, {})
+    rgb: NDArray[Any] = np.zeros((*size, 3), dtype=np.float16 if half else np.float32)
+    return FusedFrame(rgb, None, errors, alignment, exposure, {})
 
 
 @dataclass(frozen=True)
@@ -226,6 +235,7 @@ class _Pair:
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         self.exposure = find_exposure(self._lrhs_rgb)
         self._empty_regions, self._averages = EmptyRegions(self._lrhs[RGB]), HrlsAverages(alignment)
+        self._memory = ReusedMemory()
 
     @property
     def nbytes(self) -> int:
@@ -252,6 +262,12 @@ class _Pair:
         pictures = [self._prepare_picture(place, part, lit=lit) for place, part in self._pictures(pair)]
         return _PreparedTile(pair.hrls_area, pair.hrls_target, empty, pictures)
 
+    def release(self, tile: _PreparedTile) -> None:
+        """Use the memory of a tile, which is fused, for another one."""
+        for picture in tile.pictures:
+            if picture.hrls is not None:
+                self._memory.release(picture.hrls)
+
     def _pictures(self, pair: TilePair) -> Iterable[tuple[Place, TilePair]]:
         """What the network reads at once of a tile."""
         return split(pair) if self._session.stride > 1 else [((slice(None), slice(None)), pair)]
@@ -266,8 +282,10 @@ class _Pair:
         if lit:
             lrhs_rgb, hrls = dim_fireflies(pair)
             picture.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
-            picture.lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, len(contract.lrhs))
-            picture.hrls = encode_features(hrls, contract.features, self.exposure, len(contract.hrls))
+            picture.lrhs = planes(lrhs_rgb, len(contract.lrhs))
+            picture.hrls = self._memory.planes(hrls[RGB], len(contract.hrls))
+            encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, picture.lrhs)
+            encode_features(hrls, contract.features, self.exposure, picture.hrls)
             picture.noise_free = is_noise_free(pair, picture.lrhs, hrls[RGB], self.exposure)
         return picture
 
@@ -297,11 +315,11 @@ class _Pair:
 
     def luminances(self) -> tuple[Array, Array]:
         """Luminance of both renders over the grid, (h, w) each, once all tiles are prepared."""
-        return luminance(np.minimum(self._lrhs_rgb, BRIGHTEST)), self._averages.rgb
+        return bounded_luminance(self._lrhs_rgb), self._averages.rgb
 
-    def check(self) -> list[str]:
+    def check(self, lrhs_luminance: Array) -> list[str]:
         """Compare the two renders once all tiles are prepared, see :func:`check_pair`."""
-        return check_pair(self._lrhs_rgb, self._averages, self._lr.name, self._hr.name)
+        return check_pair(lrhs_luminance, self._averages, self._lr.name, self._hr.name)
 
 
 def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: _FrameMeans) -> None:
@@ -316,8 +334,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
         encoded = join(zip(places, (image for image, _ in fused), strict=True), size)
         if session.stride > 1 and not all(picture.noise_free for picture in tile.pictures):
             encoded = without_grid(encoded)
-        rgb = frame.rgb[target]
-        decode_radiance(encoded[core], frame.exposure, rgb)
+        rgb = decode_radiance(encoded[core], frame.exposure)
         lights = [(picture.place, picture.lights) for picture in tile.pictures]
         if any(image is not None for _, image in lights):
             dark = np.zeros_like(tile.pictures[0].hrls[..., :3])
@@ -325,6 +342,10 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
             np.maximum(rgb, whole[core], out=rgb)
         if empty is not None:
             rgb *= ~empty[core]
+        if frame.rgb.dtype == np.float16:
+            frame.clipped += int(np.count_nonzero(rgb > HALF_MAX))
+            np.minimum(rgb, HALF_MAX, out=rgb)
+        frame.rgb[target] = rgb
         errors = [image for _, image in fused if image is not None]
         if frame.error is not None and errors:
             error = _scene_linear_error(encoded, join(zip(places, errors, strict=True), size), frame.exposure)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import itertools
 from functools import reduce
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,10 +21,10 @@ from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.pair_colours import different_colours
 from oiio_msspl.fusion.pair_edges import foreign_aovs
-from oiio_msspl.fusion.pair_framing import find_framing, jackknife_error, parts
-from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
+from oiio_msspl.fusion.pair_framing import central_slices, find_framing, jackknife_error, parts
+from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, in_hrls_pixels, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import Tile
-from oiio_msspl.parallel import in_background
+from oiio_msspl.parallel import for_row_blocks, in_background
 
 #: Two renders hardly show the same frame if the correlation of their log luminance is below this. Matching pairs with
 #: clean references reach 0.83 to 0.99, one lit almost only by fireflies 0.31, different scenes -0.2 to 0.25.
@@ -68,8 +69,10 @@ class HrlsAverages:
     """The HRLS at the LRHS's resolution, and how both differ; filled tile by tile.
 
     Attributes:
-        rgb, albedo: luminance (h, w) over the grid of the alignment; ``albedo`` is None if the HRLS has none.
-        normal_edges: (h, w), length of the difference of the normals to the next pixels; None if there are none.
+        rgb: luminance (h, w) over the grid of the alignment.
+        albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
+        normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
+            none.
         blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
             difference of luminance, and how large it would be by the noise of the HRLS alone.
         noisy_pixels, equal_pixels: LRHS pixels over which the HRLS is noisy, and those of them that equal one of its
@@ -78,7 +81,10 @@ class HrlsAverages:
 
     def __init__(self, alignment: Alignment) -> None:
         self.alignment = alignment
-        self.rgb = np.zeros((alignment.grid.height, alignment.grid.width), np.float32)
+        grid = alignment.grid
+        self.rgb = np.zeros((grid.height, grid.width), np.float32)
+        rows, columns = central_slices(self.rgb.shape)
+        self._centre = Window(columns.start, rows.start, columns.stop, rows.stop).shift(grid.x0, grid.y0)
         self.albedo: Array | None = None
         self.normal_edges: Array | None = None
         self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
@@ -87,22 +93,27 @@ class HrlsAverages:
     def add(self, pair: TilePair) -> None:
         """Add the core of a tile."""
         rows, columns = pair.core
-        hrls = tuple(slice(part.start * pair.scale, part.stop * pair.scale) for part in (rows, columns))
-        origin, grid = pair.lrhs_area, self.alignment.grid
-        y, x = rows.start + origin.y0 - grid.y0, columns.start + origin.x0 - grid.x0
-        target = (slice(y, y + rows.stop - rows.start), slice(x, x + columns.stop - columns.start))
-        low, high = (np.minimum(v, BRIGHTEST) for v in (pair.lrhs[RGB][rows, columns], pair.hrls[RGB][hrls]))
+        area, grid = pair.lrhs_area, self.alignment.grid
+        core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
+        low, high = (np.minimum(v, BRIGHTEST) for v in (pair.lrhs[RGB][pair.core], _hrls_pixels(pair, RGB, core)))
         mean = box_downsample(high, pair.scale)
-        self.rgb[target] = luminance(mean)
-        self._add_noise(low, high, mean, y, x)
+        self.rgb[core.slices(grid)] = luminance(mean)
+        self._add_noise(low, high, mean, core.y0 - grid.y0, core.x0 - grid.x0)
+        centre = core.intersect(self._centre)
+        if centre.width and centre.height:
+            self._add_aovs(pair, centre)
+
+    def _add_aovs(self, pair: TilePair, window: Window) -> None:
+        """Fill ``albedo`` and ``normal_edges`` over a part of the central area."""
+        target, size = window.slices(self._centre), (self._centre.height, self._centre.width)
         if ALBEDO in pair.hrls:
             if self.albedo is None:
-                self.albedo = np.zeros_like(self.rgb)
-            self.albedo[target] = luminance(box_downsample(pair.hrls[ALBEDO][hrls], pair.scale))
+                self.albedo = np.zeros(size, np.float32)
+            self.albedo[target] = luminance(box_downsample(_hrls_pixels(pair, ALBEDO, window), pair.scale))
         if NORMAL in pair.hrls:
             if self.normal_edges is None:
-                self.normal_edges = np.zeros_like(self.rgb)
-            normal = box_downsample(pair.hrls[NORMAL][hrls], pair.scale)
+                self.normal_edges = np.zeros(size, np.float32)
+            normal = box_downsample(_hrls_pixels(pair, NORMAL, window), pair.scale)
             steps = [np.diff(normal, axis=axis, append=normal.take([-1], axis)) for axis in (0, 1)]
             self.normal_edges[target] = np.sqrt(sum(np.square(step).sum(axis=-1) for step in steps))
 
@@ -121,13 +132,18 @@ class HrlsAverages:
         self.noisy_pixels += int(np.count_nonzero(noisy))
         self.equal_pixels += int(np.count_nonzero(noisy & (nearest <= 1e-3 * grey)))
         difference = np.square(luminance(mean) - grey)
-        values = np.dstack([low, mean, difference, expected]).astype(np.float64)
+        values: NDArray[Any] = np.dstack([low, mean, difference, expected])
         for axis, start in ((0, y), (1, x)):
             stop = start + values.shape[axis]
             first = np.maximum(np.arange(start // BLOCK * BLOCK, stop, BLOCK) - start, 0)
-            values = np.add.reduceat(values, first, axis)
+            values = np.add.reduceat(values, first, axis).astype(np.float64)
         top, left = y // BLOCK, x // BLOCK
         self.blocks[top : top + values.shape[0], left : left + values.shape[1]] += values
+
+
+def _hrls_pixels(pair: TilePair, feature: str, window: Window) -> Array:
+    """A feature of the HRLS over a window of LRHS pixels inside the tile."""
+    return pair.hrls[feature][in_hrls_pixels(window, pair.scale).slices(pair.hrls_area)]
 
 
 def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
@@ -150,14 +166,19 @@ def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
     for top in range(grid.y0, grid.y1, rows):
         band = Window(grid.x0, top, grid.x1, min(top + rows, grid.y1))
         averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL], counts))
-    return check_pair(lrhs[RGB], averages, lr.name, hr.name)
+    return check_pair(bounded_luminance(lrhs[RGB]), averages, lr.name, hr.name)
 
 
-def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
+def bounded_luminance(rgb: Array) -> Array:
+    """Luminance of repaired colours, at most `BRIGHTEST`: (..., 3) to (...)."""
+    return np.minimum(luminance(rgb), BRIGHTEST)
+
+
+def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
     """Check whether two renders show the same frame.
 
     Args:
-        lrhs_rgb: the LRHS (h, w, 3), repaired, over the grid of the alignment.
+        low: luminance of the LRHS (h, w) over the grid of the alignment, see :func:`bounded_luminance`.
         hrls: averages of all tiles.
         lr_name, hr_name: what messages call the renders.
 
@@ -167,7 +188,7 @@ def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) 
     Raises:
         InputError: one render is black, most likely a wrong layer, and the other is not.
     """
-    low, high, alignment = luminance(np.minimum(lrhs_rgb, BRIGHTEST)), hrls.rgb, hrls.alignment
+    high, alignment = hrls.rgb, hrls.alignment
     if not low.any() and not high.any():
         return [BOTH_BLACK]
     for name, values, other in ((lr_name, low, hr_name), (hr_name, high, lr_name)):
@@ -177,7 +198,7 @@ def check_pair(lrhs_rgb: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) 
                 "check which layer it is (--map rgb=LAYER)"
             )
     warnings = []
-    framing = in_background(lambda: find_framing(low, high))  # takes as long as all other checks
+    framing = in_background(lambda: find_framing(low, high))
     if _shares_noise(hrls):
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
@@ -268,25 +289,41 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
     it, and from the frame's median, which a difference of the whole frame raises as well.
     """
     floor = 0.05 * np.median(low + high)
+    means = {size: _block_means(low, high, size) for size in {size for size, _, _ in BLOCK_GROUPS}}
     for size, side, different in BLOCK_GROUPS:
         if min(low.shape) < size * side:
             continue
-        a, b = (_in_blocks(v.astype(np.float64), size) for v in (low, high))  # a squared firefly overflows float32
-        brightness = (a + b).mean(axis=-1) / 2
+        low_mean, high_mean, low_square, difference_square = means[size]
+        difference = low_mean - high_mean
+        deviation = np.sqrt(np.maximum(difference_square - np.square(difference), 0))
+        contrast = np.sqrt(np.maximum(low_square - np.square(low_mean), 0))
         # Two percent of the brightness do not count, even between renders without noise.
-        error = (a - b).std(axis=-1) / size + 0.02 * (brightness + floor) + FILTER_SHARE * a.std(axis=-1) / size
-        t = np.minimum(np.abs((a - b).mean(axis=-1)) / np.maximum(error, 1e-30), LARGEST_T)
+        unimportant = 0.02 * ((low_mean + high_mean) / 2 + floor)
+        error = (deviation + FILTER_SHARE * contrast) / size + unimportant
+        t = np.minimum(np.abs(difference) / np.maximum(error, 1e-30), LARGEST_T)
         groups = np.lib.stride_tricks.sliding_window_view(np.square(t), (side, side))
-        means = groups.mean(axis=(-2, -1))
-        if means.max() > different * max(1.0, float(np.median(means))):
-            row, column = np.unravel_index(means.argmax(), means.shape)
+        scores = groups.mean(axis=(-2, -1))
+        if scores.max() > different * max(1.0, float(np.median(scores))):
+            row, column = np.unravel_index(scores.argmax(), scores.shape)
             y, x = np.unravel_index(groups[row, column].argmax(), (side, side))
             return int((column + x) * size + size // 2), int((row + y) * size + size // 2)
     return None
 
 
-def _in_blocks(values: NDArray[np.float64], size: int) -> NDArray[np.float64]:
-    """(h, w) to (h / size, w / size, size^2); incomplete blocks at the end are left out."""
-    height, width = (n // size for n in values.shape)
-    blocks = values[: height * size, : width * size].reshape(height, size, width, size)
-    return blocks.swapaxes(1, 2).reshape(height, width, -1)
+def _block_means(low: Array, high: Array, size: int) -> NDArray[np.float64]:
+    """Means over blocks of size x size pixels: LRHS, HRLS, square of the LRHS and of the difference, 4 x (h/s, w/s).
+
+    In double precision, because a squared firefly overflows float32. Incomplete blocks at the end are left out.
+    """
+    height, width = (n // size for n in low.shape)
+    means = np.empty((4, height, width))
+
+    def work(rows: slice) -> None:
+        a, b = (v[rows, : width * size].astype(np.float64) for v in (low, high))
+        for mean, values in zip(means, (a, b, np.square(a), np.square(a - b)), strict=True):
+            row_sums = reduce(np.add, (values[y::size] for y in range(size)))
+            sums = reduce(np.add, (row_sums[:, x::size] for x in range(size)))
+            np.divide(sums, size**2, out=mean[rows.start // size : rows.stop // size])
+
+    for_row_blocks(work, height * size, 4 * width * size, multiple=size)
+    return means

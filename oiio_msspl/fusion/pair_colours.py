@@ -36,20 +36,23 @@ def different_colours(low: NDArray[np.float64], high: NDArray[np.float64]) -> st
     Args:
         low, high: RGB of the same blocks of both renders, (n, 3).
     """
-    finite = np.isfinite(low + high).all(axis=-1)  # sums of radiance near the limit of float32 are not
-    low, high = low[finite], high[finite]
-    if len(low) < MIN_BLOCKS:
+    low, high = low.T, high.T  # each channel is contiguous
+    finite = np.isfinite(low + high).all(axis=0)  # sums of radiance near the limit of float32 are not
+    low, high = low[:, finite], high[:, finite]
+    if low.shape[1] < MIN_BLOCKS:
         return None
-    brightness = low.sum(axis=-1) + high.sum(axis=-1)
-    lit = (brightness > 0.05 * np.median(brightness)) & (low.sum(axis=-1) > 0) & (high.sum(axis=-1) > 0)
-    low, high = low[lit], high[lit]
-    if len(low) < MIN_BLOCKS:
+    brightness = low.sum(axis=0) + high.sum(axis=0)
+    lit = (brightness > 0.05 * np.median(brightness)) & (low.sum(axis=0) > 0) & (high.sum(axis=0) > 0)
+    low, high = low[:, lit], high[:, lit]
+    if low.shape[1] < MIN_BLOCKS:
         return None
-    as_it_is = _differences(low, high)
+    chromaticities = _chromaticities(low), _chromaticities(high)
+    as_it_is = _differences(*chromaticities)
     best, least = None, BETTER * as_it_is.mean()
     for reading, matrix in READINGS.items():
-        both_ways = _differences(low @ matrix.T, high), _differences(low, high @ np.linalg.inv(matrix).T)
-        worse = max(both_ways, key=np.mean)
+        forwards = _differences(_chromaticities(matrix @ low), chromaticities[1])
+        backwards = _differences(chromaticities[0], _chromaticities(np.linalg.inv(matrix) @ high))
+        worse = max(forwards, backwards, key=np.mean)
         gain = as_it_is - worse
         certain = gain.sum() > CERTAIN * np.sqrt(np.square(gain).sum())
         if certain and worse.mean() < least:
@@ -57,8 +60,12 @@ def different_colours(low: NDArray[np.float64], high: NDArray[np.float64]) -> st
     return best
 
 
+def _chromaticities(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The share of each channel in the sum of colours (3, n)."""
+    return rgb / np.maximum(rgb.sum(axis=0), 1e-30)
+
+
 def _differences(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,) of the chromaticities of colours (n, 3), whatever their brightness."""
-    chromaticities = [v / np.maximum(v.sum(axis=-1, keepdims=True), 1e-30) for v in (a, b)]
+    """Distances (n,) of chromaticities (3, n)."""
     # The limit keeps single blocks full of coloured noise from dominating.
-    return np.minimum(np.abs(chromaticities[0] - chromaticities[1]).sum(axis=-1), 0.5)
+    return np.minimum(np.abs(a - b).sum(axis=0), 0.5)

@@ -35,18 +35,19 @@ def foreign_aovs(low: Array, high: Array, albedo: Array | None, normal_edges: Ar
 
     Args:
         low, high: luminance (h, w) of LRHS and HRLS.
-        albedo: luminance (h, w) of the albedo, averaged over LRHS pixels; None if there is none.
-        normal_edges: (h, w), length of the difference of the normals to the next pixels; None if there are none.
+        albedo: luminance of the albedo, averaged over LRHS pixels, over the central area; None if there is none.
+        normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
+            none.
     """
     low, high = central_area(low), central_area(high)
     if min(low.shape) < SMALLEST:
         return []
     found = {}
     if albedo is not None:
-        surface = np.clip(central_area(albedo), 0, 1)
+        surface = np.clip(albedo, 0, 1)
         found[ALBEDO] = np.minimum(_length(_log_steps(surface, 0.05)), 1)
     if normal_edges is not None:
-        found[NORMAL] = np.minimum(central_area(normal_edges), 0.5)
+        found[NORMAL] = np.minimum(normal_edges, 0.5)
     edges = {name: _local_contrast(v) for name, v in found.items() if np.count_nonzero(v > EDGE) >= MIN_EDGES}
     if not edges:
         return []

@@ -141,8 +141,13 @@ def _move(values: Array, by: NDArray[np.float64]) -> Array:
 
 def central_area(values: Array) -> Array:
     """The middle of a picture (h, w), at most `AREA` pixels wide and high."""
-    rows, columns = (slice(max(0, n - AREA) // 2, (n + AREA) // 2) for n in values.shape)
-    return values[rows, columns]
+    return values[central_slices(values.shape)]
+
+
+def central_slices(shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the middle of a picture, at most `AREA` of each."""
+    height, width = (slice(max(0, n - AREA) // 2, min(n, (n + AREA) // 2)) for n in shape)
+    return height, width
 
 
 def parts(values: Array) -> list[Array]:
@@ -159,10 +164,14 @@ def jackknife_error(without_part: NDArray[np.float64]) -> NDArray[np.float64]:
 def smooth(values: Array) -> Array:
     """Binomial filter of 5 x 5 pixels."""
     for axis in (0, 1, 0, 1):
-        size = values.shape[axis]
-        padded = np.pad(values, [(1, 1) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
-        neighbours: Array = padded.take(range(size), axis) + padded.take(range(2, size + 2), axis)
-        values = (neighbours + 2 * values) / np.float32(4)
+        lines = values.swapaxes(0, axis)
+        result = np.empty_like(values)
+        sums = result.swapaxes(0, axis)
+        np.add(lines[:-2], lines[2:], out=sums[1:-1])
+        sums[0], sums[-1] = lines[0] + lines[1], lines[-2] + lines[-1]  # the edge pixel is repeated
+        sums += 2 * lines
+        sums /= np.float32(4)
+        values = result
     return values
 
 

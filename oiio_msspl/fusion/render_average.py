@@ -20,11 +20,10 @@ import numpy as np
 
 from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.arrays import Array, blank, repair
-from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.light import Light, bands, from_grid, grid_rows, rows_in_bands, to_grid
-from oiio_msspl.fusion.pair_checks import BRIGHTEST
+from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
 from oiio_msspl.fusion.warp import Mask, Path, Step, nearest, sample
 from oiio_msspl.parallel import for_row_blocks
@@ -55,7 +54,7 @@ class RenderPair:
         alignment = self.alignment
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts())[RGB]
         high = [to_grid(alignment, _luminance(_read(self.hr, core, [RGB])), core) for core, _ in bands(alignment)]
-        return luminance(np.minimum(lrhs, BRIGHTEST)), np.concatenate(high)
+        return bounded_luminance(lrhs), np.concatenate(high)
 
 
 @dataclass(frozen=True)
@@ -289,7 +288,7 @@ def _make_finite(features: Features) -> Mask:
 
 def _luminance(features: Features) -> Array:
     """Luminance (h, w) of the beauty, finite and >= 0."""
-    return luminance(np.minimum(repair(features[RGB])[0], BRIGHTEST))
+    return bounded_luminance(repair(features[RGB])[0])
 
 
 def _read(render: ReadableRender, window: Window, features: Sequence[str] | None = None) -> Features:

@@ -25,7 +25,7 @@ FIXED_MEMORY = 350 << 20
 STRIPS_SHARE = 1 / 6
 #: Memory of a tile. It is as large as ``MAX_MEMORY`` allows beside an 8K frame. Other tiles give other pixels, so this
 #: does not depend on what the user allows.
-TILE_MEMORY = 1844 << 20
+TILE_MEMORY = 1720 << 20
 #: Further memory for each HRLS pixel of a tile that is split into pictures (:mod:`oiio_msspl.fusion.spread`): its
 #: features before and after they are split, of this tile and the next one.
 SPLIT_BYTES = 160

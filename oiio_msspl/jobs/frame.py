@@ -14,7 +14,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
-from oiio_msspl.exr.contents import dropped_channels, widest_type
+from oiio_msspl.exr.contents import dropped_channels, stored_type
 from oiio_msspl.exr.preview import check_view, old_preview, write_preview
 from oiio_msspl.exr.write_options import ERROR_LAYER, FRAMES_LAYER, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
@@ -129,7 +129,8 @@ def fuse_files(
     if progress is not None:
         progress = Progress(progress, steps_of([View(lr, hr), *others.views], session, write))
     replaced, reports = fuse_other_views(others, session, write, max_memory, progress=progress)
-    fused = fuse(lr, hr, session, error=write.error_layer, max_memory=max_memory, progress=progress)
+    half = stored_type(hr.beauty_channels, write) == "half"
+    fused = fuse(lr, hr, session, error=write.error_layer, half=half, max_memory=max_memory, progress=progress)
     fused.replaced = replaced
     fuse_frame_passes(lr, hr, fused, session, write, max_memory, progress)
     session.release_memory()  # for the writer's cache
@@ -161,8 +162,8 @@ def write_frame(
     Args:
         cache_bytes: see :func:`oiio_msspl.exr.writer.write_fused`.
     """
-    if (options.pixel_type or widest_type(report.hr.beauty_channels)) == "half":
-        report.clipped = int(np.count_nonzero(fused.rgb > HALF_MAX))
+    if stored_type(report.hr.beauty_channels, options) == "half":
+        report.clipped = fused.clipped + int(np.count_nonzero(fused.rgb > HALF_MAX))
     if report.clipped:
         report.warnings.append(
             f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"

@@ -12,8 +12,9 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
-from oiio_msspl.arrays import HALF_MAX, Array, clip, map_rows
+from oiio_msspl.arrays import HALF_MAX, Array, clip, map_rows, planes
 from oiio_msspl.colour import luminance
+from oiio_msspl.parallel import BLOCK_VALUES
 
 #: Log-mean luminance to which a scene is exposed: photographic mid-grey.
 KEY = 0.18
@@ -45,13 +46,15 @@ def find_exposure(rgb: Array) -> float:
     Returns:
         The factor, within ``EXPOSURE_BOUNDS``; 1.0 for a black render.
     """
-    y = luminance(rgb).astype(np.float64)
+    y = luminance(rgb)
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0
-    lit = lit[lit >= NO_LIGHT * np.quantile(lit, 0.99)]
-    offset = 1e-4 * float(np.median(lit))
-    return float(np.clip(KEY / np.exp(np.mean(np.log(lit + offset))), *EXPOSURE_BOUNDS))
+    lit = lit[lit >= NO_LIGHT * float(np.quantile(lit, 0.99))]
+    offset = 1e-4 * float(np.quantile(lit, 0.5))  # np.median overflows for the brightest scenes
+    blocks = np.array_split(lit, -(-lit.size // BLOCK_VALUES))  # a block fits into the processor's cache
+    log_sum = sum(float(np.log(block.astype(np.float64) + offset).sum()) for block in blocks)
+    return float(np.clip(KEY / np.exp(log_sum / lit.size), *EXPOSURE_BOUNDS))
 
 
 def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) -> Array:
@@ -134,20 +137,20 @@ def encode_feature(feature: str, values: Array, exposure: float, out: Array | No
     raise ValueError(f"unknown feature {feature!r}")
 
 
-def encode_features(layers: dict[str, Array], features: dict[str, int], exposure: float, channels: int = 0) -> Array:
+def encode_features(
+    layers: dict[str, Array], features: dict[str, int], exposure: float, out: Array | None = None
+) -> Array:
     """Encode features and stack them along the channel axis. A missing feature gets its default.
 
     Args:
         layers: repaired features (h, w, c); ``rgb`` always.
         features: names and numbers of channels, in the order of the stack.
-        channels: channels of the result, if it needs room for more; the additional ones are not initialised.
+        out: where to put the result, (h, w, channels). It may have more channels, which stay as they are.
 
     Returns:
-        (h, w, channels), float32. Each channel is contiguous in memory, as ONNX Runtime wants it.
+        ``out``, or if that is None a new array of :func:`oiio_msspl.arrays.planes`.
     """
-    height, width = layers[RGB].shape[:2]
-    channels = max(channels, sum(features.values()))
-    stack = np.empty((channels, height, width), dtype=np.float32).transpose(1, 2, 0)
+    stack = planes(layers[RGB], sum(features.values())) if out is None else out
     position = 0
     for name, count in features.items():
         target = stack[..., position : position + count]

@@ -98,7 +98,7 @@ def write_preview(
     def rows(start: int, stop: int) -> Pixels:
         y0 = display_window.y0
         strip = Window(display_window.x0, y0 + start, display_window.x1, y0 + stop)
-        linear = np.zeros((strip.height, strip.width, 3), dtype=np.float32)
+        linear = np.zeros((strip.height, strip.width, 3), dtype=rgb.dtype)
         rendered = data_window.intersect(strip)
         if rendered.width and rendered.height:
             linear[rendered.slices(strip)] = rgb[rendered.slices(data_window)]
@@ -132,7 +132,9 @@ def _to_8_bits(display: Array) -> Pixels:
 def _srgb_pixels(linear: Array) -> Pixels:
     """Linear values through the sRGB curve, by a table of all half floats: six times as fast as to compute it. One
     value in a hundred is rounded to the other side."""
-    return _srgb_table().take(np.clip(linear, 0, 1).astype(np.float16).view(np.uint16))
+    with np.errstate(over="ignore"):  # what half can't hold becomes infinite, and white
+        half = linear.astype(np.float16, copy=False)
+    return _srgb_table().take(half.view(np.uint16))
 
 
 @lru_cache(maxsize=1)

@@ -90,14 +90,15 @@ def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
         work(rows)
 
 
-def yield_to_network() -> None:
+def _yield_to_network() -> None:
     """Let this thread work mainly while the network's threads wait for each other.
 
     The network needs all cores at once: if one of its threads has to share a core, the others wait for it. With a third
     of their weight this thread still keeps pace on a machine that other programs use.
     """
     if sys.platform == "linux":  # elsewhere a thread has no priority of its own
-        os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
+        with contextlib.suppress(OSError):  # a sandbox may forbid it
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), 5)
 
 
 def end_pools() -> None:
@@ -120,7 +121,7 @@ def _row_pool(count: int) -> ThreadPoolExecutor:
 
 def _background_pool() -> ThreadPoolExecutor:
     name = "background"
-    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(None, name, yield_to_network))
+    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(None, name, _yield_to_network))
 
 
 if hasattr(os, "register_at_fork"):

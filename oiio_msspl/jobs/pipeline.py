@@ -17,7 +17,7 @@ from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
-from oiio_msspl.parallel import limit_threads, yield_to_network
+from oiio_msspl.parallel import limit_threads
 
 
 def run_pipeline(
@@ -93,8 +93,8 @@ def run_pipeline(
     order = window.order()
     with (
         limit_threads(stages.threads),
-        ThreadPoolExecutor(1, "read", yield_to_network) as reader,
-        ThreadPoolExecutor(1, "write", yield_to_network) as writer,
+        ThreadPoolExecutor(1, "read") as reader,
+        ThreadPoolExecutor(1, "write") as writer,
     ):
         reads = [reader.submit(stages.read, frame) for frame in order[:1]]
         try:

@@ -49,6 +49,17 @@ def test_tiled_and_untiled_agree_to_half_rounding(session, scale, monkeypatch):
     np.testing.assert_allclose(tiny.rgb, whole.rgb, rtol=2**-11)
 
 
+def test_a_half_result_is_the_float_result_rounded_and_counts_what_it_clips(session, scale, monkeypatch):
+    low, high, _ = pair_of(scale, 60 * scale, 90 * scale)
+    low.layers["rgb"][:20], high.layers["rgb"][: 20 * scale] = 1e5, 1e5
+    tiles_of(monkeypatch, session, (36 * scale) ** 2)
+    full, half = (fuse(low, high, session, half=half) for half in (False, True))
+    assert half.rgb.dtype == np.float16
+    assert half.tiles > 1
+    assert half.clipped == np.count_nonzero(full.rgb > 65504) > 0 == full.clipped
+    np.testing.assert_array_equal(half.rgb, np.minimum(full.rgb, 65504).astype(np.float16))
+
+
 def tiles_of(monkeypatch, session, pixels):
     """Let tiles have at most this many HRLS pixels."""
     monkeypatch.setattr(tiling, "TILE_MEMORY", pixels * session.contract.bytes_per_pixel)

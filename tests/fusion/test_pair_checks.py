@@ -5,10 +5,13 @@ import numpy as np
 import pytest
 
 from oiio_msspl.arrays import interpolate
-from oiio_msspl.colour import ACES2065, ACESCG, REC709, conversion
-from oiio_msspl.exr.render import Render
-from oiio_msspl.fusion.pair_checks import check_renders
-from oiio_msspl.fusion.pair_framing import Framing, find_framing
+from oiio_msspl.colour import ACES2065, ACESCG, REC709, conversion, luminance
+from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.pair_checks import HrlsAverages, check_renders
+from oiio_msspl.fusion.pair_framing import Framing, central_area, find_framing
+from oiio_msspl.fusion.tile_features import RepairCounts, read_tile
+from oiio_msspl.fusion.tiling import Tile
 from tests.conftest import downsample, noisy
 
 #: Height and width of the LRHS.
@@ -59,6 +62,20 @@ def test_a_right_pair_fits(scale, seed):
 def test_a_right_pair_fits_whatever_tiles_it_is_read_in(scale, monkeypatch):
     monkeypatch.setattr("oiio_msspl.fusion.pair_checks.PIXELS_PER_READ", 30 * 30 * scale**2)
     assert warnings(scale) == []
+
+
+def test_aovs_are_averaged_over_the_area_that_is_compared(scale, monkeypatch):
+    monkeypatch.setattr("oiio_msspl.fusion.pair_framing.AREA", 40)
+    lr, hr = pair(scale)
+    alignment = align(lr, hr)
+    averages = HrlsAverages(alignment)
+    lrhs = {"rgb": lr.layers["rgb"]}
+    for tile in (Window(x, y, x + 32, y + 16) for y in range(0, LOW[0], 16) for x in range(0, LOW[1], 32)):
+        features = ["rgb", "albedo", "normal"]
+        averages.add(read_tile(Tile(tile, tile), lrhs, alignment.grid, hr, alignment, features, RepairCounts()))
+    expected = central_area(luminance(downsample(hr.layers["albedo"], scale)))
+    assert expected.shape == averages.normal_edges.shape == (40, 40)
+    np.testing.assert_allclose(averages.albedo, expected, rtol=1e-5)
 
 
 @pytest.mark.parametrize("how", ["box", "nearest"])

@@ -91,7 +91,7 @@ def test_tiles_give_nearly_the_same_as_a_whole_frame(monkeypatch):
     session = load_model(2, "joint-spread")
     pair = spread_pair(picture(512, 768), 2)
     whole = fuse(*pair, session)
-    monkeypatch.setattr(tiling, "TILE_MEMORY", 200 << 20)
+    monkeypatch.setattr(tiling, "TILE_MEMORY", 130 << 20)
     assert tile_count(whole.alignment, session) > 1
     tiled = fuse(*pair, session)
     assert tiled.tiles > 1

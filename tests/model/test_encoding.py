@@ -6,7 +6,7 @@ from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
 from oiio_msspl.arrays import repair
 from oiio_msspl.colour import srgb
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_radiance, find_exposure
-from tests.conftest import picture
+from tests.conftest import noisy, picture
 
 
 def test_compress_and_expand_are_inverse_over_the_whole_range():
@@ -34,6 +34,13 @@ def test_traces_of_light_do_not_decide_the_exposure():
     scene = np.full((8, 8, 3), 1e-40, np.float32)
     scene[:2] = 0.02
     assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
+
+
+def test_a_sample_of_a_large_frame_gives_its_exposure(monkeypatch):
+    scene = noisy(picture(256, 256), 4)
+    whole = find_exposure(scene)
+    monkeypatch.setattr("oiio_msspl.model.encoding.LARGE_SAMPLE", 1000)
+    assert find_exposure(scene) == pytest.approx(whole, rel=1e-3)
 
 
 @pytest.mark.parametrize("light", [1e-45, 1e-40, 1e-30, 1.0, 1e30, 3e38])

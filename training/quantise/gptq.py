@@ -231,7 +231,8 @@ def _patches(image: Tensor, pixels: Tensor) -> Tensor:
 def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Choose integer weights in [-MAX_WEIGHT, MAX_WEIGHT] and their steps, so that inputs give outputs.
 
-    Two input channels with even and odd number keep to ``MAX_PAIR``.
+    Channels 2 i and 2 i + 1 are a pair: at each of the 3 x 3 pixels, their weights of one sign sum to ``MAX_PAIR`` at
+    most.
 
     Args:
         inputs: (P, K), 3 x 3 pixels of each of an even number of channels.

@@ -20,7 +20,15 @@ HALF_MAX, FLOAT_MAX = 65504.0, float(np.finfo(np.float32).max)
 #: Images of more pixels that wait for others are kept in temporary files.
 MOST_PIXELS = 1_000_000
 
+#: Values that tell a quantile of a frame well enough.
+LARGE_SAMPLE = 1 << 20
+
 T = TypeVar("T", bound=np.generic)
+
+
+def quantile(values: NDArray[Any], share: float) -> float:
+    """A quantile of values (n,), of evenly spaced ones if there are many."""
+    return float(np.quantile(values[:: -(-values.size // LARGE_SAMPLE)], share))
 
 
 def blank(shape: tuple[int, ...], dtype: type[T] | np.dtype[T] = np.float32) -> NDArray[T]:  # type: ignore[assignment]

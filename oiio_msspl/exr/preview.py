@@ -17,6 +17,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
+from oiio_msspl.parallel import one_ahead
 
 Pixels = NDArray[np.uint8]
 
@@ -156,9 +157,10 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], P
         spec.attribute("png:filter", SUB_FILTER)
         spec.attribute("compression", RUNS_ONLY)
         ok = writer.open(str(temporary), spec)
-        for start in range(0, height, ROWS_PER_STRIP):
-            stop = min(start + ROWS_PER_STRIP, height)
-            ok = ok and writer.write_scanlines(start, stop, 0, np.ascontiguousarray(rows(start, stop)))
+        ranges = [(start, min(start + ROWS_PER_STRIP, height)) for start in range(0, height, ROWS_PER_STRIP)]
+        # The next rows are converted while OpenImageIO compresses these.
+        for start, stop, pixels in one_ahead((a, b, np.ascontiguousarray(rows(a, b))) for a, b in ranges):
+            ok = ok and writer.write_scanlines(start, stop, 0, pixels)
         ok = writer.close() and ok
         if not ok:
             raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")

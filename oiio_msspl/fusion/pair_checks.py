@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.arrays import Array, box_downsample, quantile
 from oiio_msspl.colour import luminance
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
@@ -199,6 +199,7 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
             )
     warnings = []
     framing = in_background(lambda: find_framing(low, high))
+    foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges))
     if _shares_noise(hrls):
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
@@ -218,7 +219,7 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
         warnings.append(f"{colours}: write both in the same colour space")
     warnings += [
         f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
-        for aov in foreign_aovs(low, high, hrls.albedo, hrls.normal_edges)
+        for aov in foreign()
     ]
     scale, grid, found = alignment.scale, alignment.grid, framing()
     x, y = found.x * scale, found.y * scale
@@ -271,7 +272,7 @@ def _brightness_ratio(low: Array, high: Array) -> tuple[float, bool]:
     """How many times as bright the HRLS is, and whether that is more than noise."""
     # Fireflies dominate a plain mean. So only pixels count that are not in the brightest percent of either render.
     lit = (low > 0) | (high > 0)
-    ordinary = lit & (low <= np.quantile(low[lit], 0.99)) & (high <= np.quantile(high[lit], 0.99))
+    ordinary = lit & (low <= quantile(low[lit], 0.99)) & (high <= quantile(high[lit], 0.99))
     low_sums, high_sums = (
         np.array([part.sum(dtype=np.float64) for part in parts(v * ordinary)]) + 1e-30 for v in (low, high)
     )
@@ -288,7 +289,7 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
     however bright it is. The mean of t^2 over neighbouring blocks is 1 for noise. A thing that moved stands out from
     it, and from the frame's median, which a difference of the whole frame raises as well.
     """
-    floor = 0.05 * np.median(low + high)
+    floor = 0.05 * quantile((low + high).ravel(), 0.5)
     means = {size: _block_means(low, high, size) for size in {size for size, _, _ in BLOCK_GROUPS}}
     for size, side, different in BLOCK_GROUPS:
         if min(low.shape) < size * side:

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, quantile
 from oiio_msspl.fusion.pair_framing import SMALLEST, central_area, smooth
 
 #: Shifts in LRHS pixels that the control consists of; smaller ones than the first still overlap the edges.
@@ -53,7 +53,7 @@ def foreign_aovs(low: Array, high: Array, albedo: Array | None, normal_edges: Ar
         return []
     both = low + high
     lit = both[both > 0]
-    floor = 0.1 * float(np.median(lit)) if lit.size else 1.0
+    floor = 0.1 * quantile(lit, 0.5) if lit.size else 1.0
     steps_low, steps_high, steps = (_log_steps(v, f) for v, f in ((low, floor / 2), (high, floor / 2), (both, floor)))
     picture = _local_contrast(np.minimum(_length(steps), 1))
     visible = _fit(*(_local_contrast(np.minimum(_length(v), 1)) for v in (steps_low, steps_high)))

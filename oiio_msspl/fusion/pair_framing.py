@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array, box_downsample, interpolate
+from oiio_msspl.arrays import Array, box_downsample, interpolate, quantile
 
 #: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
 FRAMING_CORRELATION = 0.8
@@ -55,7 +55,7 @@ def find_framing(low: Array, high: Array) -> Framing:
     if min(low.shape) < SMALLEST:
         return Framing()
     low, high = central_area(low), central_area(high)
-    grey = np.median(low[low > 0]) if low.any() else 1.0
+    grey = quantile(low[low > 0], 0.5) if low.any() else 1.0
     # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
     low, high = (smooth(v / (v + grey)) for v in (low, high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):

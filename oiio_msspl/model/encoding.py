@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
-from oiio_msspl.arrays import HALF_MAX, Array, clip, map_rows, planes
+from oiio_msspl.arrays import HALF_MAX, Array, clip, map_rows, planes, quantile
 from oiio_msspl.colour import luminance
 from oiio_msspl.parallel import BLOCK_VALUES
 
@@ -28,8 +28,6 @@ MAX_ALBEDO = 2.0
 EXPOSURE_BOUNDS = (2e-34, 1e38)
 #: Pixels darker than this share of a frame's bright pixels (33 stops below) do not count for its exposure.
 NO_LIGHT = 1e-10
-#: Pixels that tell how bright a frame's median or its brightest percent is, well enough for an exposure.
-LARGE_SAMPLE = 1 << 20
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
 #: Log-encoded ``MAX_RADIANCE``, in the arithmetic of :func:`decode_radiance`.
@@ -52,18 +50,13 @@ def find_exposure(rgb: Array) -> float:
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0
-    darkest = NO_LIGHT * _quantile(lit, 0.99)
+    darkest = NO_LIGHT * quantile(lit, 0.99)
     if lit.min() < darkest:
         lit = lit[lit >= darkest]
-    offset = 1e-4 * _quantile(lit, 0.5)
+    offset = 1e-4 * quantile(lit, 0.5)
     blocks = np.array_split(lit, -(-lit.size // BLOCK_VALUES))  # a block fits into the processor's cache
     log_sum = sum(float(np.log(block.astype(np.float64) + offset).sum()) for block in blocks)
     return float(np.clip(KEY / np.exp(log_sum / lit.size), *EXPOSURE_BOUNDS))
-
-
-def _quantile(values: Array, share: float) -> float:
-    """A quantile of values (n,), of a sample if there are many."""
-    return float(np.quantile(values[:: -(-values.size // LARGE_SAMPLE)], share))
 
 
 def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) -> Array:

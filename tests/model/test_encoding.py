@@ -39,7 +39,7 @@ def test_traces_of_light_do_not_decide_the_exposure():
 def test_a_sample_of_a_large_frame_gives_its_exposure(monkeypatch):
     scene = noisy(picture(256, 256), 4)
     whole = find_exposure(scene)
-    monkeypatch.setattr("oiio_msspl.model.encoding.LARGE_SAMPLE", 1000)
+    monkeypatch.setattr("oiio_msspl.arrays.LARGE_SAMPLE", 1000)
     assert find_exposure(scene) == pytest.approx(whole, rel=1e-3)
 
 

@@ -108,7 +108,7 @@ def draw(shown: dict[str, Any], path: Path) -> None:
     import matplotlib.pyplot as plt
     from matplotlib.ticker import LogLocator
 
-    colours = dict(zip(_families(shown), ("#0072B2", "#D55E00", "#CC79A7"), strict=True))
+    colours = dict(zip(_families(shown), ("#009E73", "#0072B2", "#D55E00", "#CC79A7"), strict=True))
     markers = dict(zip(PEERS, "*XDPd", strict=True))
     measures, averages = shown["measures"], shown["spp"]
     size = (4.2 * len(averages), 3.5 * len(measures))

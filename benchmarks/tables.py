@@ -4,7 +4,7 @@
     python -m benchmarks.tables
 
 In the pages of `TABLES`, everything between ``<!-- begin: NAME -->`` and ``<!-- end -->`` is replaced by what the
-function NAME returns. The text around it stays.
+function NAME returns. The text around it stays. The table that ``msspl models`` prints is written, too.
 """
 
 from __future__ import annotations
@@ -26,10 +26,11 @@ from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
 from benchmarks.temporal import report as temporal_report
+from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SCALES
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "pyramid", "joint")
+FAMILIES = ("paper", "pyramid", "joint", "ensemble")
 #: Methods of :mod:`benchmarks.quality` that most tables compare the models with.
 PEERS = (
     "OIDN on the HRLS",
@@ -38,14 +39,15 @@ PEERS = (
     "OIDN, same samples",
     "OIDN prefiltered, same samples",
 )
-BEST = "joint-x2"
+DEFAULT = "joint-x2"
+#: Models of the qualities "balanced" and "best", and the latter with most samples in the HRLS.
+BETTER = (DEFAULT, "ensemble-x2", "ensemble-x2, 7:1")
 #: A method of README's table -> its title, and what it needs.
 WHEN_IT_PAYS = {
-    "HRLS": ("HRLS alone", "HRLS"),
-    "paper-x2": ("`paper-x2`", "LRHS and HRLS"),
-    "pyramid-x4": ("`pyramid-x4`", "LRHS and HRLS"),
-    "joint-x2": ("`joint-x2`", "LRHS and HRLS"),
-    "joint-x4": ("`joint-x4`", "LRHS and HRLS"),
+    "pyramid-x2": ("`--quality fast` (`pyramid-x2`)", "LRHS and HRLS"),
+    "joint-x2": ("`--quality balanced` (`joint-x2`)", "LRHS and HRLS"),
+    "ensemble-x2": ("`--quality best` (`ensemble-x2`)", "LRHS and HRLS"),
+    "ensemble-x2, 7:1": ("the same, HRLS with 7/8 of the samples", "LRHS and HRLS"),
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
@@ -72,8 +74,9 @@ Found = Mapping[Hashable, Row]
 SPREAD_NOISE = {
     "HRLS": "HRLS alone",
     "joint-x2": "`joint-x2`",
-    "joint-x2-spread": "`joint-x2-spread`, which `auto` takes",
-    "joint-x4-spread": "`joint-x4-spread`",
+    "pyramid-x2-spread": "`--quality fast` (`pyramid-x2-spread`)",
+    "joint-x2-spread": "`--quality balanced` (`joint-x2-spread`)",
+    "ensemble-x2-spread": "`--quality best` (`ensemble-x2-spread`)",
     "paper-x2": "`paper-x2`",
     "OIDN on the HRLS": "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS": "OIDN on the HRLS, prefiltered",
@@ -107,10 +110,8 @@ def when_it_pays() -> str:
     for method, (name, needs) in WHEN_IT_PAYS.items():
         relative = []
         for times in runs:
-            time = times.get(SAME_WORK.get(method, method))
+            time = times.get(SAME_WORK.get(method, method.partition(", ")[0]))
             relative.append(f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "not measured")
-        if method == "HRLS":
-            relative = ["0", "0"]  # nothing is computed
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
         body.append([name, needs, *cells, *relative])
     head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time / OIDN's", "without VNNI"]
@@ -118,23 +119,26 @@ def when_it_pays() -> str:
 
 
 def how_sure() -> str:
-    """The best model against OIDN at its best, by scene."""
+    """The qualities "balanced" and "best" against OIDN at its best, by scene."""
     rows = results.read("quality")
     body = []
-    for peer, render in AT_ITS_BEST.items():
-        for spp in (2, 8):
-            if found := versus.compare(rows, BEST, peer, spp):
-                without, names = f"{found.without_too_easy:+.2f}", ", ".join(found.verdicts)
-                body.append([render, str(spp), versus.cell(found.psnr, "+.2f"), without, found.wins, names])
-    head = [f"`{BEST}` against OIDN, prefiltered", "spp", "PSNR gained, dB", f"without {versus.TOO_EASY}", "better on"]
+    for (peer, render), model, spp in itertools.product(AT_ITS_BEST.items(), BETTER, (2, 8)):
+        if "," in model and peer.endswith("on the HRLS"):
+            continue  # it got another HRLS
+        if found := versus.compare(rows, model, peer, spp):
+            cells = [versus.cell(found.psnr, "+.2f"), f"{found.without_too_easy:+.2f}", found.wins]
+            body.append([render, title(model), str(spp), *cells, ", ".join(found.verdicts)])
+    head = ["against OIDN, prefiltered", "model", "spp", "PSNR gained, dB", f"without {versus.TOO_EASY}", "better on"]
     return results.markdown([*head, "PSNR, RelMSE"], body)
 
 
 def against_oidn() -> str:
     """Models against OIDN at its best, with intervals, on all renders on which both were measured."""
     tables = {name: results.read(table) for name, table in SETS.items()}
-    text = versus.table(tables, ("joint-x2", "joint-x4", "pyramid-x4"), AT_ITS_BEST, quality.AVERAGES)
-    missing = [name for name, rows in tables.items() if not versus.compare(rows, BEST, next(iter(AT_ITS_BEST)), 2)]
+    text = versus.table(
+        tables, ("ensemble-x2", "ensemble-x4", "joint-x2", "joint-x4", "pyramid-x4"), AT_ITS_BEST, quality.AVERAGES
+    )
+    missing = [name for name, rows in tables.items() if not versus.compare(rows, DEFAULT, next(iter(AT_ITS_BEST)), 2)]
     return text + f"\nPrefiltered OIDN was not measured on these renders: {', '.join(missing)}.\n" * bool(missing)
 
 
@@ -179,11 +183,11 @@ def filters() -> str:
     differences = []
     for name, rows in tables.items():
         for spp in quality.AVERAGES:
-            if found := versus.compare(rows, BEST, "OIDN, same samples", spp):
+            if found := versus.compare(rows, DEFAULT, "OIDN, same samples", spp):
                 by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
                 without = f"{found.without_too_easy:+.2f}"
                 differences.append([f"{name}, {spp}", versus.cell(found.psnr, "+.2f"), without, found.wins, *by_scene])
-    between = f"\nPSNR of `{BEST}` minus that of plain OIDN on full resolution with the same samples:\n\n"
+    between = f"\nPSNR of `{DEFAULT}` minus that of plain OIDN on full resolution with the same samples:\n\n"
     columns = ["filter, spp", MEAN, f"without {versus.TOO_EASY}", "better on", *clean]
     return (
         f"{results.markdown(head, body)}\n{quality.mean_note(tables['box'])}\n{between}"
@@ -205,12 +209,12 @@ def cycles() -> str:
     differences = []
     for peer in ("OIDN on the HRLS", "OIDN, same samples"):
         for spp in quality.AVERAGES:
-            if found := versus.compare(rows, BEST, peer, spp):
+            if found := versus.compare(rows, DEFAULT, peer, spp):
                 by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
                 differences.append([f"{peer}, {spp}", versus.cell(found.psnr, "+.2f"), found.wins, *by_scene])
     return (
         f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
-        f"\nPSNR of `{BEST}` minus that of plain OIDN:\n\n"
+        f"\nPSNR of `{DEFAULT}` minus that of plain OIDN:\n\n"
         f"{results.markdown(['OIDN, spp', MEAN, 'better on', *clean], differences)}"
     )
 
@@ -220,7 +224,7 @@ def division() -> str:
     rows = results.read("quality_box")
     means = means_of(rows)
     ways = ["", *(f", {more}:{less}" for more, less in quality.UNEVEN)]
-    columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, BEST + way) in means]
+    columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, DEFAULT + way) in means]
     body = _measured(
         [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
         for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples", "OIDN prefiltered, same samples")
@@ -271,7 +275,11 @@ def _total(rows: Sequence[Row], runtime: Sequence[Row], render_time: Sequence[Ro
         beyond = max(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 
-    for model, call, spp in itertools.product(("joint-x2", "joint-x4"), peers, quality.AVERAGES):
+    for model, call, spp in itertools.product(
+        ("joint-x2", "joint-x4", "ensemble-x2", "ensemble-x4"), peers, quality.AVERAGES
+    ):
+        if model not in times:
+            continue
         slower = times[model]["seconds"] - times[call]["seconds"]
         for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
             if (name, spp, clean[0]) not in psnr:
@@ -340,6 +348,20 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
 }
 
 
+def measured_models() -> str:
+    """The table of :func:`oiio_msspl.model.catalogue.measured`, which ``msspl models`` prints."""
+    means = means_of(results.read("quality"))
+    runs = [results.index(results.read(table), "method") for table, _ in MACHINES]
+    lines = ["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp,time,time_without_vnni"]
+    for name in shipped_models():
+        cells = [
+            f"{means[spp, name][m]:.4g}" if (spp, name) in means else "" for spp in (2, 8) for m in ("psnr", "relmse")
+        ]
+        cells += [f"{times[name]['seconds'] / times[OIDN]['seconds']:.3g}" if name in times else "" for times in runs]
+        lines.append(",".join([name, *cells]))
+    return "\n".join(lines) + "\n"
+
+
 def laid_out(text: str, tables: Sequence[Callable[[], str]]) -> str:
     """A page with its tables replaced.
 
@@ -359,6 +381,7 @@ def main() -> None:
     argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
     for path, tables in TABLES.items():
         path.write_text(laid_out(path.read_text(), tables))
+    MEASURED.write_text(measured_models())
 
 
 if __name__ == "__main__":

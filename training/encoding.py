@@ -81,6 +81,11 @@ def srgb(exposed: Tensor) -> Tensor:
     return torch.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
 
 
+def from_srgb(encoded: Tensor) -> Tensor:
+    """Inverse of :func:`srgb`."""
+    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded.clamp_min(0.0) + 0.055) / 1.055) ** 2.4)
+
+
 def repair(values: Tensor, *, signed: bool = False) -> Tensor:
     """Stored half floats as finite float32, non-negative unless ``signed``."""
     values = torch.nan_to_num(values.float(), nan=0.0, posinf=MAX_RADIANCE, neginf=-MAX_RADIANCE)

@@ -103,7 +103,7 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
         translations = {aten.pixel_unshuffle.default: _space_to_depth}
     else:
         module, outputs = network, ["fused", "log_error"]
-        translations = {aten.pixel_unshuffle.default: _unshuffle, aten.pixel_shuffle.default: _shuffle}
+        translations = {aten.pixel_unshuffle.default: unshuffle, aten.pixel_shuffle.default: shuffle}
     model = traced(module, inputs, ["lrhs", "hrls"], outputs, alignment, translations)
     if half:
         _store_as_half(model.graph)
@@ -169,7 +169,7 @@ def _space_to_depth(x, downscale_factor: int):
     return opset18.SpaceToDepth(x, blocksize=downscale_factor)
 
 
-def _unshuffle(x, downscale_factor: int):
+def unshuffle(x, downscale_factor: int):
     """Pixel unshuffle as a grouped convolution with kernels of a single tap, in PyTorch's channel order.
 
     It runs on all cores. The exporter's own translation has a Transpose, which takes four times as long.
@@ -178,7 +178,7 @@ def _unshuffle(x, downscale_factor: int):
     return opset18.Conv(x, weight, group=x.shape[1], strides=[downscale_factor] * 2)
 
 
-def _shuffle(x, upscale_factor: int):
+def shuffle(x, upscale_factor: int):
     """Pixel shuffle as a grouped transposed convolution, likewise."""
     planes = x.shape[1] // upscale_factor**2
     return opset18.ConvTranspose(x, _taps(planes, upscale_factor), group=planes, strides=[upscale_factor] * 2)

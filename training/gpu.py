@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export a `joint` network for GPUs: convolutions in half floats, the rest in float32.
+"""Export the `joint` or the `ensemble` models for GPUs: convolutions in half floats, the rest in float32.
 
     python -m training.gpu training/checkpoints/joint.pt oiio_msspl/model/weights/joint-x*.onnx
+    python -m training.gpu training/checkpoints/joint.pt oiio_msspl/model/weights/ensemble-x*.onnx \\
+        --ensemble training/checkpoints/ensemble.pt
 
-The arguments are a checkpoint and the files for CPUs that were exported from it. Each file for GPUs lies in the folder
-`gpu` beside the one for CPUs and has the same contract, so every device cuts a frame into the same tiles. The denoiser
-of both renders' mean is written, too.
+The arguments are a checkpoint of `joint` and the files for CPUs that were exported from it. Each file for GPUs lies in
+the folder `gpu` beside the one for CPUs and has the same contract, so every device cuts a frame into the same tiles.
+With `joint`, the denoiser of both renders' mean is written, too; `ensemble` uses the same.
 
 The log curve stays in float32, because half floats overflow in it. Weights are stored as 8-bit codes with a scale for
 each 3 x 3 kernel, and become half floats when the file is loaded. The networks of all scales have the same weights,
@@ -32,6 +34,7 @@ from oiio_msspl.model import mean_denoiser
 from oiio_msspl.model.contract import METADATA_KEY, Contract
 from oiio_msspl.model.devices import GPU_FOLDER
 from training.checkpoints import load
+from training.ensemble import BandWeights, EnsembleFusion, load_weights
 from training.export import example, traced
 from training.joint import JointFusion
 from training.mean_denoiser import MeanDenoiser
@@ -65,11 +68,19 @@ def in_half_floats(network: JointFusion) -> JointFusion:
     return network.eval()
 
 
+def ensemble_in_half_floats(network: JointFusion, weights: BandWeights) -> EnsembleFusion:
+    """The ensemble with a network of :func:`in_half_floats`."""
+    ensemble = EnsembleFusion(network, copy.deepcopy(weights).half())
+    ensemble.oidn.half()
+    return ensemble.eval()
+
+
 @torch.inference_mode()
-def joint_to_onnx(network: JointFusion, contract: Contract) -> onnx.ModelProto:
-    """The graph of a network of :func:`in_half_floats` for the contract's scale."""
-    inputs = example(network, contract.scale, 4 * contract.alignment, 6 * contract.alignment)
-    model = traced(Fuse(network), inputs, ["lrhs", "hrls"], ["fused", "log_error"], contract.alignment)
+def to_onnx(network: JointFusion | EnsembleFusion, contract: Contract) -> onnx.ModelProto:
+    """The graph of a network in half floats for the contract's scale."""
+    joint, module = (network, Fuse(network)) if isinstance(network, JointFusion) else (network.joint, network)
+    inputs = example(joint, contract.scale, 4 * contract.alignment, 6 * contract.alignment)
+    model = traced(module, inputs, ["lrhs", "hrls"], ["fused", "log_error"], contract.alignment)
     contract = replace(contract, provenance=contract.provenance | PRECISION)
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return _finished(model)
@@ -137,23 +148,27 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("models", type=Path, nargs="+", help="the network's files for CPUs, one for each scale")
+    parser.add_argument("--ensemble", type=Path, metavar="WEIGHTS", help="weights of the ensemble models")
     args = parser.parse_args()
-    network, _ = load(args.checkpoint)
-    if not isinstance(network, JointFusion):
+    joint, _ = load(args.checkpoint)
+    if not isinstance(joint, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
-    network = in_half_floats(network)
-
-    denoiser = mean_denoiser.WEIGHTS.parent / GPU_FOLDER / mean_denoiser.WEIGHTS.name
-    denoiser.parent.mkdir(exist_ok=True)
-    onnx.save(mean_denoiser_to_onnx(network.mean_denoiser), denoiser)
-
-    folder = args.models[0].parent / GPU_FOLDER
+    joint = in_half_floats(joint)
+    network: JointFusion | EnsembleFusion = joint
+    folder, family = args.models[0].parent / GPU_FOLDER, "joint"
     folder.mkdir(exist_ok=True)
-    models = {path.name: joint_to_onnx(network, Contract.of_file(path)) for path in args.models}
-    share_weights(list(models.values()), folder / "joint.weights")
+    if args.ensemble:
+        network, family = ensemble_in_half_floats(joint, load_weights(args.ensemble)[0]), "ensemble"
+    else:
+        denoiser = mean_denoiser.WEIGHTS.parent / GPU_FOLDER / mean_denoiser.WEIGHTS.name
+        denoiser.parent.mkdir(exist_ok=True)
+        onnx.save(mean_denoiser_to_onnx(joint.mean_denoiser), denoiser)
+
+    models = {path.name: to_onnx(network, Contract.of_file(path)) for path in args.models}
+    share_weights(list(models.values()), folder / f"{family}.weights")
     for name, model in models.items():
         onnx.save(model, folder / name)
-    for path in (denoiser, *sorted(folder.iterdir())):
+    for path in sorted(folder.glob(f"{family}*")):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 

@@ -21,6 +21,7 @@ from training.ops import upsample
 
 #: Open Image Denoise's names of its networks, see :data:`training.oidn_weights.NETWORKS`.
 BASE_HDR, LARGE_HDR = "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large"
+ALBEDO_BASE, NORMAL_BASE = "rt_alb", "rt_nrm"
 
 Weights = Mapping[str, Tensor]
 

@@ -73,12 +73,21 @@ ViewLayer = Annotated[
         rich_help_panel=INPUT,
     ),
 ]
+Quality = Annotated[
+    str | None,
+    typer.Option(
+        metavar="NAME",
+        help="fast, balanced or best. \\[default: balanced]",
+        rich_help_panel=MODEL,
+    ),
+]
 Model = Annotated[
     str,
     typer.Option(
         metavar="NAME",
-        help="auto, a family (paper), a shipped model (see msspl models) or an ONNX file.",
+        help="Instead of a quality: a family (paper), a shipped model (see msspl models) or an ONNX file.",
         rich_help_panel=MODEL,
+        hidden=True,
     ),
 ]
 Device = Annotated[
@@ -227,6 +236,23 @@ def make_inputs(
     layers: dict[str, Any] = read_map_file(map_file) if map_file else {}
     mapped = layers | parse_map_options(mapping)
     return InputOptions(mapped, view_layer, lr_spp, hr_spp, colourspace, tuple(sums or ()), map_file)
+
+
+def choose_model(model: str, quality: str | None) -> str:
+    """The model that ``--model`` and ``--quality`` name.
+
+    Raises:
+        InputError: both are given, or there is no such quality.
+    """
+    from oiio_msspl.model.catalogue import AUTO, QUALITIES
+
+    if quality is None:
+        return model
+    if quality not in QUALITIES:
+        raise InputError(f"--quality {quality!r}: use one of {', '.join(QUALITIES)}")
+    if model != AUTO:
+        raise InputError("--quality and --model: give one of them, because a model has its quality")
+    return quality
 
 
 def make_write_options(

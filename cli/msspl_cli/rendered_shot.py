@@ -15,7 +15,7 @@ from oiio_msspl.jobs.inputs import map_pair, resolve_auto
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import AUTO, Temporal, TemporalOptions, shares
-from oiio_msspl.model.catalogue import AUTO as AUTO_MODEL
+from oiio_msspl.model.catalogue import family_of
 from oiio_msspl.parallel import limit_threads
 
 
@@ -106,8 +106,8 @@ class RenderedShot:
         self._at_work = frame.number
         try:
             with limit_threads(self._stages.threads):
-                if self._stages.model == AUTO_MODEL:  # all frames get the model that suits the first pair
-                    family = resolve_auto(*map_pair(lr, hr, self._stages.inputs), AUTO_MODEL)
+                if family_of(self._stages.model):  # all frames get the model that suits the first pair
+                    family = resolve_auto(*map_pair(lr, hr, self._stages.inputs), self._stages.model)
                     self._stages = replace(self._stages, model=family)
                 loaded = self._read(frame)
                 for ready, outcome in self._window.add(frame.number, loaded):

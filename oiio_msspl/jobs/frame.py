@@ -32,7 +32,7 @@ from oiio_msspl.jobs.views import (
     fuse_other_views,
     steps_of,
 )
-from oiio_msspl.model.catalogue import DEFAULT_FAMILY, load_model
+from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import in_background, limit_threads
 
@@ -75,7 +75,7 @@ def fuse_files(
     device: str = "cpu",
     threads: int = 0,
     max_memory: int = MAX_MEMORY,
-    preview_path: Path | None = None,
+    preview_path: str | Path | None = None,
     view_transform: str | None = None,
     overwrite: bool = False,
     progress: Callable[[int, int], None] | None = None,
@@ -87,7 +87,8 @@ def fuse_files(
         output: EXR to write.
         inputs: mapping, view and spp of the two files. If it names no view, all views and view layers are fused.
         write: layout, compression, pixel type and layers of the result.
-        model: a shipped model, a family of models (``paper``), or an ONNX file. None or ``auto`` chooses one, see
+        model: a quality (``best``), a family of models (``paper``), a shipped model, or an ONNX file. None and ``auto``
+            are the default quality, see
             :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
@@ -109,7 +110,7 @@ def fuse_files(
     if output.suffix.lower() != ".exr":
         raise InputError(f"{output}: the result is an EXR; name it .exr")
     if preview_path is not None:
-        check_target(preview_path, overwrite=overwrite)
+        preview_path = check_target(preview_path, overwrite=overwrite)
         if view_transform is not None:
             check_view(view_transform)
     lr, hr = map_pair(lr_path, hr_path, inputs)
@@ -121,7 +122,7 @@ def fuse_files(
     check_passes(hr, others, write)  # and so is a set
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
-    family = resolve_auto(lr, hr, model) if fits else model or DEFAULT_FAMILY
+    family = resolve_auto(lr, hr, model) if fits else model
     session = load_model(align(lr, hr).scale, family, device, threads)
     check_frame_memory(lr, hr, session, write, max_memory)
     opened = time.perf_counter()

@@ -18,7 +18,8 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY
+from oiio_msspl.model.catalogue import family_of
+from oiio_msspl.model.session import SPREAD
 
 
 @dataclass(frozen=True)
@@ -143,19 +144,19 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
 
 
 def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
-    """The model that is meant: ``auto`` and None are a family that suits the pair's noise.
+    """The model that is meant: a quality, ``auto`` and None are a family that suits the pair's noise.
 
     Raises:
         InputError: the pair does not fit together.
     """
-    if model not in (None, AUTO):
+    family = family_of(model)
+    if family is None:
+        assert model is not None
         return model
     if not is_noise_spread(lr, hr, align(lr, hr)):
-        return DEFAULT_FAMILY
-    hr.notes.append(
-        f"the pixel filter has spread the noise over neighbouring pixels, so --model auto takes {SPREAD_NOISE_FAMILY}"
-    )
-    return SPREAD_NOISE_FAMILY
+        return family
+    hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
+    return family + SPREAD
 
 
 def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:

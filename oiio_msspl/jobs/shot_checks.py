@@ -15,7 +15,7 @@ from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import Stages, is_left_over
-from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY
+from oiio_msspl.model.catalogue import family_of
 
 log = logging.getLogger(__name__)
 
@@ -40,24 +40,26 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
-    """The model of all frames: ``auto`` and None are a family that suits the noise of the shot's first pair.
+    """The model of all frames: a quality, ``auto`` and None are a family that suits the noise of the shot's first pair.
 
     All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and
     not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
     turn comes.
     """
-    if model not in (None, AUTO):
+    family = family_of(model)
+    if family is None:
+        assert model is not None
         return model
     for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
-            family = resolve_auto(lr, hr, model)
-            if family == SPREAD_NOISE_FAMILY:
+            suitable = resolve_auto(lr, hr, model)
+            if suitable != family:
                 log.warning("frame %d: %s", number, hr.notes[-1])
-            return family
+            return suitable
         except MssplError as error:
             log.debug("frame %d: %s", number, error)
-    return DEFAULT_FAMILY
+    return family
 
 
 def check_no_input(

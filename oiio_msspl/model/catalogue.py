@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import csv
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
@@ -10,9 +11,12 @@ from oiio_msspl.model.session import SPREAD, Session
 
 #: Folder of the models: ``NAME.onnx`` for each.
 WEIGHTS = Path(__file__).parent / "weights"
-#: The name that lets the package choose; the family that it chooses; and the one for noise that a pixel filter has
-#: spread over neighbouring pixels (:mod:`oiio_msspl.fusion.noise`).
-AUTO, DEFAULT_FAMILY, SPREAD_NOISE_FAMILY = "auto", "joint", f"joint{SPREAD}"
+#: Table of :func:`measured`.
+MEASURED = WEIGHTS / "measured.csv"
+#: The family of models of each quality. From the first to the last, pictures get better and take more time.
+QUALITIES = {"fast": "pyramid", "balanced": "joint", "best": "ensemble"}
+#: The name that stands for the default quality.
+AUTO, DEFAULT_QUALITY = "auto", "balanced"
 
 
 def shipped_models() -> dict[str, Path]:
@@ -20,20 +24,38 @@ def shipped_models() -> dict[str, Path]:
     return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx"))}
 
 
+def measured() -> dict[str, dict[str, float]]:
+    """Accuracy and time of the shipped models, by name, as ``benchmarks.tables`` wrote them.
+
+    PSNR in dB and RelMSE are means of the development scenes. The time is a multiple of Open Image Denoise's. What was
+    not measured is absent.
+    """
+    with MEASURED.open(newline="") as file:
+        return {
+            row.pop("model"): {name: float(value) for name, value in row.items() if value}
+            for row in csv.DictReader(file)
+        }
+
+
+def family_of(name: str | None) -> str | None:
+    """The family that a quality, ``auto`` or None stands for; None for any other name, which is a model already."""
+    return QUALITIES.get(DEFAULT_QUALITY if name in (None, AUTO) else name)
+
+
 def find_model(scale: int, name: str | None = None) -> Path:
     """The ONNX file of a model.
 
     Args:
         scale: 2, 4 or 8.
-        name: ``auto`` or None for the default family, a family (``paper``), a model (``paper-x4``), or an ONNX file.
-            A model or a family may end in ``SPREAD``: the network is the same.
+        name: a quality, ``auto`` or None for the default quality, a family (``paper``), a model (``paper-x4``), or an
+            ONNX file. A model or a family may end in ``SPREAD``: the network is the same.
 
     Raises:
         InputError: there is no such model.
     """
     models = shipped_models()
-    if name in (None, AUTO):
-        name = DEFAULT_FAMILY
+    name = family_of(name) or name
+    assert name is not None
     network = name.removesuffix(SPREAD)
     for known in (network, f"{network}-x{scale}"):
         if known in models:

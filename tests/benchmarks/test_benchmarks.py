@@ -146,7 +146,12 @@ def test_every_table_can_be_laid_out():
             assert body and {line.count("|") for line in body} == {head.count("|")}, make.__name__
     body = tables.when_it_pays().split("\n\n")[0].splitlines()[2:]
     assert len(body) == len(tables.WHEN_IT_PAYS) <= 9
-    assert all(re.fullmatch(r"\d+\.\d+", cell.strip()) for line in body for cell in line.split("|")[3:7])
+    for method, line in zip(tables.WHEN_IT_PAYS, body, strict=True):
+        cells = [cell.strip() for cell in line.split("|")[3:7]]
+        if ":" in method:  # 2 spp can't be divided so
+            assert cells[:2] == ["", ""]
+            cells = cells[2:]
+        assert all(re.fullmatch(r"\d+\.\d+", cell) for cell in cells)
     assert "# The paper's tables" in paper.page()
 
 

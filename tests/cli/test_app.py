@@ -38,15 +38,15 @@ def test_installed_programs_are_on_the_path():
 #: Options that --help shows, and how many more --help-all shows.
 SHOWN = {
     "msspl_fuse": (
-        "--map --view-layer --model --device --max-memory --output --layout --layers --passes --error-layer "
+        "--map --view-layer --quality --device --max-memory --output --layout --layers --passes --error-layer "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all",
-        19,
+        20,
     ),
     "msspl_render": (
-        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --model --device --output --layout "
+        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output --layout "
         "--passes --error-layer --compare "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all",
-        6,
+        7,
     ),
 }
 

@@ -37,6 +37,18 @@ def test_the_main_job(files, bilinear_models):
     assert (preview.spec().width, preview.spec().height, preview.spec().nchannels) == (128, 96, 3)
 
 
+def test_a_quality_names_the_model(files):
+    pair = files / "lr.exr", files / "hr.exr", "-o", files / "out.exr"
+    done = fuse(*pair, "--quality", "fast", "--no-preview", "--json")
+    assert (done.returncode, json.loads(done.stdout)["model"]) == (0, "pyramid-x4")
+    for options, message in (
+        (("--quality", "good"), "--quality 'good': use one of fast, balanced, best"),
+        (("--quality", "fast", "--model", "joint"), "--quality and --model: give one of them"),
+    ):
+        done = fuse(*pair, *options, "--overwrite")
+        assert done.returncode == 2 and message in done.stderr
+
+
 def test_the_predicted_error_can_be_asked_for(files, bilinear_models):
     options = ("--model", bilinear_models[4], "--error-layer", "--no-preview")
     assert fuse(files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", *options).returncode == 0

@@ -10,3 +10,8 @@ def test_models_lists_what_ships():
     data = json.loads(run("msspl", "models", "--json").stdout)
     assert {m["name"] for m in data["models"]} >= {"paper-x2", "paper-x4", "paper-x8"}
     assert "cpu" in data["devices"]
+    (default,) = (m for m in data["models"] if m["name"] == "joint-x2")
+    assert default["quality"] == "balanced" and default["layers"] == ["albedo", "normal"]
+    assert default["measured"]["psnr_8spp"] > default["measured"]["psnr_2spp"] > 30
+    printed = run("msspl", "models").stdout
+    assert f"{default['measured']['psnr_2spp']:.2f} / {default['measured']['psnr_8spp']:.2f}" in printed

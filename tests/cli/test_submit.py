@@ -42,7 +42,13 @@ def test_what_no_task_could_do_is_said_at_submission(tmp_path, monkeypatch, argu
 
 
 @pytest.mark.parametrize(
-    ("given", "model"), [([], "joint"), (["--model", "auto"], "joint"), (["--model", "paper-x4"], "paper-x4")]
+    ("given", "model"),
+    [
+        ([], "joint"),
+        (["--model", "auto"], "joint"),
+        (["--quality", "best"], "ensemble"),
+        (["--model", "paper-x4"], "paper-x4"),
+    ],
 )
 def test_a_shipped_model_goes_by_its_name_and_is_the_same_for_all_tasks(tmp_path, given, model):
     make_shot(tmp_path, 1)

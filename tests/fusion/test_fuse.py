@@ -65,7 +65,7 @@ def tiles_of(monkeypatch, session, pixels):
     monkeypatch.setattr(tiling, "TILE_MEMORY", pixels * session.contract.bytes_per_pixel)
 
 
-@pytest.mark.parametrize("family", ["joint", "pyramid", "paper"])
+@pytest.mark.parametrize("family", ["ensemble", "joint", "pyramid", "paper"])
 def test_the_result_depends_neither_on_memory_nor_on_threads(scale, family, monkeypatch):
     """In a frame of two tiles: bit for bit whatever the memory, and to float32's rounding whatever the threads, because
     ONNX Runtime cuts its work by them."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The model that ``auto`` takes: for a frame, for a shot, and for a job."""
+"""The model that a quality means: for a frame, for a shot, and for a job."""
 
 import pytest
 
@@ -18,12 +18,17 @@ def write_pair(folder, name, sigma):
         write_exr(folder / render / f"{name}.exr", rgb(image if sigma is None else spread(image, sigma)))
 
 
-@pytest.mark.parametrize(("sigma", "family"), [(None, "joint"), (0.5, "joint-spread")])
-def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, family):
+@pytest.mark.parametrize(("sigma", "ending"), [(None, ""), (0.5, "-spread")])
+@pytest.mark.parametrize(("quality", "model"), [(None, "joint-x4"), ("fast", "pyramid-x4"), ("best", "ensemble-x4")])
+def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, ending, quality, model):
     write_pair(tmp_path, "a", sigma)
-    report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "out.exr")
-    assert report.model == {"joint": "joint-x4", "joint-spread": "joint-x4-spread"}[family]
-    assert any("spread the noise" in note for note in report.as_dict()["notes"]) == (family == "joint-spread")
+    report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "out.exr", model=quality)
+    assert report.model == model + ending
+    assert any("spread the noise" in note for note in report.as_dict()["notes"]) == bool(ending)
+
+
+def test_a_model_is_taken_as_it_is_named(tmp_path):
+    write_pair(tmp_path, "a", 0.5)
     report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "named.exr", model="pyramid")
     assert report.model == "pyramid-x4"
 
@@ -39,7 +44,7 @@ def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_pa
         report = fuse_shot(*pair, frames=frames, skip_existing=True)
     assert [result.status for _, result in sorted(report.results.items())] == ["failed", "skipped", "fused"]
     assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "joint-x4-spread"
-    assert "so --model auto takes joint-spread" in caplog.text
+    assert "so the model is joint-spread" in caplog.text
     assert fuse_shot(*pair[:2], tmp_path / "chunk", frames=[3]).exit_code == 0
     assert open_exr(tmp_path / "chunk/a.0003.exr").metadata["msspl/model"] == "joint-x4-spread"
     monkeypatch.setattr("oiio_msspl.jobs.shot.model_of_shot", lambda *arguments: pytest.fail("reads a pair"))

@@ -14,6 +14,9 @@ from oiio_msspl.model.catalogue import shipped_models
 
 #: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``.
 SCORES = {
+    "ensemble-x2": (24.85, 0.0227),
+    "ensemble-x4": (24.62, 0.0236),
+    "ensemble-x8": (24.49, 0.0236),
     "joint-x2": (24.67, 0.0251),
     "joint-x4": (24.35, 0.0246),
     "joint-x8": (24.14, 0.0241),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `joint` models, which began as networks of Open Image Denoise and were trained to read both renders."""
+"""The `joint` and `ensemble` models, which began as networks of Open Image Denoise."""
 
 from __future__ import annotations
 
@@ -20,12 +20,17 @@ from tests.conftest import noisy, picture, rgb, write_exr
 
 @pytest.mark.parametrize("name", [*shipped_models(), "denoisers/mean_denoiser"])
 def test_files_are_whole(name):
+    """Only the ensemble shares weights of all scales, in a file beside it."""
     onnx = pytest.importorskip("onnx")
     model = onnx.load(WEIGHTS / f"{name}.onnx", load_external_data=False)
-    assert not any(tensor.external_data for tensor in model.graph.initializer)
+    files = {entry.value for t in model.graph.initializer for entry in t.external_data if entry.key == "location"}
+    assert files == ({"ensemble.weights"} if name.startswith("ensemble") else set())
+    assert all((WEIGHTS / file).is_file() for file in files)
 
 
-@pytest.mark.parametrize("name", [*(n for n in shipped_models() if n.startswith("joint")), "denoisers/mean_denoiser"])
+@pytest.mark.parametrize(
+    "name", [*(n for n in shipped_models() if n.startswith(("joint", "ensemble"))), "denoisers/mean_denoiser"]
+)
 def test_products_of_two_channels_fit_into_16_bits(name):
     """So processors without VNNI instructions, which add them in 16 bits, give the same result."""
     onnx = pytest.importorskip("onnx")
@@ -44,13 +49,15 @@ def test_it_is_the_default():
     assert find_model(2).stem == find_model(2, "auto").stem == "joint-x2"
 
 
-def test_its_file_says_where_its_weights_come_from():
-    assert "Open Image Denoise 2.5.1" in Session(find_model(2)).contract.provenance["initial_weights"]
+@pytest.mark.parametrize("family", ["joint", "ensemble"])
+def test_its_file_says_where_its_weights_come_from(family):
+    assert "Open Image Denoise 2.5.1" in Session(find_model(2, family)).contract.provenance["initial_weights"]
 
 
 @pytest.mark.parametrize("spp_of_albedo", [64, 1024])
 @pytest.mark.parametrize("scale", SCALES)
-def test_it_denoises_no_worse_than_open_image_denoise(scale, spp_of_albedo):
+@pytest.mark.parametrize("family", ["joint", "ensemble"])
+def test_it_denoises_no_worse_than_open_image_denoise(family, scale, spp_of_albedo):
     """Its error is at most OIDN's, and 1.1 times that at x8, whose LRHS has 17 x 25 pixels, and at x2 with a noisy
     albedo. The sides are no multiples of the alignment, and the result stays in the range of the renders."""
     pytest.importorskip("pyoidn")
@@ -61,7 +68,7 @@ def test_it_denoises_no_worse_than_open_image_denoise(scale, spp_of_albedo):
     albedo = noisy(clean.clip(0, 1), spp_of_albedo).clip(0, 1)
     lr = Render.from_arrays("lr", rgb=box_downsample(noisy(clean, 4, seed=1), scale))
     hr = Render.from_arrays("hr", rgb=noisy(clean, 4), albedo=albedo, normal=normal)
-    model = Session(find_model(scale, "joint"), threads=1)
+    model = Session(find_model(scale, family), threads=1)
     fused = fuse(lr, hr, model, error=True)
     assert fused.rgb.shape == clean.shape
     assert fused.rgb.min() >= 0
@@ -76,7 +83,8 @@ def test_it_denoises_no_worse_than_open_image_denoise(scale, spp_of_albedo):
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-def test_rare_light_leaves_no_holes(scale):
+@pytest.mark.parametrize("family", ["joint", "ensemble"])
+def test_rare_light_leaves_no_holes(family, scale):
     """One sample of fifty finds the light, so most pixels around are black in both renders. No pixel of the result is
     below a tenth of the truth, or below a quarter of what is around it."""
     rng = np.random.default_rng(scale)
@@ -88,7 +96,7 @@ def test_rare_light_leaves_no_holes(scale):
 
     lr = Render.from_arrays("lr", rgb=rendered(box_downsample(clean, scale), scale**2))
     hr = Render.from_arrays("hr", rgb=rendered(clean, 1), albedo=np.full_like(clean, 0.8))
-    fused = fuse(lr, hr, Session(find_model(scale, "joint"), threads=1)).rgb.mean(axis=-1)
+    fused = fuse(lr, hr, Session(find_model(scale, family), threads=1)).rgb.mean(axis=-1)
     around = box_downsample(fused[..., None], 16).repeat(16, 0).repeat(16, 1)[..., 0]
     assert (fused > 0.1 * clean.mean(axis=-1)).all()
     assert (fused > 0.25 * around).all()

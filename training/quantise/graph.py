@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ONNX graph of a quantised U-Net. Tensor names are those of the files that ship.
+"""Builds ONNX graphs with quantised U-Nets. Tensor names are those of the files that ship.
 
 Only standard operators are used. ONNX Runtime's own ones read pixels with their channels side by side, but transposes
 around the standard ones, which it removes, are as fast.
@@ -12,19 +12,88 @@ import onnx
 from onnx import TensorProto, helper, numpy_helper
 
 from oiio_msspl.model.mean_denoiser import INPUT_CHANNELS
+from oiio_msspl.model.pu_curve import largest_log_encoded, pu_encode_log
 from training.oidn import run_unet
 from training.quantise.gptq import COLOURS, Fit
 
+#: Entries of the table from log-encoded to PU-encoded radiance.
+ENTRIES = 1 << 16
 
-class Graph:
-    """Builds the ONNX graph of a quantised U-Net: tensors are (1, H, W, C), activations are codes throughout."""
+
+class Nodes:
+    """Nodes and constants of a graph, and operators on images (1, C, H, W) that come before and after a U-Net."""
+
+    def __init__(self) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.initializers: dict[str, np.ndarray] = {"zero": np.uint8(0)}
+
+    def finished(
+        self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
+    ) -> onnx.ModelProto:
+        values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
+        graph = helper.make_graph(self.nodes, name, inputs, outputs, list(values))
+        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+
+    def add(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
+        self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
+        return output
+
+    def constant(self, name: str, values: np.ndarray) -> str:
+        self.initializers[name] = values
+        return name
+
+    def cut(self, values: str, start: int, stop: int, output: str, axis: int = 1) -> str:
+        bounds = [self.constant(f"at{n}", np.array([n])) for n in (start, stop, axis)]
+        return self.add("Slice", [values, *bounds], output)
+
+    def part(self, image: str, start: int, stop: int) -> str:
+        """Some channels of an image."""
+        return self.cut(image, start, stop, f"{image}.{start}")
+
+    def table(self, values: str, largest: float, table: str) -> str:
+        """Replace values in [0, ``largest``] by those of a table with ``ENTRIES`` entries."""
+        scale = self.constant(f"{table}.entries", np.float32((ENTRIES - 1) / largest))
+        ends = [self.constant("nothing", np.float32(0)), self.constant("last_entry", np.float32(ENTRIES - 1))]
+        entries = self.add("Mul", [values, scale], f"{values}.entries")
+        entries = self.add("Clip", [entries, *ends], f"{values}.clipped")
+        entries = self.add("Cast", [entries], f"{values}.entry", to=TensorProto.INT32)
+        return self.add("Gather", [table, entries], f"{values}.{table}")
+
+    def log_to_pu(self, values: str) -> str:
+        """Log-encoded to PU-encoded radiance, by a table."""
+        self.constant("pu", pu_encode_log(ENTRIES).astype(np.float32))
+        return self.table(values, largest_log_encoded(), "pu")
+
+    def slices(self, values: str, count: int) -> list[str]:
+        """Quantise values in [0, 1] to the codes of slices, see :func:`training.quantise.joint.sliced`."""
+        step = self.constant(f"slice{count}", np.float32(1 / count / 255))
+        parts = []
+        for i in range(count):
+            begin = self.constant(f"begin{count}.{i}", np.float32(i / count))
+            part = self.add("Sub", [values, begin], f"{values}.{count}.{i}.from") if i else values
+            parts.append(self.add("QuantizeLinear", [part, step, "zero"], f"{values}.{count}.{i}"))
+        return parts
+
+    def zeros(self, image: str) -> str:
+        """A plane of zeros."""
+        return self.add(
+            "QuantizeLinear",
+            [self.cut(image, 0, 1, f"{image}.any"), self.constant("vast", np.float32(1e30)), "zero"],
+            f"{image}.none",
+        )
+
+    def packed(self, planes: list[str], name: str) -> str:
+        """Concatenate images and order them as a U-Net reads them, (1, H, W, C)."""
+        return self.add("Transpose", [self.add("Concat", planes, f"{name}.planes", axis=1)], name, perm=[0, 2, 3, 1])
+
+
+class Graph(Nodes):
+    """The graph of a quantised U-Net: tensors are (1, H, W, C), activations are codes throughout."""
 
     def __init__(self, fit: Fit) -> None:
+        super().__init__()
         self.fit = fit
-        self.nodes: list[onnx.NodeProto] = []
-        self.initializers: dict[str, np.ndarray] = {
-            "one": np.float32(1), "zero": np.uint8(0), "no_offset": np.int8(0)
-        }  # fmt: skip
+        self.initializers |= {"one": np.float32(1), "no_offset": np.int8(0)}
 
     def model(self) -> onnx.ModelProto:
         """The graph of a network that denoises."""
@@ -35,13 +104,6 @@ class Graph:
             [helper.make_tensor_value_info("codes", TensorProto.INT32, [1, "h", "w", 3])],
         )
 
-    def finished(
-        self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
-    ) -> onnx.ModelProto:
-        values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
-        graph = helper.make_graph(self.nodes, name, inputs, outputs, list(values))
-        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
-
     def colours(self, inputs: list[str], output: str) -> str:
         """Add the U-Net, and the sum of the slices of its last layer's colours."""
         last = run_unet(self.fit.shape, inputs, self.conv, self._pool, self._upsample, self._concat)
@@ -50,21 +112,13 @@ class Graph:
         rows = np.arange(COLOURS * self.fit.slices_out)
         all_slices[rows, rows % COLOURS] = 1
         self.initializers["all_slices"] = all_slices
-        return self._add("MatMulInteger", [last, "all_slices", "zero", "no_offset"], output)
-
-    def _add(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
-        self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
-        return output
+        return self.add("MatMulInteger", [last, "all_slices", "zero", "no_offset"], output)
 
     def _add_on_planes(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
         """Add an operator that reads and writes (1, C, H, W), where the rest of the U-Net has (1, H, W, C)."""
-        planes = self._add("Transpose", inputs[:1], f"{output}.in", perm=[0, 3, 1, 2])
-        result = self._add(kind, [planes, *inputs[1:]], f"{output}.out", **attributes)
-        return self._add("Transpose", [result], output, perm=[0, 2, 3, 1])
-
-    def _constant(self, name: str, values: np.ndarray) -> str:
-        self.initializers[name] = values
-        return name
+        planes = self.add("Transpose", inputs[:1], f"{output}.in", perm=[0, 3, 1, 2])
+        result = self.add(kind, [planes, *inputs[1:]], f"{output}.out", **attributes)
+        return self.add("Transpose", [result], output, perm=[0, 2, 3, 1])
 
     def conv(self, name: str, values: str) -> str:
         """Add a convolution. An output value in several slices has a channel for each slice."""
@@ -79,12 +133,12 @@ class Graph:
                 values,
                 "one",
                 "zero",
-                self._constant(f"{name}.weight", weights[source]),
-                self._constant(f"{name}.scale", steps / layer.outputs.scale.numpy()),
-                self._constant(f"{name}.offset", np.zeros(len(steps), np.int8)),
+                self.constant(f"{name}.weight", weights[source]),
+                self.constant(f"{name}.scale", steps / layer.outputs.scale.numpy()),
+                self.constant(f"{name}.offset", np.zeros(len(steps), np.int8)),
                 "one",
                 "zero",
-                self._constant(f"{name}.bias", bias[source] - offset),
+                self.constant(f"{name}.bias", bias[source] - offset),
             ],
             name,
             kernel_shape=[3, 3],
@@ -100,20 +154,20 @@ class Graph:
 
     def repeat(self, values: str, channels: int, factor: int) -> str:
         """Repeat every pixel in a square of factor x factor."""
-        height_width = self._add("Shape", [values], f"{values}.small", start=1, end=3)
-        factors, one = self._constant(f"by{factor}", np.array([factor, factor])), self._constant("only", np.array([1]))
-        count = self._constant(f"{values}.channels", np.array([channels]))
-        large = self._add(
+        height_width = self.add("Shape", [values], f"{values}.small", start=1, end=3)
+        factors, one = self.constant(f"by{factor}", np.array([factor, factor])), self.constant("only", np.array([1]))
+        count = self.constant(f"{values}.channels", np.array([channels]))
+        large = self.add(
             "Concat",
-            [one, self._add("Mul", [height_width, factors], f"{values}.times"), count],
+            [one, self.add("Mul", [height_width, factors], f"{values}.times"), count],
             f"{values}.shape",
             axis=0,
         )
-        apart = self._add("Unsqueeze", [values, self._constant("apart", np.array([2, 4]))], f"{values}.apart")
-        squares = self._constant(f"squares{factor}", np.array([1, 1, factor, 1, factor, 1]))
-        return self._add(
-            "Reshape", [self._add("Expand", [apart, squares], f"{values}.squares"), large], f"{values}.large"
+        apart = self.add("Unsqueeze", [values, self.constant("apart", np.array([2, 4]))], f"{values}.apart")
+        squares = self.constant(f"squares{factor}", np.array([1, 1, factor, 1, factor, 1]))
+        return self.add(
+            "Reshape", [self.add("Expand", [apart, squares], f"{values}.squares"), large], f"{values}.large"
         )
 
     def _concat(self, one: str, other: str) -> str:
-        return self._add("Concat", [one, other], f"{one}+{other}", axis=3)
+        return self.add("Concat", [one, other], f"{one}+{other}", axis=3)

@@ -16,7 +16,6 @@ from torch.nn import functional as F
 
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.mean_denoiser import log_encoded_of_code
-from oiio_msspl.model.pu_curve import largest_log_encoded, pu_encode_log
 from oiio_msspl.model.session import make_denoiser
 from training.blend import blend
 from training.data import fixed_batches
@@ -42,8 +41,6 @@ PAIRS, PATCH = 64, 256
 HRLS_SLICES, MEAN_SLICES, LRHS_SLICES, SLICES_OUT = 3, 3, 2, 9
 #: Channels of the input ``lrhs``: the denoised mean, and the LRHS.
 MEAN, LRHS = slice(LRHS_CHANNELS, 2 * LRHS_CHANNELS), slice(0, LRHS_CHANNELS)
-#: Entries of the table from log-encoded to PU-encoded radiance.
-ENTRIES = 1 << 16
 
 
 class Blend(nn.Module):
@@ -144,108 +141,77 @@ class JointGraph(Graph):
     def __init__(self, fit: Fit, scale: int) -> None:
         super().__init__(fit)
         self._scale = scale
-        self.initializers |= {
-            "entries": np.float32((ENTRIES - 1) / largest_log_encoded()),
-            "nothing": np.float32(0),
-            "last_entry": np.float32(ENTRIES - 1),
-            "seen": pu_encode_log(ENTRIES).astype(np.float32),
-            "unseen": log_encoded_of_code(SLICES_OUT),
-        }
+        self.initializers["unseen"] = log_encoded_of_code(SLICES_OUT)
 
     def whole(
         self, mixing: onnx.ModelProto, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
         """The model with the graph of :class:`Blend`, whose inputs have the names of tensors that are made here."""
-        full = self._packed(
+        full = self.packed(
             [
-                *self._slices(self._log_to_pu(self._part("hrls", 0, 3)), HRLS_SLICES),
-                self._add(
+                *self.slices(self.log_to_pu(self.part("hrls", 0, 3)), HRLS_SLICES),
+                self.add(
                     "QuantizeLinear",
-                    [self._part("hrls", 3, 6), self._constant("step", np.float32(1 / 255)), "zero"],
+                    [self.part("hrls", 3, 6), self.constant("step", np.float32(1 / 255)), "zero"],
                     "albedo",
                 ),
-                self._add(
+                self.add(
                     "QuantizeLinear",
                     [
-                        self._part("hrls", 6, 9),
-                        self._constant("half_step", np.float32(1 / 127.5)),
-                        self._constant("middle", np.uint8(SIGNED_ZERO)),
+                        self.part("hrls", 6, 9),
+                        self.constant("half_step", np.float32(1 / 127.5)),
+                        self.constant("middle", np.uint8(SIGNED_ZERO)),
                     ],
                     "normal",
                 ),
-                self._zeros("hrls"),
+                self.zeros("hrls"),
             ],
             "full",
         )
-        half = self._packed(
+        half = self.packed(
             [
-                *self._slices(self._log_to_pu(self._part("lrhs", MEAN.start, MEAN.stop)), MEAN_SLICES),
-                *self._slices(self._log_to_pu(self._part("lrhs", LRHS.start, LRHS.stop)), LRHS_SLICES),
-                self._zeros("lrhs"),
+                *self.slices(self.log_to_pu(self.part("lrhs", MEAN.start, MEAN.stop)), MEAN_SLICES),
+                *self.slices(self.log_to_pu(self.part("lrhs", LRHS.start, LRHS.stop)), LRHS_SLICES),
+                self.zeros("lrhs"),
             ],
             "half",
         )
         if self._scale > 2:
             half = self.repeat(half, 16, self._scale // 2)
         sums = self.colours([full, half], "sums")
-        pixels = self._add("Gather", ["unseen", sums], "denoised.pixels")
-        self._add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
+        pixels = self.add("Gather", ["unseen", sums], "denoised.pixels")
+        self.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
         count = len(self.fit.layers[BASE.last].step) - COLOURS
-        self._add("Identity", [self._planes(BASE.last, COLOURS * SLICES_OUT, count)], "logits0")
+        self.add("Identity", [self._planes(BASE.last, COLOURS * SLICES_OUT, count)], "logits0")
         for level in range(1, self._scale.bit_length()):
             name = self.conv(f"head{level}", DECODED[level])
             planes = self._planes(name, 0, len(self.fit.layers[name].step))
-            self._cut(planes, 0, OUTPUTS[level], f"logits{level}")
+            self.cut(planes, 0, OUTPUTS[level], f"logits{level}")
             if level == 1:
-                phases = self._cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
-                self._add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
+                phases = self.cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
+                self.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
         self.nodes += mixing.graph.node
         model = self.finished("joint", inputs, outputs)
         model.graph.initializer.extend(mixing.graph.initializer)
         return model
 
-    def _cut(self, values: str, start: int, stop: int, output: str, axis: int = 1) -> str:
-        bounds = [self._constant(f"at{n}", np.array([n])) for n in (start, stop, axis)]
-        return self._add("Slice", [values, *bounds], output)
-
-    def _part(self, image: str, start: int, stop: int) -> str:
-        return self._cut(image, start, stop, f"{image}.{start}")
-
-    def _log_to_pu(self, values: str) -> str:
-        """Log-encoded to PU-encoded radiance, by a table."""
-        entries = self._add("Mul", [values, "entries"], f"{values}.entries")
-        entries = self._add("Clip", [entries, "nothing", "last_entry"], f"{values}.clipped")
-        entries = self._add("Cast", [entries], f"{values}.entry", to=TensorProto.INT32)
-        return self._add("Gather", ["seen", entries], f"{values}.seen")
-
-    def _slices(self, values: str, count: int) -> list[str]:
-        """Quantise PU-encoded radiance to the codes of slices, see :func:`sliced`."""
-        step = self._constant(f"slice{count}", np.float32(1 / count / 255))
-        parts = []
-        for i in range(count):
-            begin = self._constant(f"begin{count}.{i}", np.float32(i / count))
-            part = self._add("Sub", [values, begin], f"{values}.{count}.{i}.from") if i else values
-            parts.append(self._add("QuantizeLinear", [part, step, "zero"], f"{values}.{count}.{i}"))
-        return parts
-
-    def _zeros(self, image: str) -> str:
-        """A plane of zeros."""
-        return self._add(
-            "QuantizeLinear",
-            [self._cut(image, 0, 1, f"{image}.any"), self._constant("vast", np.float32(1e30)), "zero"],
-            f"{image}.none",
-        )
-
-    def _packed(self, planes: list[str], name: str) -> str:
-        return self._add("Transpose", [self._add("Concat", planes, f"{name}.planes", axis=1)], name, perm=[0, 2, 3, 1])
-
     def _planes(self, layer: str, start: int, count: int) -> str:
         """Dequantise signed outputs of a layer, as (1, C, H, W)."""
-        part = self._cut(layer, start, start + count, f"{layer}.beside", axis=3)
-        planes = self._add("Transpose", [part], f"{layer}.planes", perm=[0, 3, 1, 2])
-        step = self._constant("signed_step", np.float32(2 * SIGNED_RANGE / 255))
-        middle = self._constant("middle", np.uint8(SIGNED_ZERO))
-        return self._add("DequantizeLinear", [planes, step, middle], f"{layer}.values")
+        part = self.cut(layer, start, start + count, f"{layer}.beside", axis=3)
+        planes = self.add("Transpose", [part], f"{layer}.planes", perm=[0, 3, 1, 2])
+        step = self.constant("signed_step", np.float32(2 * SIGNED_RANGE / 255))
+        middle = self.constant("middle", np.uint8(SIGNED_ZERO))
+        return self.add("DequantizeLinear", [planes, step, middle], f"{layer}.values")
+
+
+def embedded(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
+    """A copy whose tensors have a prefix, except its inputs and outputs."""
+    outside = {value.name for value in (*model.graph.input, *model.graph.output)}
+    model = compose.add_prefix(model, prefix)
+    for node in model.graph.node:
+        for names in (node.input, node.output):
+            names[:] = [own if (own := name.removeprefix(prefix)) in outside else name for name in names]
+    return model
 
 
 def to_onnx(
@@ -258,11 +224,7 @@ def to_onnx(
         mixing: the graph of :class:`Blend` with inputs ``lrhs``, ``hrls``, ``denoised``, ``logits0`` ... and output
             ``fused``.
     """
-    outside = {value.name for value in (*mixing.graph.input, *mixing.graph.output)}
-    mixing = compose.add_prefix(mixing, "mix.")
-    for node in mixing.graph.node:
-        for names in (node.input, node.output):
-            names[:] = [own if (own := name.removeprefix("mix.")) in outside else name for name in names]
+    mixing = embedded(mixing, "mix.")
     info = helper.make_tensor_value_info
     inputs = [
         info("lrhs", TensorProto.FLOAT, [1, network.lrhs_channels, "h", "w"]),

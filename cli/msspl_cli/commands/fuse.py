@@ -77,6 +77,7 @@ def fuse(
     colorspace: options.Colourspace = None,
     sums: options.Sum = [],  # noqa: B006
     # Model
+    quality: options.Quality = None,
     model: options.Model = "auto",
     device: options.Device = "cpu",
     max_memory: options.MaxMemory = "3G",
@@ -207,7 +208,7 @@ def fuse(
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
         "write": options.make_write_options(layout, compression, half, layers, error_layer, passes, frames_layer),
-        "model": model,
+        "model": options.choose_model(model, quality),
         "device": device,
         "threads": threads,
         "max_memory": options.parse_bytes(max_memory),

@@ -115,6 +115,7 @@ def render(
         ),
     ] = 0,
     # Model
+    quality: options.Quality = None,
     model: options.Model = "auto",
     device: options.Device = "cpu",
     max_memory: options.MaxMemory = "3G",
@@ -205,6 +206,7 @@ def render(
             check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
     check_separate([scene], [target for _, target in targets])
     write = options.make_write_options(layout, None, None, [], error_layer, passes)
+    model = options.choose_model(model, quality)
     wanted = {target.absolute() for _, target in targets}
     fuser = _make_fuser(shot, wanted, scale, model, device, threads, memory, write, overwrite, over_time, keep)
     job = {
@@ -297,7 +299,7 @@ def _make_fuser(
     from msspl_cli.rendered_shot import RenderedShot
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
-    from oiio_msspl.model.catalogue import AUTO, DEFAULT_FAMILY, load_model
+    from oiio_msspl.model.catalogue import family_of, load_model
 
     session = load_model(scale, model, device, threads)
     if write.error_layer:
@@ -309,7 +311,7 @@ def _make_fuser(
         threads=threads,
         max_memory=max_memory,
         overwrite=overwrite,
-        sessions={(scale, DEFAULT_FAMILY if model == AUTO else model): session},
+        sessions={(scale, family_of(model) or model): session},
     )
     frames = [Frame(number or 0, None, None, target.absolute()) for number, target in shot]
     return RenderedShot(stages, frames, [each for each in frames if each.output in wanted], temporal, keep=keep)

@@ -29,7 +29,7 @@ EXAMPLES = """[bold]Examples[/bold]
 """
 
 #: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.openjd.make_job` takes itself, or that every task has.
-_TAKEN = {"lr", "hr", "output", "frames", "model", "map_file", "device", "view", "skip_existing"}
+_TAKEN = {"lr", "hr", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"}
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
 _REFUSED = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
 _PATHS = ("lr", "hr", "output", "map_file")
@@ -69,7 +69,7 @@ def submit(
         given["output"],
         frames=given["frames"],
         inputs=inputs,
-        model=given["model"],
+        model=options.choose_model(given["model"], given["quality"]),
         map_file=given["map_file"],
         device=given["device"],
         view=given["view"],

@@ -1,0 +1,155 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The ensemble: joint, Open Image Denoise's large network, and the network that weighs their results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from oiio_msspl.arrays import box_downsample
+from oiio_msspl.model.catalogue import find_model
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.runtime import load_network
+from tests.conftest import noisy, picture
+
+pytest.importorskip("pyoidn")
+torch = pytest.importorskip("torch")
+onnx = pytest.importorskip("onnx")
+pytest.importorskip("onnxscript")
+
+from benchmarks.oidn import run_filter  # noqa: E402
+from training import checkpoints, ensemble  # noqa: E402
+from training.encoding import from_srgb, srgb  # noqa: E402
+from training.ensemble import BandWeights, EnsembleFusion, batches, evaluate, load_weights, train  # noqa: E402
+from training.joint import JointFusion  # noqa: E402
+from training.quantise.__main__ import CHECKPOINT  # noqa: E402
+
+WEIGHTS = CHECKPOINT.parent / "ensemble.pt"
+
+
+def tensor(image):
+    return torch.from_numpy(np.ascontiguousarray(image.transpose(2, 0, 1)[None]))
+
+
+def arguments(size=64, scale=2):
+    """Two results that differ, and a pair whose range holds both."""
+    clean = encode_radiance(picture(size, size), 1.0)
+    rng = np.random.default_rng(0)
+    names = "joint", "large", "albedo", "normal"
+    images = {name: clean + np.float32(0.05) * rng.random(clean.shape, np.float32) for name in names}
+    low = box_downsample(clean, scale)
+    lrhs = np.concatenate([low + np.float32(0.2), low - np.float32(0.2)], axis=-1)
+    hrls = np.concatenate([clean, clean, clean], axis=-1)
+    hrls[::2, :, :3] += np.float32(0.5)
+    hrls[1::2, :, :3] -= np.float32(0.5)
+    error = np.full((size, size, 1), -2, np.float32)
+    return {
+        name: tensor(image) for name, image in (images | {"lrhs": lrhs, "hrls": hrls, "joint_error": error}).items()
+    }
+
+
+def test_new_weights_give_the_mean_of_both_results():
+    given = arguments()
+    with torch.no_grad():
+        fused, log_error = BandWeights()(**given)
+    torch.testing.assert_close(fused, (given["joint"] + given["large"]) / 2)
+    torch.testing.assert_close(log_error, given["joint_error"])
+
+
+@pytest.mark.parametrize(("bias", "name"), [(-20.0, "joint"), (20.0, "large")])
+def test_weights_of_zero_and_one_give_one_of_the_results(bias, name):
+    given, network = arguments(), BandWeights()
+    with torch.no_grad():
+        network.weights.bias.fill_(bias)
+        torch.testing.assert_close(network(**given)[0], given[name])
+
+
+def test_the_result_keeps_to_the_range_of_the_renders():
+    given = arguments()
+    given["large"] = given["large"] + 5
+    with torch.no_grad():
+        fused, _ = BandWeights()(**given)
+    assert fused.max() <= max(given["hrls"][:, :3].max(), given["lrhs"].max())
+
+
+def test_srgb_and_its_inverse():
+    values = torch.linspace(0, 1, 1001)
+    torch.testing.assert_close(from_srgb(srgb(values)), values)
+
+
+def test_the_second_result_is_open_image_denoise_with_prefiltered_layers():
+    """With base networks for albedo and normal, and the large one for colour."""
+    import pyoidn
+
+    clean = picture(64, 96)
+    colour = noisy(clean, 4)
+    albedo = noisy(clean.clip(0, 1), 64, seed=2).clip(0, 1)
+    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape).copy()
+    network, taken = EnsembleFusion(JointFusion(), BandWeights()).eval(), {}
+    network.weights.register_forward_pre_hook(
+        lambda _, values: taken.update(zip(("joint", "large", "albedo", "normal"), values, strict=False))
+    )
+    hrls = np.concatenate([encode_radiance(colour, 1.0), albedo, normal], axis=-1)
+    with torch.inference_mode():
+        network(torch.zeros(1, 6, 32, 48), tensor(hrls))
+    large, clean_albedo, clean_normal = (taken[k][0].permute(1, 2, 0).numpy() for k in ("large", "albedo", "normal"))
+
+    def prefiltered(name, image):
+        denoiser = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
+        denoiser.set_quality(pyoidn.OIDN_QUALITY_BALANCED)
+        output = np.empty_like(image)
+        for kind, values in ((name, image), (pyoidn.OIDN_IMAGE_OUTPUT, output)):
+            denoiser.set_image(kind, values, pyoidn.OIDN_FORMAT_FLOAT3)
+        denoiser.commit()
+        denoiser.execute()
+        return output
+
+    device = pyoidn.Device()
+    device.commit()
+    layers = {"albedo": prefiltered("albedo", albedo), "normal": prefiltered("normal", normal)}
+    np.testing.assert_allclose(clean_albedo, layers["albedo"], atol=1e-3)
+    np.testing.assert_allclose(2 * clean_normal - 1, layers["normal"], atol=1e-3)
+    expected = run_filter({"color": colour, **layers}, hdr=True, input_scale=1.0, cleanAux=True)
+    np.testing.assert_allclose(decode_radiance(large, 1.0), expected, rtol=1e-2, atol=1e-3)
+
+
+@pytest.mark.parametrize("scale", [2, 4])
+def test_the_files_for_cpus_are_close_to_the_network_in_32_bits(scale):
+    """To less than a fifth of the noise that it removes."""
+    clean = picture(64, 96)
+    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
+    hrls = np.concatenate([encode_radiance(noisy(clean, 4), 1.0), clean.clip(0, 1), normal], axis=-1)
+    low = box_downsample(clean, scale)
+    lrhs = np.concatenate([encode_radiance(noisy(low, 4 * scale**2), 1.0), encode_radiance(low, 1.0)], axis=-1)
+    joint, _ = checkpoints.load(CHECKPOINT)
+    network = EnsembleFusion(joint, load_weights(WEIGHTS)[0]).eval()
+    with torch.inference_mode():
+        exact, log_error = network(tensor(lrhs), tensor(hrls))
+    feed = {"lrhs": tensor(lrhs).numpy(), "hrls": tensor(hrls).numpy()}
+    fused, predicted = load_network(find_model(scale, "ensemble")).run(["fused", "log_error"], feed)
+    assert np.abs(fused - exact.numpy()).mean() < 0.2 * np.abs(feed["hrls"][:, :3] - exact.numpy()).mean()
+    assert np.abs(predicted - log_error.numpy()).mean() < 0.3
+
+
+def test_training_learns_which_result_is_right(tmp_path, monkeypatch):
+    """``large`` is closer to the target than ``joint``."""
+    monkeypatch.setattr(ensemble, "BATCH", 2)
+    for index in range(2):
+        given = {name: image.numpy() for name, image in arguments().items()}
+        given["target"] = (3 * given["large"] + given["albedo"]) / 4
+        np.savez(tmp_path / f"x2-{index}.npz", **{name: image.astype(np.float16) for name, image in given.items()})
+    files = sorted(tmp_path.glob("*.npz"))
+    before = evaluate(None, files)
+    after = evaluate(train(files, files, steps=20), files)
+    assert after["psnr"] > before["psnr"] + 0.5
+
+
+def test_albedo_and_colour_are_permuted_alike(tmp_path):
+    given = {name: image.numpy() for name, image in arguments().items()}
+    given["target"] = given["joint"] = given["albedo"]
+    np.savez(tmp_path / "x2-0.npz", **given)
+    for _, batch in zip(range(4), batches([Path(tmp_path / "x2-0.npz")], np.random.default_rng(0)), strict=False):
+        torch.testing.assert_close(batch["target"], batch["albedo"])
+        torch.testing.assert_close(batch["joint"], batch["albedo"])

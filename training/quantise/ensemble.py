@@ -1,0 +1,265 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Write the ``ensemble`` models in 8 bits: ``joint`` and Open Image Denoise's networks first, their weights last.
+
+    python -m training.quantise.ensemble VIEWS --out RUN
+    python -m training.quantise.ensemble VIEWS --out RUN --export
+
+The first command quantises Open Image Denoise's networks on training views, joins them with the files of ``joint``, and
+stores the results of many training pairs, with which :mod:`training.ensemble` trains. It continues where it stopped.
+The second adds what was trained, and writes the files into the package.
+"""
+
+from __future__ import annotations
+
+import argparse
+import datetime
+import zlib
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import islice
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper
+from torch import Tensor
+from torch.nn import functional as F
+
+from datagen.views import Folder
+from oiio_msspl.model.catalogue import WEIGHTS, find_model
+from oiio_msspl.model.contract import MEAN_DENOISER, METADATA_KEY, SCALES, Contract
+from oiio_msspl.model.mean_denoiser import log_encoded_of_code
+from oiio_msspl.model.runtime import load_network
+from oiio_msspl.model.session import make_denoiser
+from training.data import Sampling, draw, fixed_batches, view_tensors
+from training.encoding import from_srgb, log_to_pu, srgb
+from training.ensemble import BandWeights, load_weights
+from training.export import shuffle, traced, unshuffle
+from training.gpu import share_weights
+from training.oidn import ALBEDO_BASE, BASE, LARGE, LARGE_HDR, NORMAL_BASE, Shape, pretrained_weights
+from training.quantise.gptq import Activations, CodeLayout, Fit, run_unet_on_activations
+from training.quantise.graph import ENTRIES, Graph, Nodes
+from training.quantise.joint import concatenated, embedded, sliced, sliced_layout
+
+#: Calibration images of each network, and their width.
+IMAGES, PATCH = 32, 256
+#: Bounds of the powers of brighter albedos.
+BRIGHTER = (0.1, 1.0)
+#: Slices of albedo and normal before and after they are denoised, of the colour, and of the denoised colour.
+AUXILIARY_SLICES, COLOUR_SLICES, COLOUR_SLICES_OUT = 5, 3, 10
+#: Stored pairs for training and validation.
+PAIRS = {"train": 480, "validation": 36}
+#: The file of the networks that the models of all scales share.
+SHARED = "ensemble.weights"
+#: Memory of a tile in bytes per HRLS pixel, see :data:`training.export.MEMORY`.
+MEMORY = 1160
+
+#: Outputs of the graph without the weights.
+RESULTS = ("joint", "large", "albedo", "normal", "joint_error")
+
+
+# Open Image Denoise's networks in 8 bits
+
+
+def auxiliary_codes(image: Tensor) -> Activations:
+    """An albedo, sRGB-encoded, or a normal, both (1, 3, H, W) in [0, 1], as the network's input."""
+    layout = concatenated(sliced_layout(AUXILIARY_SLICES, 0))
+    codes = F.pad(sliced(image, AUXILIARY_SLICES), (0, 0, 0, 0, 0, 1))
+    return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
+
+
+def colour_codes(colour: Tensor, albedo: Tensor, normal: Tensor) -> Activations:
+    """A log-encoded colour and denoised layers in [0, 1], (1, 3, H, W), as the input of the large network."""
+    plain = CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
+    layout = concatenated(sliced_layout(COLOUR_SLICES, 0), plain)
+    layers = [(image.clamp(0, 1) * 255).round() for image in (albedo, normal)]
+    codes = F.pad(torch.cat([sliced(log_to_pu(colour), COLOUR_SLICES), *layers], dim=1), (0, 0, 0, 0, 0, 1))
+    return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
+
+
+def fitted(network: str, shape: Shape, slices_out: int, images: Sequence[Activations]) -> tuple[Fit, list[Tensor]]:
+    """Quantise a network; also return its exact outputs (1, 3, H, W)."""
+    fit = Fit(shape, pretrained_weights(network), slices_out)
+    exact, codes = ([getattr(image, kind)[0] for image in images] for kind in ("exact", "codes"))
+    result = run_unet_on_activations(shape, [Activations(exact, codes, images[0].layout)], fit.conv)
+    return fit, [image[:, :3].clamp(0, 1) for image in result.exact]
+
+
+def fit_networks(hrls: Sequence[Tensor]) -> dict[str, Fit]:
+    """Quantise the three networks on HRLS (1, 9, H, W), encoded."""
+    albedo, albedos = fitted(
+        ALBEDO_BASE, BASE, AUXILIARY_SLICES, [auxiliary_codes(srgb(image[:, 3:6])) for image in hrls]
+    )
+    normal, normals = fitted(
+        NORMAL_BASE, BASE, AUXILIARY_SLICES, [auxiliary_codes(0.5 * image[:, 6:9] + 0.5) for image in hrls]
+    )
+    images = [colour_codes(h[:, :3], from_srgb(a), n) for h, a, n in zip(hrls, albedos, normals, strict=True)]
+    colour, _ = fitted(LARGE_HDR, LARGE, COLOUR_SLICES_OUT, images)
+    return {"albedo": albedo, "normal": normal, "colour": colour}
+
+
+# The graphs
+
+
+class Results(Nodes):
+    """The graph up to the two results: inputs ``lrhs`` and ``hrls``, outputs :data:`RESULTS`."""
+
+    def __init__(self, scale: int, networks: dict[str, onnx.ModelProto]) -> None:
+        super().__init__()
+        self.tensors: list[onnx.TensorProto] = []
+        self.initializers["unseen"] = log_encoded_of_code(COLOUR_SLICES_OUT)
+        self._embed(onnx.load(find_model(scale, "joint")), "joint.", {"fused": "joint", "log_error": "joint_error"})
+        # OIDN denoises an albedo in sRGB, and reads it linear beside the colour.
+        self.constant("srgb", srgb(torch.linspace(0, 1, ENTRIES)).numpy())
+        albedo = self._denoised(networks["albedo"], "albedo", self.table(self.part("hrls", 3, 6), 1.0, "srgb"))
+        half = self.constant("half", np.float32(0.5))
+        scaled = self.add("Mul", [self.part("hrls", 6, 9), half], "normal.scaled")
+        normal = self._denoised(networks["normal"], "normal", self.add("Add", [scaled, half], "normal.shifted"))
+        colour = self.slices(self.log_to_pu(self.part("hrls", 0, 3)), COLOUR_SLICES)
+        step = self.constant("step", np.float32(1 / 255))
+        rounded = [self.add("QuantizeLinear", [image, step, "zero"], f"{image}.rounded") for image in (albedo, normal)]
+        packed = self.packed([*colour, *rounded, self.zeros("hrls")], "colour.layers")
+        pixels = self.add("Gather", ["unseen", self._run(networks["colour"], "colour", packed)], "large.pixels")
+        self.add("Transpose", [pixels], "large", perm=[0, 3, 1, 2])
+
+    def _denoised(self, network: onnx.ModelProto, name: str, noisy: str) -> str:
+        """Add the network of an albedo or a normal; return the denoised image, (1, 3, H, W) in [0, 1]."""
+        packed = self.packed([*self.slices(noisy, AUXILIARY_SLICES), self.zeros(noisy)], f"{name}.layers")
+        values = torch.linspace(0, 1, 255 * AUXILIARY_SLICES + 1)
+        table = self.constant(f"{name}.table", (from_srgb(values) if name == "albedo" else values).numpy())
+        pixels = self.add("Gather", [table, self._run(network, name, packed)], f"{name}.pixels")
+        return self.add("Transpose", [pixels], name, perm=[0, 3, 1, 2])
+
+    def _run(self, network: onnx.ModelProto, name: str, layers: str) -> str:
+        """Add a network that reads the codes ``layers``; return its sums of codes."""
+        self._embed(network, f"{name}.", {"layers": layers, "codes": f"{name}.codes"})
+        return f"{name}.codes"
+
+    def _embed(self, model: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:
+        """Add the graph of a model; its inputs and outputs get other names."""
+        graph = embedded(model, prefix).graph
+        for node in graph.node:
+            for tensors in (node.input, node.output):
+                tensors[:] = [names.get(name, name) for name in tensors]
+        self.nodes += graph.node
+        self.tensors += graph.initializer
+
+    def model(self, weights: onnx.ModelProto | None = None) -> onnx.ModelProto:
+        """The graph; with ``weights`` (:class:`training.ensemble.BandWeights`), the model that ships."""
+        info = helper.make_tensor_value_info
+        inputs = [info("lrhs", TensorProto.FLOAT, [1, 6, "h", "w"]), info("hrls", TensorProto.FLOAT, [1, 9, "H", "W"])]
+        channels = dict.fromkeys(RESULTS, 3) | {"joint_error": 1}
+        if weights is not None:
+            self._embed(weights, "weights.", {})
+            channels = {"fused": 3, "log_error": 1}
+        outputs = [info(name, TensorProto.FLOAT, [1, count, "H", "W"]) for name, count in channels.items()]
+        model = self.finished("ensemble", inputs, outputs)
+        model.graph.initializer.extend(self.tensors)
+        return model
+
+
+# The stored pairs
+
+
+def store_pairs(views: Path, out: Path) -> None:
+    """Store the results of random pairs, see :func:`training.ensemble.read_pair`."""
+    sessions = {scale: load_network(out / f"results-x{scale}.onnx") for scale in SCALES}
+    denoiser = make_denoiser(MEAN_DENOISER)
+    for split, count in PAIRS.items():
+        (out / split).mkdir(exist_ok=True)
+        tensors = view_tensors(Folder(views), split, torch.device("cpu"))
+        for index in range(count):
+            scale = SCALES[index % len(SCALES)]
+            file = out / split / f"x{scale}-{index:05d}.npz"
+            if file.exists():
+                continue
+            rng = np.random.default_rng([zlib.crc32(split.encode()), index])
+            with torch.no_grad():
+                batch = draw(tensors, scale, PATCH, 1, rng, Sampling(), denoiser)
+            feed = {name: batch[name].contiguous().numpy() for name in ("lrhs", "hrls")}
+            feed["hrls"] = feed["hrls"][:, :9]
+            results = dict(zip(RESULTS, sessions[scale].run(list(RESULTS), feed), strict=True))
+            pair = feed | results | {"target": batch["target"].numpy()}
+            partial = file.with_suffix(".partial.npz")
+            np.savez(partial, **{name: image.astype(np.float16) for name, image in pair.items()})
+            partial.rename(file)
+
+
+def calibration_images(views: Path, count: int = IMAGES) -> list[Tensor]:
+    """HRLS (1, 9, H, W) of training views. Every second one has a brighter albedo, up to white, in some channels.
+
+    Codes only cover the range that calibration has seen.
+    """
+    batches = islice(fixed_batches(views, "train", [2], PATCH, 1), count)
+    images = [batch["hrls"][:, :9].contiguous() for batch in batches]
+    generator = torch.Generator().manual_seed(0)
+    for image in images[1::2]:
+        power = BRIGHTER[0] + (BRIGHTER[1] - BRIGHTER[0]) * torch.rand(1, 3, 1, 1, generator=generator)
+        image[:, 3:6] = image[:, 3:6].clamp(0, 1) ** power
+    return images
+
+
+# The files that ship
+
+
+def weights_graph(weights: BandWeights, scale: int) -> onnx.ModelProto:
+    """The graph of the network that weighs the results."""
+    height, width = 64, 96
+    full = {name: torch.rand(1, 3, height * scale, width * scale) for name in ("joint", "large", "albedo", "normal")}
+    lrhs, hrls = torch.rand(1, 6, height, width), torch.rand(1, 9, height * scale, width * scale)
+    inputs = {**full, "lrhs": lrhs, "hrls": hrls, "joint_error": hrls[:, :1]}
+    translations = {torch.ops.aten.pixel_unshuffle.default: unshuffle, torch.ops.aten.pixel_shuffle.default: shuffle}
+    return traced(weights, tuple(inputs.values()), list(inputs), ["fused", "log_error"], 16 * scale, translations)
+
+
+def export(out: Path, networks: dict[str, onnx.ModelProto]) -> None:
+    """Write the models into the package."""
+    weights, trained = load_weights(out / "weights.pt")
+    models = {}
+    for scale in SCALES:
+        contract = Contract.of_file(find_model(scale, "joint"))
+        name = f"ensemble-x{scale}"
+        provenance = contract.provenance | {
+            "network": "ensemble",
+            "other_networks": f"Open Image Denoise 2.5.1, {ALBEDO_BASE}, {NORMAL_BASE}, {LARGE_HDR} (Apache-2.0)",
+            "trained_weights": trained,
+            "date": datetime.date.today().isoformat(),
+        }
+        contract = replace(contract, name=name, bytes_per_pixel=MEMORY, provenance=provenance)
+        model = Results(scale, networks).model(weights_graph(weights, scale))
+        helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+        models[f"{name}.onnx"] = model
+    share_weights(list(models.values()), WEIGHTS / SHARED)
+    for file, model in models.items():
+        onnx.save(model, WEIGHTS / file)
+    for path in sorted(WEIGHTS.glob("ensemble*")):
+        print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m training.quantise.ensemble",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("views", type=Path, help="folder of training views")
+    parser.add_argument("--out", type=Path, required=True, help="folder of the stored results and of what was trained")
+    parser.add_argument("--export", action="store_true", help="write the models, once their weights are trained")
+    args = parser.parse_args()
+    args.out.mkdir(parents=True, exist_ok=True)
+    files = {name: args.out / f"{name}.onnx" for name in ("albedo", "normal", "colour")}
+    if not all(file.exists() for file in files.values()):
+        for name, fit in fit_networks(calibration_images(args.views)).items():
+            onnx.save(Graph(fit).model(), files[name])
+    networks = {name: onnx.load(file) for name, file in files.items()}
+    if args.export:
+        export(args.out, networks)
+        return
+    for scale in SCALES:
+        onnx.save(Results(scale, networks).model(), args.out / f"results-x{scale}.onnx")
+    store_pairs(args.views, args.out)
+
+
+if __name__ == "__main__":
+    main()

@@ -43,9 +43,9 @@ SHOWN = {
         20,
     ),
     "msspl_render": (
-        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output --layout "
-        "--passes --error-layer --compare "
-        "--overwrite --json --frames --temporal --skip-existing --help --help-all",
+        "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "
+        "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
+        "--help --help-all",
         7,
     ),
 }

@@ -130,14 +130,17 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
     return (fixed if signed else np.maximum(fixed, 0.0)).astype(np.float32), bad
 
 
-def box_downsample(image: Array, scale: int) -> Array:
-    """Mean over ``scale`` x ``scale`` pixels: (H, W, ...) to (H/s, W/s, ...). It is finite if the pixels are."""
+def box_downsample(image: NDArray[Any], scale: int) -> Array:
+    """Mean over ``scale`` x ``scale`` pixels, of half or float: (H, W, ...) to (H/s, W/s, ...).
+
+    It is finite if the pixels are.
+    """
     height, width, *channels = image.shape
     result = np.empty((height // scale, width // scale, *channels), np.float32)
 
     def work(rows: slice) -> None:
-        # Sums of strided views are ten times as fast as np.mean over short axes.
-        block = image[rows]
+        # Sums of strided views are ten times as fast as np.mean over short axes. Sums of half floats would be rounded.
+        block = image[rows].astype(np.float32, copy=False)
         with np.errstate(over="ignore"):
             row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
             sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))

@@ -37,6 +37,12 @@ def test_the_main_job(files, bilinear_models):
     assert (preview.spec().width, preview.spec().height, preview.spec().nchannels) == (128, 96, 3)
 
 
+def test_the_example_is_fused_with_its_passes_and_without_a_warning(tmp_path):
+    done = fuse(EXAMPLES / "lr.exr", EXAMPLES / "hr.exr", "-o", tmp_path / "out.exr")
+    assert (done.returncode, done.stderr) == (0, "")
+    assert "components: fused" in done.stdout
+
+
 def test_a_quality_names_the_model(files):
     pair = files / "lr.exr", files / "hr.exr", "-o", files / "out.exr"
     done = fuse(*pair, "--quality", "fast", "--no-preview", "--json")

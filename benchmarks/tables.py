@@ -124,7 +124,7 @@ def how_sure() -> str:
     body = []
     for (peer, render), model, spp in itertools.product(AT_ITS_BEST.items(), BETTER, (2, 8)):
         if "," in model and peer.endswith("on the HRLS"):
-            continue  # it got another HRLS
+            continue  # its HRLS has more samples
         if found := versus.compare(rows, model, peer, spp):
             cells = [versus.cell(found.psnr, "+.2f"), f"{found.without_too_easy:+.2f}", found.wins]
             body.append([render, title(model), str(spp), *cells, ", ".join(found.verdicts)])

@@ -47,7 +47,7 @@ OPSET, IR_VERSION = 18, 8
 
 #: Memory of a tile in bytes per HRLS pixel, by network: the peak of a process that fuses a frame, without the frame
 #: itself, and with room for the rows that are decoded for the next tiles.
-MEMORY = {"paper": 1000, "pyramid": 850, "joint": 800}
+MEMORY = {"paper": 1000, "pyramid": 850, "joint": 800, "ensemble": 1160}
 
 #: Smaller tensors, such as biases, stay float32.
 HALF_ELEMENTS = 256

@@ -88,8 +88,7 @@ def fuse_files(
         inputs: mapping, view and spp of the two files. If it names no view, all views and view layers are fused.
         write: layout, compression, pixel type and layers of the result.
         model: a quality (``best``), a family of models (``paper``), a shipped model, or an ONNX file. None and ``auto``
-            are the default quality, see
-            :func:`oiio_msspl.model.catalogue.find_model`.
+            are the default quality, see :func:`oiio_msspl.model.catalogue.find_model`.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
         threads: CPU threads; 0 for one on each core.
         max_memory: bytes that the process should stay below. The result does not depend on it.

@@ -35,7 +35,7 @@ from oiio_msspl.model.session import make_denoiser
 from training.data import Sampling, draw, fixed_batches, view_tensors
 from training.encoding import from_srgb, log_to_pu, srgb
 from training.ensemble import BandWeights, load_weights
-from training.export import shuffle, traced, unshuffle
+from training.export import MEMORY, shuffle, traced, unshuffle
 from training.gpu import share_weights
 from training.oidn import ALBEDO_BASE, BASE, LARGE, LARGE_HDR, NORMAL_BASE, Shape, pretrained_weights
 from training.quantise.gptq import Activations, CodeLayout, Fit, run_unet_on_activations
@@ -43,7 +43,7 @@ from training.quantise.graph import ENTRIES, Graph, Nodes
 from training.quantise.joint import concatenated, embedded, sliced, sliced_layout
 
 #: Calibration images of each network, and their width.
-IMAGES, PATCH = 32, 256
+IMAGES, PATCH = 36, 256
 #: Bounds of the powers of brighter albedos.
 BRIGHTER = (0.1, 1.0)
 #: Slices of albedo and normal before and after they are denoised, of the colour, and of the denoised colour.
@@ -52,8 +52,6 @@ AUXILIARY_SLICES, COLOUR_SLICES, COLOUR_SLICES_OUT = 5, 3, 10
 PAIRS = {"train": 480, "validation": 36}
 #: The file of the networks that the models of all scales share.
 SHARED = "ensemble.weights"
-#: Memory of a tile in bytes per HRLS pixel, see :data:`training.export.MEMORY`.
-MEMORY = 1160
 
 #: Outputs of the graph without the weights.
 RESULTS = ("joint", "large", "albedo", "normal", "joint_error")
@@ -226,7 +224,7 @@ def export(out: Path, networks: dict[str, onnx.ModelProto]) -> None:
             "trained_weights": trained,
             "date": datetime.date.today().isoformat(),
         }
-        contract = replace(contract, name=name, bytes_per_pixel=MEMORY, provenance=provenance)
+        contract = replace(contract, name=name, bytes_per_pixel=MEMORY["ensemble"], provenance=provenance)
         model = Results(scale, networks).model(weights_graph(weights, scale))
         helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
         models[f"{name}.onnx"] = model

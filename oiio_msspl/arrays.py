@@ -173,6 +173,31 @@ def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Arr
     return values.take(before, axis) * (1 - weight) + values.take(after, axis) * weight
 
 
+def enlarged(image: Array, scale: int) -> Array:
+    """An image (h, w, c), interpolated linearly at ``scale`` times its resolution."""
+    for axis in (0, 1):
+        image = interpolate(image, (np.arange(image.shape[axis] * scale) + 0.5) / scale - 0.5, axis)
+    return image
+
+
+def filled(image: Array, missing: NDArray[np.bool_]) -> Array:
+    """Fill missing pixels (h, w) of a finite image (h, w, c) from those around.
+
+    They are taken from the image at half the size, in which the pixels that are still missing are filled likewise
+    (push-pull, Gortler et al. 1996, *The Lumigraph*). An image without any pixel stays as it is.
+    """
+    if missing.all() or not missing.any():
+        return image
+    margins = [(0, side % 2) for side in missing.shape]
+    known = np.pad(~missing, margins)[..., None]
+    shares = box_downsample(known.astype(np.float32), 2)
+    sums = box_downsample(np.pad(image, [*margins, (0, 0)]) * known, 2)
+    half = np.divide(sums, shares, out=np.zeros_like(sums), where=shares > 0)
+    half = filled(half, shares[..., 0] == 0)
+    around = enlarged(half, 2)[: len(image), : image.shape[1]]
+    return np.where(missing[..., None], around, image)
+
+
 def mean_around(plane: Array, radius: int) -> Array:
     """Mean over the pixels up to ``radius`` rows and columns away that exist."""
     for axis in (0, 1):

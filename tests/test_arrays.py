@@ -6,7 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
-from oiio_msspl.arrays import box_downsample
+from oiio_msspl.arrays import box_downsample, filled
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
@@ -22,3 +22,20 @@ def test_means_are_exact_and_finite_up_to_the_largest_value(dtype):
     # Sums of floats are limited
     expected = np.float32(65504) if dtype is np.float16 else np.finfo(np.float32).max / 16
     np.testing.assert_allclose(means[0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (37, 51), (5, 29)])
+def test_missing_pixels_are_filled_from_those_around(size):
+    ramp = np.linspace(1, 2, size[1], dtype=np.float32)[None, :, None] * np.ones((*size, 3), np.float32)
+    missing = np.zeros(size, bool)
+    missing[size[0] // 3 : size[0] // 3 + 12, size[1] // 3 : size[1] // 3 + 5] = True
+    image = np.where(missing[..., None], np.float32(0), ramp)
+    result = filled(image, missing)
+    np.testing.assert_array_equal(result[~missing], ramp[~missing])
+    assert np.abs(result - ramp)[missing].max() < 0.2
+
+
+def test_without_any_known_pixel_nothing_is_filled():
+    image = np.zeros((5, 7, 3), np.float32)
+    assert filled(image, np.ones((5, 7), bool)) is image
+    assert filled(image, np.zeros((5, 7), bool)) is image

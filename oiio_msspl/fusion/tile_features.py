@@ -9,13 +9,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import NORMAL
-from oiio_msspl.arrays import Array, interpolate, repair
+from oiio_msspl.aovs.features import NORMAL, RGB
+from oiio_msspl.arrays import Array, enlarged, filled, interpolate, repair
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.tiling import Tile
 
 Indices = NDArray[np.int64]
+Mask = NDArray[np.bool_]
 
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
@@ -30,7 +31,7 @@ class RepairCounts:
     negative: dict[str, int] = field(default_factory=dict)
     """Negative and set to 0: colours out of gamut, in files that are otherwise sound."""
 
-    def add(self, feature: str, values: Array, changed: NDArray[np.bool_]) -> None:
+    def add(self, feature: str, values: Array, changed: Mask) -> None:
         """Count values; ``changed`` is the mask of :func:`oiio_msspl.arrays.repair`."""
         broken = int(np.count_nonzero(~np.isfinite(values)))
         for counts, count in ((self.repaired, broken), (self.negative, int(np.count_nonzero(changed)) - broken)):
@@ -78,9 +79,14 @@ def read_tile(
     scale = alignment.scale
     area, core = in_hrls_pixels(tile.area, scale), in_hrls_pixels(tile.core, scale)
     window = tile.area.slices(grid)
+    broken: dict[str, Mask] = {}
+    hrls = read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core, broken=broken)
+    if RGB in broken:
+        # The LRHS knows the light of a bucket that failed.
+        hrls[RGB] = np.where(broken[RGB][..., None], enlarged(lrhs[RGB][window], scale), hrls[RGB])
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},
-        hrls=read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core),
+        hrls=hrls,
         scale=scale,
         lrhs_area=tile.area,
         hrls_area=area,
@@ -130,15 +136,18 @@ def read_features(
     *,
     counts: RepairCounts | None = None,
     counted: Window | None = None,
+    broken: dict[str, Mask] | None = None,
 ) -> dict[str, Array]:
     """Read and repair features over a window. Beyond the data window the picture is mirrored.
 
-    Repeating the last pixel would turn its noise into lines, which networks take for texture.
+    Repeating the last pixel would turn its noise into lines, which networks take for texture. Pixels that are NaN or
+    minus infinity are filled from those around (:func:`oiio_msspl.arrays.filled`).
 
     Args:
         window, data_window: both relative to the top left of the display window, as all windows here.
         features: names of features; all if None. Those that the render lacks are left out.
         counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
+        broken: gets a mask (h, w) of the pixels that were filled, for each feature that has some.
     """
     rows, columns = mirrored_pixels(window, data_window)
     stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
@@ -149,6 +158,11 @@ def read_features(
         if bad is not None and counts is not None and counted is not None:
             inside = counted.intersect(stored).slices(stored)
             counts.add(name, values[inside], bad[inside])
+        missing = None if bad is None else np.any(np.isnan(values) | np.isneginf(values), axis=-1)
+        if missing is not None and missing.any():
+            repaired = filled(repaired, missing)
+            if broken is not None:
+                broken[name] = missing[rows - stored.y0].take(columns - stored.x0, axis=1)
         result[name] = repaired if stored == window else repaired[rows - stored.y0].take(columns - stored.x0, axis=1)
     return result
 

@@ -114,6 +114,17 @@ def test_bad_values_are_repaired_and_counted_once(session, scale, bad, monkeypat
     assert (fused.rgb >= 0).all()
 
 
+def test_a_bucket_that_failed_is_filled_from_the_lrhs():
+    """All layers of the HRLS are NaN there. Black instead would leave a dark square."""
+    session, side, bucket = Session(find_model(4, "joint")), 256, slice(96, 128)
+    low, high, clean = pair_of(4, side, side, albedo=np.full((side, side, 3), 0.5, np.float32))
+    expected = np.abs(fuse(low, high, session).rgb - clean)[bucket, bucket].mean()
+    for values in high.layers.values():
+        values[bucket, bucket] = np.nan
+    error = np.abs(fuse(low, high, session).rgb - clean)[bucket, bucket].mean()
+    assert error < 3 * expected
+
+
 @pytest.mark.parametrize("value", [1e6, 1e20, 3e38])
 def test_a_firefly_of_any_size_stays_where_it_is(session, scale, value):
     """One absurd pixel in each render: the rest of the frame keeps its brightness."""

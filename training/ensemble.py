@@ -52,6 +52,9 @@ IMAGES = ("joint", "large", "samples", "albedo", "normal")
 WIDTHS = (32, 48, 64, 64)
 #: Each band of the pictures has a weight: details below 4 pixels, below 16 pixels, and the rest.
 BANDS = (4, 16)
+#: A result is at least the darker of the two times the first, and at most the brighter one times the second,
+#: log-encoded: a band of one may hold more than all of the other.
+AGREED = (0.8, 1.25)
 #: Largest change of the logarithm of the error that ``joint`` expects.
 MAX_CHANGE = 2.0
 #: Share of the expected error's likelihood in the loss. Its gradient does not reach the other layers.
@@ -65,8 +68,8 @@ REPORT = 250
 class BandWeights(nn.Module):
     """A U-Net that weighs the results of ``joint`` and of OIDN's large network, in three bands of each pixel.
 
-    Weights lie in [0, 1] and start at one half. The result is clamped to the range of ``joint``, see
-    :func:`training.blend.highest_allowed`. Sizes are multiples of ``multiple`` HRLS pixels.
+    Weights lie in [0, 1] and start at one half. The result stays near the range of the two (``AGREED``), and is clamped
+    to that of ``joint``, see :func:`training.blend.highest_allowed`. Sizes are multiples of ``multiple`` HRLS pixels.
     """
 
     multiple = 16
@@ -127,6 +130,7 @@ class BandWeights(nn.Module):
         fused = joint
         for band, weight in zip(bands, torch.sigmoid(logits).split(1, dim=1), strict=True):
             fused = fused + weight * band
+        fused = torch.clamp(fused, AGREED[0] * torch.minimum(joint, large), AGREED[1] * torch.maximum(joint, large))
         lowest, highest = (sign * highest_allowed(sign * low, sign * mean, sign * samples) for sign in (-1.0, 1.0))
         return torch.clamp(fused, lowest, highest), log_error
 
@@ -144,13 +148,13 @@ class EnsembleFusion(nn.Module):
         self.joint, self.weights = joint, weights
         self.oidn = nn.ModuleDict({name: _convolutions(name) for name in (ALBEDO_BASE, NORMAL_BASE, LARGE_HDR)})
 
-    def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-        """See :meth:`training.joint.JointFusion.fuse`."""
+    def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """See :meth:`training.joint.JointFusion.fuse`. Also returns the denoised albedo and normal, in [0, 1]."""
         joint, error = self.joint.fuse(lrhs, hrls)
         albedo = from_srgb(self._run(ALBEDO_BASE, BASE, srgb(hrls[:, 3:6])))
         normal = self._run(NORMAL_BASE, BASE, 0.5 * hrls[:, 6:9] + 0.5)
         large = self._run(LARGE_HDR, LARGE, torch.cat([log_to_pu(hrls[:, :3]), albedo, normal], dim=1))
-        return self.weights(joint, pu_to_log(large), albedo, normal, lrhs, hrls, error)
+        return *self.weights(joint, pu_to_log(large), albedo, normal, lrhs, hrls, error), albedo, normal
 
     def _run(self, network: str, shape: Shape, image: Tensor) -> Tensor:
         convs = self.oidn[network]

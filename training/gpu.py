@@ -80,7 +80,8 @@ def to_onnx(network: JointFusion | EnsembleFusion, contract: Contract) -> onnx.M
     """The graph of a network in half floats for the contract's scale."""
     joint, module = (network, Fuse(network)) if isinstance(network, JointFusion) else (network.joint, network)
     inputs = example(joint, contract.scale, 4 * contract.alignment, 6 * contract.alignment)
-    model = traced(module, inputs, ["lrhs", "hrls"], ["fused", "log_error"], contract.alignment)
+    outputs = ["fused", "log_error", *(["albedo", "normal"] if isinstance(network, EnsembleFusion) else [])]
+    model = traced(module, inputs, ["lrhs", "hrls"], outputs, contract.alignment)
     contract = replace(contract, provenance=contract.provenance | PRECISION)
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     return _finished(model)

@@ -107,6 +107,15 @@ ErrorLayer = Annotated[
         rich_help_panel=OUTPUT,
     ),
 ]
+DataPasses = Annotated[
+    bool,
+    typer.Option(
+        "--data-passes",
+        help="Add the layers 'denoised_albedo' and 'denoised_normal'. For --quality best.",
+        rich_help_panel=OUTPUT,
+        hidden=True,
+    ),
+]
 Frames = Annotated[
     str | None,
     typer.Option(metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=SHOT),
@@ -263,6 +272,7 @@ def make_write_options(
     error_layer: bool,
     passes: list[str] | None = None,
     frames_layer: bool = False,
+    data_passes: bool = False,
 ) -> WriteOptions:
     """The options that describe the result.
 
@@ -273,7 +283,9 @@ def make_write_options(
 
     pixel_type = None if half is None else "half" if half else "float"
     patterns = tuple(passes) if passes and "auto" not in passes else ()
-    return WriteOptions(layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer)
+    return WriteOptions(
+        layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer, data_passes
+    )
 
 
 def make_temporal_options(frames: str, motion_format: str | None) -> TemporalOptions:

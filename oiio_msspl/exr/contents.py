@@ -29,8 +29,8 @@ class FusedPixels:
     """Scene linear, (height, width, 3)."""
     alpha: Array | None
     """(height, width, 1), if the HRLS has an alpha."""
-    extra: Mapping[str, Array]
-    """Further layers by name, (height, width, 1) each."""
+    extra: Mapping[str, NDArray[Any]]
+    """Further layers, those of :data:`oiio_msspl.exr.write_options.COMPONENTS`, (height, width, channels) each."""
     kind: str
     """Pixel type in the file: ``half`` or ``float``."""
 
@@ -42,10 +42,10 @@ class FusedPixels:
         return self._stored(values)
 
     def extra_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Rows of a further layer as stored, (stop - start, width, 1)."""
+        """Rows of a further layer as stored, (stop - start, width, channels)."""
         return self._stored(self.extra[name][start:stop])
 
-    def _stored(self, values: Array) -> NDArray[Any]:
+    def _stored(self, values: NDArray[Any]) -> NDArray[Any]:
         if self.kind == "half":
             values = np.minimum(values, np.float32(HALF_MAX))
         return np.ascontiguousarray(values, dtype=DTYPES[self.kind])

@@ -15,6 +15,7 @@ import OpenImageIO as oiio
 from oiio_msspl.exr.contents import FileContents, lossless
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, Part
+from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Attributes that say how the source was stored. The writer sets them anew, or they have no meaning in the copy.
 _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
@@ -67,8 +68,9 @@ def beauty_spec(contents: FileContents) -> Any:
 
 def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
     """The part of a further layer; its name is not among ``taken`` and is added to them."""
-    channel = "Y" if contents.options.layout == "nuke" else f"{name}.Y"
-    spec = _spec(contents.home, _unique(name, taken), [channel], contents.pixels.kind)
+    prefix = "" if contents.options.layout == "nuke" else f"{name}."
+    channels = [f"{prefix}{component}" for component in COMPONENTS[name]]
+    spec = _spec(contents.home, _unique(name, taken), channels, contents.pixels.kind)
     _drop_repeated_attributes(spec)
     _compress(spec, contents.compression)
     return spec

@@ -19,6 +19,7 @@ from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.part_specs import runs
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.replaced import DTYPES
+from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Header entries that say how the source was stored. The ACES flag is forbidden in a file with AOVs (ST 2065-4).
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
@@ -49,7 +50,10 @@ def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
     beauty = contents.pixels.rows(0, height)
     channels = {c.name: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate(contents.beauty)}
     for name in contents.pixels.extra:
-        channels[f"{name}.Y"] = np.ascontiguousarray(contents.pixels.extra_rows(name, 0, height)[..., 0])
+        pixels = np.moveaxis(contents.pixels.extra_rows(name, 0, height), -1, 0)
+        channels |= {
+            f"{name}.{c}": np.ascontiguousarray(plane) for c, plane in zip(COMPONENTS[name], pixels, strict=True)
+        }
     return channels
 
 

@@ -22,6 +22,10 @@ DEFAULT_COMPRESSION = "zip"
 
 #: Names of the layers that hold the predicted error, and how many frames were averaged.
 ERROR_LAYER, FRAMES_LAYER = "error", "frames"
+#: Names of the layers that hold albedo and normal without noise.
+ALBEDO_LAYER, NORMAL_LAYER = "denoised_albedo", "denoised_normal"
+#: The channels of each of these layers.
+COMPONENTS = {ERROR_LAYER: "Y", FRAMES_LAYER: "Y", ALBEDO_LAYER: "RGB", NORMAL_LAYER: "XYZ"}
 
 
 @dataclass(frozen=True)
@@ -48,6 +52,8 @@ class WriteOptions:
     """Add a layer ``error``: the error that the model predicts for the fused beauty."""
     frames_layer: bool = False
     """Add a layer ``frames``: of how many frames a pixel of a shot is the average."""
+    data_passes: bool = False
+    """Add the layers ``denoised_albedo`` and ``denoised_normal``."""
 
     def __post_init__(self) -> None:
         if self.layout not in LAYOUTS:

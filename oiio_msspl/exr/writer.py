@@ -39,7 +39,7 @@ def write_fused(
     attributes: dict[str, str],
     options: WriteOptions,
     *,
-    extra: Mapping[str, Array] = MappingProxyType({}),
+    extra: Mapping[str, NDArray[Any]] = MappingProxyType({}),
     replaced: ReplacedChannels | None = None,
     overwrite: bool = False,
     cache_bytes: int = 0,
@@ -55,7 +55,7 @@ def write_fused(
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
         attributes: header attributes that are added to the beauty's part.
         options: layout, compression, pixel type and layers.
-        extra: further layers by name, (height, width, 1) each, such as ``error``.
+        extra: further layers, such as ``error``, see :attr:`FusedPixels.extra`.
         replaced: new pixels for some of the other channels, each over the data window of its part.
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for

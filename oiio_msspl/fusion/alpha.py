@@ -33,7 +33,7 @@ def fuse_alpha(pair: TilePair, session: Session, lrhs_aovs: Images, mean: MeanSe
     if (solid | empty).all():
         return solid.astype(np.float32)
     lrhs, hrls = encode_alpha(pair, session.contract)
-    encoded, _ = session.run(lrhs, hrls, lrhs_aovs=lrhs_aovs, mean=mean)
+    encoded = session.run(lrhs, hrls, lrhs_aovs=lrhs_aovs, mean=mean)["fused"]
     check_finite(session, encoded)
     fused = np.clip(decode_radiance(encoded, 1.0).mean(axis=-1, keepdims=True), 0.0, 1.0)
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))

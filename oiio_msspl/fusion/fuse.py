@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import HALF_MAX, Array, ReusedMemory, planes
+from oiio_msspl.arrays import HALF_MAX, Array, ReusedMemory, blank, planes
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -75,6 +75,9 @@ class FusedFrame:
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
     """One sentence each."""
+    clean_aovs: dict[str, NDArray[np.float16]] = field(default_factory=dict)
+    """Albedo and normal of the HRLS without noise, (height, width, 3), as far as it has them, the model denoises them,
+    and they are asked for."""
     passes: FusedPasses | None = None
     """The fused layers of additive sets; None if there are none."""
     replaced: ReplacedChannels | None = None
@@ -95,6 +98,7 @@ def fuse(
     session: Session,
     *,
     error: bool = False,
+    clean_aovs: bool = False,
     half: bool = False,
     max_memory: int = MAX_MEMORY,
     held: int = 0,
@@ -106,6 +110,7 @@ def fuse(
         lr, hr: files with their layers mapped (:func:`oiio_msspl.aovs.matching.map_render`), or renders in memory.
         session: a model for the scale of the pair.
         error: also predict the error of the result.
+        clean_aovs: also keep the albedo and the normal that the model denoises, see :attr:`Session.clean_aovs`.
         half: keep the result as half floats, in half the memory, with what is too bright clipped to ``HALF_MAX``.
         max_memory: bytes that the whole process should stay below. The result does not depend on it.
         held: bytes that the caller holds beside this frame.
@@ -121,7 +126,7 @@ def fuse(
     require_memory(memory_to_fuse(alignment, session, error=error) + held, session.contract, max_memory)
     seconds = session.seconds
     with limit_threads(session.threads):
-        pair = _Pair(lr, hr, alignment, session)
+        pair = _Pair(lr, hr, alignment, session, session.clean_aovs if clean_aovs else ())
         frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
         tiles = plan_tiles(pair.grid, session.contract, session.stride)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
@@ -208,6 +213,8 @@ class _Picture:
     """See :func:`oiio_msspl.fusion.guards.lights_above_ceiling`."""
     noise_free: bool = False
     """There is no noise to remove: the HRLS is the result."""
+    aovs: tuple[str, ...] = ()
+    """AOVs of the HRLS whose denoised pixels are kept."""
 
 
 @dataclass
@@ -226,8 +233,11 @@ class _PreparedTile:
 class _Pair:
     """The LRHS in memory, and the HRLS that is read tile by tile."""
 
-    def __init__(self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session) -> None:
-        self._lr, self._hr, self._alignment, self._session = lr, hr, alignment, session
+    def __init__(
+        self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session, aovs: Sequence[str]
+    ) -> None:
+        """``aovs``: see :attr:`_Picture.aovs`."""
+        self._lr, self._hr, self._alignment, self._session, self._aovs = lr, hr, alignment, session, aovs
         self.grid = _grid(alignment, session)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         features = [RGB, *session.lrhs_aovs, "alpha"]
@@ -258,7 +268,8 @@ class _Pair:
         pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
         self._averages.add(pair)
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
-        lit = empty is None or not empty.all()
+        # An empty tile may still show surfaces.
+        lit = empty is None or not empty.all() or bool(self._aovs)
         pictures = [self._prepare_picture(place, part, lit=lit) for place, part in self._pictures(pair)]
         return _PreparedTile(pair.hrls_area, pair.hrls_target, empty, pictures)
 
@@ -275,10 +286,11 @@ class _Pair:
     def _prepare_picture(self, place: Place, pair: TilePair, *, lit: bool) -> _Picture:
         """Dim fireflies and encode the features, unless no pixel is ``lit``."""
         contract, hrls = self._session.contract, pair.hrls
+        aovs = tuple(name for name in self._aovs if name in hrls)
         # Copies, because views would keep the memory of all features.
-        for_alpha = [name for name in ("alpha", ALBEDO, NORMAL) if name in hrls and "alpha" in hrls]
-        needed_for_alpha = {name: hrls[name].copy("K") for name in for_alpha}
-        picture = _Picture(place, replace(pair, hrls=needed_for_alpha), self._lrhs_aovs(pair))
+        kept = {*aovs, *(("alpha", ALBEDO, NORMAL) if "alpha" in hrls else ())}
+        copies = {name: values.copy("K") for name, values in hrls.items() if name in kept}
+        picture = _Picture(place, replace(pair, hrls=copies), self._lrhs_aovs(pair), aovs=aovs)
         if lit:
             lrhs_rgb, hrls = dim_fireflies(pair)
             picture.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
@@ -329,11 +341,12 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
     target = tile.target.slices(frame.alignment.hr_data_window)
     core = tile.target.slices(tile.area)
     if tile.pictures[0].hrls is not None:
-        fused = [_fuse_picture(picture, session, means, error=frame.error is not None) for picture in tile.pictures]
-        places = [picture.place for picture in tile.pictures]
-        encoded = join(zip(places, (image for image, _ in fused), strict=True), size)
-        if session.stride > 1 and not all(picture.noise_free for picture in tile.pictures):
-            encoded = without_grid(encoded)
+        images = _fuse_pictures(tile.pictures, size, session, means, error=frame.error is not None)
+        encoded = images["fused"]
+        for name in tile.pictures[0].aovs:
+            if name not in frame.clean_aovs:
+                frame.clean_aovs[name] = blank(frame.rgb.shape, np.float16)
+            frame.clean_aovs[name][target] = images[name][core]
         rgb = decode_radiance(encoded[core], frame.exposure)
         lights = [(picture.place, picture.lights) for picture in tile.pictures]
         if any(image is not None for _, image in lights):
@@ -346,9 +359,8 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
             frame.clipped += int(np.count_nonzero(rgb > HALF_MAX))
             np.minimum(rgb, HALF_MAX, out=rgb)
         frame.rgb[target] = rgb
-        errors = [image for _, image in fused if image is not None]
-        if frame.error is not None and errors:
-            error = _scene_linear_error(encoded, join(zip(places, errors, strict=True), size), frame.exposure)
+        if frame.error is not None:
+            error = _scene_linear_error(encoded, images["error"], frame.exposure)
             if empty is not None:
                 error *= ~empty
             frame.error[target] = error[core]
@@ -359,20 +371,35 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
         frame.alpha[target] = join(alpha, size)[core]
 
 
-def _fuse_picture(
-    picture: _Picture, session: Session, means: _FrameMeans, *, error: bool
-) -> tuple[Array, Array | None]:
-    """Fused colour (h, w, 3), log-encoded, and its expected error (h, w, 1) if asked for."""
+def _fuse_pictures(
+    pictures: Sequence[_Picture], size: tuple[int, int], session: Session, means: _FrameMeans, *, error: bool
+) -> Images:
+    """What :meth:`Session.run` returns, for the pictures of a tile of ``size`` (h, w) together."""
+    images = [_fuse_picture(picture, session, means, error=error) for picture in pictures]
+    places = [picture.place for picture in pictures]
+    result = {name: join(zip(places, (each[name] for each in images), strict=True), size) for name in images[0]}
+    if session.stride > 1 and not all(picture.noise_free for picture in pictures):
+        result |= {name: without_grid(image) for name, image in result.items() if name != "error"}
+    return result
+
+
+def _fuse_picture(picture: _Picture, session: Session, means: _FrameMeans, *, error: bool) -> Images:
+    """What :meth:`Session.run` returns for a picture, with its expected error if asked for."""
     assert picture.lrhs is not None and picture.hrls is not None
-    encoded_error: Array | None
     if picture.noise_free:
-        encoded, encoded_error = picture.hrls[..., :3], np.zeros_like(picture.hrls[..., :1])
-    else:
-        encoded, encoded_error = session.run(
-            picture.lrhs, picture.hrls, lrhs_aovs=picture.lrhs_aovs, mean=means.rgb, error=error
-        )
-    check_finite(session, encoded, encoded_error)
-    return encoded, encoded_error
+        own = {name: picture.pair.hrls[name] for name in picture.aovs}
+        errors = {"error": np.zeros_like(picture.hrls[..., :1])} if error else {}
+        return {"fused": picture.hrls[..., :3], **errors, **own}
+    images = session.run(
+        picture.lrhs,
+        picture.hrls,
+        lrhs_aovs=picture.lrhs_aovs,
+        mean=means.rgb,
+        error=error,
+        aovs=picture.aovs,
+    )
+    check_finite(session, *images.values())
+    return images
 
 
 def _scene_linear_error(encoded: Array, error: Array, exposure: float) -> Array:

@@ -132,12 +132,12 @@ def _largest_difference(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: 
     return float(np.abs(difference).max())
 
 
-def check_finite(session: Session, *images: Array | None) -> None:
+def check_finite(session: Session, *images: Array) -> None:
     """Raise MssplError if the output of a network, whose input is always finite, is not.
 
     A frame with repaired holes would look finished.
     """
-    if not all(np.isfinite(image).all() for image in images if image is not None):
+    if not all(np.isfinite(image).all() for image in images):
         raise MssplError(
             f"{session.contract.name} on {session.provider} returned NaN or infinite values, so this frame is not "
             "fused; try --device cpu or another --model"
@@ -148,7 +148,7 @@ class EmptyRegions:
     """Where neither render has any light, not even around: the result is black there, and a transparent film stays
     empty.
 
-    A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only if its 15 x 15 LRHS
+    A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only if its 31 x 31 LRHS
     neighbourhood is black.
 
     Args:
@@ -157,7 +157,7 @@ class EmptyRegions:
 
     def __init__(self, lrhs_rgb: Array) -> None:
         self._black = np.all(lrhs_rgb == 0, axis=-1, keepdims=True)
-        self._black_far_around = _all_in_15x15(self._black) if self._black.any() else self._black
+        self._black_far_around = _all_in_31x31(self._black) if self._black.any() else self._black
 
     def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
         """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
@@ -183,8 +183,8 @@ def _enlarge(lrhs: Mask, scale: int) -> Mask:
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _all_in_15x15(mask: Mask) -> Mask:
-    for distance in (1, 2, 4):
+def _all_in_31x31(mask: Mask) -> Mask:
+    for distance in (1, 2, 4, 8):
         mask = reduce(np.logical_and, _neighbours(mask, distance))
     return mask
 

@@ -13,8 +13,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
@@ -53,6 +55,9 @@ OTHER_LIGHT = 1.0
 DARKEST_COLOUR = 1e-3
 #: What known layers leave of the beauty counts as rounding below this share of it.
 ROUNDING = np.float32(5e-7)
+#: Albedo and normal without noise, of half or float.
+Guides = Mapping[str, NDArray[Any]]
+NO_GUIDES: Guides = {}
 #: Larger values of fitted layers are clipped before they are scaled to the sum, which would overflow.
 BRIGHTEST = np.float32(1e30)
 
@@ -77,6 +82,7 @@ def fuse_passes(
     sets: Sequence[AdditiveSet],
     cache_bytes: int = 0,
     pixels: ReplacedChannels | None = None,
+    guides: Guides = NO_GUIDES,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
     """Fuse the layers of additive sets of the HRLS.
@@ -88,6 +94,7 @@ def fuse_passes(
         sets: of ``hr.additive_sets``. Those that do not sum to its beauty are refused.
         cache_bytes: memory for decoded rows that two bands need.
         pixels: where the fused layers go; None for a new store.
+        guides: albedo and normal without noise, (height, width, 3) as the HRLS's own, as far as they are known.
         progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
@@ -108,7 +115,7 @@ def fuse_passes(
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
         for core in _bands(alignment) if jobs else []:
-            band = _Band(hr, rgb, alignment, core, dark, jobs)
+            band = _Band(hr, rgb, alignment, core, dark, jobs, guides)
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
                 made = band.fuse(job, lr, pixels, lights)
@@ -220,9 +227,20 @@ class _Band:
     """Some rows of the frame, with what their layers are fitted to."""
 
     def __init__(
-        self, hr: MappedRender, rgb: Array, alignment: Alignment, core: Window, dark: float, jobs: Sequence[_Job]
+        self,
+        hr: MappedRender,
+        rgb: Array,
+        alignment: Alignment,
+        core: Window,
+        dark: float,
+        jobs: Sequence[_Job],
+        guides: Guides,
     ) -> None:
-        """``dark``: light that counts as equal to none in logarithms."""
+        """
+        Args:
+            dark: light that counts as equal to none in logarithms.
+            guides: see :func:`fuse_passes`.
+        """
         self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, dark
         reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
@@ -235,24 +253,28 @@ class _Band:
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
         self._low_beauty = _downsampled(self._beauty, self._scale)
         log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + dark)
-        features = self._read(hr, jobs)
-        guides = [log[None] / SPREAD[RGB]]
-        guides += [_smoothed(planes_of(features[n]), log) / SPREAD[n] for n in (ALBEDO, NORMAL) if n in features]
-        full = np.concatenate(guides, dtype=np.float32)
+        clean = {
+            name: planes_of(image[rows - window.y0].take(columns - window.x0, axis=1)).astype(np.float32, copy=False)
+            for name, image in guides.items()
+        }
+        noisy = self._read(hr, jobs, [name for name in (ALBEDO, NORMAL) if name not in clean])
+        clean |= {name: _smoothed(planes_of(image), log) for name, image in noisy.items()}
+        others = (clean[name] / SPREAD[name] for name in (ALBEDO, NORMAL) if name in clean)
+        full = np.concatenate([log[None] / SPREAD[RGB], *others], dtype=np.float32)
         low = _downsampled(full, self._scale)
         with np.errstate(over="ignore", invalid="ignore"):
             self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
-    def _read(self, hr: MappedRender, jobs: Sequence[_Job]) -> dict[str, Array]:
+    def _read(self, hr: MappedRender, jobs: Sequence[_Job], guides: Sequence[str]) -> dict[str, Array]:
         """Read all layers of the HRLS that the band needs, at once, because a file decodes all of them together.
 
         The light of each layer stays at low resolution, and the colours of products over the core.
 
         Returns:
-            Albedo and normal (height, width, 3), as far as the HRLS has them.
+            The features ``guides`` (height, width, 3), as far as the HRLS has them.
         """
-        formulas = {name: hr.features[name] for name in (RGB, ALBEDO, NORMAL) if name in hr.features}
+        formulas = {name: hr.features[name] for name in (RGB, *guides) if name in hr.features}
         factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
         names = {factor: f"colour {i}" for i, factor in enumerate(factors)}
         formulas |= {name: FeatureFormula((factor,)) for factor, name in names.items()}
@@ -262,13 +284,13 @@ class _Band:
         render = replace(hr, features=formulas, alpha=None)
         features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
         self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in names.items()}
-        guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
+        found = {name: features.pop(name) for name in guides if name in features}
         low = {name: box_downsample(values, self._scale) for name, values in features.items()}
         self._low_layers = {
             job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
             for i, job in enumerate(jobs)
         }
-        return guides
+        return found
 
     def fuse(
         self,

@@ -7,16 +7,19 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import HALF_MAX, Array
+from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
 from oiio_msspl.exr.contents import dropped_channels, stored_type
 from oiio_msspl.exr.preview import check_view, old_preview, write_preview
-from oiio_msspl.exr.write_options import ERROR_LAYER, FRAMES_LAYER, WriteOptions
+from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
@@ -31,6 +34,7 @@ from oiio_msspl.jobs.views import (
     fuse_frame_passes,
     fuse_other_views,
     steps_of,
+    uses_clean_aovs,
 )
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
@@ -41,6 +45,14 @@ def memory_to_write(alignment: Alignment, hr: MappedRender, write: WriteOptions)
     """The smallest ``max_memory`` with which the result can be written, from the headers."""
     held = bytes_held(hr.file, hr.beauty_channels, write)
     return FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + held
+
+
+def require_outputs(session: Session, write: WriteOptions) -> None:
+    """Raise InputError if a model does not make a layer that is asked for."""
+    if write.error_layer:
+        session.require_error()
+    if write.data_passes:
+        session.require_clean_aovs()
 
 
 def check_frame_memory(
@@ -123,6 +135,7 @@ def fuse_files(
     fits = memory_to_write(align(lr, hr), hr, write) <= max_memory
     family = resolve_auto(lr, hr, model) if fits else model
     session = load_model(align(lr, hr).scale, family, device, threads)
+    require_outputs(session, write)
     check_frame_memory(lr, hr, session, write, max_memory)
     opened = time.perf_counter()
 
@@ -130,7 +143,16 @@ def fuse_files(
         progress = Progress(progress, steps_of([View(lr, hr), *others.views], session, write))
     replaced, reports = fuse_other_views(others, session, write, max_memory, progress=progress)
     half = stored_type(hr.beauty_channels, write) == "half"
-    fused = fuse(lr, hr, session, error=write.error_layer, half=half, max_memory=max_memory, progress=progress)
+    fused = fuse(
+        lr,
+        hr,
+        session,
+        error=write.error_layer,
+        clean_aovs=uses_clean_aovs(hr, write),
+        half=half,
+        max_memory=max_memory,
+        progress=progress,
+    )
     fused.replaced = replaced
     fuse_frame_passes(lr, hr, fused, session, write, max_memory, progress)
     session.release_memory()  # for the writer's cache
@@ -168,6 +190,8 @@ def write_frame(
         report.warnings.append(
             f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
         )
+    if options.data_passes and not fused.clean_aovs:
+        report.warnings.append("the HRLS has no albedo and no normal, so --data-passes adds no layer")
     report.warnings += write_fused(
         report.output,
         report.hr.file,
@@ -184,11 +208,14 @@ def write_frame(
     )
 
 
-def _layers_about(fused: FusedFrame, options: WriteOptions) -> dict[str, Array]:
+def _layers_about(fused: FusedFrame, options: WriteOptions) -> dict[str, NDArray[Any]]:
     """The layers about the fused beauty that are asked for."""
-    layers = {} if fused.error is None else {ERROR_LAYER: fused.error}
+    layers: dict[str, NDArray[Any]] = {} if fused.error is None else {ERROR_LAYER: fused.error}
     if options.frames_layer:
         layers[FRAMES_LAYER] = np.ones_like(fused.rgb[..., :1]) if fused.frames is None else fused.frames
+    if options.data_passes:
+        names = {ALBEDO: ALBEDO_LAYER, NORMAL: NORMAL_LAYER}
+        layers |= {names[feature]: pixels for feature, pixels in fused.clean_aovs.items()}
     return layers
 
 

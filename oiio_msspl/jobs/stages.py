@@ -20,13 +20,20 @@ from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import check_frame_memory, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import check_frame_memory, require_outputs, write_frame, write_frame_preview
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
-from oiio_msspl.jobs.views import OtherViews, check_passes, find_other_views, fuse_frame_passes, fuse_other_views
+from oiio_msspl.jobs.views import (
+    OtherViews,
+    check_passes,
+    find_other_views,
+    fuse_frame_passes,
+    fuse_other_views,
+    uses_clean_aovs,
+)
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 
@@ -135,14 +142,13 @@ class Stages:
         """The model for this pair's scale. Each model is loaded once.
 
         Raises:
-            InputError: there is no such model, or it does not predict the error that is asked for.
+            InputError: there is no such model, or it does not make a layer that is asked for.
         """
         scale = align(loaded.lr_pixels, loaded.hr_pixels).scale
         session = self.sessions.get((scale, self.model))
         if session is None:
             session = self.sessions[scale, self.model] = load_model(scale, self.model, self.device, self.threads)
-        if self.write_options.error_layer:
-            session.require_error()
+        require_outputs(session, self.write_options)
         return session
 
     def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours = ((), ())) -> FusedAlone:
@@ -164,8 +170,15 @@ class Stages:
         if any(neighbours):
             averaged = average_renders(pair, *neighbours, _features_read(session))
             pair, frames = RenderPair(averaged.lr, averaged.hr), averaged.frames
-        error = self.write_options.error_layer
-        fused = fuse(pair.lr, pair.hr, session, error=error, max_memory=self.max_memory, held=held)
+        fused = fuse(
+            pair.lr,
+            pair.hr,
+            session,
+            error=self.write_options.error_layer,
+            clean_aovs=uses_clean_aovs(loaded.hr, self.write_options),
+            max_memory=self.max_memory,
+            held=held,
+        )
         fused.frames = frames
         # The pixels in memory are not needed any more. A neighbour may need the frame for a while.
         alone = replace(loaded, lr_pixels=loaded.lr, hr_pixels=loaded.hr)

@@ -128,7 +128,8 @@ def fuse_other_views(
     replaced = ReplacedChannels() if others.views else None
     reports = []
     for view in others.views:
-        fused = fuse(view.lr, view.hr, session, max_memory=max_memory, held=held, progress=progress)
+        clean = bool(sets_to_fuse(view.hr, write))
+        fused = fuse(view.lr, view.hr, session, clean_aovs=clean, max_memory=max_memory, held=held, progress=progress)
         fused.replaced = replaced
         fuse_frame_passes(view.lr, view.hr, fused, session, write, max_memory - held, progress)
         assert fused.replaced is not None
@@ -155,6 +156,11 @@ def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> N
 def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
     """The additive sets of a view that are asked for and of which a layer is written."""
     return [each for each in _written_sets(hr, write) if not write.passes or any(each.matches(p) for p in write.passes)]
+
+
+def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
+    """Whether albedo and normal without noise are of use: as layers, or to fuse passes."""
+    return write.data_passes or bool(sets_to_fuse(hr, write))
 
 
 def check_passes(hr: MappedRender, others: OtherViews, write: WriteOptions) -> None:
@@ -199,7 +205,9 @@ def fuse_frame_passes(
     if sets:
         session.release_memory()
         cache_bytes = max(0, int((max_memory - fused.nbytes) * STRIPS_SHARE))
-        fused.passes = fuse_passes(lr, hr, fused.rgb, fused.alignment, sets, cache_bytes, fused.replaced, progress)
+        fused.passes = fuse_passes(
+            lr, hr, fused.rgb, fused.alignment, sets, cache_bytes, fused.replaced, fused.clean_aovs, progress
+        )
         fused.replaced = fused.passes.pixels
 
 

@@ -62,7 +62,8 @@ class Contract:
 
     ONNX inputs: ``lrhs`` (1, C_l, h, w) and ``hrls`` (1, C_h, s*h, s*w), float32, encoded. Output: ``fused``
     (1, 3, s*h, s*w), log-encoded RGB. Some models also have ``log_error`` (1, 1, s*h, s*w): the natural logarithm
-    of the expected absolute error of the log-encoded RGB, mean of the channels.
+    of the expected absolute error of the log-encoded RGB, mean of the channels. Some have ``albedo`` and ``normal``
+    (1, 3, s*h, s*w): those of the HRLS without noise, in [0, 1]; a normal n as (n + 1) / 2.
     """
 
     name: str

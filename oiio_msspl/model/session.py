@@ -6,11 +6,13 @@ from __future__ import annotations
 import collections
 import logging
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.model.contract import NO_DENOISER, Contract
@@ -100,6 +102,16 @@ class Session:
             raise InputError(f"model {self.contract.name} does not predict its error; choose another --model")
 
     @property
+    def clean_aovs(self) -> tuple[str, ...]:
+        """AOVs of the HRLS that the model denoises, see :meth:`run`."""
+        return tuple(name for name in (ALBEDO, NORMAL) if name in self._outputs)
+
+    def require_clean_aovs(self) -> None:
+        """Raise InputError if the model does not denoise albedo and normal."""
+        if not self.clean_aovs:
+            raise InputError(f"--data-passes: {self.name} does not denoise albedo and normal; use --quality best")
+
+    @property
     def lrhs_aovs(self) -> tuple[str, ...]:
         """AOVs of the LRHS that are read if it has them."""
         return useful_lrhs_aovs(self.contract.scale) if self._denoiser is not None else ()
@@ -112,7 +124,8 @@ class Session:
         lrhs_aovs: Images = NO_IMAGES,
         mean: MeanSettings | None = None,
         error: bool = False,
-    ) -> tuple[Array, Array | None]:
+        aovs: Sequence[str] = (),
+    ) -> Images:
         """Run the denoiser, if the model has one, and the model.
 
         Args:
@@ -122,10 +135,12 @@ class Session:
             lrhs_aovs: those of :attr:`lrhs_aovs` that the LRHS has, encoded, (h, w, 3) each.
             mean: how the denoiser averages both renders of the frame; decided from these images if None.
             error: also return the expected error of a model that predicts it.
+            aovs: those of :attr:`clean_aovs` that are also returned.
 
         Returns:
-            The fused image, log-encoded (s*h, s*w, 3); and its expected absolute error in the same values, mean of the
-            channels, (s*h, s*w, 1), or None.
+            ``fused``: the fused image, log-encoded (s*h, s*w, 3). ``error``: its expected absolute error in the same
+            values, mean of the channels, (s*h, s*w, 1). The AOVs of the HRLS without noise, (s*h, s*w, 3): albedo in
+            [0, 1], normal in [-1, 1].
 
         Raises:
             MssplError: the model failed.
@@ -145,7 +160,7 @@ class Session:
             "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
         }
         try:
-            wanted = ["fused", "log_error"] if error else ["fused"]
+            wanted = ["fused", *(["log_error"] if error else []), *aovs]
             results = dict(zip(wanted, self._session.run(wanted, feed), strict=True))
         except Exception as cause:
             raise MssplError(
@@ -154,7 +169,11 @@ class Session:
             ) from cause
         self.seconds += time.perf_counter() - start
         images = {name: values[0].transpose(1, 2, 0) for name, values in results.items()}
-        return images["fused"], np.exp(images["log_error"]) if error else None
+        if error:
+            images["error"] = np.exp(images.pop("log_error"))
+        if NORMAL in images:
+            images[NORMAL] = 2 * images[NORMAL] - 1
+        return images
 
     def release_memory(self) -> None:
         """Give the memory of intermediate results on the CPU back to the system. The next run asks for it again."""

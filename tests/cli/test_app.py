@@ -40,13 +40,13 @@ SHOWN = {
     "msspl_fuse": (
         "--map --view-layer --quality --device --max-memory --output --layout --layers --passes --error-layer "
         "--overwrite --json --frames --temporal --skip-existing --help --help-all",
-        20,
+        21,
     ),
     "msspl_render": (
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "
         "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
         "--help --help-all",
-        7,
+        8,
     ),
 }
 

@@ -62,6 +62,19 @@ def test_the_predicted_error_can_be_asked_for(files, bilinear_models):
     assert (part.name, [channel.name for channel in part.channels]) == ("error", ["error.Y"])
 
 
+def test_albedo_and_normal_without_noise_can_be_asked_for(files):
+    """The HRLS has an albedo and no normal. Its own albedo stays as it is."""
+    pair = files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--data-passes", "--no-preview"
+    refused = fuse(*pair)
+    assert refused.returncode == 2
+    assert "--data-passes: joint-x4 does not denoise albedo and normal; use --quality best" in refused.stderr
+    done = fuse(*pair, "--quality", "best")
+    assert done.returncode == 0, done.stderr
+    names = [[channel.name for channel in part.channels] for part in open_exr(files / "out.exr").parts]
+    assert names[1] == [f"denoised_albedo.{c}" for c in "RGB"]
+    assert [f"albedo.{c}" for c in "RGB"] in names
+
+
 def test_the_report_for_machines(files, bilinear_models):
     done = fuse(
         files / "lr.exr",

@@ -22,9 +22,10 @@ from tests.exr.sources import SOURCES, H, W, everything, flat, plain, stereo, wr
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
+def test_layers_about_the_beauty_are_beside_it(tmp_path, layout):
     path = write_exr(tmp_path / "hr.exr", everything())
     error = np.arange(H * W, dtype=np.float32).reshape(H, W, 1)
+    normal = -np.arange(H * W * 3, dtype=np.float32).reshape(H, W, 3)
     image = np.ones((H, W, 4), np.float32)
     hr = map_render(open_exr(path))
     write_fused(
@@ -35,14 +36,16 @@ def test_the_predicted_error_is_a_layer_beside_the_beauty(tmp_path, layout):
         image[..., 3:],
         {},
         WriteOptions(layout, pixel_type="float"),
-        extra={} if error is None else {"error": error},
+        extra={"error": error, "denoised_normal": normal},
     )
     parts = read_bits(tmp_path / "out.exr")
     layers = flat(parts)
     assert same_bits(layers["error", "Y"], error[..., 0])
+    for i, component in enumerate("XYZ"):
+        assert same_bits(layers["denoised_normal", component], normal[..., i])
     if layout != "multilayer":
-        assert parts[1][0] == "error"
-    assert len(layers) == len(everything()) + 1
+        assert [name for name, _ in parts[1:3]] == ["error", "denoised_normal"]
+    assert len(layers) == len(everything()) + 4
 
 
 @pytest.mark.parametrize("source", ["everything", "karma"])

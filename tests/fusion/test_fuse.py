@@ -125,6 +125,39 @@ def test_a_bucket_that_failed_is_filled_from_the_lrhs():
     assert error < 3 * expected
 
 
+@pytest.mark.parametrize("spread", [False, True])
+def test_albedo_and_normal_without_noise(monkeypatch, spread):
+    """They are cleaner, tiles or not, and the beauty is the same bit for bit."""
+    session = Session(find_model(2, "ensemble"), spread=spread)
+    albedo = 0.2 + 0.5 * picture(160, 224).clip(0, 1)
+    clean = {"albedo": albedo, "normal": np.broadcast_to(np.float32([0, 0.6, 0.8]), (160, 224, 3))}
+    rng = np.random.default_rng(0)
+    layers = {name: (v + 0.05 * rng.standard_normal(v.shape)).astype(np.float32) for name, v in clean.items()}
+    low, high, _ = pair_of(2, 160, 224, **layers)
+    fused = fuse(low, high, session, clean_aovs=True)
+    np.testing.assert_array_equal(fused.rgb, fuse(low, high, session).rgb)
+    tiles_of(monkeypatch, session, 128 * 128)
+    for result in (fused, fuse(low, high, session, clean_aovs=True)):
+        for name, expected in clean.items():
+            left = np.abs(result.clean_aovs[name].astype(np.float32) - expected).mean()
+            assert left < 0.5 * np.abs(layers[name] - expected).mean(), name
+
+
+def test_albedo_and_normal_without_noise_show_what_the_hrls_has():
+    """A frame that is black, or free of noise, keeps its own layers. A layer that is absent stays absent."""
+    session = Session(find_model(2, "ensemble"))
+    albedo = picture(64, 96).clip(0, 1)
+    for light in (np.zeros((64, 96, 3), np.float32), np.full((64, 96, 3), 0.25, np.float32)):
+        low, high = (
+            Render.from_arrays("lr", rgb=downsample(light, 2)),
+            Render.from_arrays("hr", rgb=light, albedo=albedo),
+        )
+        aovs = fuse(low, high, session, clean_aovs=True).clean_aovs
+        assert aovs.keys() == {"albedo"}
+        assert np.abs(aovs["albedo"] - albedo).mean() < 0.02
+    assert not fuse(*pair_of(2)[:2], session, clean_aovs=True).clean_aovs
+
+
 @pytest.mark.parametrize("value", [1e6, 1e20, 3e38])
 def test_a_firefly_of_any_size_stays_where_it_is(session, scale, value):
     """One absurd pixel in each render: the rest of the frame keeps its brightness."""
@@ -247,11 +280,10 @@ def test_a_network_that_fails_is_an_error_and_no_frame(bilinear_models, monkeypa
 
     def broken(*arrays, **more):
         calls.append(arrays)
-        colour, error = (None if image is None else image.copy() for image in run(*arrays, **more))
-        image = error if what == "error" else colour
+        images = {name: image.copy() for name, image in run(*arrays, **more).items()}
         if len(calls) == (2 if what == "alpha" else 1):
-            image[3, 5] = bad
-        return colour, error
+            images["error" if what == "error" else "fused"][3, 5] = bad
+        return images
 
     monkeypatch.setattr(session, "run", broken)
     with pytest.raises(MssplError, match="bilinear-x4 on CPUExecutionProvider returned NaN or infinite values"):
@@ -554,7 +586,7 @@ def test_a_surface_that_hardly_a_sample_lights_has_no_holes(bilinear_models, mon
     """Black in both renders, 3 x 3 LRHS pixels around included: empty where nothing is, dark where a surface is, unless
     there is no light far around either."""
     session = Session(bilinear_models[4])
-    monkeypatch.setattr(session, "run", lambda lrhs, hrls, **more: (np.full_like(hrls[..., :3], 0.3), None))
+    monkeypatch.setattr(session, "run", lambda lrhs, hrls, **more: {"fused": np.full_like(hrls[..., :3], 0.3)})
     low, high = np.zeros((32, 64, 3), np.float32), np.zeros((128, 256, 3), np.float32)
     low[::8, :32:8], high[::32, :128:32] = 1.0, 1.0  # a sample in 64 finds light; right half: none
     surface = np.zeros_like(high)

@@ -74,6 +74,25 @@ def test_fused_layers_sum_to_the_fused_beauty(tmp_path, bilinear_models, low, dt
         assert errors[0] < errors[1] / 5
 
 
+def test_an_albedo_without_noise_sharpens_components(tmp_path):
+    """Two lamps that light one material each. The HRLS's albedo, which tells them apart, is noisy."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    stripes = ((x // 9 + y // 13) % 2)[..., None].astype(np.float32)
+    clean = {"light_a": np.float32(0.6) * stripes * (1, 1, 1), "light_b": np.float32(0.5) * (1 - stripes) * (1, 1, 1)}
+    albedo = stripes * np.float32((0.8, 0.5, 0.3)) + (1 - stripes) * np.float32((0.3, 0.5, 0.8))
+    noise = np.random.default_rng(0).standard_normal(albedo.shape).astype(np.float32)
+    low, high = (
+        map_render(open_exr(file)) for file in write_pair(tmp_path, clean, extra=rgb(albedo + noise, "albedo."))
+    )
+    errors = []
+    for guides in ({}, {"albedo": albedo.astype(np.float16)}):
+        beauty = sum(clean.values()).astype(np.float32)
+        result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets, guides=guides)
+        found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.sets[0].layers[0].channels], axis=-1)
+        errors.append(np.abs(found - clean["light_a"]).mean())
+    assert errors[1] < 0.5 * errors[0]
+
+
 def test_all_else_is_what_it_is_without_passes(tmp_path, bilinear_models):
     pair = write_pair(
         tmp_path, lights(), extra={"Z": picture(HEIGHT, WIDTH)[..., 0], "id.X": np.ones((HEIGHT, WIDTH), np.uint32)}

@@ -63,9 +63,12 @@ def test_the_files_for_gpus_compute_the_same(family, scale):
     lrhs = hrls[::scale, ::scale, :3] + np.float32(0.02) * rng.random((128 // scale, 192 // scale, 3), np.float32)
     on_cpu, on_gpu = (Session(path(find_model(scale, family))) for path in (Path, gpu_file))
     on_gpu._denoiser = MeanDenoiser(path=gpu_file(DENOISER))
-    (one, error), (other, other_error) = (s.run(lrhs, hrls, error=True) for s in (on_cpu, on_gpu))
-    assert np.abs(one - other).mean() < 0.1 * np.abs(one - hrls[..., :3]).mean()
-    assert np.abs(np.log(error / other_error)).mean() < 0.2
+    one, other = (s.run(lrhs, hrls, error=True, aovs=s.clean_aovs) for s in (on_cpu, on_gpu))
+    assert one.keys() == other.keys() == {"fused", "error", *on_cpu.clean_aovs}
+    assert np.abs(one["fused"] - other["fused"]).mean() < 0.1 * np.abs(one["fused"] - hrls[..., :3]).mean()
+    assert np.abs(np.log(one["error"] / other["error"])).mean() < 0.2
+    for name in on_cpu.clean_aovs:
+        assert np.abs(one[name] - other[name]).mean() < 0.01
 
 
 def test_the_denoiser_for_gpus_takes_any_size():
@@ -136,8 +139,8 @@ def test_the_predicted_error_is_computed_when_it_is_wanted():
     lrhs, hrls = np.zeros((32, 48, 3), np.float32), np.zeros((64, 96, 9), np.float32)
     model.run(lrhs, hrls)
     asked.clear()  # the first run also releases memory
-    assert model.run(lrhs, hrls)[1] is None
-    assert model.run(lrhs, hrls, error=True)[1].shape == (64, 96, 1)
+    assert model.run(lrhs, hrls).keys() == {"fused"}
+    assert model.run(lrhs, hrls, error=True)["error"].shape == (64, 96, 1)
     assert asked == [["fused"], ["fused", "log_error"]]
 
 

@@ -27,7 +27,7 @@ def test_shipped_models_load_and_say_where_they_come_from(scale):
     assert session.contract.provenance["steps"] > 0
     size = 32 // scale * 2, 32 // scale * 3
     high = size[0] * scale, size[1] * scale
-    values, _ = session.run(np.zeros((*size, 3), np.float32), np.zeros((*high, 16), np.float32))
+    values = session.run(np.zeros((*size, 3), np.float32), np.zeros((*high, 16), np.float32))["fused"]
     assert values.shape == (*high, 3)
     assert np.isfinite(values).all()
 

@@ -150,7 +150,7 @@ class Results(Nodes):
         channels = dict.fromkeys(RESULTS, 3) | {"joint_error": 1}
         if weights is not None:
             self._embed(weights, "weights.", {})
-            channels = {"fused": 3, "log_error": 1}
+            channels = {"fused": 3, "log_error": 1, "albedo": 3, "normal": 3}
         outputs = [info(name, TensorProto.FLOAT, [1, count, "H", "W"]) for name, count in channels.items()]
         model = self.finished("ensemble", inputs, outputs)
         model.graph.initializer.extend(self.tensors)

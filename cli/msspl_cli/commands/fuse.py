@@ -115,6 +115,7 @@ def fuse(
     ] = [],  # noqa: B006
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
+    data_passes: options.DataPasses = False,
     compression: Annotated[
         str | None,
         typer.Option(
@@ -207,7 +208,9 @@ def fuse(
 
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
-        "write": options.make_write_options(layout, compression, half, layers, error_layer, passes, frames_layer),
+        "write": options.make_write_options(
+            layout, compression, half, layers, error_layer, passes, frames_layer, data_passes
+        ),
         "model": options.choose_model(model, quality),
         "device": device,
         "threads": threads,

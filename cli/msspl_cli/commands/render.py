@@ -134,6 +134,7 @@ def render(
     layout: options.Layout = "multilayer",
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
+    data_passes: options.DataPasses = False,
     keep: Annotated[
         bool,
         typer.Option(
@@ -205,7 +206,7 @@ def render(
         for suffix in suffixes:
             check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
     check_separate([scene], [target for _, target in targets])
-    write = options.make_write_options(layout, None, None, [], error_layer, passes)
+    write = options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes)
     model = options.choose_model(model, quality)
     wanted = {target.absolute() for _, target in targets}
     fuser = _make_fuser(shot, wanted, scale, model, device, threads, memory, write, overwrite, over_time, keep)
@@ -297,13 +298,13 @@ def _make_fuser(
         InputError: the model, the device or the neighbours can't be had. No frame was rendered for nothing.
     """
     from msspl_cli.rendered_shot import RenderedShot
+    from oiio_msspl.jobs.frame import require_outputs
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
     from oiio_msspl.model.catalogue import family_of, load_model
 
     session = load_model(scale, model, device, threads)
-    if write.error_layer:
-        session.require_error()
+    require_outputs(session, write)
     stages = Stages(
         write_options=write,
         model=model,

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,16 @@ def denoise_prefiltered(color: Array, albedo: Array | None = None, normal: Array
     quality "high". See https://github.com/RenderKit/oidn, "prefiltering".
     """
     auxiliary = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
-    clean = {name: run_filter({name: image}) for name, image in auxiliary.items()}
+    return denoise_with_clean(color, prefiltered(auxiliary))
+
+
+def prefiltered(auxiliary: Mapping[str, Array]) -> dict[str, Array]:
+    """Albedo and normal without noise, each by a filter of its own."""
+    return {name: run_filter({name: image}) for name, image in auxiliary.items()}
+
+
+def denoise_with_clean(color: Array, clean: Mapping[str, Array]) -> Array:
+    """A colour, denoised with an albedo and a normal of :func:`prefiltered`."""
     return run_filter({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
 
 

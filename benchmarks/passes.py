@@ -16,6 +16,9 @@ the albedo and the normal:
   so that they sum to the beauty that OIDN makes of this render.
 - "msspl": :mod:`oiio_msspl.fusion.passes`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
+- "msspl, best": with the beauty of ``--quality best``, and with albedo and normal as its networks denoise them.
+
+Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
 
 Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
 part of the sum, but is not scored: every method has a high PSNR there.
@@ -37,10 +40,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import results
-from benchmarks.oidn import denoise, denoise_prefiltered
+from benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
 from benchmarks.results import MEAN, Row
 from benchmarks.versus import cell, with_interval
-from oiio_msspl import Session, find_model, fuse
+from oiio_msspl import FusedFrame, fuse
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.formula import FeatureFormula
@@ -50,10 +53,10 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.colour import srgb
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.passes import fuse_passes
 from oiio_msspl.fusion.sums import layer_keys, with_layers
 from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.model.catalogue import load_model
 
 SCALES, SPP = (2, 4), (1, 2)
 KEYS = ("scene", "set", "spp", "method")
@@ -63,6 +66,8 @@ WARM_UP = 2
 ALL = "all"
 #: Share of the beauty's light that a scored layer has at least.
 FAINT = 0.01
+#: The model of each quality that is measured.
+BALANCED, BEST = "joint", "ensemble"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
 
@@ -88,38 +93,50 @@ def colours_of(render: MappedRender, layers: AdditiveSet) -> Array:
 
 
 def methods(
-    lr: MappedRender, hr: MappedRender, beauty: Array, layers: AdditiveSet, ordinary: MappedRender | None = None
+    lr: MappedRender,
+    hr: MappedRender,
+    fused: Mapping[str, FusedFrame],
+    layers: AdditiveSet,
+    ordinary: MappedRender | None = None,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
     """The name of each method, and a function that computes the layers.
 
     Args:
+        fused: the fused frame of each model.
         ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
     """
     noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
+    beauty = fused[BEST].rgb
 
-    def each(call: Callable[..., Array], layers: Array, guides: Mapping[str, Array]) -> Array:
-        return np.maximum([call(layer, guides[ALBEDO], guides[NORMAL]) for layer in layers], np.float32(0))
+    def plain() -> Array:
+        return np.maximum([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy], np.float32(0))
 
-    def ours(low: MappedRender) -> Array:
-        fused = fuse_passes(low, hr, beauty, align(lr, hr), [layers])
-        assert not fused.refused
+    def recommended(noisy: Array, guides: Mapping[str, Array]) -> Array:
+        clean = prefiltered({name: guides[name] for name in (ALBEDO, NORMAL)})
+        return np.maximum([denoise_with_clean(layer, clean) for layer in noisy], np.float32(0))
+
+    def ours(low: MappedRender, model: str) -> Array:
+        frame = fused[model]
+        made = fuse_passes(low, hr, frame.rgb, frame.alignment, [layers], guides=frame.clean_aovs)
+        assert not made.refused
         height = hr.data_window.height
-        planes = [[fused.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
+        planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
         return colours * np.moveaxis(np.asarray(planes, np.float32), 1, -1)
 
     yield "HRLS", lambda: noisy
     yield "ratio", lambda: rescaled(noisy, beauty)
-    yield "OIDN", lambda: each(denoise, noisy, guides)
-    yield "OIDN, rescaled", lambda: rescaled(each(denoise, noisy, guides), beauty)
-    yield PEER, lambda: rescaled(each(denoise_prefiltered, noisy, guides), beauty)
+    yield "OIDN", plain
+    yield "OIDN, rescaled", lambda: rescaled(plain(), beauty)
+    yield PEER, lambda: rescaled(recommended(noisy, guides), beauty)
     if ordinary is not None:
         theirs = layers_of(ordinary, layers_like(ordinary, layers))
         pixels = ordinary.load().layers
         total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
-        yield "OIDN, ordinary render", lambda: rescaled(each(denoise_prefiltered, theirs, pixels), total)
-    yield "msspl", lambda: ours(lr)
-    yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]))
+        yield "OIDN, ordinary render", lambda: rescaled(recommended(theirs, pixels), total)
+    yield "msspl", lambda: ours(lr, BALANCED)
+    yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]), BALANCED)
+    yield "msspl, best", lambda: ours(lr, BEST)
 
 
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
@@ -135,15 +152,19 @@ def regraded(layers: Array) -> Array:
     return np.einsum("i,ihwc->hwc", grades, layers)
 
 
-def picture(folder: Path, output: Path, model: str) -> None:
+def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, FusedFrame]:
+    """The fused frame of each model."""
+    return {model: fuse(lr, hr, load_model(scale, model), clean_aovs=True) for model in (BALANCED, BEST)}
+
+
+def picture(folder: Path, output: Path) -> None:
     """Write a WebP: the light groups of a scene as rendered, fused and as they should be; below them the regraded
     beauty."""
     from PIL import Image
 
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in ("lr_x4_32spp", "hr_2spp", "ref"))
-    beauty = fuse(lr, hr, Session(find_model(4, model))).rgb
     layers = hr.additive_sets[0]
-    made = dict(methods(lr, hr, beauty, layers))
+    made = dict(methods(lr, hr, fused_frames(lr, hr, 4), layers))
     columns = [made["HRLS"](), made["msspl"](), layers_of(reference, reference.additive_sets[0])]
     rows = [*zip(*columns, strict=True), tuple(regraded(column) for column in columns)]
     shown = np.concatenate([np.concatenate([srgb(image) for image in row], axis=1) for row in rows], axis=0)
@@ -174,20 +195,20 @@ def timed(function: Callable[[], Array]) -> tuple[Array, float]:
     return result, time.perf_counter() - start
 
 
-def measure(folder: Path, scale: int, spp: int, model: str, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
+def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
     """One scene: rows for each set and method, without those whose `KEYS` are known."""
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     other = folder / f"hr_{2 * spp}spp.exr"
     ordinary = map_render(open_exr(other)) if other.exists() else None
-    beauty = fuse(lr, hr, Session(find_model(scale, model))).rgb
+    fused = fused_frames(lr, hr, scale)
     pixels = hr.load().layers
     plain = [timed(lambda: denoise(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]))[1] for _ in range(WARM_UP + 1)]
     oidn_seconds = plain[-1]
     rows = []
     for layers in hr.additive_sets:
         clean = layers_of(reference, layers_like(reference, layers))
-        for name, function in methods(lr, hr, beauty, layers, ordinary):
+        for name, function in methods(lr, hr, fused, layers, ordinary):
             title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
@@ -248,14 +269,13 @@ def layout(rows: list[Row]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("passes", type=Path)
-    parser.add_argument("--model", default="joint")
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     results.add_option(parser)
     args = parser.parse_args()
     scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
     if args.picture:
-        picture(args.passes / scenes[0], args.picture, args.model)
+        picture(args.passes / scenes[0], args.picture)
         return
     rows: list[Row] = []
     for scene in scenes:
@@ -263,7 +283,7 @@ def main() -> None:
             for scale in SCALES:
                 known = {tuple(row[k] for k in KEYS) for row in rows}
                 # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += measure(args.passes / scene, scale, spp, args.model, known)
+                rows += measure(args.passes / scene, scale, spp, known)
                 print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
         if args.table:
             add(args.table, rows)

@@ -3,7 +3,8 @@
 
 Writes hr.exr, lr.exr and (with --ref-spp) ref.exr, RGB alone: the case of a renderer that gives no
 albedo, no normal and no depth.  --aovs adds ALBEDO, AVG_SHADING_NORMAL and DEPTH, a file each, as
-LuxCore writes them.  See datagen/README.md for the commands.
+LuxCore writes them.  --benchmark writes all renders that benchmarks.quality reads.  See
+datagen/README.md for the commands.
 """
 
 from __future__ import annotations
@@ -17,6 +18,10 @@ from pathlib import Path
 import pyluxcore
 
 AOVS = ("ALBEDO", "AVG_SHADING_NORMAL", "DEPTH")
+# LuxCore's filters, and half of their width in pixels: one pixel, and LuxCore's default.
+FILTERS = {"box": ("BOX", 0.5), "blackman-harris": ("BLACKMANHARRIS", 1.5)}
+# Samples for every HRLS pixel of the renders for benchmarks.quality, and their scales.
+BENCHMARK_SPP, BENCHMARK_SCALES = (1, 2, 4, 8), (2, 4, 8)
 
 
 def properties(values):
@@ -163,7 +168,8 @@ def build_scene():
     return scene
 
 
-def render(scene, out, name, size, spp, seed, aovs, threads):
+def render(scene, out, name, size, spp, seed, aovs, pixel_filter, threads):
+    kind, width = FILTERS[pixel_filter]
     values = {
         "renderengine.type": "PATHCPU",
         "renderengine.seed": seed,
@@ -175,8 +181,8 @@ def render(scene, out, name, size, spp, seed, aovs, threads):
         "path.pathdepth.glossy": 5,
         "film.width": size[0],
         "film.height": size[1],
-        "film.filter.type": "BOX",
-        "film.filter.width": 0.5,
+        "film.filter.type": kind,
+        "film.filter.width": width,
         "film.noiseestimation.warmup": 1 << 20,
         "batch.haltspp": (spp, 0),
         "film.imagepipelines.0.0.type": "NOP",
@@ -212,6 +218,8 @@ def main(argv):
     p.add_argument("--suffix", default="")
     p.add_argument("--raw", action="store_true", help="leave the frame where LuxCore puts it")
     p.add_argument("--aovs", action="store_true")
+    p.add_argument("--filter", choices=FILTERS, default="box")
+    p.add_argument("--benchmark", action="store_true", help="write all renders that benchmarks.quality reads")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--threads", type=int, default=1)
     args = p.parse_args(argv)
@@ -219,22 +227,22 @@ def main(argv):
     out.mkdir(parents=True, exist_ok=True)
     pyluxcore.Init(lambda message: None)
     scene = build_scene()
-    low = args.size // args.scale
-    for name, size, spp, offset in (
-        ("hr", args.size, args.hr_spp, 1),
-        ("lr", low, args.lr_spp, 2),
-        ("ref", args.size, args.ref_spp, 3),
-    ):
-        if name in args.only.split(",") and spp > 0:
-            set_camera(scene, size, args.raw)
+    jobs = [("hr", 1, args.hr_spp), ("lr", args.scale, args.lr_spp)]
+    if args.benchmark:
+        jobs = [(f"hr_{n}spp", 1, n) for n in BENCHMARK_SPP]
+        jobs += [(f"lr_x{s}_{s * s * n}spp", s, s * s * n) for s in BENCHMARK_SCALES for n in BENCHMARK_SPP[:3]]
+    for offset, (name, scale, spp) in enumerate([*jobs, ("ref", 1, args.ref_spp)], start=1):
+        if name.partition("_")[0] in args.only.split(",") and spp > 0:
+            set_camera(scene, args.size // scale, args.raw)
             render(
                 scene,
                 out,
                 name + args.suffix,
-                (size, size),
+                (args.size // scale, args.size // scale),
                 spp,
                 1000 * args.seed + offset,
                 AOVS if args.aovs else (),
+                args.filter,
                 args.threads,
             )
 

@@ -57,7 +57,6 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path, help="the sequences")
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
-    parser.add_argument("--model", default="joint")
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
@@ -89,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
     rows: list[Row] = []
     for index, name in enumerate(names):
         sequence = load(args.folder / name, args.motion_format)
-        made = list(all_methods(sequence, args.model, args.motion_format))
+        made = list(all_methods(sequence, args.motion_format))
         of_sequence = list(measure(sequence, made, with_jod=args.jod))
         print(layout(of_sequence), flush=True)
         rows += of_sequence

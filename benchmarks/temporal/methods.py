@@ -24,6 +24,8 @@ from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, plan_temporal
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
 OIDN, OIDN_BEST, OIDN_NEIGHBOURS = "OIDN", "OIDN prefiltered", "OIDN prefiltered, with neighbours"
 SCALES = (2, 4)
+#: The qualities that are measured: what the names of their methods begin with.
+QUALITIES = {"balanced": "", "best": "best, "}
 
 
 @dataclass(frozen=True)
@@ -39,7 +41,7 @@ class Made:
     """How the motion is known; empty for single frames."""
 
 
-def all_methods(sequence: Sequence, model: str, motion_format: str | None = None) -> Iterator[Made]:
+def all_methods(sequence: Sequence, motion_format: str | None = None) -> Iterator[Made]:
     """Each method on a sequence.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
@@ -50,20 +52,24 @@ def all_methods(sequence: Sequence, model: str, motion_format: str | None = None
     yield Made(OIDN, 1, np.stack([oidn(render) for render in full]))
     yield Made(OIDN_BEST, 1, np.stack([oidn_prefiltered(render) for render in full]))
     for scale in SCALES:
-        yield from _by_scale(sequence, model, scale, TemporalOptions(motion_format=motion_format))
+        yield from _by_scale(sequence, scale, TemporalOptions(motion_format=motion_format))
 
 
-def _by_scale(sequence: Sequence, model: str, scale: int, options: TemporalOptions) -> Iterator[Made]:
+def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Iterator[Made]:
     """Our frames alone and with neighbours, and OIDN's with neighbours."""
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     temporal = plan_temporal(shot, InputOptions(), options)
     motion = f"{temporal.motion.kind}: {temporal.text}" if temporal.motion else temporal.text
-    # More threads only wait for each other: the pictures are small.
-    stages = Stages(model=model, threads=1, temporal=temporal)
+    for quality, prefix in QUALITIES.items():
+        # More threads only wait for each other: the pictures are small.
+        stages = Stages(model=quality, threads=1, temporal=temporal)
 
-    def ours(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
-        return stages.fuse(loaded, stages.session(loaded), neighbours)
+        def ours(loaded: LoadedFrame, neighbours: Neighbours, stages: Stages = stages) -> FusedAlone:
+            return stages.fuse(loaded, stages.session(loaded), neighbours)
+
+        yield Made(prefix + ALONE, scale, _frames(stages.read, Temporal(), shot.frames, ours))
+        yield Made(prefix + NEIGHBOURS, scale, _frames(stages.read, temporal, shot.frames, ours), motion)
 
     def with_full(frame: Frame) -> LoadedFrame:
         """A frame whose HRLS has the pixels of the full render, and its own motion vectors."""
@@ -76,8 +82,6 @@ def _by_scale(sequence: Sequence, model: str, scale: int, options: TemporalOptio
         fused = FusedFrame(oidn_prefiltered(averaged.hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
         return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
 
-    yield Made(ALONE, scale, _frames(stages.read, Temporal(), shot.frames, ours))
-    yield Made(NEIGHBOURS, scale, _frames(stages.read, temporal, shot.frames, ours), motion)
     yield Made(OIDN_NEIGHBOURS, scale, _frames(with_full, temporal, shot.frames, theirs), motion)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks import results
 from benchmarks.results import Row
-from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, SCALES
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, QUALITIES, SCALES
 from benchmarks.temporal.sequence import MASKS
 from benchmarks.versus import cell, with_interval
 from oiio_msspl.arrays import Array
@@ -40,13 +40,20 @@ def layout(rows: Rows[Row]) -> str:
 
 
 def summary(rows: Rows[Row]) -> str:
-    """Gains of averaging by sequence, and in how many it reaches what is wanted."""
+    """For each quality: gains of averaging by sequence, and in how many it reaches what is wanted."""
+    measured = {row["method"] for row in rows}
+    return "\n".join(
+        _summary_of(rows, quality, prefix) for quality, prefix in QUALITIES.items() if prefix + NEIGHBOURS in measured
+    )
+
+
+def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
     found = results.index(rows, "sequence", "scale", "method")
     peers = results.index((row for row in rows if row["method"] == OIDN_BEST), "sequence")
     body, missed = [], []
-    compared = [row for row in rows if row["method"] == NEIGHBOURS]
+    compared = [row for row in rows if row["method"] == prefix + NEIGHBOURS]
     for row in compared:
-        alone, peer = found[row["sequence"], row["scale"], ALONE], peers[row["sequence"]]
+        alone, peer = found[row["sequence"], row["scale"], prefix + ALONE], peers[row["sequence"]]
         gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
         steadier = [row["flicker"] / other["flicker"] for other in (alone, peer)]
         masks = {name: row[name] - alone[name] for name in MASKS if name in row}
@@ -57,7 +64,7 @@ def summary(rows: Rows[Row]) -> str:
         ])  # fmt: skip
         least = masks.get(worst, 0.0)
         missed += [f"{row['sequence']} x{row['scale']}: {text}" for text in _missed(row, alone, peer, least)]
-    head = ["sequence", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
+    head = [f"`{quality}`", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
     head += ["flicker, of single frames'", "of OIDN's", "least gain in a mask, dB"]
     lines = [results.markdown(head, body)]
     for unit in ("psnr", "jod"):
@@ -65,14 +72,14 @@ def summary(rows: Rows[Row]) -> str:
             rows_of = [row for row in compared if row["scale"] == scale and unit in row]
             if not rows_of:
                 continue
-            gains = [row[unit] - found[row["sequence"], scale, ALONE][unit] for row in rows_of]
+            gains = [row[unit] - found[row["sequence"], scale, prefix + ALONE][unit] for row in rows_of]
             over = [row[unit] - peers[row["sequence"]][unit] for row in rows_of]
             lines.append(
-                f"- {unit.upper()} at x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: {_mean(gains)} "
-                f"over single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over prefiltered "
-                f"OIDN (better on {sum(gain > 0 for gain in over)})."
+                f"- `{quality}`, {unit.upper()} at x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: "
+                f"{_mean(gains)} over single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over "
+                f"prefiltered OIDN (better on {sum(gain > 0 for gain in over)})."
             )
-    lines.append(f"- Targets missed: {'; '.join(missed) or 'none'}.\n")
+    lines.append(f"- `{quality}`, targets missed: {'; '.join(missed) or 'none'}.\n")
     return "\n".join(lines)
 
 

@@ -27,9 +27,8 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from oiio_msspl.metrics import psnr, relmse
 from training import losses
-from training.blend import highest_allowed
 from training.encoding import from_srgb, log_decode, log_to_pu, pu_to_log, srgb
-from training.joint import JointFusion
+from training.joint import JointFusion, highest_allowed
 from training.oidn import (
     ALBEDO_BASE,
     BASE,
@@ -69,7 +68,7 @@ class BandWeights(nn.Module):
     """A U-Net that weighs the results of ``joint`` and of OIDN's large network, in three bands of each pixel.
 
     Weights lie in [0, 1] and start at one half. The result stays near the range of the two (``AGREED``), and is clamped
-    to that of ``joint``, see :func:`training.blend.highest_allowed`. Sizes are multiples of ``multiple`` HRLS pixels.
+    to that of ``joint``, see :func:`training.joint.highest_allowed`. Sizes are multiples of ``multiple`` HRLS pixels.
     """
 
     multiple = 16

@@ -22,7 +22,7 @@ pytest.importorskip("onnxscript")
 from benchmarks.oidn import run_filter  # noqa: E402
 from training import checkpoints, ensemble  # noqa: E402
 from training.encoding import from_srgb, srgb  # noqa: E402
-from training.ensemble import BandWeights, EnsembleFusion, batches, evaluate, load_weights, train  # noqa: E402
+from training.ensemble import AGREED, BandWeights, EnsembleFusion, batches, evaluate, load_weights, train  # noqa: E402
 from training.joint import JointFusion  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT  # noqa: E402
 
@@ -72,6 +72,19 @@ def test_the_result_keeps_to_the_range_of_the_renders():
     with torch.no_grad():
         fused, _ = BandWeights()(**given)
     assert fused.max() <= max(given["hrls"][:, :3].max(), given["lrhs"].max())
+
+
+def test_details_of_one_result_cannot_darken_what_both_have():
+    """Where dark lines of ``large`` are deeper than ``joint`` is bright."""
+    given, network = arguments(), BandWeights()
+    lines = torch.zeros_like(given["large"])
+    lines[..., ::4] = 1
+    given["large"], given["joint"] = 4 - 3 * lines, torch.full_like(lines, 0.5)
+    # Black samples allow any darkness, and a bright LRHS any brightness.
+    given["hrls"], given["lrhs"] = torch.zeros_like(given["hrls"]), torch.full_like(given["lrhs"], 5.0)
+    with torch.no_grad():
+        network.weights.bias.copy_(torch.tensor([20.0, 20, -20]).repeat_interleave(4))
+        assert network(**given)[0].min() >= AGREED[0] * 0.5
 
 
 def test_srgb_and_its_inverse():
@@ -126,11 +139,14 @@ def test_the_files_for_cpus_are_close_to_the_network_in_32_bits(scale):
     joint, _ = checkpoints.load(CHECKPOINT)
     network = EnsembleFusion(joint, load_weights(WEIGHTS)[0]).eval()
     with torch.inference_mode():
-        exact, log_error = network(tensor(lrhs), tensor(hrls))
+        exact, log_error, albedo, normal = (image.numpy() for image in network(tensor(lrhs), tensor(hrls)))
     feed = {"lrhs": tensor(lrhs).numpy(), "hrls": tensor(hrls).numpy()}
-    fused, predicted = load_network(find_model(scale, "ensemble")).run(["fused", "log_error"], feed)
-    assert np.abs(fused - exact.numpy()).mean() < 0.2 * np.abs(feed["hrls"][:, :3] - exact.numpy()).mean()
-    assert np.abs(predicted - log_error.numpy()).mean() < 0.3
+    outputs = ["fused", "log_error", "albedo", "normal"]
+    fused, predicted, *aovs = load_network(find_model(scale, "ensemble")).run(outputs, feed)
+    assert np.abs(fused - exact).mean() < 0.2 * np.abs(feed["hrls"][:, :3] - exact).mean()
+    assert np.abs(predicted - log_error).mean() < 0.3
+    for found, expected in zip(aovs, (albedo, normal), strict=True):
+        assert np.abs(found - expected).mean() < 0.01
 
 
 def test_training_learns_which_result_is_right(tmp_path, monkeypatch):

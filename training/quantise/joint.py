@@ -17,10 +17,9 @@ from torch.nn import functional as F
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.mean_denoiser import log_encoded_of_code
 from oiio_msspl.model.session import make_denoiser
-from training.blend import blend
 from training.data import fixed_batches
 from training.encoding import log_to_pu
-from training.joint import DECODED, OUTPUTS, JointFusion
+from training.joint import DECODED, OUTPUTS, JointFusion, blend
 from training.oidn import BASE
 from training.ops import upsample
 from training.paper import LRHS_CHANNELS

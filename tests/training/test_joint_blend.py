@@ -9,8 +9,8 @@ torch = pytest.importorskip("torch")
 from torch.nn import functional as F  # noqa: E402
 
 from oiio_msspl.model.contract import SCALES  # noqa: E402
-from training.blend import blend, mixed  # noqa: E402
 from training.encoding import log_encode  # noqa: E402
+from training.joint import blend, mixed  # noqa: E402
 
 HEIGHT, WIDTH = 64, 96
 #: Indices of the candidates in FINER and in COARSEST.
@@ -19,7 +19,7 @@ DENOISED_MEAN, DENOISED_HRLS, HRLS_MEAN, LRHS = range(4, 8)
 
 
 def images(scale: int) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Random inputs of :func:`training.blend.blend`: LRHS with the denoised mean, HRLS, denoised HRLS."""
+    """Random inputs of :func:`training.joint.blend`: LRHS with the denoised mean, HRLS, denoised HRLS."""
     generator = torch.Generator().manual_seed(scale)
     sizes = ((6, HEIGHT // scale, WIDTH // scale), (6, HEIGHT, WIDTH), (3, HEIGHT, WIDTH))
     lrhs, hrls, denoised = (torch.rand(1, *size, generator=generator) for size in sizes)

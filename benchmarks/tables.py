@@ -58,6 +58,13 @@ AT_ITS_BEST = {
     "OIDN prefiltered on the HRLS": "on the HRLS",
     "OIDN prefiltered, same samples": "at full resolution",
 }
+#: OIDN's calls on the renders by LuxCore.
+LUXCORE_PEERS = (
+    "OIDN on the HRLS",
+    "OIDN prefiltered on the HRLS",
+    "OIDN, same samples",
+    "OIDN prefiltered, same samples",
+)
 #: Tables of accuracy on all methods, and the renders they are about.
 SETS = {
     "Mitsuba": "quality",
@@ -219,6 +226,18 @@ def cycles() -> str:
     )
 
 
+def luxcore() -> str:
+    """A room by LuxCore, with either filter."""
+    rows = results.read("quality_luxcore")
+    found = results.index(rows, *quality.KEYS)
+    cases = [(scene, spp) for scene in versus.clean_scenes(rows) for spp in quality.AVERAGES]
+    body = _measured(
+        [title(method), *(quality.cell(found.get((*case, method)), "psnr", "relmse") for case in cases)]
+        for method in (*LUXCORE_PEERS, *models(SCALES[:2]))
+    )
+    return results.markdown(["PSNR / RelMSE", *(f"{scene}, {spp} spp" for scene, spp in cases)], body)
+
+
 def division() -> str:
     """PSNR when the HRLS has more than half of the samples: box filter, all layers."""
     rows = results.read("quality_box")
@@ -338,6 +357,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         total,
         filters,
         cycles,
+        luxcore,
         division,
         errors,
         over_time,

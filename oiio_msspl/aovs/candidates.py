@@ -16,7 +16,7 @@ from typing import Any
 from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapping import split_exr
-from oiio_msspl.aovs.renderers import detect_renderer, layer_of_source, view_layer_of
+from oiio_msspl.aovs.renderers import detect_renderer, layer_of_source, siblings_of, view_layer_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr
@@ -124,16 +124,16 @@ class LayerFinder:
 
     def _layer_of_file(self, feature: str, name: str) -> Layer | None:
         """A layer of another EXR: ``folder/other.exr:layer``, the only layer of ``folder/other.exr``, or the plain R,
-        G, B of the file of this stem in the same folder."""
+        G, B of a sibling file."""
         file = self._file
         named, wanted = split_exr(name)
         if not named:
-            path = file.path.with_name(name + ".exr")
-            if path == file.path or not path.is_file():
+            sibling = next((p for p in siblings_of(file.path, name) if p != file.path and p.is_file()), None)
+            if sibling is None:
                 return None
-            layers = layers_of(self._open(path))
+            layers = layers_of(self._open(sibling))
             first = next((layer for layer in layers if layer.triple()), layers[0] if layers else None)
-            return first and replace(first, name=path.name)
+            return first and replace(first, name=sibling.name)
         path = Path(named)
         other = self._open(path)
         layers = layers_of(other)
@@ -193,21 +193,21 @@ def _views_and_view_layers(layers: list[Layer], first: tuple[str, str]) -> list[
     return [first, *sorted(prefixes - {first})]
 
 
-def _path_of_sibling(path: Path, name: str) -> Path:
-    """The EXR that ``file:NAME`` means in a mapping of the file ``path``."""
+def _paths_of(path: Path, name: str) -> list[Path]:
+    """The EXRs that ``file:NAME`` may mean in a mapping of the file ``path``."""
     named, _ = split_exr(name)
-    return Path(named) if named else path.with_name(name + ".exr")
+    return [Path(named)] if named else siblings_of(path, name)
 
 
 def mapped_files(mapping: Mapping[str, Any], path: Path) -> set[Path]:
-    """The other EXRs that a user's mapping of the file ``path`` names, whether they exist or not."""
+    """The other EXRs that a user's mapping of the file ``path`` may name, whether they exist or not."""
     files = set()
     for candidate in mapping.values():
         values = candidate.values() if isinstance(candidate, dict) else [candidate]
         for names in values:
             for name in names if isinstance(names, list) else [names]:
                 if isinstance(name, str) and name.startswith("file:"):
-                    files.add(_path_of_sibling(path, name.removeprefix("file:")))
+                    files.update(_paths_of(path, name.removeprefix("file:")))
     return files
 
 

@@ -8,6 +8,7 @@ import tomllib
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
+from pathlib import Path
 from typing import Any
 
 from oiio_msspl.exr.layers import Layer, same_spelling
@@ -87,4 +88,12 @@ def _holds(condition: dict[str, Any], file: ExrFile, layers: list[Layer]) -> boo
     for key, value in condition.get("attributes", {}).items():
         if not any(re.search(key, k) and re.search(value, str(v)) for k, v in file.metadata.items()):
             return False
+    if "sibling" in condition and not siblings_of(file.path, condition["sibling"])[0].is_file():
+        return False
     return bool(re.search(condition.get("file", ""), file.path.stem))
+
+
+def siblings_of(path: Path, name: str) -> list[Path]:
+    """Where a renderer that writes a file for each AOV may have put one, beside the beauty ``path``: the file that
+    belongs to this beauty by its name first."""
+    return [path.with_name(f"{stem}.exr") for stem in (f"{path.stem}.{name}", name)]

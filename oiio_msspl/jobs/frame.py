@@ -190,8 +190,6 @@ def write_frame(
         report.warnings.append(
             f"{report.clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}; --float keeps them"
         )
-    if options.data_passes and not fused.clean_aovs:
-        report.warnings.append("the HRLS has no albedo and no normal, so --data-passes adds no layer")
     report.warnings += write_fused(
         report.output,
         report.hr.file,

@@ -18,7 +18,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.model.catalogue import family_of
+from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of
 from oiio_msspl.model.session import SPREAD
 
 
@@ -144,7 +144,10 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
 
 
 def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
-    """The model that is meant: a quality, ``auto`` and None are a family that suits the pair's noise.
+    """The model that is meant: a quality, ``auto`` and None are a family that suits the pair.
+
+    ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
+    filter has spread needs the family that reads every second pixel. Notes of the HRLS tell.
 
     Raises:
         InputError: the pair does not fit together.
@@ -153,6 +156,9 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     if family is None:
         assert model is not None
         return model
+    if family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
+        family = QUALITIES[DEFAULT_QUALITY]
+        hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
     if not is_noise_spread(lr, hr, align(lr, hr)):
         return family
     hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")

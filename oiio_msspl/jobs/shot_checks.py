@@ -40,7 +40,7 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
-    """The model of all frames: a quality, ``auto`` and None are a family that suits the noise of the shot's first pair.
+    """The model of all frames: a quality, ``auto`` and None are a family that suits the shot's first pair.
 
     All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and
     not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
@@ -53,9 +53,10 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
     for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
+            known = len(hr.notes)
             suitable = resolve_auto(lr, hr, model)
-            if suitable != family:
-                log.warning("frame %d: %s", number, hr.notes[-1])
+            for note in hr.notes[known:]:
+                log.warning("frame %d: %s", number, note)
             return suitable
         except MssplError as error:
             log.debug("frame %d: %s", number, error)

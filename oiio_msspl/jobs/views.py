@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
@@ -164,7 +165,10 @@ def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
 
 
 def check_passes(hr: MappedRender, others: OtherViews, write: WriteOptions) -> None:
-    """Raise InputError if the user asks for additive sets by a name that no view has."""
+    """Raise InputError if the user asks for additive sets by a name that no view has, or for data passes that the first
+    one lacks."""
+    if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
+        raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
     views = [hr, *(view.hr for view in others.views)]
     if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
         names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))

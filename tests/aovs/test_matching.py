@@ -71,6 +71,17 @@ def test_luxcores_files_are_layers_of_one_frame(tmp_path):
         map_render(open_exr(tmp_path / "ALBEDO.exr"))
 
 
+def test_files_of_a_frame_may_have_its_name(tmp_path):
+    """Those of other frames do not belong to it."""
+    for stem, value in (("one.ALBEDO", 2), ("one.SHADING_NORMAL", 0), ("two.DEPTH", 3)):
+        write_exr(tmp_path / f"{stem}.exr", layer("", value))
+    render = mapped(tmp_path, layer("", 1), stem="one")
+    assert (render.renderer, render.read(render.data_window)["albedo"][0, 0, 0]) == ("LuxCore", 2)
+    assert found(mapped(tmp_path, layer("", 1), stem="two")) == {"rgb": "R G B"}
+    with pytest.raises(InputError, match=r"LuxCore's one\.ALBEDO alone"):
+        map_render(open_exr(tmp_path / "one.ALBEDO.exr"))
+
+
 def test_view_layers_are_told_apart(tmp_path):
     """Names with dots and spaces; the first view layer by default, another on request, never layers of two mixed."""
     channels = {}

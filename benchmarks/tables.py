@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import confidence, quality, results, runtime_files, versus
+from benchmarks import confidence, quality, results, runtime_files, runtime_passes, versus
 from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
@@ -348,6 +348,11 @@ def passes() -> str:
     return f"{passes_benchmark.layout(rows)}\nMeans over all layers of these scenes: {scenes}.\n"
 
 
+def passes_time() -> str:
+    """Time of fused passes on a frame of real size."""
+    return runtime_passes.layout(results.read("runtime_passes"))
+
+
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
@@ -364,7 +369,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         stability,
         pair_checks,
     ),
-    ROOT / "docs/design/passes.md": (passes,),
+    ROOT / "docs/design/passes.md": (passes, passes_time),
 }
 
 

@@ -77,7 +77,7 @@ class FusedFrame:
     """One sentence each."""
     clean_aovs: dict[str, NDArray[np.float16]] = field(default_factory=dict)
     """Albedo and normal of the HRLS without noise, (height, width, 3), as far as it has them, the model denoises them,
-    and they are asked for."""
+    and they are asked for. Albedos above 1 are as rendered."""
     passes: FusedPasses | None = None
     """The fused layers of additive sets; None if there are none."""
     replaced: ReplacedChannels | None = None
@@ -399,6 +399,10 @@ def _fuse_picture(picture: _Picture, session: Session, means: _FrameMeans, *, er
         aovs=picture.aovs,
     )
     check_finite(session, *images.values())
+    if ALBEDO in images:
+        # The albedo of an emitter may be its light. The network only knows albedos up to 1.
+        albedo = np.minimum(picture.pair.hrls[ALBEDO], np.float32(HALF_MAX))
+        images[ALBEDO] = np.where((albedo > 1).any(axis=-1, keepdims=True), albedo, images[ALBEDO])
     return images
 
 

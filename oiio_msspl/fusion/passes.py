@@ -94,7 +94,8 @@ def fuse_passes(
         sets: of ``hr.additive_sets``. Those that do not sum to its beauty are refused.
         cache_bytes: memory for decoded rows that two bands need.
         pixels: where the fused layers go; None for a new store.
-        guides: albedo and normal without noise, (height, width, 3) as the HRLS's own, as far as they are known.
+        guides: albedo and normal without noise, (height, width, 3) as the HRLS's own, as far as they are known. Albedos
+            above 1 are taken from the HRLS.
         progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
@@ -253,28 +254,30 @@ class _Band:
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
         self._low_beauty = _downsampled(self._beauty, self._scale)
         log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + dark)
-        clean = {
-            name: planes_of(image[rows - window.y0].take(columns - window.x0, axis=1)).astype(np.float32, copy=False)
-            for name, image in guides.items()
-        }
-        noisy = self._read(hr, jobs, [name for name in (ALBEDO, NORMAL) if name not in clean])
-        clean |= {name: _smoothed(planes_of(image), log) for name, image in noisy.items()}
-        others = (clean[name] / SPREAD[name] for name in (ALBEDO, NORMAL) if name in clean)
-        full = np.concatenate([log[None] / SPREAD[RGB], *others], dtype=np.float32)
+        planes = [log[None] / SPREAD[RGB]]
+        for name, image in self._read(hr, jobs).items():
+            noisy = planes_of(image)
+            guide = _smoothed(noisy, log)
+            if name in guides:
+                clean = planes_of(guides[name][rows - window.y0].take(columns - window.x0, axis=1))
+                # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
+                guide = np.where((noisy > 1).any(axis=0), guide, clean)
+            planes.append(guide / SPREAD[name])
+        full = np.concatenate(planes, dtype=np.float32)
         low = _downsampled(full, self._scale)
         with np.errstate(over="ignore", invalid="ignore"):
             self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
-    def _read(self, hr: MappedRender, jobs: Sequence[_Job], guides: Sequence[str]) -> dict[str, Array]:
+    def _read(self, hr: MappedRender, jobs: Sequence[_Job]) -> dict[str, Array]:
         """Read all layers of the HRLS that the band needs, at once, because a file decodes all of them together.
 
         The light of each layer stays at low resolution, and the colours of products over the core.
 
         Returns:
-            The features ``guides`` (height, width, 3), as far as the HRLS has them.
+            Albedo and normal (height, width, 3), as far as the HRLS has them.
         """
-        formulas = {name: hr.features[name] for name in (RGB, *guides) if name in hr.features}
+        formulas = {name: hr.features[name] for name in (RGB, ALBEDO, NORMAL) if name in hr.features}
         factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
         names = {factor: f"colour {i}" for i, factor in enumerate(factors)}
         formulas |= {name: FeatureFormula((factor,)) for factor, name in names.items()}
@@ -284,13 +287,13 @@ class _Band:
         render = replace(hr, features=formulas, alpha=None)
         features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
         self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in names.items()}
-        found = {name: features.pop(name) for name in guides if name in features}
+        guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         low = {name: box_downsample(values, self._scale) for name, values in features.items()}
         self._low_layers = {
             job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
             for i, job in enumerate(jobs)
         }
-        return found
+        return guides
 
     def fuse(
         self,

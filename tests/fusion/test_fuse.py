@@ -143,6 +143,15 @@ def test_albedo_and_normal_without_noise(monkeypatch, spread):
             assert left < 0.5 * np.abs(layers[name] - expected).mean(), name
 
 
+def test_an_albedo_above_1_stays_as_it_is():
+    """Cycles writes the light of an emitter as its albedo."""
+    albedo = np.full((64, 96, 3), 0.5, np.float32)
+    albedo[20:30, 40:60] = (870, 0.5, 1e6)
+    low, high, _ = pair_of(2, 64, 96, albedo=albedo)
+    found = fuse(low, high, Session(find_model(2, "ensemble")), clean_aovs=True).clean_aovs["albedo"]
+    np.testing.assert_array_equal(found[20:30, 40:60], np.float16([[(870, 0.5, 65504)]]) + np.zeros((10, 20, 1)))
+
+
 def test_albedo_and_normal_without_noise_show_what_the_hrls_has():
     """A frame that is black, or free of noise, keeps its own layers. A layer that is absent stays absent."""
     session = Session(find_model(2, "ensemble"))

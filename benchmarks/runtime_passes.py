@@ -47,11 +47,14 @@ def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Mappe
     lights = {f"light_{i}": pixels["rgb"] * shares[..., i, None] for i in range(LAYERS)}
     layers = {"": sum(lights.values()), "albedo": pixels["albedo"], "N": pixels["normal"], **lights}
     found = []
-    for name, factor in (("lr", scale), ("hr", 1)):
+    # The LRHS shows other pixels, or there would be no noise to remove.
+    for name, factor, shift in (("lr", scale, height // 2), ("hr", 1, 0)):
         channels = {
             f"{layer}.{component}".lstrip("."): np.ascontiguousarray(plane, np.float16)
             for layer, image in layers.items()
-            for component, plane in zip("RGB", np.moveaxis(box_downsample(image, factor), -1, 0), strict=True)
+            for component, plane in zip(
+                "RGB", np.moveaxis(box_downsample(np.roll(image, shift, axis=0), factor), -1, 0), strict=True
+            )
         }
         header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
         with OpenEXR.File(header, channels) as file:

@@ -5,6 +5,12 @@
     python -m datagen.cycles.sequence SEQUENCES
     python -m benchmarks.temporal SEQUENCES --table benchmarks/results/temporal.csv
 
+The things in ``cycles/slide`` move to the side alone, so its pixels don't tell which way y points. If the benchmark
+says so, give that sequence Blender's format, in one line::
+
+    --motion-format layer=Vector,channels=XY,to=previous,x=right,y=up,unit=pixels
+                   +layer=Vector,channels=ZW,to=next,x=left,y=down,unit=pixels
+
 :mod:`benchmarks.temporal.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
 """
 

@@ -81,8 +81,8 @@ def read_tile(
     window = tile.area.slices(grid)
     broken: dict[str, Mask] = {}
     hrls = read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core, broken=broken)
-    if RGB in broken:
-        # The LRHS knows the light of a bucket that failed.
+    if RGB in broken and not broken[RGB].all():
+        # The LRHS knows the light of a bucket that failed. A frame that failed stays black, and is refused for that.
         hrls[RGB] = np.where(broken[RGB][..., None], enlarged(lrhs[RGB][window], scale), hrls[RGB])
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},

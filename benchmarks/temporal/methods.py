@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
@@ -61,15 +62,12 @@ def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Itera
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     temporal = plan_temporal(shot, InputOptions(), options)
     motion = f"{temporal.motion.kind}: {temporal.text}" if temporal.motion else temporal.text
-    for quality, prefix in QUALITIES.items():
-        # More threads only wait for each other: the pictures are small.
-        stages = Stages(model=quality, threads=1, temporal=temporal)
+    # More threads only wait for each other: the pictures are small.
+    by_quality = {quality: Stages(model=quality, threads=1, temporal=temporal) for quality in QUALITIES}
+    stages = by_quality["balanced"]
 
-        def ours(loaded: LoadedFrame, neighbours: Neighbours, stages: Stages = stages) -> FusedAlone:
-            return stages.fuse(loaded, stages.session(loaded), neighbours)
-
-        yield Made(prefix + ALONE, scale, _frames(stages.read, Temporal(), shot.frames, ours))
-        yield Made(prefix + NEIGHBOURS, scale, _frames(stages.read, temporal, shot.frames, ours), motion)
+    def ours(quality: str, loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
+        return by_quality[quality].fuse(loaded, by_quality[quality].session(loaded), neighbours)
 
     def with_full(frame: Frame) -> LoadedFrame:
         """A frame whose HRLS has the pixels of the full render, and its own motion vectors."""
@@ -82,6 +80,10 @@ def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Itera
         fused = FusedFrame(oidn_prefiltered(averaged.hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
         return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
 
+    for quality, prefix in QUALITIES.items():
+        fuse = partial(ours, quality)
+        yield Made(prefix + ALONE, scale, _frames(stages.read, Temporal(), shot.frames, fuse))
+        yield Made(prefix + NEIGHBOURS, scale, _frames(stages.read, temporal, shot.frames, fuse), motion)
     yield Made(OIDN_NEIGHBOURS, scale, _frames(with_full, temporal, shot.frames, theirs), motion)
 
 

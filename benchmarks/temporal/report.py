@@ -48,6 +48,7 @@ def summary(rows: Rows[Row]) -> str:
 
 
 def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
+    """The same for one quality, whose methods begin with ``prefix``."""
     found = results.index(rows, "sequence", "scale", "method")
     peers = results.index((row for row in rows if row["method"] == OIDN_BEST), "sequence")
     body, missed = [], []

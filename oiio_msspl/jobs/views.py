@@ -210,7 +210,15 @@ def fuse_frame_passes(
         session.release_memory()
         cache_bytes = max(0, int((max_memory - fused.nbytes) * STRIPS_SHARE))
         fused.passes = fuse_passes(
-            lr, hr, fused.rgb, fused.alignment, sets, cache_bytes, fused.replaced, fused.clean_aovs, progress
+            lr,
+            hr,
+            fused.rgb,
+            fused.alignment,
+            sets,
+            cache_bytes=cache_bytes,
+            pixels=fused.replaced,
+            guides=fused.clean_aovs,
+            progress=progress,
         )
         fused.replaced = fused.passes.pixels
 

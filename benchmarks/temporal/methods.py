@@ -46,7 +46,7 @@ def all_methods(sequence: Sequence, motion_format: str | None = None) -> Iterato
     """Each method on a sequence.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
-    are averaged exactly as ours are. The test of the light gets the same LRHS. ``motion_format`` is that of
+    are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``motion_format`` is that of
     `msspl-fuse`.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
@@ -60,14 +60,15 @@ def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Itera
     """Our frames alone and with neighbours, and OIDN's with neighbours."""
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
-    temporal = plan_temporal(shot, InputOptions(), options)
-    motion = f"{temporal.motion.kind}: {temporal.text}" if temporal.motion else temporal.text
     # More threads only wait for each other: the pictures are small.
-    by_quality = {quality: Stages(model=quality, threads=1, temporal=temporal) for quality in QUALITIES}
-    stages = by_quality["balanced"]
+    by_quality = {
+        quality: Stages(model=quality, threads=1, temporal=plan_temporal(shot, InputOptions(), options, quality))
+        for quality in QUALITIES
+    }
+    stages = by_quality["best"]
 
-    def ours(quality: str, loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
-        return by_quality[quality].fuse(loaded, by_quality[quality].session(loaded), neighbours)
+    def ours(stages: Stages, loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
+        return stages.fuse(loaded, stages.session(loaded), neighbours)
 
     def with_full(frame: Frame) -> LoadedFrame:
         """A frame whose HRLS has the pixels of the full render, and its own motion vectors."""
@@ -81,10 +82,18 @@ def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Itera
         return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
 
     for quality, prefix in QUALITIES.items():
-        fuse = partial(ours, quality)
-        yield Made(prefix + ALONE, scale, _frames(stages.read, Temporal(), shot.frames, fuse))
-        yield Made(prefix + NEIGHBOURS, scale, _frames(stages.read, temporal, shot.frames, fuse), motion)
-    yield Made(OIDN_NEIGHBOURS, scale, _frames(with_full, temporal, shot.frames, theirs), motion)
+        own = by_quality[quality]
+        fuse = partial(ours, own)
+        yield Made(prefix + ALONE, scale, _frames(own.read, Temporal(), shot.frames, fuse))
+        averaged = _frames(own.read, own.temporal, shot.frames, fuse)
+        yield Made(prefix + NEIGHBOURS, scale, averaged, _motion(own.temporal))
+    averaged = _frames(with_full, stages.temporal, shot.frames, theirs)
+    yield Made(OIDN_NEIGHBOURS, scale, averaged, _motion(stages.temporal))
+
+
+def _motion(temporal: Temporal) -> str:
+    """How the motion is known, in words."""
+    return f"{temporal.motion.kind}: {temporal.text}" if temporal.motion else temporal.text
 
 
 def _frames(

@@ -59,10 +59,12 @@ class RenderedShot:
         #: Warnings about the frames that are written.
         self._warnings: dict[Path, list[str]] = {}
         frames = {frame.number: frame for frame in shot}
-        length = f"{options.count} frame{'s' if options.count > 1 else ''}"
+        # Every neighbour must be rendered, so `best` takes no more of them than other models.
+        count = options.count()
+        length = f"{count} frame{'s' if count > 1 else ''}"
         text = f"with {length} before and after each, along the motion vectors of Cycles"
-        self._plan(Temporal(*shares(options.count, VECTORS), None, frames, text if options.count else ""))
-        if options.count and not any(number + 1 in frames for number in frames):
+        self._plan(Temporal(*shares(count, VECTORS), None, frames, text if count else ""))
+        if count and not any(number + 1 in frames for number in frames):
             self.fuse_alone("no two frames follow each other")
 
     def _plan(self, temporal: Temporal) -> None:

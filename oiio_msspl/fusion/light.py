@@ -87,8 +87,9 @@ class Light:
 
     def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
         self._alignment = alignment
-        floor = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
-        self._brightness = mean_around(picture, 1) + np.float32(floor)
+        self.darkest = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
+        """Luminance that is added to the local brightness."""
+        self._brightness = mean_around(picture, 1) + np.float32(self.darkest)
         self._renders = lrhs, hrls
         low, high = (render / self._brightness for render in self._renders)
         noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))

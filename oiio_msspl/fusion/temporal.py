@@ -3,7 +3,9 @@
 
 Two questions decide how much a pixel of a neighbour counts:
 
-- Does it show the same surface? A vector leads to the neighbour, and the neighbour's own vector must lead back.
+- Does it show the same surface? A vector leads to the neighbour, and the neighbour's own vector must lead back. A pixel
+  at the border of two surfaces has the light of both, and their shares differ from frame to frame. So there a neighbour
+  also counts less the more its brightness differs.
 - Has the light changed? See :mod:`oiio_msspl.fusion.light`.
 
 A pixel that no neighbour may change keeps its bits.
@@ -21,9 +23,11 @@ from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.light import Light, bands, from_grid, rows_in_bands, to_grid
-from oiio_msspl.fusion.warp import Path, Step, sample
+from oiio_msspl.fusion.warp import Mask, Path, Step, near_borders, sample
 from oiio_msspl.parallel import for_row_blocks
 
+#: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
+DIFFERENT_MIX = 0.3
 #: Memory for each pixel of the rows that are averaged at a time.
 BYTES_PER_PIXEL = 96
 
@@ -91,6 +95,7 @@ def _accumulate_band(
     for steps in (before, after):
         path = Path(area, window)
         trusted: Array | None = None
+        borders = _borders(steps, area, window)
         for step in steps:
             path.follow(step)
             warped = _warp(step.frame, path)
@@ -100,8 +105,29 @@ def _accumulate_band(
             trusted = weight if trusted is None else np.minimum(trusted, weight)
             if len(warped) < len(total):  # the neighbour has no alpha
                 warped = np.concatenate([warped, _channels(frame, area)[3:]])
-            _add(total, weights, squares, warped, from_grid(frame.alignment, trusted, area) * path.valid)
+            weight = from_grid(frame.alignment, trusted, area) * path.valid
+            if borders is not None:
+                weight[borders] *= _likeness(own[borders], _luminance(warped)[borders], light.darkest)
+            _add(total, weights, squares, warped, weight)
     return total, weights, squares
+
+
+def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) -> Mask | None:
+    """Pixels (h, w) over ``area`` that may show two surfaces; None if nothing moves."""
+    if not steps or steps[0].vectors is None:
+        return None
+    return near_borders(steps[0].vectors[area.slices(window)], steps[0].tolerance)
+
+
+def _likeness(own: Array, other: Array, darkest: float) -> Array:
+    """How much pixels count whose brightness may differ because they show other shares of two surfaces, from 0 to 1.
+
+    Args:
+        own, other: luminance.
+        darkest: differences are relative to at least this luminance.
+    """
+    difference = (own - other) / np.maximum(np.maximum(own, other), np.float32(darkest))
+    return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
 
 
 def _warp(frame: FusedFrame, path: Path) -> Array:

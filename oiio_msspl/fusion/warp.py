@@ -17,8 +17,9 @@ from oiio_msspl.parallel import for_row_blocks
 
 Mask = NDArray[np.bool_]
 
-#: A vector and the way back may differ by this, in HRLS pixels.
-ROUND_TRIP = 1.0
+#: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
+#: Vectors of optical flow are estimates, so more is allowed.
+ROUND_TRIP, ROUND_TRIP_OF_FLOW = 0.25, 1.0
 #: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer ones blur with every frame.
 SHARPNESS = -1.0
 
@@ -48,6 +49,8 @@ class Step(Generic[F]):
     back: Array | None
     """(h, w, 2) over the data window of ``frame``: the way back."""
     back_valid: Mask | None
+    tolerance: float = ROUND_TRIP
+    """How far the way back may miss the pixel, in HRLS pixels."""
 
 
 class Path:
@@ -90,7 +93,7 @@ class Path:
                 there = nearest(to_x, to_y, end)
                 if vectors is not None and back is not None:
                     home = vector + back.reshape(-1).take(there)
-                    good &= np.square(home.real) + np.square(home.imag) < ROUND_TRIP**2  # false for NaN, too
+                    good &= np.square(home.real) + np.square(home.imag) < step.tolerance**2  # false for NaN, too
                 if step.back_valid is not None:
                     good &= step.back_valid.reshape(-1).take(there)
             if x is not None and y is not None and (moves or start != end):
@@ -122,6 +125,28 @@ class Path:
         low, high = int(np.floor(self.y.min())) - 2, int(np.ceil(self.y.max())) + 3
         top = min(max(low, window.y0), window.y1 - 1)
         return Window(window.x0, top, window.x1, max(min(high, window.y1), top + 1))
+
+
+def near_borders(vectors: Array, tolerance: float) -> Mask:
+    """Pixels (h, w) within one pixel of the border between two surfaces: vectors change there by more than ``tolerance``.
+
+    Args:
+        vectors: (h, w, 2), in pixels. NaN counts as another surface.
+    """
+    motion = _as_complex(vectors)
+    across, down = (~(np.abs(np.diff(motion, axis=axis)) < tolerance) for axis in (1, 0))
+    borders = np.zeros(motion.shape, bool)
+    for pixels in (borders[:, :-1], borders[:, 1:]):
+        pixels |= across
+    for pixels in (borders[:-1], borders[1:]):
+        pixels |= down
+    for axis in (0, 1):
+        borders = np.moveaxis(borders, axis, 0)
+        beside = borders.copy()
+        beside[1:] |= borders[:-1]
+        beside[:-1] |= borders[1:]
+        borders = np.moveaxis(beside, 0, axis)
+    return borders
 
 
 def _as_complex(vectors: Array) -> NDArray[np.complex64]:

@@ -11,10 +11,10 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, kept
 from oiio_msspl.errors import InputError, explain
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.motion import MotionFrame
+from oiio_msspl.fusion.motion import FLOW, MotionFrame
 from oiio_msspl.fusion.render_average import RenderPair, shared_noise
 from oiio_msspl.fusion.temporal import accumulate
-from oiio_msspl.fusion.warp import Mask, Placed, Step
+from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Mask, Placed, Step
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session
@@ -172,6 +172,8 @@ class FrameWindow:
         here = self._placed(outcomes[number], placed)
         count = self._temporal.renders if outcomes is self._loaded else self._temporal.results
         neighbours = [n for n in self._temporal.neighbours(number, count) if (n - number) * step > 0]
+        motion = self._temporal.motion
+        tolerance = ROUND_TRIP_OF_FLOW if motion is not None and motion.kind == FLOW else ROUND_TRIP
         for n in neighbours[::step]:
             try:
                 there = self._placed(outcomes[n], placed)
@@ -187,7 +189,7 @@ class FrameWindow:
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
                 break
-            steps.append(Step(there[1], vectors, valid, back, back_valid))
+            steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance))
         return steps
 
     def _placed(self, outcome: T | Exception, placed: Callable[[T], tuple[LoadedFrame, F]]) -> tuple[LoadedFrame, F]:

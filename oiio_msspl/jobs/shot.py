@@ -94,7 +94,7 @@ def fuse_shot(
     report_path = None if report_path is None else Path(report_path)
     pngs = [frame.output.with_suffix(".png") for frame in shot.frames] if previews else []
     prepare_output(shot, inputs, model, [*pngs, *([report_path] if report_path else [])])
-    over_time = plan_temporal(shot, inputs, temporal)
+    over_time = plan_temporal(shot, inputs, temporal, model)
     report = ShotReport(shot, temporal=over_time.text)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
 

@@ -21,13 +21,17 @@ from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.sequence import Frame, Shot
+from oiio_msspl.model.catalogue import QUALITIES, family_of
 
 log = logging.getLogger(__name__)
 
 #: What ``--temporal`` takes beside a number.
 AUTO, OFF = "auto", "off"
-#: Frames before and after a frame that it depends on, where motion is known.
-AUTO_COUNT = 4
+#: Frames before and after a frame that it depends on, where motion is known; and the same for the quality `best`, which
+#: takes so long that averaging more renders adds little.
+AUTO_COUNT, AUTO_COUNT_SLOW = 4, 6
+#: The most fused frames on each side that are averaged. More of them gain less than more renders.
+MOST_RESULTS = 2
 #: The most that can be asked for.
 MOST = 8
 #: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
@@ -51,10 +55,15 @@ class TemporalOptions:
         if self.frames not in (AUTO, OFF) and not (str(self.frames).isdecimal() and int(self.frames) <= MOST):
             raise InputError(f"--temporal {self.frames}: give auto, off, or a number of frames up to {MOST}")
 
-    @property
-    def count(self) -> int:
-        """Frames before and after each frame, if their motion is known."""
-        return {AUTO: AUTO_COUNT, OFF: 0}[str(self.frames)] if self.frames in (AUTO, OFF) else int(self.frames)
+    def count(self, model: str | None = None) -> int:
+        """Frames before and after each frame, if their motion is known.
+
+        Args:
+            model: what the user has chosen, see :func:`oiio_msspl.model.catalogue.find_model`.
+        """
+        if self.frames == AUTO:
+            return AUTO_COUNT_SLOW if _is_slow(model) else AUTO_COUNT
+        return 0 if self.frames == OFF else int(self.frames)
 
 
 @dataclass(frozen=True)
@@ -121,13 +130,23 @@ class Temporal:
         return [each for each in near if first < each < last and each not in self.frames and each != number]
 
 
-def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions) -> Temporal:
+def _is_slow(model: str | None) -> bool:
+    """Whether a name stands for a model of the quality `best`, at any scale."""
+    return (family_of(model) or model or "").startswith(QUALITIES["best"])
+
+
+def plan_temporal(
+    shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None = None
+) -> Temporal:
     """Decide how a shot is fused over time. The decision depends on all files of the shot, not on the frames chosen.
+
+    Args:
+        model: see :meth:`TemporalOptions.count`.
 
     Raises:
         InputError: the user asks for neighbours, and nothing is known of the motion.
     """
-    count, asked = options.count, options.frames != AUTO
+    count, asked = options.count(model), options.frames != AUTO
     if count == 0:
         return Temporal()
     low, high = shot.lr.files, shot.hr.files
@@ -155,8 +174,8 @@ def shares(count: int, kind: str) -> tuple[int, int]:
         kind: of the source of motion.
     """
     # Optical flow is computed on fused frames, so their renders can't be averaged before.
-    renders = 0 if kind == FLOW else count // 2
-    return renders, count - renders
+    results = count if kind == FLOW else min(MOST_RESULTS, count - count // 2)
+    return count - results, results
 
 
 def _motion_of(

@@ -11,7 +11,7 @@ from oiio_msspl.fusion import light
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.temporal import accumulate
-from oiio_msspl.fusion.warp import Step
+from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Step, near_borders
 from tests.fusion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
 
 #: Deviation of the error of a fused frame, as a share of its light, and of a sample's noise.
@@ -49,6 +49,38 @@ def test_neighbours_are_found_where_their_surfaces_are():
     assert rms(result.rgb, texture(), inside) < 0.6 * rms(frames[0].rgb, texture(), inside)
     wrong = accumulate(frames[0], [still(frames[-1])], [still(frames[1])])
     assert rms(wrong.rgb, texture(), inside) > 1.2 * rms(result.rgb, texture(), inside)
+
+
+def test_another_mix_of_two_surfaces_hardly_counts():
+    """A bright thing moves over a dark one. The pixels of its edge show a little of it, and in the neighbour a lot."""
+    truth = np.full((HEIGHT, WIDTH, 3), 0.05, np.float32)
+    truth[:, WIDTH // 2 :] = 0.8
+    edge = np.s_[:, WIDTH // 2 - 1]
+    vectors = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    vectors[:, WIDTH // 2 :] = (0.5, 0)
+    frame, neighbour = (frame_of(truth, seed, error=0) for seed in (1, 2))
+    frame.rgb[edge], neighbour.rgb[edge] = 0.1, 0.3
+    steps = [Step(neighbour, motion, None, None, None) for motion in (np.zeros_like(vectors), vectors)]
+    without, with_borders = (accumulate(frame, [step], []).rgb[edge] - 0.1 for step in steps)
+    assert 0 < 3 * with_borders.mean() < without.mean()
+
+
+def test_borders_reach_one_pixel_to_each_side():
+    vectors = np.zeros((7, 9, 2), np.float32)
+    vectors[:, 5:] = (0.3, 0)
+    borders = near_borders(vectors, 0.25)
+    assert (borders == np.isin(np.arange(9), (3, 4, 5, 6))).all()
+    assert not near_borders(vectors, 0.35).any()
+    vectors[3, 1] = np.nan  # another surface
+    assert near_borders(vectors, 0.35)[1:6, 0:4].sum() == near_borders(vectors, 0.35).sum() > 0
+
+
+def test_a_way_back_that_misses_by_more_than_the_tolerance_does_not_count():
+    frame, neighbour = frame_of(texture(), 1), frame_of(texture(), 2)
+    vectors = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    for tolerance, counts in ((ROUND_TRIP, False), (ROUND_TRIP_OF_FLOW, True)):
+        step = Step(neighbour, vectors, None, vectors + np.float32(0.5), None, tolerance)
+        assert np.array_equal(accumulate(frame, [step], []).rgb, frame.rgb) != counts
 
 
 def test_without_neighbours_every_bit_stays():

@@ -67,7 +67,7 @@ def test_the_menu_of_neighbours_has_what_msspl_fuse_takes(nodes):
     items = knob(nodes, "temporal").items
     assert items == ["auto", "off", "1", "2", "3", "4"]
     assert items[0] == Settings.temporal
-    assert [TemporalOptions(item).count for item in items] == [4, 0, 1, 2, 3, 4]
+    assert [TemporalOptions(item).count() for item in items] == [4, 0, 1, 2, 3, 4]
 
 
 def test_the_tooltips_name_every_quality_and_every_feature(nodes):

@@ -43,7 +43,9 @@ SPP = (1, 2, 4)
 #: Columns: how the network computes.
 WAYS = ("32bit", "8bit", "half")
 SIZE, REPEATS = 1024, 5
-CHECKPOINT = Path(__file__).parents[1] / "training/checkpoints/joint.pt"
+_FOLDER = Path(__file__).parents[1] / "training/checkpoints"
+#: By family of models.
+CHECKPOINTS = {"joint": _FOLDER / "joint.pt", "joint-small": _FOLDER / "joint_small.pt"}
 
 
 def medians(ways: list[Callable[[], object]]) -> list[float]:
@@ -71,9 +73,9 @@ def accuracy(views: list[scenes.Scene], scale: int, sessions: Sequence[Session])
 class InTorch(Session):
     """A joint model computed by PyTorch in 32 bits, from its checkpoint."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, checkpoint: Path) -> None:
         super().__init__(path)
-        network, _ = load_checkpoint(CHECKPOINT)
+        network, _ = load_checkpoint(checkpoint)
         assert isinstance(network, JointFusion)
         self._network = network
 
@@ -85,13 +87,14 @@ class InTorch(Session):
         lrhs_aovs: Images = NO_IMAGES,
         mean: MeanSettings | None = None,
         error: bool = False,
-    ) -> tuple[Array, Array | None]:
+        aovs: Sequence[str] = (),
+    ) -> Images:
         light = lrhs[..., :3]
         layers = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs, mean)
         images = np.concatenate([light, self._network.mean_denoiser.denoise(layers)], axis=-1), hrls
         with torch.inference_mode():
             fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
-        return fused[0].permute(1, 2, 0).numpy(), None
+        return {"fused": fused[0].permute(1, 2, 0).numpy()}
 
 
 class ForGpus(Session):
@@ -99,7 +102,7 @@ class ForGpus(Session):
 
     def __init__(self, path: Path) -> None:
         super().__init__(gpu_file(path) or path)
-        self._denoiser = MeanDenoiser(path=gpu_file(WEIGHTS))
+        self._denoiser = MeanDenoiser(path=gpu_file(WEIGHTS[self.contract.denoiser]) or path)
 
 
 def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Iterator[Row]:
@@ -108,7 +111,7 @@ def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Ite
     hr = Render.from_arrays("hr", **layers)
     for name in models:
         path = find_model(0, name)
-        sessions = [InTorch(path), Session(path), ForGpus(path)]
+        sessions = [InTorch(path, CHECKPOINTS[name.rpartition("-x")[0]]), Session(path), ForGpus(path)]
         scale = sessions[0].contract.scale
         lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
         seconds: Row = {}
@@ -129,7 +132,7 @@ def layout(rows: list[Row]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, metavar="RENDERS_OR_VIEWS")
-    parser.add_argument("--models", nargs="+", default=[f"joint-x{scale}" for scale in SCALES])
+    parser.add_argument("--models", nargs="+", default=[f"{family}-x{scale}" for family in CHECKPOINTS for scale in SCALES])
     parser.add_argument("--time", action="store_true", help="also measure times")
     results.add_option(parser)
     args = parser.parse_args()

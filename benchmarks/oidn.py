@@ -44,18 +44,21 @@ def denoise_with_clean(color: Array, clean: Mapping[str, Array]) -> Array:
     return run_filter({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
 
 
-def run_filter(images: dict[str, Array], *, input_scale: float = math.nan, **flags: bool) -> Array:
+def run_filter(
+    images: dict[str, Array], *, input_scale: float = math.nan, quality: str = "high", **flags: bool
+) -> Array:
     """The output of one OIDN filter. It denoises the color, or the only image that it gets.
 
     Args:
         input_scale: brings the color to OIDN's range; OIDN finds it if it is not a number.
+        quality: "fast" for the small networks, "balanced" for the base ones, "high" for the largest.
         flags: parameters of OIDN's filter.
     """
     import pyoidn
 
     images = {name: np.ascontiguousarray(image, np.float32) for name, image in images.items()}
     output = np.empty_like(next(iter(images.values())))
-    oidn_filter = _filter(tuple(images), **flags)
+    oidn_filter = _filter(tuple(images), quality, **flags)
     for name, image in {**images, pyoidn.OIDN_IMAGE_OUTPUT: output}.items():
         oidn_filter.set_image(name, image, pyoidn.OIDN_FORMAT_FLOAT3)
     oidn_filter.set_float("inputScale", input_scale)
@@ -67,12 +70,12 @@ def run_filter(images: dict[str, Array], *, input_scale: float = math.nan, **fla
 
 
 @functools.cache
-def _filter(inputs: tuple[str, ...], **flags: bool) -> Any:
+def _filter(inputs: tuple[str, ...], quality: str, **flags: bool) -> Any:
     """A filter for these inputs. It is used again for the next picture, as in pyoidn's plain call."""
     import pyoidn
 
     oidn_filter = pyoidn.Filter(_device(), pyoidn.OIDN_FILTER_TYPE_RT)
-    oidn_filter.set_quality(pyoidn.OIDN_QUALITY_HIGH)
+    oidn_filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{quality.upper()}"))
     for flag, value in flags.items():
         oidn_filter.set_bool(flag, value)
     return oidn_filter

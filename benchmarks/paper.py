@@ -47,7 +47,7 @@ def title(method: str) -> str:
 def comparison(rows: list[Row], averages: tuple[int, ...], paper: dict[str, tuple[Any, ...]] | None = None) -> str:
     """PSNR and RelMSE by average spp, and the paper's own if they are measured alike."""
     means = results.index((row for row in rows if row["scene"] == MEAN), "spp", "method")
-    models = sorted({row["method"] for row in rows if row["method"].startswith(("paper-", "pyramid-", "joint-"))})
+    models = sorted({row["method"] for row in rows if row["method"].startswith(("paper-", "joint-"))})
     peers = ("full resolution", *tables.PEERS)
     body = []
     for method in [*peers, *(name for name in models if ":" not in name)]:

@@ -30,7 +30,7 @@ from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SCALES
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "pyramid", "joint", "ensemble")
+FAMILIES = ("paper", "joint-small", "joint", "ensemble")
 #: Methods of :mod:`benchmarks.quality` that most tables compare the models with.
 PEERS = (
     "OIDN on the HRLS",
@@ -44,7 +44,7 @@ DEFAULT = "joint-x2"
 BETTER = (DEFAULT, "ensemble-x2", "ensemble-x2, 7:1")
 #: A method of README's table -> its title, and what it needs.
 WHEN_IT_PAYS = {
-    "pyramid-x2": ("`--quality fast` (`pyramid-x2`)", "LRHS and HRLS"),
+    "joint-small-x2": ("`--quality fast` (`joint-small-x2`)", "LRHS and HRLS"),
     "joint-x2": ("`--quality balanced` (`joint-x2`)", "LRHS and HRLS"),
     "ensemble-x2": ("`--quality best` (`ensemble-x2`)", "LRHS and HRLS"),
     "ensemble-x2, 7:1": ("the same, HRLS with 7/8 of the samples", "LRHS and HRLS"),
@@ -81,7 +81,7 @@ Found = Mapping[Hashable, Row]
 SPREAD_NOISE = {
     "HRLS": "HRLS alone",
     "joint-x2": "`joint-x2`",
-    "pyramid-x2-spread": "`--quality fast` (`pyramid-x2-spread`)",
+    "joint-small-x2-spread": "`--quality fast` (`joint-small-x2-spread`)",
     "joint-x2-spread": "`--quality balanced` (`joint-x2-spread`)",
     "ensemble-x2-spread": "`--quality best` (`ensemble-x2-spread`)",
     "paper-x2": "`paper-x2`",
@@ -143,7 +143,7 @@ def against_oidn() -> str:
     """Models against OIDN at its best, with intervals, on all renders on which both were measured."""
     tables = {name: results.read(table) for name, table in SETS.items()}
     text = versus.table(
-        tables, ("ensemble-x2", "ensemble-x4", "joint-x2", "joint-x4", "pyramid-x4"), AT_ITS_BEST, quality.AVERAGES
+        tables, ("ensemble-x2", "ensemble-x4", "joint-x2", "joint-x4", "joint-small-x4"), AT_ITS_BEST, quality.AVERAGES
     )
     missing = [name for name, rows in tables.items() if not versus.compare(rows, DEFAULT, next(iter(AT_ITS_BEST)), 2)]
     return text + f"\nPrefiltered OIDN was not measured on these renders: {', '.join(missing)}.\n" * bool(missing)
@@ -246,7 +246,7 @@ def division() -> str:
     columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, DEFAULT + way) in means]
     body = _measured(
         [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
-        for name in ("joint-x2", "joint-x4", "pyramid-x4", "OIDN, same samples", "OIDN prefiltered, same samples")
+        for name in ("joint-x2", "joint-x4", "joint-small-x4", "OIDN, same samples", "OIDN prefiltered, same samples")
     )
     head = ["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"

@@ -192,7 +192,7 @@ def main() -> int:
         for what, lr, hr in mutants(pairs, folder, options.count, options.seed):
             out = folder / "out.exr"
             layout = rng.choice(("spec", "nuke", "multilayer"))
-            more = ["--layout", layout, "--max-memory", f"{MAX_MEMORY}M", "--model", "pyramid", "--threads", "2"]
+            more = ["--layout", layout, "--max-memory", f"{MAX_MEMORY}M", "--model", "joint-small", "--threads", "2"]
             code, output, seconds, peak = run([sys.executable, "-c", program, str(lr), str(hr), "-o", str(out), *more])
             wrong = fault(code, output, seconds, peak, MAX_MEMORY)
             left = [path.name for path in folder.iterdir() if path.name.startswith(".")]

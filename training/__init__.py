@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training: networks, data, the run, and export to ONNX. The only part of the project that needs PyTorch.
 
-Networks: ``paper`` is the paper's, ``pyramid``, ``mix`` and ``joint`` are ours; ``networks`` lists them. ``ops``,
-``encoding``, ``trunk``, ``oidn`` and ``mean_denoiser`` are what they are made of.
+Networks: ``paper`` is the paper's, ``joint`` and ``ensemble`` are ours; ``networks`` lists those that ``train`` trains.
+``ops``, ``encoding``, ``oidn`` and ``mean_denoiser`` are what they are made of.
 Training: ``data`` draws pairs from views of :mod:`datagen`, ``losses``, ``validation``, ``train``, ``checkpoints``.
 Checkpoints: ``average``, ``prune`` and ``error`` change one; ``export`` and ``quantise`` make a model of it.
 """

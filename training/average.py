@@ -2,13 +2,11 @@
 """Average the weights of several checkpoints of one network; the result can be exported or trained further.
 
     python -m training.average training/checkpoints/NEW.pt training/checkpoints/OLD.pt RUN/checkpoint.pt
-    python -m training.average training/checkpoints/NEW.pt RUN/checkpoint.pt --kernels 1 3 3 3 3
     python -m training.average training/checkpoints/joint.pt RUN/checkpoint.pt --initial 0.25 0.75
 
 The mean of a network and of its continuation by further training often keeps the strengths of both (Wortsman et al.
-2022). A pyramid network's kernels are cropped to ``--kernels``, or to the sizes of the last checkpoint. The mean of a
-joint network may include its initial state, which is Open Image Denoise with constant logits. The result is stored in
-half precision, with the provenance of the last checkpoint.
+2022). The mean of a joint network may include its initial state, which is Open Image Denoise with constant logits. The
+result is stored in half precision, with the provenance of the last checkpoint.
 """
 
 from __future__ import annotations
@@ -23,28 +21,21 @@ from training import checkpoints
 from training.checkpoints import State
 from training.joint import JointFusion
 from training.networks import NETWORKS
-from training.pyramid import LEVELS
 
 #: Parts of a checkpoint that only a continued run needs.
 RUN_STATE = ("network", "optimizer", "best_gain")
 
 
-def mean(states: list[State], kernels: list[int] | None = None, initial: tuple[float, float] = (0, 0)) -> State:
+def mean(states: list[State], initial: tuple[float, float] = (0, 0)) -> State:
     """A checkpoint with the mean of the averaged weights of several.
 
     Args:
-        kernels: kernel sizes of a pyramid network by level; the last checkpoint's if None.
         initial: shares of a joint network's initial state: of the network, and of its denoiser of both renders' mean.
 
     Raises:
         SystemExit: the checkpoints are of different networks.
     """
     last = states[-1]
-    kernels = kernels or last["config"].get("own_size")
-    for state in states:
-        if kernels and "own_size" in state["config"]:
-            checkpoints.crop_kernels(state["ema"], state["config"]["own_size"], kernels)
-            state["config"]["own_size"] = kernels
     if any((state["architecture"], state["config"]) != (last["architecture"], last["config"]) for state in states):
         raise SystemExit("these checkpoints are of different networks")
     if any(initial) and last["architecture"] != "joint":
@@ -70,10 +61,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="checkpoint to write")
     parser.add_argument("checkpoints", type=Path, nargs="+", help="checkpoints to average")
-    parser.add_argument("--kernels", type=int, nargs=LEVELS, metavar="SIZE", help="as for training.train")
     parser.add_argument(
         "--initial",
-        "--beginning",
         type=float,
         nargs=2,
         default=(0, 0),
@@ -82,7 +71,7 @@ def main() -> None:
     )
     args = parser.parse_args()
     states = [checkpoints.read(path) for path in args.checkpoints]
-    checkpoints.save(mean(states, args.kernels, tuple(args.initial)), args.out)
+    checkpoints.save(mean(states, tuple(args.initial)), args.out)
 
 
 if __name__ == "__main__":

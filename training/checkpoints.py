@@ -13,17 +13,13 @@ from __future__ import annotations
 
 import logging
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import torch
-from torch import Tensor
 
-from training.mean_denoiser import MeanDenoiser
 from training.networks import NETWORKS, Network
 from training.paper import MultiResolutionFusion
-from training.pyramid import PyramidFusion
 
 State = dict[str, Any]
 log = logging.getLogger(__name__)
@@ -62,15 +58,6 @@ def load(path: Path) -> tuple[Network, State]:
     return network.eval(), state
 
 
-def load_mean_denoiser(path: Path) -> MeanDenoiser:
-    """The denoiser of both renders' mean of a joint network's checkpoint."""
-    prefix = "mean_denoiser."
-    weights = {k.removeprefix(prefix): w for k, w in read(path)["ema"].items() if k.startswith(prefix)}
-    network = MeanDenoiser()
-    network.load_state_dict(weights)
-    return network.eval()
-
-
 def warm_start(network: Network, path: Path) -> None:
     """Copy the averaged weights of another run that fit: all scales share the trunk, and stages by position.
 
@@ -83,28 +70,6 @@ def warm_start(network: Network, path: Path) -> None:
             shuffle.reset_to_bilinear(network.config["channels"])
     state = read(path)
     theirs, ours = state["ema"], network.state_dict()
-    if isinstance(network, PyramidFusion):
-        if "own_size" not in state["config"]:
-            raise SystemExit(f"--init {path}: not a pyramid network; choose a checkpoint of one")
-        crop_kernels(theirs, state["config"]["own_size"], network.own_size)
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)
-
-
-def crop_kernels(weights: dict[str, Tensor], sizes: Sequence[int], wanted: Sequence[int]) -> None:
-    """Crop a pyramid network's kernels, whose sizes at H, H/2, ... are ``sizes``, to ``wanted`` sizes, in place."""
-    for level, (size, smaller) in enumerate(zip(sizes, wanted, strict=True)):
-        for name in (f"heads.{level}.weight", f"heads.{level}.bias"):
-            weights[name] = _middle_taps(weights[name], size, smaller, 1 if level else 4)
-
-
-def _middle_taps(parameter: Tensor, size: int, wanted: int, phases: int) -> Tensor:
-    """Crop a parameter of a pyramid's head, whose first outputs are size x size taps for each phase."""
-    if size < wanted:
-        raise SystemExit(f"--kernels: the checkpoint has {size}x{size} kernels, which cannot grow")
-    outputs = parameter.unflatten(0, (-1, phases))
-    margin = (size - wanted) // 2
-    middle = slice(margin, margin + wanted)
-    taps = outputs[: size**2].unflatten(0, (size, size))[middle, middle].flatten(0, 1)
-    return torch.cat([taps, outputs[size**2 :]]).flatten(0, 1)

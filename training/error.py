@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Train the prediction of a network's own error, for every network but the paper's.
+"""Train the prediction of a joint network's own error.
 
     python -m training.error RUN/best.pt --data VIEWS
 
@@ -20,14 +20,11 @@ from training import checkpoints, data, losses
 from training.joint import JointFusion
 from training.networks import preparation, run
 from training.train import lr_factor
-from training.trunk import Trunk
 
 PATCH, BATCH, LEARNING_RATE = 192, 4, 2e-3
 
 
-def fit(
-    network: Trunk | JointFusion, views: Path, scales: list[int], prepare: data.Prepare | None, steps: int
-) -> float:
+def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prepare | None, steps: int) -> float:
     """Train the prediction in place; return the mean loss of the last tenth of the steps."""
     network.requires_grad_(False)
     network.error.requires_grad_(True)
@@ -58,8 +55,8 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     network, state = checkpoints.load(args.checkpoint)
-    if not isinstance(network, Trunk | JointFusion):
-        raise SystemExit(f"{args.checkpoint}: the paper's network does not predict its error")
+    if not isinstance(network, JointFusion):
+        raise SystemExit(f"{args.checkpoint}: not a joint network; the paper's does not predict its error")
     network.reset_error()
     scales = [int(scale) for scale in state["training_spp"]]
     loss = fit(network, args.data, scales, preparation(state["architecture"]), args.steps)

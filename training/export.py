@@ -3,7 +3,7 @@
 
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
-    python -m training.export RUN/best.pt --scale 2 --name pyramid-x2 -o pyramid-x2.onnx --int8 VIEWS --overlap 32
+    python -m training.export JOINT.pt --scale 2 --name joint-x2 -o joint-x2.onnx --int8 VIEWS --overlap 48
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
 computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`).
@@ -31,23 +31,23 @@ from torch.utils._pytree import tree_map
 
 from datagen.views import Folder, View
 from oiio_msspl.aovs.features import channel_names
-from oiio_msspl.model.contract import METADATA_KEY, NO_DENOISER, Contract, network_inputs
+from oiio_msspl.model.contract import METADATA_KEY, Contract, network_inputs
 from oiio_msspl.model.mean_denoiser import ALIGNMENT
 from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
-from training.joint import JointFusion
-from training.networks import DENOISERS, Network, run
-from training.oidn import BASE_HDR, provenance
+from training.joint import SIZES, JointFusion
+from training.networks import Network, denoiser_of, run
+from training.oidn import provenance
 from training.paper import MultiResolutionFusion
-from training.quantise import joint, static
+from training.quantise import joint
 from training.validation import ValidationPair
 
 #: Operators and file format that ONNX Runtime 1.14 and newer understand.
 OPSET, IR_VERSION = 18, 8
 
-#: Memory of a tile in bytes per HRLS pixel, by network: the peak of a process that fuses a frame, without the frame
-#: itself, and with room for the rows that are decoded for the next tiles.
-MEMORY = {"paper": 1000, "pyramid": 850, "joint": 800, "ensemble": 1160}
+#: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
+#: frame itself, and with room for the rows that are decoded for the next tiles.
+MEMORY = {"paper": 1000, "joint-small": 700, "joint": 800, "ensemble": 1160}
 
 #: Smaller tensors, such as biases, stay float32.
 HALF_ELEMENTS = 256
@@ -55,7 +55,7 @@ HALF_ELEMENTS = 256
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """The contract of a checkpoint's network for one of its scales."""
-    denoiser = DENOISERS.get(state["architecture"], NO_DENOISER)
+    denoiser = denoiser_of(network, scale)
     lrhs, hrls = network_inputs(denoiser)
     # Tiles begin on the grid of the denoiser's lowest level, too, so that it divides a tile as it divides the frame.
     alignment = ALIGNMENT if denoiser else network.multiple // scale
@@ -63,7 +63,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
         lrhs=channel_names(lrhs),
         hrls=channel_names(hrls),
         denoiser=denoiser,
-        bytes_per_pixel=MEMORY[state["architecture"]],
+        bytes_per_pixel=MEMORY[name.rpartition("-x")[0]],
         name=name,
         scale=scale,
         alignment=alignment,
@@ -71,7 +71,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
         training_spp=state["training_spp"][str(scale)],
         provenance=state["provenance"]
         | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()}
-        | (provenance(BASE_HDR) if isinstance(network, JointFusion) else {}),
+        | (provenance(SIZES[network.size]) if isinstance(network, JointFusion) else {}),
     )
 
 
@@ -339,9 +339,7 @@ def main() -> None:
                 raise SystemExit("a joint network can only be exported with --int8")
             model = joint_to_onnx(network, contract, joint.calibration_pairs(args.int8, contract))
         else:
-            model = to_onnx(network, contract, half=args.half and not args.int8)
-            if args.int8:
-                model = static.quantise(model, contract, args.int8)
+            model = to_onnx(network, contract, half=args.half)
         onnx.save(model, args.output)
         if args.half:
             _check_casts(args.output)

@@ -2,6 +2,7 @@
 """Export the `joint` or the `ensemble` models for GPUs: convolutions in half floats, the rest in float32.
 
     python -m training.gpu training/checkpoints/joint.pt oiio_msspl/model/weights/joint-x*.onnx
+    python -m training.gpu training/checkpoints/joint_small.pt oiio_msspl/model/weights/joint-small-x*.onnx
     python -m training.gpu training/checkpoints/joint.pt oiio_msspl/model/weights/ensemble-x*.onnx \\
         --ensemble training/checkpoints/ensemble.pt
 
@@ -31,14 +32,14 @@ from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
 from oiio_msspl.model import mean_denoiser
-from oiio_msspl.model.contract import METADATA_KEY, Contract
+from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.devices import GPU_FOLDER
 from training.checkpoints import load
 from training.ensemble import BandWeights, EnsembleFusion, load_weights
 from training.export import example, traced
 from training.joint import JointFusion
 from training.mean_denoiser import MeanDenoiser
-from training.oidn import LARGE_HDR, provenance
+from training.oidn import provenance
 
 IR_VERSION = 8
 #: What is added to the provenance of a file.
@@ -94,7 +95,7 @@ def mean_denoiser_to_onnx(network: MeanDenoiser) -> onnx.ModelProto:
     alignment = mean_denoiser.ALIGNMENT
     inputs = tuple(torch.rand(1, channels, 4 * alignment, 6 * alignment) for channels in (3, 1, 3, 3))
     model = traced(network, inputs, ["colour", "noise", "albedo", "normal"], ["denoised"], alignment)
-    helper.set_model_props(model, {"provenance": json.dumps(provenance(LARGE_HDR) | PRECISION)})
+    helper.set_model_props(model, {"provenance": json.dumps(provenance(network.start.network) | PRECISION)})
     return _finished(model)
 
 
@@ -156,12 +157,13 @@ def main() -> None:
         raise SystemExit(f"{args.checkpoint}: not a joint network")
     joint = in_half_floats(joint)
     network: JointFusion | EnsembleFusion = joint
-    folder, family = args.models[0].parent / GPU_FOLDER, "joint"
+    folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
     folder.mkdir(exist_ok=True)
     if args.ensemble:
-        network, family = ensemble_in_half_floats(joint, load_weights(args.ensemble)[0]), "ensemble"
+        network = ensemble_in_half_floats(joint, load_weights(args.ensemble)[0])
     else:
-        denoiser = mean_denoiser.WEIGHTS.parent / GPU_FOLDER / mean_denoiser.WEIGHTS.name
+        path = mean_denoiser.WEIGHTS[joint.denoiser(SCALES[0])]
+        denoiser = path.parent / GPU_FOLDER / path.name
         denoiser.parent.mkdir(exist_ok=True)
         onnx.save(mean_denoiser_to_onnx(joint.mean_denoiser), denoiser)
 
@@ -169,7 +171,7 @@ def main() -> None:
     share_weights(list(models.values()), folder / f"{family}.weights")
     for name, model in models.items():
         onnx.save(model, folder / name)
-    for path in sorted(folder.glob(f"{family}*")):
+    for path in sorted([*folder.glob(f"{family}-x*"), folder / f"{family}.weights"]):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 

@@ -1,5 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The ``joint`` network: Open Image Denoise's base network for HDR colour, fine-tuned to read both renders.
+"""The ``joint`` network: a network of Open Image Denoise for HDR colour, fine-tuned to read both renders.
+
+It has two sizes. ``usual`` starts from the base network, and denoises the mean of both renders by a fine-tuned large
+one. ``small`` starts from small networks for both.
 
 1. Encode. At H the U-Net reads the HRLS's colour, albedo and normal, as in Open Image Denoise (OIDN). At H/2 it also
    reads the LRHS and the denoised mean of both renders at the LRHS's resolution (:mod:`training.mean_denoiser`). Their
@@ -26,20 +29,31 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.arrays import Array
-from oiio_msspl.model.contract import MEAN_DENOISER, network_inputs
+from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, network_inputs
 from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
 from training.encoding import log_decode, log_encode, log_to_pu, pu_to_log
 from training.mean_denoiser import MeanDenoiser
-from training.oidn import BASE, BASE_HDR, FineTunedConv, convolutions, pretrained_weights, run_unet_on_tensors
+from training.oidn import (
+    BASE,
+    BASE_HDR,
+    SMALL_HDR,
+    FineTunedConv,
+    convolutions,
+    pretrained_weights,
+    run_unet_on_tensors,
+)
 from training.ops import box_downsample, highest_around, log2_scale, pyramid, upsample
 from training.paper import LRHS_CHANNELS
-from training.pyramid import MIN_ALBEDO
 
+#: By size: the network of Open Image Denoise from which the U-Net starts.
+SIZES = {"small": SMALL_HDR, "usual": BASE_HDR}
 #: Initial logits at the LRHS's resolution: the denoised mean of both renders, the denoised HRLS, the HRLS, the LRHS.
 COARSEST = (2.0, 0.0, -2.0, -2.0)
 #: Initial logits at finer levels: the denoised HRLS at the coarser level's brightness, the denoised HRLS, light times
 #: albedo, the HRLS.
 FINER = (2.0, 0.0, 0.0, -2.0)
+#: Lower bound of the albedo that light is divided by.
+MIN_ALBEDO = 0.02
 #: LRHS pixels over which the renders' brightest samples allow a bright result.
 FAR = 16
 #: Bounds of the ratio of a level's light to the denoised HRLS: 1 / MAX_RATIO and MAX_RATIO.
@@ -65,17 +79,18 @@ class JointFusion(nn.Module):
 
     Args:
         kept: output channels that pruning has kept, by convolution; all channels of the others.
+        size: a key of ``SIZES``.
     """
 
     multiple = 16
 
-    def __init__(self, kept: Mapping[str, Sequence[int]] | None = None) -> None:
+    def __init__(self, kept: Mapping[str, Sequence[int]] | None = None, size: str = "usual") -> None:
         super().__init__()
-        self.kept = dict(kept or {})
-        self.config = {"kept": self.kept}
+        self.kept, self.size = dict(kept or {}), size
+        self.config = {"kept": self.kept, "size": size}
         self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in network_inputs(MEAN_DENOISER))
-        self.pretrained = pretrained_weights(BASE_HDR)
-        self.mean_denoiser = MeanDenoiser()
+        self.pretrained = pretrained_weights(SIZES[size])
+        self.mean_denoiser = MeanDenoiser(size)
         self.convs = nn.ModuleDict()
         for name in convolutions(self.pretrained):
             rows, columns = self.pretrained_channels(name)
@@ -92,6 +107,11 @@ class JointFusion(nn.Module):
                 head.weight.mul_(0.1)
                 head.bias.copy_(torch.tensor(FINER + COARSEST if level else (*FINER, 2.0)))
         self.reset_error()
+
+    def denoiser(self, scale: int) -> str:
+        """The value of ``Contract.denoiser``. At x4 and x8 the LRHS is so small that the large denoiser takes hardly
+        longer than the small one, and is better."""
+        return SMALL_MEAN_DENOISER if self.size == "small" and scale == 2 else MEAN_DENOISER
 
     def pretrained_channels(self, name: str) -> tuple[list[int], list[int]]:
         """Indices of the outputs and inputs of a pretrained convolution that this network has."""

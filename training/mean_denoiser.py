@@ -1,12 +1,14 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise's large network, fine-tuned to denoise the mean of both renders at the LRHS's resolution.
+"""A network of Open Image Denoise, fine-tuned to denoise the mean of both renders at the LRHS's resolution.
 
-The large network expects a noise-free albedo and normal, and estimates the noise of the colour itself. Here albedo and
+The given network expects a noise-free albedo and normal, and estimates the noise of the colour itself. Here albedo and
 normal are means of s x s HRLS pixels, which are noisy at x2, and the difference of the two renders gives an estimate of
-the colour's noise. The fine-tuned network reads all of these as they are. Its outer levels are trained.
+the colour's noise. The fine-tuned network reads all of these as they are.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
@@ -16,28 +18,66 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.model.mean_denoiser import ALIGNMENT
 from oiio_msspl.model.render_mean import Images
 from training.encoding import log_to_pu, pu_to_log
-from training.oidn import LARGE, LARGE_HDR, FineTunedConv, convolutions, pretrained_weights, run_unet_on_tensors
+from training.oidn import (
+    BASE,
+    LARGE,
+    LARGE_HDR,
+    SMALL_CLEAN_HDR,
+    FineTunedConv,
+    Shape,
+    convolutions,
+    pretrained_weights,
+    run_unet_on_tensors,
+)
 
-#: Convolutions that keep the pretrained weights: those of the two lowest levels, two thirds of all weights.
-FROZEN = ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b")
-#: The extra input channel is the noise. These convolutions read the input.
+#: The extra input channel is the noise.
 EXTRA = 1
-READERS = ("enc_conv1a", "dec_conv1a")
+
+
+@dataclass(frozen=True)
+class Start:
+    """What the fine-tuning starts from."""
+
+    network: str
+    """A key of :data:`training.oidn_weights.NETWORKS`."""
+    shape: Shape
+    readers: tuple[str, ...]
+    """The convolutions that read the input."""
+    frozen: tuple[str, ...] = ()
+    """Convolutions that keep the pretrained weights."""
+
+
+#: By the size of :class:`training.joint.JointFusion`. Of the large network, only the outer levels are trained: the two
+#: lowest ones have two thirds of all weights.
+STARTS = {
+    "small": Start(SMALL_CLEAN_HDR, BASE, ("enc_conv0", "dec_conv1a")),
+    "usual": Start(
+        LARGE_HDR,
+        LARGE,
+        ("enc_conv1a", "dec_conv1a"),
+        ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b"),
+    ),
+}
 
 
 class MeanDenoiser(nn.Module):
-    """See the module's docstring."""
+    """See the module's docstring.
 
-    def __init__(self) -> None:
+    Args:
+        size: a key of ``STARTS``.
+    """
+
+    def __init__(self, size: str = "usual") -> None:
         super().__init__()
-        pretrained = pretrained_weights(LARGE_HDR)
+        self.start = STARTS[size]
+        pretrained = pretrained_weights(self.start.network)
         self.convs = nn.ModuleDict(
             {
                 name: FineTunedConv(
                     pretrained[f"{name}.weight"],
                     pretrained[f"{name}.bias"],
-                    EXTRA if name in READERS else 0,
-                    frozen=name in FROZEN,
+                    EXTRA if name in self.start.readers else 0,
+                    frozen=name in self.start.frozen,
                 )
                 for name in convolutions(pretrained)
             }
@@ -62,7 +102,7 @@ class MeanDenoiser(nn.Module):
         def conv(name: str, values: Tensor) -> Tensor:
             return F.relu(self.convs[name](values))
 
-        colour = run_unet_on_tensors(LARGE, [inputs], conv)[..., :height, :width]
+        colour = run_unet_on_tensors(self.start.shape, [inputs], conv)[..., :height, :width]
         return pu_to_log(colour.float().clamp_max(1.0))
 
     def weights(self) -> dict[str, Tensor]:

@@ -5,21 +5,21 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from oiio_msspl.model.contract import MEAN_DENOISER
+from oiio_msspl.model.contract import NO_DENOISER
 from training.data import Prepare
 from training.joint import JointFusion, with_mean
 from training.paper import MultiResolutionFusion
-from training.pyramid import PyramidFusion
 
-Network = MultiResolutionFusion | PyramidFusion | JointFusion
-NETWORKS: dict[str, type[MultiResolutionFusion] | type[PyramidFusion] | type[JointFusion]] = {
+Network = MultiResolutionFusion | JointFusion
+NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {
     "paper": MultiResolutionFusion,
-    "pyramid": PyramidFusion,
     "joint": JointFusion,
 }
 
-#: The denoising that precedes a network, see :func:`oiio_msspl.model.session.make_denoiser`.
-DENOISERS = {"joint": MEAN_DENOISER}
+
+def denoiser_of(network: Network, scale: int) -> str:
+    """The denoising that precedes a network, see :func:`oiio_msspl.model.session.make_denoiser`."""
+    return network.denoiser(scale) if isinstance(network, JointFusion) else NO_DENOISER
 
 
 def preparation(architecture: str) -> Prepare | None:

@@ -20,7 +20,9 @@ from training.oidn_weights import require_weights
 from training.ops import upsample
 
 #: Open Image Denoise's names of its networks, see :data:`training.oidn_weights.NETWORKS`.
-BASE_HDR, LARGE_HDR = "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large"
+SMALL_HDR, BASE_HDR, LARGE_HDR = "rt_hdr_alb_nrm_small", "rt_hdr_alb_nrm", "rt_hdr_calb_cnrm_large"
+#: The small network for noise-free albedo and normal.
+SMALL_CLEAN_HDR = "rt_hdr_calb_cnrm_small"
 ALBEDO_BASE, NORMAL_BASE = "rt_alb", "rt_nrm"
 
 Weights = Mapping[str, Tensor]
@@ -58,6 +60,7 @@ class Shape:
     """The convolution that returns the colour."""
 
 
+#: Small and base networks.
 BASE = Shape(
     [["enc_conv0", "enc_conv1"], ["enc_conv2"], ["enc_conv3"], ["enc_conv4"]],
     ["enc_conv5a", "enc_conv5b"],

@@ -19,9 +19,12 @@ from numpy.typing import NDArray
 from oiio_msspl.errors import InputError
 
 #: Networks of Open Image Denoise 2.5 by its own names, with the size in bytes and the SHA-256 of their weights: HDR
-#: colour with albedo and normal; the large network for noise-free albedo and normal; albedo alone; normal alone.
+#: colour with albedo and normal, in two sizes; with noise-free albedo and normal, in two sizes; albedo alone; normal
+#: alone.
 NETWORKS = {
     "rt_hdr_alb_nrm": (1841160, "e586ef2ff48d7fbb7611986405220ed8fc5c13ca79bfc40be4dc742fbf959e1a"),
+    "rt_hdr_alb_nrm_small": (641480, "980ea307e7825cae23ed8b1addf8de62ece84b61094795a5631ebf1c91b2e1a7"),
+    "rt_hdr_calb_cnrm_small": (641480, "a6c43bfdbff01bdd8a9c777e139720f9e58b872a50c8db07079bddd007482dc5"),
     "rt_hdr_calb_cnrm_large": (7698439, "08130cdc4f33b7a513d0073757f089ac830f900613bb5bad72ca42c52b934465"),
     "rt_alb": (1830792, "752c9a8d57884d660ae375a7c853cad8a44f77d559bb282f0ef39f8e758601a4"),
     "rt_nrm": (1830792, "fb8f7f5571332b602406f88a0b570d809dd3c06aebb530f5d048828f57490bc7"),

@@ -58,7 +58,7 @@ def pruned(network: JointFusion, name: str, count: int, pairs: list[data.Batch])
     kept = importance.argsort(descending=True)[:count].sort().values
     removed = torch.tensor(sorted(set(range(len(mean))) - set(kept.tolist())))
     rows, _ = network.pretrained_channels(name)
-    result = JointFusion(network.kept | {name: [rows[i] for i in kept]})
+    result = JointFusion(network.kept | {name: [rows[i] for i in kept]}, network.size)
     weights = network.state_dict()
     prefixes = {id(module): prefix for prefix, module in network.named_modules()}
     for kind in ("weight", "bias", "extra"):

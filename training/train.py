@@ -31,10 +31,9 @@ from torch.optim.swa_utils import AveragedModel
 from datagen.views import Folder, SampleView, View
 from training import checkpoints, losses
 from training.data import PAPER_PATCH, PAPER_SAMPLING, Batches, Sampling, spp_range
-from training.joint import JointFusion
+from training.joint import SIZES, JointFusion
 from training.networks import NETWORKS, Network, preparation, run
 from training.paper import MultiResolutionFusion
-from training.pyramid import LEVELS, PYRAMID_CHANNELS, PyramidFusion
 from training.validation import ValidationPair, evaluate
 
 log = logging.getLogger(__name__)
@@ -127,12 +126,11 @@ def averaged(network: Network) -> AveragedModel:
 
 def new_network(args: argparse.Namespace) -> Network:
     """An untrained network, as the command line describes it."""
-    if args.network == "pyramid":
-        return PyramidFusion(args.channels or PYRAMID_CHANNELS, args.kernels)
     if args.network == "joint":
         started = args.out / "checkpoint.pt"
         earlier = started if started.exists() else args.init
-        return JointFusion(checkpoints.read(earlier)["config"].get("kept") if earlier else None)
+        config = checkpoints.read(earlier)["config"] if earlier else {"size": args.size}
+        return JointFusion(**config)
     if len(args.scale) > 1:
         raise SystemExit("--network paper: a network has one --scale")
     return MultiResolutionFusion(args.scale[0])
@@ -380,20 +378,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
     parser.add_argument("--network", choices=NETWORKS, default="paper", help="(default: %(default)s)")
-    parser.add_argument(
-        "--channels",
-        type=int,
-        nargs="+",
-        help="channels at H/2, H/4, ... (default: those of the shipped network)",
-    )
-    parser.add_argument(
-        "--kernels",
-        type=int,
-        nargs=LEVELS,
-        default=(5,) * LEVELS,
-        metavar="SIZE",
-        help="pyramid: kernel sizes at H, H/2, ...",
-    )
+    parser.add_argument("--size", choices=SIZES, default="usual", help="joint: (default: %(default)s)")
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
     parser.add_argument("--only", default="", help="train only the part of the network with this name, such as heads")
@@ -402,7 +387,6 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--lr", type=float, help="peak learning rate (default: the preset's)")
     parser.add_argument(
         "--fine-tune",
-        "--retrain",
         type=float,
         default=0.06,
         help="joint: share of the learning rate for pretrained weights",

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import math
 from collections.abc import Sequence as Rows
 from pathlib import Path
 
@@ -57,6 +58,7 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
         alone, peer = found[row["sequence"], row["scale"], prefix + ALONE], peers[row["sequence"]]
         gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
         steadier = [row["flicker"] / other["flicker"] for other in (alone, peer)]
+        steadier += [math.sqrt(row["ewarp"] / other["ewarp"]) for other in (alone, peer)]
         masks = {name: row[name] - alone[name] for name in MASKS if name in row}
         worst = min(masks, key=lambda name: masks[name], default="")
         body.append([
@@ -66,7 +68,8 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
         least = masks.get(worst, 0.0)
         missed += [f"{row['sequence']} x{row['scale']}: {text}" for text in _missed(row, alone, peer, least)]
     head = [f"`{quality}`", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
-    head += ["flicker, of single frames'", "of OIDN's", "least gain in a mask, dB"]
+    head += ["flicker, of single frames'", "of OIDN's", "along the motion, of single frames'", "of OIDN's"]
+    head += ["least gain in a mask, dB"]
     lines = [results.markdown(head, body)]
     for unit in ("psnr", "jod"):
         for scale in SCALES:

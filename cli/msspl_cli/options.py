@@ -184,7 +184,17 @@ Temporal = Annotated[
         "--temporal",
         metavar="N",
         help="Average each frame with N frames before and after it, along their motion; or off. auto: 4 where motion "
-        "is known.",
+        "is known, 6 with --quality best.",
+        rich_help_panel=SHOT,
+    ),
+]
+RenderedTemporal = Annotated[
+    str,
+    typer.Option(
+        "--temporal",
+        metavar="N",
+        help="Average each frame with N frames before and after it, along their motion; or off. auto: 4, or off where "
+        "motion blur is on.",
         rich_help_panel=SHOT,
     ),
 ]

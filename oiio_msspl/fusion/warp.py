@@ -128,7 +128,7 @@ class Path:
 
 
 def near_borders(vectors: Array, tolerance: float) -> Mask:
-    """Pixels (h, w) within one pixel of the border between two surfaces: vectors change there by more than ``tolerance``.
+    """Pixels (h, w) within one pixel of a border between two surfaces, where vectors change by more than ``tolerance``.
 
     Args:
         vectors: (h, w, 2), in pixels. NaN counts as another surface.

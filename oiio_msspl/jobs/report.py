@@ -17,6 +17,9 @@ from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
 
+#: Samples of the LRHS below which a pair gets a warning, as a share of those of the HRLS, both per pixel of the frame.
+LEAST_SHARE = 1 / 8
+
 
 @dataclass
 class FrameReport:
@@ -185,7 +188,7 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
     """Warn of spp that the method or the model was not made for."""
     warnings = []
-    if lr.spp is not None and hr.spp is not None and lr.spp <= hr.spp:
+    if lr.spp is not None and hr.spp is not None and lr.spp / contract.scale**2 < LEAST_SHARE * hr.spp:
         warnings.append(
             f"the LRHS has {lr.spp:g} spp and the HRLS {hr.spp:g}: the method expects more in the low-resolution render"
         )

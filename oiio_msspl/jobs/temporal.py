@@ -135,9 +135,7 @@ def _is_slow(model: str | None) -> bool:
     return (family_of(model) or model or "").startswith(QUALITIES["best"])
 
 
-def plan_temporal(
-    shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None = None
-) -> Temporal:
+def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None = None) -> Temporal:
     """Decide how a shot is fused over time. The decision depends on all files of the shot, not on the frames chosen.
 
     Args:

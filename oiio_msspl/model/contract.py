@@ -25,9 +25,9 @@ if TYPE_CHECKING:
 SCALES = (2, 4, 8)
 
 #: Values of ``Contract.denoiser``: none; the denoiser of both renders' mean
-#: (:class:`oiio_msspl.model.mean_denoiser.MeanDenoiser`).
-NO_DENOISER, MEAN_DENOISER = "", "mean"
-#: The network of ``MEAN_DENOISER`` works on blocks of this many LRHS pixels.
+#: (:class:`oiio_msspl.model.mean_denoiser.MeanDenoiser`); its small version.
+NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER = "", "mean", "mean-small"
+#: Both versions work on blocks of this many LRHS pixels.
 MEAN_DENOISER_ALIGNMENT = 16
 #: Channels of the denoised mean, behind the LRHS's own.
 DENOISED_FEATURES: dict[str, int] = {"denoised": 3}
@@ -87,7 +87,7 @@ class Contract:
     defaults: dict[str, float] = field(default_factory=lambda: dict(DEFAULTS))
     """Encoded values of missing features."""
     denoiser: str = NO_DENOISER
-    """What is denoised before the model runs: ``NO_DENOISER`` or ``MEAN_DENOISER``."""
+    """What is denoised before the model runs: ``NO_DENOISER``, ``MEAN_DENOISER`` or ``SMALL_MEAN_DENOISER``."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -97,7 +97,7 @@ class Contract:
     @property
     def tile_alignment(self) -> int:
         """Tiles begin at multiples of this many LRHS pixels, so that all networks divide them as the whole frame."""
-        return math.lcm(self.alignment, MEAN_DENOISER_ALIGNMENT if self.denoiser == MEAN_DENOISER else 1)
+        return math.lcm(self.alignment, MEAN_DENOISER_ALIGNMENT if self.denoiser else 1)
 
     @property
     def features(self) -> dict[str, int]:
@@ -121,7 +121,7 @@ class Contract:
                 return name
         if not isinstance(self.name, str) or not 0 < len(self.name) <= 100:
             return "name"
-        if self.denoiser not in (NO_DENOISER, MEAN_DENOISER):
+        if self.denoiser not in (NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER):
             return "denoiser"
         if not isinstance(self.provenance, dict):
             return "provenance"

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LRHS_FEATURES
 from oiio_msspl.arrays import Array
+from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER
 from oiio_msspl.model.devices import file_for, providers
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.pu_curve import largest_log_encoded, pu_decode, pu_encode_log
@@ -23,8 +24,12 @@ from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denois
 from oiio_msspl.model.runtime import convolutions, load_network
 from oiio_msspl.parallel import for_row_blocks
 
-#: The network's file for CPUs.
-WEIGHTS = Path(__file__).parent / "weights" / "denoisers" / "mean_denoiser.onnx"
+_FOLDER = Path(__file__).parent / "weights" / "denoisers"
+#: The file for CPUs by the value of ``Contract.denoiser``.
+WEIGHTS = {
+    MEAN_DENOISER: _FOLDER / "mean_denoiser.onnx",
+    SMALL_MEAN_DENOISER: _FOLDER / "mean_denoiser_small.onnx",
+}
 #: Height and width of its input are multiples of this.
 ALIGNMENT = 16
 #: Slices of a colour channel at the input and at the output.
@@ -42,17 +47,17 @@ Codes = NDArray[np.uint8]
 class MeanDenoiser:
     """Denoises the mean of both renders at the LRHS's resolution.
 
-    The network was trained from Open Image Denoise's large one. It also reads how far the two renders differ, as an
-    estimate of their noise, so the albedo needs no prefilter.
+    The network was trained from Open Image Denoise's large one, its small version from the small one. It also reads how
+    far the two renders differ, as an estimate of their noise, so the albedo needs no prefilter.
 
     Args:
         threads: CPU threads; 0 for one a core.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
-        path: the network's file; None for the one that suits the device.
+        path: the network's file for CPUs. A GPU runs the one that belongs to it.
     """
 
-    def __init__(self, threads: int = 0, device: str = "cpu", path: Path | None = None) -> None:
-        self._session = load_network(path or file_for(WEIGHTS, device), threads, providers(device))
+    def __init__(self, threads: int = 0, device: str = "cpu", path: Path = WEIGHTS[MEAN_DENOISER]) -> None:
+        self._session = load_network(file_for(path, device), threads, providers(device))
         self._reads_codes = [each.name for each in self._session.get_inputs()] == ["layers"]
         self.convolutions = convolutions(self._session)
         """See :func:`oiio_msspl.model.runtime.convolutions`."""

@@ -17,7 +17,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.model.contract import NO_DENOISER, Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
-from oiio_msspl.model.mean_denoiser import MeanDenoiser
+from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, useful_lrhs_aovs
 from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
 
@@ -31,7 +31,7 @@ SPREAD = "-spread"
 
 def make_denoiser(mode: str, threads: int = 0, device: str = "cpu") -> MeanDenoiser | None:
     """The denoiser that runs before a model, for its contract's ``denoiser``."""
-    return None if mode == NO_DENOISER else MeanDenoiser(threads, device)
+    return None if mode == NO_DENOISER else MeanDenoiser(threads, device, WEIGHTS[mode])
 
 
 class Session:

@@ -180,7 +180,7 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
     )
     blender.chmod(0o755)
     options = ["-s", "2", "--hr-spp", "4", "--view-layer", "ViewLayer", "--keep", "--compare", "--json"]
-    options += ["--model", "pyramid", "--error-layer", "--components"]
+    options += ["--model", "joint-small", "--error-layer", "--components"]
     frames = ["--frames", "3-4", "-o", out / "out.##.exr"]
     done = msspl_render(results / "scene.blend", "--blender", blender, *options, *frames)
     assert done.returncode == 0, done.stderr
@@ -196,7 +196,7 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
         assert report["plain_spp"] > 3
         assert report["oidn"]["spp"] >= 1
     written = open_exr(out / "out.03.exr")
-    assert written.metadata["msspl/model"] == "pyramid-x2"
+    assert written.metadata["msspl/model"] == "joint-small-x2"
     assert "error.Y" in [channel.name for channel in written.parts[0].channels]
     names = [f"out.{n}{suffix}.exr" for n in ("03", "04") for suffix in ("", "_hr", "_lr", "_oidn")]
     assert sorted(p.name for p in out.iterdir()) == sorted(names)
@@ -214,7 +214,19 @@ def test_msspl_render_goes_from_a_scene_to_fused_frames(python, results, tmp_pat
 def test_msspl_render_averages_frames_along_the_vectors_that_cycles_writes(python, results, tmp_path):
     """Vectors are those of a render without persistent data, and frames gain from them. A resumed run gives the same
     frames."""
-    options = ["--blender", python, "-s", "2", "--hr-spp", "4", "--model", "pyramid", "--layout", "spec", "--frames"]
+    options = [
+        "--blender",
+        python,
+        "-s",
+        "2",
+        "--hr-spp",
+        "4",
+        "--model",
+        "joint-small",
+        "--layout",
+        "spec",
+        "--frames",
+    ]
     for name, more in (("alone", []), ("whole", ["--temporal", "1", "--keep"])):
         out = tmp_path / name / "out.####.exr"
         done = msspl_render(results / "motion.blend", *options, "1-4", *more, "-o", out)
@@ -257,7 +269,7 @@ def beauty(path):
 
 def test_neighbouring_frames_have_different_noise_if_they_are_averaged(python, results, tmp_path):
     """The scene stands still."""
-    options = ["--blender", python, "-s", "2", "--hr-spp", "4", "--model", "pyramid", "--view-layer", "ViewLayer"]
+    options = ["--blender", python, "-s", "2", "--hr-spp", "4", "--model", "joint-small", "--view-layer", "ViewLayer"]
     for temporal in ("off", "1"):
         more = ["--temporal", temporal, "--keep", "--frames", "1-2", "-o", tmp_path / f"{temporal}.#.exr"]
         done = msspl_render(results / "scene.blend", *options, *more)

@@ -46,7 +46,7 @@ def test_the_example_is_fused_with_its_passes_and_without_a_warning(tmp_path):
 def test_a_quality_names_the_model(files):
     pair = files / "lr.exr", files / "hr.exr", "-o", files / "out.exr"
     done = fuse(*pair, "--quality", "fast", "--no-preview", "--json")
-    assert (done.returncode, json.loads(done.stdout)["model"]) == (0, "pyramid-x4")
+    assert (done.returncode, json.loads(done.stdout)["model"]) == (0, "joint-small-x4")
     for options, message in (
         (("--quality", "good"), "--quality 'good': use one of fast, balanced, best"),
         (("--quality", "fast", "--model", "joint"), "--quality and --model: give one of them"),

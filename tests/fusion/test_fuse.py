@@ -65,7 +65,7 @@ def tiles_of(monkeypatch, session, pixels):
     monkeypatch.setattr(tiling, "TILE_MEMORY", pixels * session.contract.bytes_per_pixel)
 
 
-@pytest.mark.parametrize("family", ["ensemble", "joint", "pyramid", "paper"])
+@pytest.mark.parametrize("family", ["ensemble", "joint", "joint-small", "paper"])
 def test_the_result_depends_neither_on_memory_nor_on_threads(scale, family, monkeypatch):
     """In a frame of two tiles: bit for bit whatever the memory, and to float32's rounding whatever the threads, because
     ONNX Runtime cuts its work by them."""
@@ -194,7 +194,7 @@ def test_a_pixel_that_the_lrhs_rules_out_is_dimmed_before_it_is_fused(session, s
 LAMP_ROWS, LAMP_COLUMNS = slice(45, 72), slice(67, 102)  # not along the borders of LRHS pixels
 
 
-@pytest.mark.parametrize("family", ["pyramid", "paper"])
+@pytest.mark.parametrize("family", ["joint-small", "paper"])
 @pytest.mark.parametrize(("lamp", "room"), [(5000, 0.002), (60_000, 0.05), (1e7, 0.05)])
 def test_a_lamp_is_as_bright_as_in_both_renders(scale, family, lamp, room):
     """However dark the room is: inside, along the rim, and where it is smaller than an LRHS pixel; without a halo."""
@@ -256,7 +256,7 @@ def test_the_end_of_a_fade_stays_finite(scale, light):
     """Light so weak that the exposure would be infinite."""
     low = np.full((96 // scale, 128 // scale, 3), light, np.float32)
     high = low.repeat(scale, 0).repeat(scale, 1) * np.random.default_rng(0).integers(0, 3, (96, 128, 1))
-    fused = fuse(*renders(low, high), Session(find_model(scale, "pyramid")))
+    fused = fuse(*renders(low, high), Session(find_model(scale, "joint-small")))
     assert np.isfinite(np.float32(fused.exposure))
     assert np.isfinite(fused.rgb).all()
     assert fused.rgb.max() <= 4 * light
@@ -388,7 +388,7 @@ def test_nothing_glows_where_neither_render_has_light(scale):
     low, high, _ = pair_of(scale)
     low.layers["rgb"][:, : 64 // scale] = 0
     high.layers["rgb"][:, :64] = 0
-    fused = fuse(low, high, Session(find_model(scale, "pyramid"))).rgb
+    fused = fuse(low, high, Session(find_model(scale, "joint-small"))).rgb
     assert not fused[:, : 64 - scale].any()
     assert fused[:, 64:].mean() > 0.1
 
@@ -405,7 +405,7 @@ def test_two_black_frames_give_a_black_frame(scale):
     low, high, _ = pair_of(scale)
     low.layers["rgb"][:] = 0
     high.layers["rgb"][:] = 0
-    fused = fuse(low, high, Session(find_model(scale, "pyramid")))
+    fused = fuse(low, high, Session(find_model(scale, "joint-small")))
     assert not fused.rgb.any()
     assert "black" in fused.warnings[0]
 
@@ -510,7 +510,7 @@ def test_a_frame_of_one_tile_is_averaged_as_it_suggests(scale, monkeypatch):
     assert fuse(low, high, session).tiles == 1
 
 
-@pytest.mark.parametrize("family", ["joint", "pyramid", "paper"])
+@pytest.mark.parametrize("family", ["joint", "joint-small", "paper"])
 def test_the_shipped_overlap_hides_the_seams(scale, family, monkeypatch):
     """Steps between pixels are no larger across the borders of tiles than they are in the frame fused as a whole."""
     shipped = Session(find_model(scale, family))

@@ -87,7 +87,7 @@ def test_the_last_rows_are_as_good_as_inside_a_larger_frame(scale, rows):
     clean = picture(256, 256)
     low = Render.from_arrays("lr", rgb=noisy(downsample(clean, scale), scale**2))
     high = Render.from_arrays("hr", rgb=noisy(clean, 1, seed=1))
-    session = Session(find_model(scale, "pyramid"))
+    session = Session(find_model(scale, "joint-small"))
     errors = []
     for pair in ((low, high), (cut(low, 256 // scale, -(-height // scale)), cut(high, 256, height))):
         fused = fuse(*pair, session)

@@ -22,7 +22,9 @@ def write_pair(folder, name, sigma, extra=None):
 
 
 @pytest.mark.parametrize(("sigma", "ending"), [(None, ""), (0.5, "-spread")])
-@pytest.mark.parametrize(("quality", "model"), [(None, "joint-x4"), ("fast", "pyramid-x4"), ("best", "ensemble-x4")])
+@pytest.mark.parametrize(
+    ("quality", "model"), [(None, "joint-x4"), ("fast", "joint-small-x4"), ("best", "ensemble-x4")]
+)
 def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, ending, quality, model):
     write_pair(tmp_path, "a", sigma, "albedo")
     report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "out.exr", model=quality)
@@ -49,8 +51,8 @@ def test_the_best_quality_needs_an_albedo_or_a_normal(tmp_path, caplog):
 
 def test_a_model_is_taken_as_it_is_named(tmp_path):
     write_pair(tmp_path, "a", 0.5)
-    report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "named.exr", model="pyramid")
-    assert report.model == "pyramid-x4"
+    report = fuse_files(tmp_path / "lr/a.exr", tmp_path / "hr/a.exr", tmp_path / "named.exr", model="joint-small")
+    assert report.model == "joint-small-x4"
 
 
 def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path, caplog, monkeypatch):

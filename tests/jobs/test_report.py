@@ -43,6 +43,7 @@ def test_the_average_spp_counts_the_lrhs_by_its_pixels(report_of):
     [
         (64, 2, None),
         (None, 2, None),
+        (8, 4, None),  # a ninth of all samples
         (2, 2, "the LRHS has 2 spp and the HRLS 2: the method expects more in the low-resolution render"),
         (256, 2, "the LRHS has 256 spp; x was trained on 2 to 64"),
         (64, 0.5, "the HRLS has 0.5 spp; x was trained on 1 to 4"),

@@ -155,7 +155,9 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)
 
 
-@pytest.mark.parametrize(("count", "averaged"), [(1, (0, 1)), (2, (1, 1)), (3, (1, 2)), (4, (2, 2)), (6, (4, 2)), (8, (6, 2))])
+@pytest.mark.parametrize(
+    ("count", "averaged"), [(1, (0, 1)), (2, (1, 1)), (3, (1, 2)), (4, (2, 2)), (6, (4, 2)), (8, (6, 2))]
+)
 def test_renders_and_fused_frames_share_the_neighbours(count, averaged):
     assert shares(count, VECTORS) == averaged
     assert shares(count, FLOW) == (0, count)  # flow is computed on fused frames

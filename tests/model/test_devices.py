@@ -17,17 +17,17 @@ from oiio_msspl import Session, find_model
 from oiio_msspl.errors import InputError
 from oiio_msspl.model import devices, runtime, session
 from oiio_msspl.model.catalogue import WEIGHTS
-from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.contract import MEAN_DENOISER, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS, file_for, gpu_file, providers, require_device
-from oiio_msspl.model.mean_denoiser import WEIGHTS as DENOISER
+from oiio_msspl.model.mean_denoiser import WEIGHTS as DENOISERS
 from oiio_msspl.model.mean_denoiser import MeanDenoiser
 from tests.conftest import SHARED, needs_shared
 
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 #: Files for GPUs, relative to the folder of the weights.
-FAMILIES = ("joint", "ensemble")
+FAMILIES = ("joint-small", "joint", "ensemble")
 GPU_FILES = [f"gpu/{family}-x{scale}.onnx" for family in FAMILIES for scale in SCALES]
-GPU_FILES += ["denoisers/gpu/mean_denoiser.onnx"]
+GPU_FILES += ["denoisers/gpu/mean_denoiser.onnx", "denoisers/gpu/mean_denoiser_small.onnx"]
 
 
 def test_a_gpu_gets_the_file_that_was_made_for_it(tmp_path):
@@ -62,7 +62,7 @@ def test_the_files_for_gpus_compute_the_same(family, scale):
     hrls[..., 3:6] = 0.5
     lrhs = hrls[::scale, ::scale, :3] + np.float32(0.02) * rng.random((128 // scale, 192 // scale, 3), np.float32)
     on_cpu, on_gpu = (Session(path(find_model(scale, family))) for path in (Path, gpu_file))
-    on_gpu._denoiser = MeanDenoiser(path=gpu_file(DENOISER))
+    on_gpu._denoiser = MeanDenoiser(path=gpu_file(DENOISERS[on_gpu.contract.denoiser]))
     one, other = (s.run(lrhs, hrls, error=True, aovs=s.clean_aovs) for s in (on_cpu, on_gpu))
     assert one.keys() == other.keys() == {"fused", "error", *on_cpu.clean_aovs}
     assert np.abs(one["fused"] - other["fused"]).mean() < 0.1 * np.abs(one["fused"] - hrls[..., :3]).mean()
@@ -73,7 +73,7 @@ def test_the_files_for_gpus_compute_the_same(family, scale):
 
 def test_the_denoiser_for_gpus_takes_any_size():
     """It repeats the edge pixels, so a part of an even image gives the same as the whole."""
-    denoiser = MeanDenoiser(1, path=gpu_file(DENOISER))
+    denoiser = MeanDenoiser(1, path=gpu_file(DENOISERS[MEAN_DENOISER]))
     part, whole = (
         denoiser(np.full((h, w, 3), 0.5, np.float32), np.full((2 * h, 2 * w, 9), 0.5, np.float32))[0]
         for h, w in ((21, 35), (32, 48))

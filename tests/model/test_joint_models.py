@@ -17,8 +17,10 @@ from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.encoding import encode_radiance
 from tests.conftest import noisy, picture, rgb, write_exr
 
+DENOISERS = ("denoisers/mean_denoiser", "denoisers/mean_denoiser_small")
 
-@pytest.mark.parametrize("name", [*shipped_models(), "denoisers/mean_denoiser"])
+
+@pytest.mark.parametrize("name", [*shipped_models(), *DENOISERS])
 def test_files_are_whole(name):
     """Only the ensemble shares weights of all scales, in a file beside it."""
     onnx = pytest.importorskip("onnx")
@@ -28,9 +30,7 @@ def test_files_are_whole(name):
     assert all((WEIGHTS / file).is_file() for file in files)
 
 
-@pytest.mark.parametrize(
-    "name", [*(n for n in shipped_models() if n.startswith(("joint", "ensemble"))), "denoisers/mean_denoiser"]
-)
+@pytest.mark.parametrize("name", [*(n for n in shipped_models() if n.startswith(("joint", "ensemble"))), *DENOISERS])
 def test_products_of_two_channels_fit_into_16_bits(name):
     """So processors without VNNI instructions, which add them in 16 bits, give the same result."""
     onnx = pytest.importorskip("onnx")

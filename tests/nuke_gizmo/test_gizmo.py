@@ -5,7 +5,7 @@ import pytest
 from msspl_bridge.command import Settings
 
 from oiio_msspl.aovs.features import FEATURES
-from oiio_msspl.jobs.temporal import TemporalOptions
+from oiio_msspl.jobs.temporal import MOST, TemporalOptions
 from oiio_msspl.model.catalogue import QUALITIES
 from oiio_msspl.model.devices import PROVIDERS
 from tests.nuke_gizmo.conftest import GIZMO
@@ -65,9 +65,9 @@ def test_the_device_menu_lists_the_devices_of_msspl_fuse(nodes):
 
 def test_the_menu_of_neighbours_has_what_msspl_fuse_takes(nodes):
     items = knob(nodes, "temporal").items
-    assert items == ["auto", "off", "1", "2", "3", "4"]
+    assert items == ["auto", "off", *map(str, range(1, MOST + 1))]
     assert items[0] == Settings.temporal
-    assert [TemporalOptions(item).count() for item in items] == [4, 0, 1, 2, 3, 4]
+    assert [TemporalOptions(item).count() for item in items] == [4, 0, *range(1, MOST + 1)]
 
 
 def test_the_tooltips_name_every_quality_and_every_feature(nodes):

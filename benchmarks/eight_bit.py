@@ -31,7 +31,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import psnr
-from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import MEAN_DENOISER, SCALES
 from oiio_msspl.model.devices import gpu_file
 from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
@@ -75,9 +75,12 @@ class InTorch(Session):
 
     def __init__(self, path: Path, checkpoint: Path) -> None:
         super().__init__(path)
-        network, _ = load_checkpoint(checkpoint)
-        assert isinstance(network, JointFusion)
+        network, other = (load_checkpoint(path)[0] for path in (checkpoint, CHECKPOINTS["joint"]))
+        assert isinstance(network, JointFusion) and isinstance(other, JointFusion)
         self._network = network
+        # The small network has the large denoiser at x4 and x8
+        large = self.contract.denoiser == MEAN_DENOISER
+        self._mean_denoiser = other.mean_denoiser if large else network.mean_denoiser
 
     def run(
         self,
@@ -91,7 +94,7 @@ class InTorch(Session):
     ) -> Images:
         light = lrhs[..., :3]
         layers = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs, mean)
-        images = np.concatenate([light, self._network.mean_denoiser.denoise(layers)], axis=-1), hrls
+        images = np.concatenate([light, self._mean_denoiser.denoise(layers)], axis=-1), hrls
         with torch.inference_mode():
             fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
         return {"fused": fused[0].permute(1, 2, 0).numpy()}

@@ -89,7 +89,7 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
 
     run_unet(shape, [10], conv, same, same, lambda one, other: one + other)
     images = [layers(64, 48, seed) for seed in range(2)]
-    fit = gptq.quantise_mean_denoiser(weights, images)
+    fit = gptq.quantise_mean_denoiser(shape, weights, images)
     onnx.save(Graph(fit).model(), tmp_path / "base.onnx")
     session = load_network(tmp_path / "base.onnx", 1)
     codes = gptq.quantise_inputs(images).codes[0]

@@ -60,7 +60,8 @@ def main() -> None:
     network.reset_error()
     scales = [int(scale) for scale in state["training_spp"]]
     loss = fit(network, args.data, scales, preparation(state["architecture"]), args.steps)
-    state["ema"] = network.state_dict()
+    # In the precision of the checkpoint: training.average stores half floats
+    state["ema"] = {name: values.to(state["ema"][name].dtype) for name, values in network.state_dict().items()}
     state["provenance"]["error_steps"] = args.steps
     checkpoints.save(state, args.checkpoint)
     print(f"{args.steps} steps, loss {loss:.3f}")

@@ -146,16 +146,19 @@ def test_a_new_mean_denoiser_is_open_image_denoise(size):
     assert np.abs(found - expected).mean() < 1e-3
 
 
-@pytest.mark.parametrize(("checkpoint", "denoiser"), [("joint", MEAN_DENOISER), ("joint_small", SMALL_MEAN_DENOISER)])
-def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint(checkpoint, denoiser):
-    """To an eighth of the noise, also for sides that are no multiple of 16."""
+@pytest.mark.parametrize(
+    ("checkpoint", "denoiser", "share"),
+    [("joint", MEAN_DENOISER, 0.1), ("joint_small", SMALL_MEAN_DENOISER, 0.125)],
+)
+def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint(checkpoint, denoiser, share):
+    """To this share of the noise, also for sides that are no multiple of 16."""
     ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
     low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
     layers = mean_of_renders(low, denoiser_images(high))
     network, _ = checkpoints.load(CHECKPOINT.with_stem(checkpoint))
     expected = network.mean_denoiser.denoise(layers)
     found = QuantisedMeanDenoiser(threads=1, path=WEIGHTS[denoiser])(low, high)[0][..., 3:]
-    assert np.abs(found - expected).mean() < np.abs(layers["colour"] - expected).mean() / 8
+    assert np.abs(found - expected).mean() < share * np.abs(layers["colour"] - expected).mean()
 
 
 def test_a_run_starts_from_a_pruned_checkpoint_with_older_names(tmp_path: Path):

@@ -16,7 +16,7 @@ the albedo and the normal:
   so that they sum to the beauty that OIDN makes of this render.
 - "msspl": :mod:`oiio_msspl.fusion.passes`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
-- "msspl, best": with the beauty of ``--quality best``, and with albedo and normal as its networks denoise them.
+- "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
 
 Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
 
@@ -43,7 +43,7 @@ from benchmarks import results
 from benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
 from benchmarks.results import MEAN, Row
 from benchmarks.versus import cell, with_interval
-from oiio_msspl import FusedFrame, fuse
+from oiio_msspl import FusedFrame, Session, fuse
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.formula import FeatureFormula
@@ -53,6 +53,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.colour import srgb
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.fuse import layer_fuser
 from oiio_msspl.fusion.passes import fuse_passes
 from oiio_msspl.fusion.sums import layer_keys, with_layers
 from oiio_msspl.metrics import psnr, relmse
@@ -95,19 +96,19 @@ def colours_of(render: MappedRender, layers: AdditiveSet) -> Array:
 def methods(
     lr: MappedRender,
     hr: MappedRender,
-    fused: Mapping[str, FusedFrame],
+    fused: Mapping[str, tuple[FusedFrame, Session]],
     layers: AdditiveSet,
     ordinary: MappedRender | None = None,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
     """The name of each method, and a function that computes the layers.
 
     Args:
-        fused: the fused frame of each model.
+        fused: the fused frame of each model, and the model.
         ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
     """
     noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
-    beauty = fused[BEST].rgb
+    beauty = fused[BEST][0].rgb
 
     def plain() -> Array:
         return np.maximum([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy], np.float32(0))
@@ -117,8 +118,16 @@ def methods(
         return np.maximum([denoise_with_clean(layer, clean) for layer in noisy], np.float32(0))
 
     def ours(low: MappedRender, model: str) -> Array:
-        frame = fused[model]
-        made = fuse_passes(low, hr, frame.rgb, frame.alignment, [layers], guides=frame.clean_aovs)
+        frame, session = fused[model]
+        made = fuse_passes(
+            low,
+            hr,
+            frame.rgb,
+            frame.alignment,
+            [layers],
+            guides=frame.clean_aovs,
+            fuse_layer=layer_fuser(session, frame),
+        )
         assert not made.refused
         height = hr.data_window.height
         planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
@@ -152,9 +161,11 @@ def regraded(layers: Array) -> Array:
     return np.einsum("i,ihwc->hwc", grades, layers)
 
 
-def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, FusedFrame]:
-    """The fused frame of each model."""
-    return {model: fuse(lr, hr, load_model(scale, model), clean_aovs=True) for model in (BALANCED, BEST)}
+def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tuple[FusedFrame, Session]]:
+    """The fused frame of each model, and the model. That of single layers is loaded, too."""
+    sessions = {model: load_model(scale, model) for model in (BALANCED, BEST)}
+    assert sessions[BEST].layer_session is not None
+    return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
 
 
 def picture(folder: Path, output: Path) -> None:

@@ -5,7 +5,8 @@
 
 A pair of half-float EXRs has eight light groups of random pixels that sum to the beauty, an albedo and a normal. Ours
 reads the layers from the files. OIDN gets them as arrays in memory. The methods take turns; the median of all rounds
-counts, after one that does not. :mod:`benchmarks.passes` measures accuracy, on frames that are much smaller.
+counts, after one that does not. With ``--quality best``, a network fuses each layer. :mod:`benchmarks.passes` measures
+accuracy, on frames that are much smaller.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ import os
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,12 +28,13 @@ from benchmarks import results
 from benchmarks.oidn import denoise, denoise_with_clean, prefiltered
 from benchmarks.results import Row
 from benchmarks.runtime import frame, processor
-from oiio_msspl import fuse, map_render, open_exr
+from oiio_msspl import FusedFrame, fuse, map_render, open_exr
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import box_downsample
-from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.fuse import layer_fuser
 from oiio_msspl.fusion.passes import fuse_passes
 from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.session import Session
 
 LAYERS = 8
 BEAUTY, PASSES, PLAIN = "beauty", "passes", "OIDN on each layer"
@@ -63,11 +66,12 @@ def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Mappe
     return found[0], found[1]
 
 
-def methods(lr: MappedRender, hr: MappedRender, model: str) -> dict[str, Callable[[], Any]]:
+#: A method, and the model that it is for; no model for a peer.
+Key = tuple[str, str]
+
+
+def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> dict[Key, Callable[[], Any]]:
     """What is timed."""
-    alignment = align(lr, hr)
-    session = load_model(alignment.scale, model)
-    beauty = fuse(lr, hr, session).rgb
     (lights,) = (each for each in hr.additive_sets if len(each.layers) == LAYERS)
     pixels = frame(hr.data_window.height, hr.data_window.width)
     noisy, guides = pixels["rgb"], {name: pixels[name] for name in ("albedo", "normal")}
@@ -77,51 +81,58 @@ def methods(lr: MappedRender, hr: MappedRender, model: str) -> dict[str, Callabl
         for _ in range(LAYERS):
             denoise_with_clean(noisy, clean)
 
-    def passes() -> None:
-        assert not fuse_passes(lr, hr, beauty, alignment, [lights]).refused
+    def passes(session: Session, beauty: FusedFrame) -> None:
+        fuser = layer_fuser(session, beauty)
+        assert not fuse_passes(lr, hr, beauty.rgb, beauty.alignment, [lights], fuse_layer=fuser).refused
 
-    return {
-        BEAUTY: lambda: fuse(lr, hr, session),
-        PASSES: passes,
-        PLAIN: lambda: [denoise(noisy, **guides) for _ in range(LAYERS)],
-        PREFILTERED: each_prefiltered,
-    }
+    calls: dict[Key, Callable[[], Any]] = {}
+    for session in sessions:
+        calls[BEAUTY, session.name] = partial(fuse, lr, hr, session)
+        calls[PASSES, session.name] = partial(passes, session, fuse(lr, hr, session))
+    calls[PLAIN, ""] = lambda: [denoise(noisy, **guides) for _ in range(LAYERS)]
+    calls[PREFILTERED, ""] = each_prefiltered
+    return calls
 
 
 def layout(rows: list[Row]) -> str:
     """A line for each method."""
-    seconds = {row["method"]: row["seconds"] for row in rows}
-    first = rows[0]
-    titles = {BEAUTY: f"`{first['model']}` on the beauty", PASSES: f"{LAYERS} passes, fused"}
+    seconds = {(row["method"], row["model"] or ""): row["seconds"] for row in rows}
+    titles = {BEAUTY: "`{}` on the beauty", PASSES: f"{LAYERS} passes with `{{}}`"}
     body = [
-        [titles.get(name, name), f"{value:.2f}", f"{value / seconds[PLAIN]:.2f}", f"{value / seconds[BEAUTY]:.2f}"]
-        for name, value in seconds.items()
+        [
+            titles.get(name, name).format(model),
+            f"{value:.2f}",
+            *(f"{value / seconds[peer, '']:.2f}" for peer in (PLAIN, PREFILTERED)),
+            f"{value / seconds[BEAUTY, model]:.2f}" if model else "",
+        ]
+        for (name, model), value in seconds.items()
     ]
+    first = rows[0]
     head = [f"{first['size'].replace('x', ' x ')}, {first['cores']} cores, {first['machine']}"]
-    return results.markdown([*head, "seconds", "of plain OIDN's time", "of the beauty's"], body)
+    return results.markdown([*head, "seconds", "of plain OIDN's", "of prefiltered OIDN's", "of the beauty's"], body)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--scale", type=int, default=2)
-    parser.add_argument("--model", default="balanced")
+    parser.add_argument("--models", nargs="+", default=["balanced", "best"])
     results.add_option(parser)
     args = parser.parse_args()
     width, height = (int(v) for v in args.size.split("x"))
-    times: dict[str, list[float]] = {}
+    times: dict[Key, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
         lr, hr = write_pair(Path(folder), width, height, args.scale)
-        calls = methods(lr, hr, args.model)
+        calls = methods(lr, hr, [load_model(args.scale, model) for model in args.models])
         for _ in range(ROUNDS + 1):
-            for name, call in calls.items():
+            for key, call in calls.items():
                 start = time.perf_counter()
                 call()
-                times.setdefault(name, []).append(time.perf_counter() - start)
-    name = load_model(args.scale, args.model).name
-    key = {"size": args.size, "model": name, "machine": processor(), "cores": os.cpu_count()}
+                times.setdefault(key, []).append(time.perf_counter() - start)
+    machine = {"size": args.size, "machine": processor(), "cores": os.cpu_count()}
     rows: list[Row] = [
-        {"method": name, **key, "seconds": statistics.median(found[1:])} for name, found in times.items()
+        {"method": name, "model": model, **machine, "seconds": statistics.median(found[1:])}
+        for (name, model), found in times.items()
     ]
     print(layout(rows))
     if args.table:

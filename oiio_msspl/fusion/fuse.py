@@ -18,6 +18,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import encode_alpha, fuse_alpha
 from oiio_msspl.fusion.guards import (
+    FAR,
     EmptyRegions,
     Mask,
     check_finite,
@@ -26,7 +27,7 @@ from oiio_msspl.fusion.guards import (
     lights_above_ceiling,
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, bounded_luminance, check_pair
-from oiio_msspl.fusion.passes import FusedPasses
+from oiio_msspl.fusion.passes import FusedPasses, LayerFuser
 from oiio_msspl.fusion.spread import Place, join, split, without_grid
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
@@ -44,6 +45,10 @@ from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_fe
 from oiio_msspl.model.render_mean import Images, MeanSettings, mean_settings
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import limit_threads, one_ahead
+
+#: HRLS pixels around a surface over which a layer without light makes it black. Black layers are common, and a network
+#: leaves a trace of light in them.
+LAYER_REACH = 16
 
 
 @dataclass
@@ -128,24 +133,45 @@ def fuse(
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session, session.clean_aovs if clean_aovs else ())
         frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
-        tiles = plan_tiles(pair.grid, session.contract, session.stride)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
-            means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
-            # The next tile is read and encoded while the network works on this one.
-            for done, tile in enumerate(one_ahead(map(pair.prepare, tiles)), start=1):
-                _fuse_tile(tile, session, frame, means)
-                pair.release(tile)
-                if progress is not None:
-                    progress(done, len(tiles))
-        if len(tiles) > 1:
+            frame.tiles = _fuse_tiles(pair, session, frame, progress)
+        if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
         frame.warnings += pair.check(frame.lrhs_luminance)
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
-    frame.tiles, frame.seconds = len(tiles), session.seconds - seconds
+    frame.seconds = session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     return frame
+
+
+def fuse_layer(lr: ReadableRender, hr: ReadableRender, session: Session, frame: FusedFrame) -> Array:
+    """Fuse a layer of both renders of a frame, such as the light of one lamp.
+
+    Args:
+        lr, hr: renders with the layer in place of the beauty.
+        session: a model for the scale of the pair.
+        frame: the fused beauty. The layer is exposed as this is, because networks tell light from noise by brightness.
+
+    Returns:
+        (height, width, 3) over the HRLS's data window, finite and >= 0.
+
+    Raises:
+        InputError: pixels can't be decoded.
+        MssplError: the network failed, or returned NaN or infinite values.
+    """
+    with limit_threads(session.threads):
+        pair = _Pair(lr, hr, frame.alignment, session, (), beauty=frame)
+        layer = _blank_frame(frame.alignment, frame.exposure, error=False, half=False)
+        _fuse_tiles(pair, session, layer)
+        return layer.rgb
+
+
+def layer_fuser(session: Session, frame: FusedFrame) -> LayerFuser | None:
+    """What fuses single layers of a frame whose beauty ``session`` has fused; None if no network does."""
+    layer_session = session.layer_session
+    return None if layer_session is None else lambda lr, hr: fuse_layer(lr, hr, layer_session, frame)
 
 
 def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> int:
@@ -234,17 +260,29 @@ class _Pair:
     """The LRHS in memory, and the HRLS that is read tile by tile."""
 
     def __init__(
-        self, lr: ReadableRender, hr: ReadableRender, alignment: Alignment, session: Session, aovs: Sequence[str]
+        self,
+        lr: ReadableRender,
+        hr: ReadableRender,
+        alignment: Alignment,
+        session: Session,
+        aovs: Sequence[str],
+        beauty: FusedFrame | None = None,
     ) -> None:
-        """``aovs``: see :attr:`_Picture.aovs`."""
+        """
+        Args:
+            aovs: see :attr:`_Picture.aovs`.
+            beauty: that of the frame, if the pair shows a layer of it. Then there is no :meth:`check`.
+        """
         self._lr, self._hr, self._alignment, self._session, self._aovs = lr, hr, alignment, session, aovs
         self.grid = _grid(alignment, session)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         features = [RGB, *session.lrhs_aovs, "alpha"]
         self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_counts)
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
-        self.exposure = find_exposure(self._lrhs_rgb)
-        self._empty_regions, self._averages = EmptyRegions(self._lrhs[RGB]), HrlsAverages(alignment)
+        self.exposure = find_exposure(self._lrhs_rgb) if beauty is None else beauty.exposure
+        reach = FAR if beauty is None else max(LAYER_REACH // alignment.scale - 1, 1)
+        self._empty_regions = EmptyRegions(self._lrhs[RGB], reach)
+        self._averages = HrlsAverages(alignment) if beauty is None else None
         self._memory = ReusedMemory()
 
     @property
@@ -266,7 +304,8 @@ class _Pair:
         contract, grid = self._session.contract, self.grid
         features = [*contract.features, "alpha"]
         pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
-        self._averages.add(pair)
+        if self._averages is not None:
+            self._averages.add(pair)
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
         # An empty tile may still show surfaces.
         lit = empty is None or not empty.all() or bool(self._aovs)
@@ -327,11 +366,28 @@ class _Pair:
 
     def luminances(self) -> tuple[Array, Array]:
         """Luminance of both renders over the grid, (h, w) each, once all tiles are prepared."""
+        assert self._averages is not None
         return bounded_luminance(self._lrhs_rgb), self._averages.rgb
 
     def check(self, lrhs_luminance: Array) -> list[str]:
         """Compare the two renders once all tiles are prepared, see :func:`check_pair`."""
+        assert self._averages is not None
         return check_pair(lrhs_luminance, self._averages, self._lr.name, self._hr.name)
+
+
+def _fuse_tiles(
+    pair: _Pair, session: Session, frame: FusedFrame, progress: Callable[[int, int], None] | None = None
+) -> int:
+    """Fuse a frame tile by tile; return how many there are."""
+    tiles = plan_tiles(pair.grid, session.contract, session.stride)
+    means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
+    # The next tile is read and encoded while the network works on this one.
+    for done, tile in enumerate(one_ahead(map(pair.prepare, tiles)), start=1):
+        _fuse_tile(tile, session, frame, means)
+        pair.release(tile)
+        if progress is not None:
+            progress(done, len(tiles))
+    return len(tiles)
 
 
 def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: _FrameMeans) -> None:

@@ -144,20 +144,25 @@ def check_finite(session: Session, *images: Array) -> None:
         )
 
 
+#: LRHS pixels around a surface that are black where it becomes black: as far as networks look.
+FAR = 15
+
+
 class EmptyRegions:
     """Where neither render has any light, not even around: the result is black there, and a transparent film stays
     empty.
 
-    A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only if its 31 x 31 LRHS
-    neighbourhood is black.
+    A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only where the LRHS is
+    black far around.
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
+        reach: how far, in LRHS pixels.
     """
 
-    def __init__(self, lrhs_rgb: Array) -> None:
+    def __init__(self, lrhs_rgb: Array, reach: int = FAR) -> None:
         self._black = np.all(lrhs_rgb == 0, axis=-1, keepdims=True)
-        self._black_far_around = _all_in_31x31(self._black) if self._black.any() else self._black
+        self._black_far_around = _all_within(self._black, reach) if self._black.any() else self._black
 
     def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
         """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
@@ -183,9 +188,12 @@ def _enlarge(lrhs: Mask, scale: int) -> Mask:
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _all_in_31x31(mask: Mask) -> Mask:
-    for distance in (1, 2, 4, 8):
-        mask = reduce(np.logical_and, _neighbours(mask, distance))
+def _all_within(mask: Mask, reach: int) -> Mask:
+    """Where a mask holds for all pixels up to ``reach`` rows and columns away."""
+    distance = 1
+    while reach > 0:
+        mask = reduce(np.logical_and, _neighbours(mask, min(distance, reach)))
+        reach, distance = reach - distance, 2 * distance
     return mask
 
 

@@ -1,17 +1,22 @@
 # SPDX-License-Identifier: Apache-2.0
 """Fuses the layers of an additive set, so that they still sum to the fused beauty.
 
-A layer is fitted, around every LRHS pixel, as a linear function of the fused beauty, which has little noise. Pixels
-count by how much they look alike in albedo and normal (first-order regression with cross-bilateral weights: Bitterli et
-al. 2016; the fit at low resolution: fast guided filter, He and Sun 2015). The function is then applied at full
-resolution. A fit needs averages of noisy layers only, so no network runs for the layers. What the fitted
-layers lack of the fused beauty is spread over them in proportion to their light, so their sum is the beauty to the last
-bits.
+A layer is estimated in one of two ways:
+
+- It is fitted, around every LRHS pixel, as a linear function of the fused beauty, which has little noise. Pixels count
+  by how much they look alike in albedo and normal (first-order regression with cross-bilateral weights: Bitterli et al.
+  2016; the fit at low resolution: fast guided filter, He and Sun 2015). The function is then applied at full
+  resolution. A fit needs averages of noisy layers only, so it is fast.
+- A network fuses it, as if it were a beauty. That is more accurate, and takes a run of the network for each layer. Both
+  renders must have the layer.
+
+What the layers then lack of the fused beauty is spread over them in proportion to their light, so their sum is the
+beauty to the last bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Sized
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -22,9 +27,9 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, box_downsample, planes_of, upsample_linear
+from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, upsample_linear
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import max_3x3
@@ -58,6 +63,9 @@ ROUNDING = np.float32(5e-7)
 #: Albedo and normal without noise, of half or float.
 Guides = Mapping[str, NDArray[Any]]
 NO_GUIDES: Guides = {}
+#: Fuses a layer, given both renders with the layer in place of the beauty: (height, width, 3) over the HRLS's data
+#: window.
+LayerFuser = Callable[[Render, Render], Array]
 #: Larger values of fitted layers are clipped before they are scaled to the sum, which would overflow.
 BRIGHTEST = np.float32(1e30)
 
@@ -83,6 +91,7 @@ def fuse_passes(
     cache_bytes: int = 0,
     pixels: ReplacedChannels | None = None,
     guides: Guides = NO_GUIDES,
+    fuse_layer: LayerFuser | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
     """Fuse the layers of additive sets of the HRLS.
@@ -96,6 +105,7 @@ def fuse_passes(
         pixels: where the fused layers go; None for a new store.
         guides: albedo and normal without noise, (height, width, 3) as the HRLS's own, as far as they are known. Albedos
             above 1 are taken from the HRLS.
+        fuse_layer: the network that fuses single layers. Layers that it can't fuse are fitted, and all without one.
         progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
@@ -109,14 +119,23 @@ def fuse_passes(
     fused = FusedPasses([replace(job.layers, coarser=tuple(job.coarser)) for job in in_order], pixels, refused)
     later = {part for job in jobs for parts in job.known.values() for part in parts}
     tell = progress or (lambda done, count: None)
-    steps = pass_steps(alignment, sets)
-    done = steps - pass_steps(alignment, jobs)
+    by_network = fuse_layer is not None
+    steps = pass_steps(alignment, sets, by_network=by_network)
+    done = steps - len(_bands(alignment)) * sum(1 + by_network * len(job.fitted) for job in jobs)
     tell(done, steps)
+    fused_light: dict[AdditiveLayer, Array] = {}
+    if fuse_layer is not None:
+        for job in jobs:
+            for layer, light in _fused_layers(lr, hr, job, fuse_layer):
+                if light is not None:
+                    fused_light[layer] = light
+                done += len(_bands(alignment))
+                tell(done, steps)
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
         for core in _bands(alignment) if jobs else []:
-            band = _Band(hr, rgb, alignment, core, dark, jobs, guides)
+            band = _Band(hr, rgb, alignment, core, dark, jobs, guides, fused_light)
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
                 made = band.fuse(job, lr, pixels, lights)
@@ -127,15 +146,56 @@ def fuse_passes(
     return fused
 
 
-def pass_steps(alignment: Alignment, sets: Sized) -> int:
-    """The steps in which sets are fused, for progress: each set in each band of rows."""
-    return len(_bands(alignment)) * len(sets)
+def pass_steps(alignment: Alignment, sets: Sequence[AdditiveSet], *, by_network: bool) -> int:
+    """The steps in which sets are fused, for progress: each set in each band of rows. A layer that a network fuses
+    counts as much as a set."""
+    layers = sum(len(each.layers) for each in sets) if by_network else 0
+    return len(_bands(alignment)) * (len(sets) + layers)
 
 
 def _bands(alignment: Alignment) -> list[Window]:
     """The bands of LRHS rows that are fused one after the other."""
     grid, rows = alignment.grid, BAND_ROWS // alignment.scale
     return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
+
+
+def _fused_layers(
+    lr: MappedRender, hr: MappedRender, job: _Job, fuse_layer: LayerFuser
+) -> Iterator[tuple[AdditiveLayer, Array | None]]:
+    """Each layer of a set that is to be fitted, and its light as a network fuses it; None if that can't be done."""
+    if job.lrhs is None:
+        yield from ((layer, None) for layer in job.fitted)
+        return
+    low, high = _decoded(lr, job.lrhs), _decoded(hr, job.layers)
+    for key, layer in zip(layer_keys(job.layers), job.layers.layers, strict=True):
+        if layer in job.known:
+            continue
+        lit = [bool(render.layers[key].any()) for render in (low, high)]
+        if all(lit):
+            yield layer, kept(fuse_layer(*(_as_beauty(render, key) for render in (low, high))))
+        else:
+            yield layer, None if any(lit) else np.zeros_like(high.layers[key])
+
+
+def _decoded(render: MappedRender, layers: AdditiveSet) -> Render:
+    """The light of a set's layers, albedo and normal. A file is decoded once, because it has all layers together."""
+    guides = {name: render.features[name] for name in (ALBEDO, NORMAL) if name in render.features}
+    source, window = with_layers(render, layers), render.data_window
+    source = replace(source, features=source.features | guides)
+    pixels: dict[str, Array] = {}
+    for y in range(window.y0, window.y1, BAND_ROWS):
+        part = Window(window.x0, y, window.x1, min(y + BAND_ROWS, window.y1))
+        for name, rows in source.read(part, [*layer_keys(layers), *guides]).items():
+            if name not in pixels:
+                pixels[name] = blank((window.height, window.width, rows.shape[-1]))
+            pixels[name][part.slices(window)] = rows
+    return Render(pixels, window, render.display_window, render.pixel_aspect, name=render.name)
+
+
+def _as_beauty(render: Render, layer: str) -> Render:
+    """A render of :func:`_decoded` with a layer in place of the beauty."""
+    guides = {name: render.layers[name] for name in (ALBEDO, NORMAL) if name in render.layers}
+    return replace(render, layers={RGB: render.layers[layer], **guides})
 
 
 #: Layers, each with the layers that it is the sum of.
@@ -236,12 +296,15 @@ class _Band:
         dark: float,
         jobs: Sequence[_Job],
         guides: Guides,
+        fused_light: Mapping[AdditiveLayer, Array],
     ) -> None:
         """
         Args:
             dark: light that counts as equal to none in logarithms.
             guides: see :func:`fuse_passes`.
+            fused_light: light (height, width, 3) of the layers that a network has fused, over the HRLS's data window.
         """
+        self._fused_light = fused_light
         self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, dark
         reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
@@ -253,9 +316,18 @@ class _Band:
         rows, columns = mirrored_pixels(self._hrls_area, window)
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
         self._low_beauty = _downsampled(self._beauty, self._scale)
-        log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + dark)
+        to_fit = [job for job in jobs if job.remainder or any(each not in fused_light for each in job.fitted)]
+        read = self._read(hr, jobs, to_fit)
+        if to_fit:
+            self._prepare_fit(read, guides)
+
+    def _prepare_fit(self, read: Mapping[str, Array], guides: Guides) -> None:
+        """Compare pixels by the albedo and normal that are ``read`` from the HRLS, or by the ``guides``."""
+        window = self._alignment.hr_data_window
+        rows, columns = mirrored_pixels(self._hrls_area, window)
+        log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + self._dark)
         planes = [log[None] / SPREAD[RGB]]
-        for name, image in self._read(hr, jobs).items():
+        for name, image in read.items():
             noisy = planes_of(image)
             guide = _smoothed(noisy, log)
             if name in guides:
@@ -269,29 +341,32 @@ class _Band:
             self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
-    def _read(self, hr: MappedRender, jobs: Sequence[_Job]) -> dict[str, Array]:
+    def _read(self, hr: MappedRender, jobs: Sequence[_Job], to_fit: Sequence[_Job]) -> dict[str, Array]:
         """Read all layers of the HRLS that the band needs, at once, because a file decodes all of them together.
 
-        The light of each layer stays at low resolution, and the colours of products over the core.
+        The light of each layer that is fitted stays at low resolution, and the colours of products over the core.
 
         Returns:
-            Albedo and normal (height, width, 3), as far as the HRLS has them.
+            Albedo and normal (height, width, 3), as far as the HRLS has them and a layer is fitted.
         """
-        formulas = {name: hr.features[name] for name in (RGB, ALBEDO, NORMAL) if name in hr.features}
+        needed = (RGB, ALBEDO, NORMAL) if to_fit else ()
+        formulas = {name: hr.features[name] for name in needed if name in hr.features}
         factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
         names = {factor: f"colour {i}" for i, factor in enumerate(factors)}
         formulas |= {name: FeatureFormula((factor,)) for factor, name in names.items()}
-        for i, job in enumerate(jobs):
+        for i, job in enumerate(to_fit):
             layers = with_layers(hr, job.layers).features
             formulas |= {f"{i} {name}": formula for name, formula in layers.items() if name != RGB}
-        render = replace(hr, features=formulas, alpha=None)
-        features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
+        features: dict[str, Array] = {}
+        if formulas:
+            render = replace(hr, features=formulas, alpha=None)
+            features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
         self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in names.items()}
         guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         low = {name: box_downsample(values, self._scale) for name, values in features.items()}
         self._low_layers = {
             job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
-            for i, job in enumerate(jobs)
+            for i, job in enumerate(to_fit)
         }
         return guides
 
@@ -336,42 +411,67 @@ class _Band:
         return lights
 
     def _fitted(
-        self, job: _Job, lr: MappedRender, light: Array, colours: Mapping[AdditiveLayer, Array]
+        self,
+        job: _Job,
+        lr: MappedRender,
+        light: Array,
+        colours: Mapping[AdditiveLayer, Array],
     ) -> dict[AdditiveLayer, Array]:
-        """Divide ``light`` (3, h, w) among the layers of a set that are fitted."""
-        noisy = self._average(job, lr)
-        beauty = self._beauty[:, self._hrls_rows]
-        fitted = np.empty((len(noisy), *light.shape), np.float32)
-        flat_noisy, flat_fitted = noisy.reshape(-1, *noisy.shape[2:]), fitted.reshape(-1, *light.shape[1:])
-
-        def fit(planes: slice) -> None:
-            # NumPy's settings for errors belong to the thread.
-            with np.errstate(over="ignore", invalid="ignore"):
-                fit_planes(planes)
-
-        def fit_planes(planes: slice) -> None:
-            for i in range(planes.start, planes.stop):
-                slope, offset = self._fit.line(flat_noisy[i], i % 3)
-                np.multiply(self._nearby.mean(slope), beauty[i % 3], out=flat_fitted[i])
-                flat_fitted[i] += self._nearby.mean(offset)
-                # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
-                low, high = -max_3x3(-flat_noisy[i]), max_3x3(flat_noisy[i])
-                bounds = (upsample_linear(plane, self._scale, self._core_rows) for plane in (low, high))
-                np.clip(flat_fitted[i], *bounds, out=flat_fitted[i])
-
-        for_row_blocks(fit, len(flat_noisy), light[0].size)
+        """Divide ``light`` (3, h, w) among the layers of a set that earlier sets do not know."""
+        layers = job.fitted
+        fitted = np.empty((len(layers) + job.remainder, *light.shape), np.float32)
+        for planes, layer in zip(fitted, layers, strict=False):
+            if layer in self._fused_light:
+                planes[:] = self._over_core(self._fused_light[layer])
+        missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
+        noisy = self._average(job, lr) if missing else fitted
+        self._fit_layers(noisy, missing, fitted)
         # The squares of light beyond 1e19 overflow, so there is no fit there.
         fitted[:, ~np.isfinite(fitted).all(axis=0)] = 0
         np.clip(fitted, 0, BRIGHTEST, out=fitted)
         # Where no layer is left, the beauty is divided as in the whole band.
         dark = fitted.sum(axis=0) == 0
         fitted[:, dark] = np.minimum(noisy, BRIGHTEST).mean(axis=(1, 2, 3))[:, None]
-        layers = job.fitted
         for i, layer in enumerate(layers):
             if layer in colours:
                 fitted[i] *= colours[layer] >= DARKEST_COLOUR
         _make_sum(fitted, light)
         return dict(zip(layers, fitted, strict=False))
+
+    def _over_core(self, image: Array) -> Array:
+        """An image (height, width, 3) over the HRLS's data window, mirrored beyond it, as planes over the core."""
+        window = self._alignment.hr_data_window
+        rows, columns = mirrored_pixels(in_hrls_pixels(self._core, self._scale), window)
+        return planes_of(image[rows - window.y0].take(columns - window.x0, axis=1))
+
+    def _fit_layers(self, noisy: Array, chosen: Sequence[int], fitted: Array) -> None:
+        """Fit some layers to the fused beauty.
+
+        Args:
+            noisy: all layers (layers, 3, h, w) at low resolution.
+            chosen: those to fit.
+            fitted: gets them, (layers, 3, h, w), over the core.
+        """
+        beauty = self._beauty[:, self._hrls_rows]
+        pairs = [(i, channel) for i in chosen for channel in range(3)]
+
+        def fit(part: slice) -> None:
+            # NumPy's settings for errors belong to the thread.
+            with np.errstate(over="ignore", invalid="ignore"):
+                for pair in pairs[part]:
+                    fit_plane(noisy[pair], pair[1], fitted[pair])
+
+        def fit_plane(plane: Array, channel: int, out: Array) -> None:
+            slope, offset = self._fit.line(plane, channel)
+            np.multiply(self._nearby.mean(slope), beauty[channel], out=out)
+            out += self._nearby.mean(offset)
+            # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
+            bounds = (
+                upsample_linear(each, self._scale, self._core_rows) for each in (-max_3x3(-plane), max_3x3(plane))
+            )
+            np.clip(out, *bounds, out=out)
+
+        for_row_blocks(fit, len(pairs), beauty[0].size)
 
     def _average(self, job: _Job, lr: MappedRender) -> Array:
         """The mean of both renders' layers at low resolution, (layers, 3, h, w), of those that are fitted.

@@ -21,7 +21,7 @@ from oiio_msspl.exr.contents import dropped_channels, widest_type
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, tile_count
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, layer_fuser, memory_to_fuse, tile_count
 from oiio_msspl.fusion.passes import fuse_passes, pass_steps
 from oiio_msspl.fusion.tiling import STRIPS_SHARE, require_memory
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
@@ -218,9 +218,12 @@ def fuse_frame_passes(
             cache_bytes=cache_bytes,
             pixels=fused.replaced,
             guides=fused.clean_aovs,
+            fuse_layer=layer_fuser(session, fused),
             progress=progress,
         )
         fused.replaced = fused.passes.pixels
+        if session.layer_session is not None:
+            session.layer_session.release_memory()
 
 
 class Progress:
@@ -246,5 +249,7 @@ def steps_of(views: Sequence[View], session: Session, write: WriteOptions) -> in
     steps = 0
     for view in views:
         alignment = align(view.lr, view.hr)
-        steps += tile_count(alignment, session) + pass_steps(alignment, sets_to_fuse(view.hr, write))
+        by_network = session.layers is not None
+        steps += tile_count(alignment, session)
+        steps += pass_steps(alignment, sets_to_fuse(view.hr, write), by_network=by_network)
     return steps

@@ -78,4 +78,8 @@ def load_model(scale: int, name: str | None = None, device: str = "cpu", threads
         InputError: there is no such model, or it can't run on this device.
     """
     path = find_model(scale, name)
-    return Session(path, device, threads, spread=name is not None and path != Path(name) and name.endswith(SPREAD))
+    spread = name is not None and path != Path(name) and name.endswith(SPREAD)
+    # The best model is slow. A fast one for each layer costs little more than the beauty.
+    best = path == find_model(scale, QUALITIES["best"])
+    layers = find_model(scale, QUALITIES["fast"]) if best else None
+    return Session(path, device, threads, spread=spread, layers=layers)

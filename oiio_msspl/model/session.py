@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import collections
+import functools
 import logging
 import time
 from collections.abc import Sequence
@@ -43,13 +44,22 @@ class Session:
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
         spread: the model fuses pairs whose noise the pixel filter has spread.
+        layers: ONNX file of the model that fuses single layers of passes; None if no network does.
 
     Raises:
         InputError: no model; no contract; a device that this onnxruntime was not built for or that cannot start; or a
             model whose convolutions would stay on the CPU though the device has operators for them.
     """
 
-    def __init__(self, path: str | Path, device: str = "cpu", threads: int = 0, *, spread: bool = False) -> None:
+    def __init__(
+        self,
+        path: str | Path,
+        device: str = "cpu",
+        threads: int = 0,
+        *,
+        spread: bool = False,
+        layers: Path | None = None,
+    ) -> None:
         require_device(device)
         file = file_for(Path(path), device)
         self._session = load_network(file, threads, providers(device))
@@ -70,8 +80,8 @@ class Session:
                 f"{path}: its network has the inputs {', '.join(inputs)[:99]} and the outputs "
                 f"{', '.join(self._outputs)[:99]}, not lrhs, hrls and fused; export it again"
             )
-        self.path = Path(path)
-        self.threads = threads
+        self.path, self.layers = Path(path), layers
+        self.device, self.threads = device, threads
         self.seconds = 0.0
         """Time spent in :meth:`run` so far, including the denoiser."""
         self._largest = 0
@@ -110,6 +120,14 @@ class Session:
         """Raise InputError if the model does not denoise albedo and normal."""
         if not self.clean_aovs:
             raise InputError(f"--data-passes: {self.name} does not denoise albedo and normal; use --quality best")
+
+    @functools.cached_property
+    def layer_session(self) -> Session | None:
+        """The model that fuses single layers of passes, which is loaded when it is first needed; None if no network
+        does."""
+        if self.layers is None:
+            return None
+        return Session(self.layers, self.device, self.threads, spread=self.stride > 1)
 
     @property
     def lrhs_aovs(self) -> tuple[str, ...]:

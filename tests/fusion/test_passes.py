@@ -44,10 +44,16 @@ def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=No
     return paths
 
 
-def fused(pair, out, models, passes=(), sums=(), layout="spec", **options):
+@pytest.fixture(params=["fit", "network"])
+def model(request, bilinear_models):
+    """A model whose passes are fitted, and one whose passes a network fuses."""
+    return str(bilinear_models[4]) if request.param == "fit" else "best"
+
+
+def fused(pair, out, model, passes=(), sums=(), layout="spec", **options):
     """The report, and {channel: pixels} of the fused file."""
     write, inputs = WriteOptions(passes=passes, layout=layout, **options), InputOptions(sums=sums)
-    report = fuse_files(*pair, out, model=str(models[4]), write=write, inputs=inputs, overwrite=True)
+    report = fuse_files(*pair, out, model=model, write=write, inputs=inputs, overwrite=True)
     return report, {name: pixels for _, part in read_bits(out) for name, pixels in part.items()}
 
 
@@ -58,15 +64,15 @@ def layer(channels, name=""):
 
 @pytest.mark.parametrize("low", [True, False])
 @pytest.mark.parametrize(("dtype", "rounding"), [(np.float32, 1e-6), (np.float16, 3 * HALF_ROUNDING)])
-def test_fused_layers_sum_to_the_fused_beauty(tmp_path, bilinear_models, low, dtype, rounding):
+def test_fused_layers_sum_to_the_fused_beauty(tmp_path, model, low, dtype, rounding):
     clean = lights()
     pair = write_pair(tmp_path, clean, dtype, low)
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    report, out = fused(pair, tmp_path / "out.exr", model)
     assert report.passes == {"light groups": "fused: light_key, light_spot"}
     total = sum(layer(out, name) for name in clean)
     assert np.abs(total - layer(out)).max() <= rounding * layer(out).max()
     assert np.all(np.abs(total - layer(out)) <= 2 * rounding * layer(out) + 1e-5)
-    _, raw = fused(pair, tmp_path / "raw.exr", bilinear_models, ("none",))
+    _, raw = fused(pair, tmp_path / "raw.exr", model, ("none",))
     for name, values in clean.items():
         assert np.all(layer(out, name) >= 0)
         assert out[f"{name}.R"].dtype == dtype
@@ -108,12 +114,12 @@ def test_lamps_are_told_apart_by_albedos_above_1(tmp_path):
     assert errors[1] == errors[0]
 
 
-def test_all_else_is_what_it_is_without_passes(tmp_path, bilinear_models):
+def test_all_else_is_what_it_is_without_passes(tmp_path, model):
     pair = write_pair(
         tmp_path, lights(), extra={"Z": picture(HEIGHT, WIDTH)[..., 0], "id.X": np.ones((HEIGHT, WIDTH), np.uint32)}
     )
-    _, out = fused(pair, tmp_path / "out.exr", bilinear_models)
-    _, raw = fused(pair, tmp_path / "raw.exr", bilinear_models, ("none",))
+    _, out = fused(pair, tmp_path / "out.exr", model)
+    _, raw = fused(pair, tmp_path / "raw.exr", model, ("none",))
     assert out.keys() == raw.keys()
     changed = {name for name in out if not same_bits(out[name], raw[name])}
     assert changed == {f"{name}.{c}" for name in lights() for c in "RGB"}
@@ -122,7 +128,7 @@ def test_all_else_is_what_it_is_without_passes(tmp_path, bilinear_models):
 
 def test_layers_that_are_not_written_are_not_fused(tmp_path, bilinear_models):
     pair = write_pair(tmp_path, lights())
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, layers=("albedo",))
+    report, out = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]), layers=("albedo",))
     assert report.passes == {}
     assert "light_key.R" not in out
 
@@ -130,16 +136,16 @@ def test_layers_that_are_not_written_are_not_fused(tmp_path, bilinear_models):
 @pytest.mark.parametrize("layout", ["nuke", "multilayer"])
 def test_every_layout_holds_the_same_layers(tmp_path, bilinear_models, layout):
     pair = write_pair(tmp_path, lights())
-    _, expected = fused(pair, tmp_path / "out.exr", bilinear_models)
-    fused(pair, tmp_path / "other.exr", bilinear_models, layout=layout)
+    _, expected = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]))
+    fused(pair, tmp_path / "other.exr", str(bilinear_models[4]), layout=layout)
     found = [pixels for _, part in read_bits(tmp_path / "other.exr") for pixels in part.values()]
     for name in ("light_key.R", "light_spot.B"):
         assert any(same_bits(expected[name], pixels) for pixels in found)
 
 
-def test_a_layer_stays_black_where_it_has_no_light(tmp_path, bilinear_models):
+def test_a_layer_stays_black_where_it_has_no_light(tmp_path, model):
     pair = write_pair(tmp_path, lights() | {"light_off": np.zeros((HEIGHT, WIDTH, 3))})
-    _, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    _, out = fused(pair, tmp_path / "out.exr", model)
     assert not layer(out, "light_off").any()
     near = lights()["light_spot"].any(axis=-1)
     reach = 16  # HRLS pixels: the renders around bound a fit, and both are interpolated
@@ -149,18 +155,18 @@ def test_a_layer_stays_black_where_it_has_no_light(tmp_path, bilinear_models):
     assert (~near).any()
 
 
-def test_light_in_no_layer_is_left_out(tmp_path, bilinear_models):
+def test_light_in_no_layer_is_left_out(tmp_path, model):
     clean = lights() | {"light_rest": 0.2 * picture(HEIGHT, WIDTH)}
     pair = write_pair(tmp_path, clean, beauty=lambda layers: sum(v.astype(np.float64) for v in layers.values()))
     sums = ("some=light_key+light_spot",)
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, ("some",), sums)
+    report, out = fused(pair, tmp_path / "out.exr", model, ("some",), sums)
     assert report.passes == {"some": "fused: light_key, light_spot"}
     rest = layer(out) - layer(out, "light_key") - layer(out, "light_spot")
     assert rest.min() >= -1e-5 * layer(out).max()
     assert np.mean((rest - clean["light_rest"]) ** 2) < 0.02
 
 
-def test_products_of_light_and_colour_sum_too(tmp_path, bilinear_models):
+def test_products_of_light_and_colour_sum_too(tmp_path, model):
     colour = np.where(picture(HEIGHT, WIDTH) > 0.3, np.float32(0.8), np.float32(0.0))
     clean = {"DiffDir": lights()["light_key"], "DiffInd": 0.3 * picture(HEIGHT, WIDTH), "Emit": lights()["light_spot"]}
     extra = rgb(colour, "DiffCol.")
@@ -172,7 +178,7 @@ def test_products_of_light_and_colour_sum_too(tmp_path, bilinear_models):
 
     pair = write_pair(tmp_path, clean, low=False, extra=extra, beauty=beauty)
     sums = ("components=DiffDir*DiffCol+DiffInd*DiffCol+Emit",)
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, sums=sums)
+    report, out = fused(pair, tmp_path / "out.exr", model, sums=sums)
     assert list(report.passes) == ["components"]
     total = (layer(out, "DiffDir") + layer(out, "DiffInd")) * layer(out, "DiffCol") + layer(out, "Emit")
     lit = layer(out, "DiffCol") > 0
@@ -180,17 +186,17 @@ def test_products_of_light_and_colour_sum_too(tmp_path, bilinear_models):
     assert not layer(out, "DiffDir")[~lit].any()
     (stored,) = json.loads(open_exr(tmp_path / "out.exr").metadata["msspl/passes"])
     assert stored == {"name": "components", "layers": [["DiffDir", "DiffCol"], ["DiffInd", "DiffCol"], ["Emit"]]}
-    fused(pair, tmp_path / "plain.exr", bilinear_models, passes=("none",))
+    fused(pair, tmp_path / "plain.exr", model, passes=("none",))
     assert open_exr(tmp_path / "plain.exr").metadata["msspl/passes"] == "[]"
 
 
 @pytest.mark.filterwarnings("error::RuntimeWarning")
-def test_a_lamp_whose_square_overflows_stays_finite(tmp_path, bilinear_models):
+def test_a_lamp_whose_square_overflows_stays_finite(tmp_path, model):
     clean = lights()
     clean["light_spot"] = clean["light_spot"].copy()
     clean["light_spot"][40:44, 72:76] = 1e25
     pair = write_pair(tmp_path, clean)
-    _, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    _, out = fused(pair, tmp_path / "out.exr", model)
     total = layer(out, "light_key") + layer(out, "light_spot")
     assert np.isfinite(total).all() and layer(out).max() > 1e20
     np.testing.assert_allclose(total, layer(out), rtol=1e-5, atol=1e-6)
@@ -205,12 +211,12 @@ def test_a_lamp_whose_square_overflows_stays_finite(tmp_path, bilinear_models):
 )
 def test_layers_that_do_not_sum_are_passed_on(tmp_path, bilinear_models, beauty, message):
     pair = write_pair(tmp_path, lights(), beauty=beauty)
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    report, out = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]))
     assert report.passes["light groups"].startswith("passed on: does not sum to the beauty")
     assert message in report.passes["light groups"]
     assert same_bits(out["light_spot.G"], read_bits(pair[1])[0][1]["light_spot.G"])
     assert not [text for text in report.warnings if "light" in text]
-    report, _ = fused(pair, tmp_path / "out.exr", bilinear_models, sums=("mine=light_spot+light_key",))
+    report, _ = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]), sums=("mine=light_spot+light_key",))
     assert [text for text in report.warnings if text.startswith("--sum mine: does not sum to the beauty")]
 
 
@@ -226,7 +232,7 @@ def test_a_wrong_name_is_one_sentence_before_the_work(tmp_path, bilinear_models,
     pair = write_pair(tmp_path, lights())
     monkeypatch.setattr(frame, "Session", pytest.fail)
     with pytest.raises(InputError, match=message):
-        fused(pair, tmp_path / "out.exr", bilinear_models, passes, sums)
+        fused(pair, tmp_path / "out.exr", str(bilinear_models[4]), passes, sums)
     assert not (tmp_path / "out.exr").exists()
 
 
@@ -264,11 +270,11 @@ def write_levels(folder, extra, dtype=np.float32):
 
 
 @pytest.mark.parametrize(("dtype", "rounding"), [(np.float32, 2e-6), (np.float16, 4 * HALF_ROUNDING)])
-def test_coarser_layers_are_sums_of_the_finest(tmp_path, bilinear_models, dtype, rounding):
+def test_coarser_layers_are_sums_of_the_finest(tmp_path, model, dtype, rounding):
     extra = {name: set(name.split("_")) for name in ("diffuse", "diffuse_key", "specular_direct", "specular")}
     extra |= {f"RGBA_{lamp}": {lamp} for lamp in ("key", "spot")}
     pair = write_levels(tmp_path, extra, dtype)
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    report, out = fused(pair, tmp_path / "out.exr", model)
     fine = list(lobes_by_light())
     assert set(report.passes) == {"light groups", "components", "finest components"}
     assert all(text.startswith("fused: ") for text in report.passes.values())
@@ -284,12 +290,12 @@ def test_coarser_layers_are_sums_of_the_finest(tmp_path, bilinear_models, dtype,
 
 def test_a_coarser_layer_whose_pixels_are_no_sum_is_passed_on(tmp_path, bilinear_models):
     pair = write_levels(tmp_path, {"diffuse_key": {"diffuse", "direct"}})  # wrong by its pixels
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models)
+    report, out = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]))
     assert "sums of these" not in report.passes["finest components"]
     assert same_bits(out["diffuse_key.R"], read_bits(pair[1])[0][1]["diffuse_key.R"])
 
 
-def test_light_groups_and_components_may_share_a_layer(tmp_path, bilinear_models):
+def test_light_groups_and_components_may_share_a_layer(tmp_path, model):
     """Each set sums to the beauty; the shared layer has the value that the larger set gives it."""
     emission = lobes_by_light()["emission"]
     clean = lights() | {"light_rim": 0.2 * picture(HEIGHT, WIDTH), "emission": emission}
@@ -302,16 +308,16 @@ def test_light_groups_and_components_may_share_a_layer(tmp_path, bilinear_models
         channels |= rgb((lit * (1 - share)).astype(np.float32), "specular.")
         write_exr(path, channels)
     sums = ("lights=light_key+light_spot+light_rim+emission", "parts=diffuse+specular+emission")
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, sums=sums)
+    report, out = fused(pair, tmp_path / "out.exr", model, sums=sums)
     assert report.passes["parts"] == "fused: diffuse, specular, emission"
     assert report.passes["lights"].startswith("fused")
     for names in (("light_key", "light_spot", "light_rim", "emission"), ("diffuse", "specular", "emission")):
         total = sum(layer(out, name) for name in names)
         assert np.abs(total - layer(out)).max() <= 3e-6 * layer(out).max()
         assert all(layer(out, name).min() >= 0 for name in names)
-    _, alone = fused(pair, tmp_path / "lights.exr", bilinear_models, ("lights",), sums[:1])
+    _, alone = fused(pair, tmp_path / "lights.exr", model, ("lights",), sums[:1])
     assert all(same_bits(out[f"{name}.{c}"], alone[f"{name}.{c}"]) for name in clean for c in "RGB")
-    _, raw = fused(pair, tmp_path / "raw.exr", bilinear_models, ("none",))
+    _, raw = fused(pair, tmp_path / "raw.exr", model, ("none",))
     truth = (sum(clean.values()) - emission) * np.linspace(0.2, 0.8, WIDTH)[None, :, None]
     errors = [np.mean((layer(channels, "diffuse") - truth) ** 2) for channels in (out, raw)]
     assert errors[0] < errors[1] / 5
@@ -327,12 +333,12 @@ def test_a_set_that_shares_layers_with_two_others_is_passed_on(tmp_path, bilinea
         rest = sum(layer(channels, name) for name in names[4:])
         write_exr(path, channels | rgb(half.astype(np.float32), "a.") | rgb(rest.astype(np.float32), "b."))
     sums = (f"first=b+{'+'.join(names[:4])}", f"second=a+{'+'.join(names[4:])}", "third=a+b")
-    report, _ = fused(pair, tmp_path / "out.exr", bilinear_models, sums=sums)
+    report, _ = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]), sums=sums)
     assert report.passes["third"] == "passed on: shares b with another set that does not have its other layers"
     assert [text for text in report.warnings if text.startswith("--sum third: shares")]
 
 
-def test_an_emitter_leaves_nothing_to_the_other_set(tmp_path, bilinear_models):
+def test_an_emitter_leaves_nothing_to_the_other_set(tmp_path, model):
     """Where all light is the shared layer's, the other layers of the second set stay exactly black."""
     dark = np.zeros((HEIGHT, WIDTH, 3), np.float32)
     lamp, glow = dark.copy(), dark.copy()
@@ -345,7 +351,7 @@ def test_an_emitter_leaves_nothing_to_the_other_set(tmp_path, bilinear_models):
         write_exr(
             path, channels | rgb((0.4 * lit).astype(np.float32), "a.") | rgb((0.6 * lit).astype(np.float32), "b.")
         )
-    report, out = fused(pair, tmp_path / "out.exr", bilinear_models, sums=("x=key+fill+rim+glow", "y=a+b+glow"))
+    report, out = fused(pair, tmp_path / "out.exr", model, sums=("x=key+fill+rim+glow", "y=a+b+glow"))
     assert all(text.startswith("fused") for text in report.passes.values())
     for name in ("a", "b", "key"):
         assert not layer(out, name)[:, 88:].any()

@@ -164,7 +164,7 @@ def regraded(layers: Array) -> Array:
 def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tuple[FusedFrame, Session]]:
     """The fused frame of each model, and the model. That of single layers is loaded, too."""
     sessions = {model: load_model(scale, model) for model in (BALANCED, BEST)}
-    assert sessions[BEST].layer_session is not None
+    sessions[BEST].layer_session  # noqa: B018 - loads it
     return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
 
 

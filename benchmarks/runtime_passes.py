@@ -96,7 +96,7 @@ def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> 
 
 def layout(rows: list[Row]) -> str:
     """A line for each method."""
-    seconds = {(row["method"], row["model"] or ""): row["seconds"] for row in rows}
+    seconds = {(row["method"], row.get("model", "")): row["seconds"] for row in rows}
     titles = {BEAUTY: "`{}` on the beauty", PASSES: f"{LAYERS} passes with `{{}}`"}
     body = [
         [

@@ -11,8 +11,10 @@ from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.passes import fuse_passes
+from oiio_msspl.fusion.fuse import fuse, layer_fuser
+from oiio_msspl.fusion.passes import fuse_passes, pass_steps
 from oiio_msspl.jobs import frame
+from oiio_msspl.model.catalogue import load_model
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
 HEIGHT, WIDTH = 90, 122  # no multiple of 4
@@ -112,6 +114,34 @@ def test_lamps_are_told_apart_by_albedos_above_1(tmp_path):
         found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.sets[0].layers[0].channels], axis=-1)
         errors.append(np.abs(found - clean["light_a"]).mean())
     assert errors[1] == errors[0]
+
+
+@pytest.mark.parametrize("low", [True, False])
+def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
+    """Squares smaller than an LRHS pixel, dark in one layer where they are bright in the other. Layers that the LRHS
+    lacks are fitted all the same."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    squares = ((x // 3 + y // 3) % 2)[..., None] * np.ones(3)
+    clean = {"light_a": 0.1 + 0.8 * squares, "light_b": 0.9 - 0.8 * squares}
+    pair = [map_render(open_exr(file)) for file in write_pair(tmp_path, clean, low=low)]
+    session = load_model(4, "best", threads=1)
+    beauty = fuse(*pair, session)
+    found, steps = [], []
+    for fuser in (None, layer_fuser(session, beauty)):
+        result = fuse_passes(
+            *pair,
+            beauty.rgb,
+            beauty.alignment,
+            pair[1].additive_sets,
+            fuse_layer=fuser,
+            progress=lambda *told: steps.append(told),
+        )
+        channels = result.sets[0].layers[0].channels
+        found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
+        done, count = steps[-1]
+        assert done == count == pass_steps(beauty.alignment, result.sets, by_network=fuser is not None)
+    errors = [np.abs(each - clean["light_a"]).mean() for each in found]
+    assert errors[1] < 0.7 * errors[0] if low else errors[1] == errors[0]
 
 
 def test_all_else_is_what_it_is_without_passes(tmp_path, model):

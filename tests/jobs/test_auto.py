@@ -6,6 +6,7 @@ import pytest
 from oiio_msspl import InputError, WriteOptions, fuse_files, fuse_shot, open_exr
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.jobs.openjd import make_job
+from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture, rgb, write_exr
 from tests.fusion.test_noise import spread
 
@@ -47,6 +48,16 @@ def test_the_best_quality_needs_an_albedo_or_a_normal(tmp_path, caplog):
     write_pair(tmp_path, "normal", None, "N")
     report = fuse_files(tmp_path / "lr/normal.exr", tmp_path / "hr/normal.exr", tmp_path / "out2.exr", model="best")
     assert report.model == "ensemble-x4"
+
+
+@pytest.mark.parametrize(
+    ("name", "layers"),
+    [("best", "joint-small-x4"), ("ensemble-spread", "joint-small-x4-spread"), ("balanced", None)],
+)
+def test_only_the_best_quality_has_a_network_for_single_layers(name, layers):
+    """It copes with spread noise where the model of the beauty does."""
+    found = load_model(4, name, threads=1).layer_session
+    assert (found and found.name) == layers
 
 
 def test_a_model_is_taken_as_it_is_named(tmp_path):

@@ -411,11 +411,7 @@ class _Band:
         return lights
 
     def _fitted(
-        self,
-        job: _Job,
-        lr: MappedRender,
-        light: Array,
-        colours: Mapping[AdditiveLayer, Array],
+        self, job: _Job, lr: MappedRender, light: Array, colours: Mapping[AdditiveLayer, Array]
     ) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that earlier sets do not know."""
         layers = job.fitted
@@ -431,7 +427,8 @@ class _Band:
         np.clip(fitted, 0, BRIGHTEST, out=fitted)
         # Where no layer is left, the beauty is divided as in the whole band.
         dark = fitted.sum(axis=0) == 0
-        fitted[:, dark] = np.minimum(noisy, BRIGHTEST).mean(axis=(1, 2, 3))[:, None]
+        if dark.any():
+            fitted[:, dark] = np.minimum(noisy, BRIGHTEST).mean(axis=(1, 2, 3))[:, None]
         for i, layer in enumerate(layers):
             if layer in colours:
                 fitted[i] *= colours[layer] >= DARKEST_COLOUR

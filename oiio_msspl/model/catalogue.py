@@ -79,7 +79,7 @@ def load_model(scale: int, name: str | None = None, device: str = "cpu", threads
     """
     path = find_model(scale, name)
     spread = name is not None and path != Path(name) and name.endswith(SPREAD)
-    # The best model is slow, so a fast one for each layer adds little.
+    # The best model would take too long for every layer.
     best = path == WEIGHTS / f"{QUALITIES['best']}-x{scale}.onnx"
     layers = find_model(scale, QUALITIES["fast"]) if best else None
     return Session(path, device, threads, spread=spread, layers=layers)

@@ -126,7 +126,7 @@ def methods(
             frame.alignment,
             [layers],
             guides=frame.clean_aovs,
-            fuse_layer=layer_fuser(session, frame),
+            fuse_layers=layer_fuser(session, frame),
         )
         assert not made.refused
         height = hr.data_window.height

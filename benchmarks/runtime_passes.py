@@ -83,7 +83,7 @@ def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> 
 
     def passes(session: Session, beauty: FusedFrame) -> None:
         fuser = layer_fuser(session, beauty)
-        assert not fuse_passes(lr, hr, beauty.rgb, beauty.alignment, [lights], fuse_layer=fuser).refused
+        assert not fuse_passes(lr, hr, beauty.rgb, beauty.alignment, [lights], fuse_layers=fuser).refused
 
     calls: dict[Key, Callable[[], Any]] = {}
     for session in sessions:

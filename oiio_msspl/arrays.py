@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import reduce
 from typing import Any, TypeVar
 
@@ -216,18 +216,23 @@ def mean_around(plane: Array, radius: int) -> Array:
 
 def upsample_linear(plane: Array, scale: int, rows: slice) -> Array:
     """Interpolate a plane linearly at ``scale`` times its resolution; only these of its rows, in its own pixels."""
-    return _upsample_rows(_upsample_rows(plane, scale, rows).T, scale, slice(0, plane.shape[1])).T
-
-
-def _upsample_rows(plane: Array, scale: int, rows: slice) -> Array:
     padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")
+    tall = np.empty(((rows.stop - rows.start) * scale, plane.shape[1]), np.float32)
     before, here, after = (padded[rows.start + i : rows.stop + i] for i in range(3))
-    result = np.empty((len(here) * scale, plane.shape[1]), np.float32)
-    for phase in range(scale):
-        position = (phase + 0.5) / scale - 0.5
-        other = before if position < 0 else after
-        result[phase::scale] = here + np.float32(abs(position)) * (other - here)
+    _interleave(before, here, after, [tall[phase::scale] for phase in range(scale)])
+    padded = np.pad(tall, ((0, 0), (1, 1)), mode="edge")
+    result = np.empty((len(tall), plane.shape[1] * scale), np.float32)
+    before, here, after = (padded[:, i : i + plane.shape[1]] for i in range(3))
+    _interleave(before, here, after, [result[:, phase::scale] for phase in range(scale)])
     return result
+
+
+def _interleave(before: Array, here: Array, after: Array, phases: Sequence[Array]) -> None:
+    """Fill the lines of an enlarged plane that lie in the lines ``here``, from first to last."""
+    for phase, lines in enumerate(phases):
+        position = (phase + 0.5) / len(phases) - 0.5
+        other = before if position < 0 else after
+        lines[:] = here + np.float32(abs(position)) * (other - here)
 
 
 def planes_of(image: Array) -> Array:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -134,7 +134,10 @@ def fuse(
         pair = _Pair(lr, hr, alignment, session, session.clean_aovs if clean_aovs else ())
         frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
         with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
-            frame.tiles = _fuse_tiles(pair, session, frame, progress)
+            for step in _run(_steps(pair, frame), session):
+                frame.tiles = step.count
+                if progress is not None:
+                    progress(step.done, step.count)
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
@@ -146,32 +149,40 @@ def fuse(
     return frame
 
 
-def fuse_layer(lr: ReadableRender, hr: ReadableRender, session: Session, frame: FusedFrame) -> Array:
-    """Fuse a layer of both renders of a frame, such as the light of one lamp.
+def fuse_layers(
+    pairs: Iterable[tuple[ReadableRender, ReadableRender]], session: Session, frame: FusedFrame
+) -> Iterator[Array]:
+    """Fuse layers of both renders of a frame, such as the light of each lamp.
 
     Args:
-        lr, hr: renders with the layer in place of the beauty.
+        pairs: both renders with a layer in place of the beauty, for each layer. The next pair is taken in the
+            background while the network works.
         session: a model for the scale of the pair.
-        frame: the fused beauty. The layer is exposed as this is, because networks tell light from noise by brightness.
+        frame: the fused beauty. Layers are exposed as this is, because networks tell light from noise by brightness.
 
-    Returns:
-        (height, width, 3) over the HRLS's data window, finite and >= 0.
+    Yields:
+        The fused layers, (height, width, 3) over the HRLS's data window, finite and >= 0.
 
     Raises:
         InputError: pixels can't be decoded.
         MssplError: the network failed, or returned NaN or infinite values.
     """
-    with limit_threads(session.threads):
-        pair = _Pair(lr, hr, frame.alignment, session, (), beauty=frame)
-        layer = _blank_frame(frame.alignment, frame.exposure, error=False, half=False)
-        _fuse_tiles(pair, session, layer)
-        return layer.rgb
+    memory = ReusedMemory()
+
+    def steps() -> Iterator[_Step]:
+        for lr, hr in pairs:
+            pair = _Pair(lr, hr, frame.alignment, session, (), frame, memory)
+            yield from _steps(pair, _blank_frame(frame.alignment, frame.exposure, error=False, half=False))
+
+    for step in _run(steps(), session):
+        if step.done == step.count:
+            yield step.result.rgb
 
 
 def layer_fuser(session: Session, frame: FusedFrame) -> LayerFuser | None:
     """What fuses single layers of a frame whose beauty ``session`` has fused; None if no network does."""
     layer_session = session.layer_session
-    return None if layer_session is None else lambda lr, hr: fuse_layer(lr, hr, layer_session, frame)
+    return None if layer_session is None else lambda pairs: fuse_layers(pairs, layer_session, frame)
 
 
 def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> int:
@@ -267,11 +278,13 @@ class _Pair:
         session: Session,
         aovs: Sequence[str],
         beauty: FusedFrame | None = None,
+        memory: ReusedMemory | None = None,
     ) -> None:
         """
         Args:
             aovs: see :attr:`_Picture.aovs`.
             beauty: that of the frame, if the pair shows a layer of it. Then there is no :meth:`check`.
+            memory: for network input; None for its own.
         """
         self._lr, self._hr, self._alignment, self._session, self._aovs = lr, hr, alignment, session, aovs
         self.grid = _grid(alignment, session)
@@ -283,7 +296,7 @@ class _Pair:
         reach = FAR if beauty is None else max(LAYER_REACH // alignment.scale - 1, 1)
         self._empty_regions = EmptyRegions(self._lrhs[RGB], reach)
         self._averages = HrlsAverages(alignment) if beauty is None else None
-        self._memory = ReusedMemory()
+        self._memory = ReusedMemory() if memory is None else memory
 
     @property
     def nbytes(self) -> int:
@@ -298,6 +311,10 @@ class _Pair:
         """What :attr:`FusedFrame.repaired` (``repaired``) or :attr:`FusedFrame.negative` (``negative``) holds."""
         renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
         return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
+
+    def tiles(self) -> list[Tile]:
+        """The tiles in which the pair is fused."""
+        return plan_tiles(self.grid, self._session.contract, self._session.stride)
 
     def prepare(self, tile: Tile) -> _PreparedTile:
         """Read a tile, dim fireflies and encode its features."""
@@ -375,19 +392,35 @@ class _Pair:
         return check_pair(lrhs_luminance, self._averages, self._lr.name, self._hr.name)
 
 
-def _fuse_tiles(
-    pair: _Pair, session: Session, frame: FusedFrame, progress: Callable[[int, int], None] | None = None
-) -> int:
-    """Fuse a frame tile by tile; return how many there are."""
-    tiles = plan_tiles(pair.grid, session.contract, session.stride)
+@dataclass(frozen=True)
+class _Step:
+    """A tile that is ready for the network, of the beauty or of a layer."""
+
+    pair: _Pair
+    tile: _PreparedTile
+    means: _FrameMeans
+    result: FusedFrame
+    """Gets the tile's core."""
+    done: int
+    """Tiles of the result up to this one."""
+    count: int
+    """Tiles of the result."""
+
+
+def _steps(pair: _Pair, result: FusedFrame) -> Iterator[_Step]:
+    """Prepare the tiles of a frame, one after the other."""
+    tiles = pair.tiles()
     means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
-    # The next tile is read and encoded while the network works on this one.
-    for done, tile in enumerate(one_ahead(map(pair.prepare, tiles)), start=1):
-        _fuse_tile(tile, session, frame, means)
-        pair.release(tile)
-        if progress is not None:
-            progress(done, len(tiles))
-    return len(tiles)
+    for done, tile in enumerate(tiles, start=1):
+        yield _Step(pair, pair.prepare(tile), means, result, done, len(tiles))
+
+
+def _run(steps: Iterable[_Step], session: Session) -> Iterator[_Step]:
+    """Run the network on each tile; the next one is read and encoded meanwhile. Yield each when it is fused."""
+    for step in one_ahead(steps):
+        _fuse_tile(step.tile, session, step.result, step.means)
+        step.pair.release(step.tile)
+        yield step
 
 
 def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: _FrameMeans) -> None:

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -35,10 +36,12 @@ from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import max_3x3
 from oiio_msspl.fusion.sums import check_sum, is_sum_of, layer_keys, with_layers
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
-from oiio_msspl.parallel import for_row_blocks
+from oiio_msspl.parallel import for_row_blocks, in_background, one_ahead
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
+#: Rows of a band whose weights stay in a core's cache while several planes are averaged.
+CACHED_ROWS = 16
 #: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. At x2 a pixel has fewer samples, so
 #: more of them are needed.
 STEPS = {2: (1, 3), 4: (1, 2), 8: (1, 2)}
@@ -63,9 +66,9 @@ ROUNDING = np.float32(5e-7)
 #: Albedo and normal without noise, of half or float.
 Guides = Mapping[str, NDArray[Any]]
 NO_GUIDES: Guides = {}
-#: Fuses a layer, given both renders with the layer in place of the beauty: (height, width, 3) over the HRLS's data
-#: window.
-LayerFuser = Callable[[Render, Render], Array]
+#: Fuses layers, given both renders with a layer in place of the beauty, for each layer: (height, width, 3) over the
+#: HRLS's data window. It takes the next pair in the background.
+LayerFuser = Callable[[Iterable[tuple[Render, Render]]], Iterator[Array]]
 #: Larger values of fitted layers are clipped before they are scaled to the sum, which would overflow.
 BRIGHTEST = np.float32(1e30)
 
@@ -91,7 +94,7 @@ def fuse_passes(
     cache_bytes: int = 0,
     pixels: ReplacedChannels | None = None,
     guides: Guides = NO_GUIDES,
-    fuse_layer: LayerFuser | None = None,
+    fuse_layers: LayerFuser | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
     """Fuse the layers of additive sets of the HRLS.
@@ -105,7 +108,7 @@ def fuse_passes(
         pixels: where the fused layers go; None for a new store.
         guides: albedo and normal without noise, (height, width, 3) as the HRLS's own, as far as they are known. Albedos
             above 1 are taken from the HRLS.
-        fuse_layer: the network that fuses single layers. Layers that it can't fuse are fitted, and all without one.
+        fuse_layers: the network that fuses single layers. Layers that it can't fuse are fitted, and all without one.
         progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
@@ -119,14 +122,14 @@ def fuse_passes(
     fused = FusedPasses([replace(job.layers, coarser=tuple(job.coarser)) for job in in_order], pixels, refused)
     later = {part for job in jobs for parts in job.known.values() for part in parts}
     tell = progress or (lambda done, count: None)
-    by_network = fuse_layer is not None
+    by_network = fuse_layers is not None
     steps = pass_steps(alignment, sets, by_network=by_network)
     done = steps - len(_bands(alignment)) * sum(1 + by_network * len(job.fitted) for job in jobs)
     tell(done, steps)
     fused_light: dict[AdditiveLayer, Array] = {}
-    if fuse_layer is not None:
+    if fuse_layers is not None:
         for job in jobs:
-            for layer, light in _fused_layers(lr, hr, job, fuse_layer):
+            for layer, light in _fused_layers(lr, hr, job, fuse_layers):
                 if light is not None:
                     fused_light[layer] = light
                 done += len(_bands(alignment))
@@ -134,11 +137,12 @@ def fuse_passes(
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
-        for core in _bands(alignment) if jobs else []:
-            band = _Band(hr, rgb, alignment, core, dark, jobs, guides, fused_light)
+        bands = (_Band(lr, hr, rgb, alignment, core, dark, jobs, guides, fused_light) for core in _bands(alignment))
+        # The next band is read and compared while the layers of this one are fitted.
+        for band in one_ahead(bands) if jobs else []:
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
-                made = band.fuse(job, lr, pixels, lights)
+                made = band.fuse(job, pixels, lights)
                 # Copies, because a layer alone would keep the memory of its whole set.
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1
@@ -160,21 +164,24 @@ def _bands(alignment: Alignment) -> list[Window]:
 
 
 def _fused_layers(
-    lr: MappedRender, hr: MappedRender, job: _Job, fuse_layer: LayerFuser
+    lr: MappedRender, hr: MappedRender, job: _Job, fuse_layers: LayerFuser
 ) -> Iterator[tuple[AdditiveLayer, Array | None]]:
     """Each layer of a set that is to be fitted, and its light as a network fuses it; None if that can't be done."""
     if job.lrhs is None:
         yield from ((layer, None) for layer in job.fitted)
         return
-    low, high = _decoded(lr, job.lrhs), _decoded(hr, job.layers)
-    for key, layer in zip(layer_keys(job.layers), job.layers.layers, strict=True):
-        if layer in job.known:
-            continue
-        lit = [bool(render.layers[key].any()) for render in (low, high)]
-        if all(lit):
-            yield layer, kept(fuse_layer(*(_as_beauty(render, key) for render in (low, high))))
+    waiting = in_background(partial(_decoded, lr, job.lrhs))
+    high, low = _decoded(hr, job.layers), waiting()
+    keys = dict(zip(job.layers.layers, layer_keys(job.layers), strict=True))
+    lit = {layer: [bool(each.layers[keys[layer]].any()) for each in (low, high)] for layer in job.fitted}
+    fused = fuse_layers(
+        (_as_beauty(low, keys[layer]), _as_beauty(high, keys[layer])) for layer in job.fitted if all(lit[layer])
+    )
+    for layer in job.fitted:
+        if all(lit[layer]):
+            yield layer, kept(next(fused))
         else:
-            yield layer, None if any(lit) else np.zeros_like(high.layers[key])
+            yield layer, None if any(lit[layer]) else np.zeros_like(high.layers[keys[layer]])
 
 
 def _decoded(render: MappedRender, layers: AdditiveSet) -> Render:
@@ -235,6 +242,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
+        same_layers = in_background(partial(_same_layers, lr, layers))
         check = check_sum(hr, layers)
         if check.problem:
             refused[layers.name] = check.text
@@ -246,7 +254,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        jobs.append(_Job(layers, _same_layers(lr, layers), check.remainder, known))
+        jobs.append(_Job(layers, same_layers(), check.remainder, known))
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
@@ -289,6 +297,7 @@ class _Band:
 
     def __init__(
         self,
+        lr: MappedRender,
         hr: MappedRender,
         rgb: Array,
         alignment: Alignment,
@@ -317,7 +326,7 @@ class _Band:
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
         self._low_beauty = _downsampled(self._beauty, self._scale)
         to_fit = [job for job in jobs if job.remainder or any(each not in fused_light for each in job.fitted)]
-        read = self._read(hr, jobs, to_fit)
+        read = self._read(lr, hr, jobs, to_fit)
         if to_fit:
             self._prepare_fit(read, guides)
 
@@ -341,8 +350,10 @@ class _Band:
             self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
 
-    def _read(self, hr: MappedRender, jobs: Sequence[_Job], to_fit: Sequence[_Job]) -> dict[str, Array]:
-        """Read all layers of the HRLS that the band needs, at once, because a file decodes all of them together.
+    def _read(
+        self, lr: MappedRender, hr: MappedRender, jobs: Sequence[_Job], to_fit: Sequence[_Job]
+    ) -> dict[str, Array]:
+        """Read all layers that the band needs, at once, because a file decodes all of them together.
 
         The light of each layer that is fitted stays at low resolution, and the colours of products over the core.
 
@@ -368,12 +379,16 @@ class _Band:
             job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
             for i, job in enumerate(to_fit)
         }
+        renders = {job.layers: with_layers(lr, job.lrhs) for job in to_fit if job.lrhs is not None}
+        self._lrhs_layers = {
+            layers: read_lrhs(render, self._alignment, self._area, render.features, RepairCounts())
+            for layers, render in renders.items()
+        }
         return guides
 
     def fuse(
         self,
         job: _Job,
-        lr: MappedRender,
         pixels: ReplacedChannels,
         earlier: Mapping[AdditiveLayer, Array],
     ) -> dict[AdditiveLayer, Array]:
@@ -381,7 +396,6 @@ class _Band:
 
         Args:
             job: the set, one of those that the band was made for.
-            lr: the LRHS.
             pixels: gets the rows of the band.
             earlier: light (3, h, w) of layers of earlier sets.
 
@@ -396,7 +410,7 @@ class _Band:
             if lights:
                 rest = rest - _total(lights, lights)
                 rest[rest < ROUNDING * self._beauty[:, rows]] = 0
-            lights |= self._fitted(job, lr, rest, colours)
+            lights |= self._fitted(job, rest, colours)
         lights |= {layer: _total(lights, parts) for layer, parts in job.coarser.items()}
         window = self._alignment.hr_data_window
         core = in_hrls_pixels(self._core, self._scale)
@@ -410,9 +424,7 @@ class _Band:
                 pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
         return lights
 
-    def _fitted(
-        self, job: _Job, lr: MappedRender, light: Array, colours: Mapping[AdditiveLayer, Array]
-    ) -> dict[AdditiveLayer, Array]:
+    def _fitted(self, job: _Job, light: Array, colours: Mapping[AdditiveLayer, Array]) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that earlier sets do not know."""
         layers = job.fitted
         fitted = np.empty((len(layers) + job.remainder, *light.shape), np.float32)
@@ -420,7 +432,7 @@ class _Band:
             if layer in self._fused_light:
                 planes[:] = self._over_core(self._fused_light[layer])
         missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
-        noisy = self._average(job, lr) if missing else fitted
+        noisy = self._average(job) if missing else fitted
         self._fit_layers(noisy, missing, fitted)
         # The squares of light beyond 1e19 overflow, so there is no fit there.
         fitted[:, ~np.isfinite(fitted).all(axis=0)] = 0
@@ -450,36 +462,36 @@ class _Band:
             fitted: gets them, (layers, 3, h, w), over the core.
         """
         beauty = self._beauty[:, self._hrls_rows]
-        pairs = [(i, channel) for i in chosen for channel in range(3)]
+        fitted[chosen] = 0
+        lit = [i for i in chosen if noisy[i].any()]
 
         def fit(part: slice) -> None:
             # NumPy's settings for errors belong to the thread.
             with np.errstate(over="ignore", invalid="ignore"):
-                for pair in pairs[part]:
-                    fit_plane(noisy[pair], pair[1], fitted[pair])
+                for i in lit[part]:
+                    fit_layer(noisy[i], fitted[i])
 
-        def fit_plane(plane: Array, channel: int, out: Array) -> None:
-            slope, offset = self._fit.line(plane, channel)
-            np.multiply(self._nearby.mean(slope), beauty[channel], out=out)
-            out += self._nearby.mean(offset)
+        def fit_layer(layer: Array, out: Array) -> None:
+            lines = self._nearby.mean(self._fit.lines(layer))
+            np.multiply(lines[:3], beauty, out=out)
+            out += lines[3:]
             # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
-            bounds = (
-                upsample_linear(each, self._scale, self._core_rows) for each in (-max_3x3(-plane), max_3x3(plane))
-            )
-            np.clip(out, *bounds, out=out)
+            for channel, plane in enumerate(layer):
+                bounds = (
+                    upsample_linear(each, self._scale, self._core_rows) for each in (-max_3x3(-plane), max_3x3(plane))
+                )
+                np.clip(out[channel], *bounds, out=out[channel])
 
-        for_row_blocks(fit, len(pairs), beauty[0].size)
+        for_row_blocks(fit, len(lit), beauty.size)
 
-    def _average(self, job: _Job, lr: MappedRender) -> Array:
+    def _average(self, job: _Job) -> Array:
         """The mean of both renders' layers at low resolution, (layers, 3, h, w), of those that are fitted.
 
         The remainder is the last layer.
         """
         total = self._dimmed(job, self._low_layers[job.layers])
-        if job.lrhs is not None:
-            render = with_layers(lr, job.lrhs)
-            low = read_lrhs(render, self._alignment, self._area, render.features, RepairCounts())
-            layers = self._dimmed(job, low)
+        if job.layers in self._lrhs_layers:
+            layers = self._dimmed(job, self._lrhs_layers[job.layers])
             weight = self._likeness(layers)
             total += weight * layers
             total /= 1 + weight
@@ -516,37 +528,56 @@ class _Fit:
         """``beauty``: (3, h, w). ``guides``: (guides, h, w), in units of their spread."""
         self._beauty, self._steps = beauty, steps
         self._kernels = [_kernel(guides, step) for step in steps]
-        self._means = np.stack([self._mean(plane) for plane in beauty])
-        squares = np.stack([self._mean(plane * plane) for plane in beauty])
-        variances = np.maximum(squares - self._means**2, 0)
+        means = self._mean(np.concatenate([beauty, beauty * beauty]))
+        self._means = means[:3]
+        variances = np.maximum(means[3:] - self._means**2, 0)
         self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
 
-    def line(self, layer: Array, channel: int) -> tuple[Array, Array]:
-        """Slope and offset (h, w) of a layer in a channel."""
-        mean, guide = self._mean(layer), self._means[channel]
-        slope = (self._mean(layer * self._beauty[channel]) - mean * guide) / self._variances[channel]
-        return slope, mean - slope * guide
+    def lines(self, layer: Array) -> Array:
+        """The slopes of a layer (3, h, w) in each channel, and then the offsets, (6, h, w)."""
+        means = self._mean(np.concatenate([layer, layer * self._beauty]))
+        mean, products = means[:3], means[3:]
+        slopes = (products - mean * self._means) / self._variances
+        return np.concatenate([slopes, mean - slopes * self._means])
 
-    def _mean(self, plane: Array) -> Array:
-        """Mean over pixels around that look alike."""
+    def _mean(self, planes: Array) -> Array:
+        """Means (n, h, w) over pixels around that look alike."""
         for kernel, step in zip(self._kernels, self._steps, strict=True):
-            padded, product = np.pad(plane, 2 * step), np.empty_like(plane)
-            plane = np.zeros_like(plane)
-            for weight, around in zip(kernel, _around(padded, step), strict=True):
-                plane += np.multiply(weight, around, out=product)
-        return plane
+            padded = np.pad(planes, [(0, 0), (2 * step, 2 * step), (2 * step, 2 * step)])
+            planes = np.empty_like(planes)
+            _add_up(kernel, list(_around(padded, step)), planes)
+        return planes
+
+
+def _add_up(weights: Array, images: Sequence[Array], out: Array) -> None:
+    """Sum of k images (n, h, w), times weights (k, h, w)."""
+    for start in range(0, out.shape[1], CACHED_ROWS):
+        rows = slice(start, start + CACHED_ROWS)
+        total = weights[0, rows] * images[0][:, rows]
+        product = np.empty_like(total)
+        for weight, image in zip(weights[1:], images[1:], strict=True):
+            total += np.multiply(weight[rows], image[:, rows], out=product)
+        out[:, rows] = total
 
 
 def _kernel(guides: Array, step: int) -> Array:
     """Weights (25, h, w) of the pixels of :func:`_around`, which sum to 1. Pixels outside weigh nothing."""
-    padded = np.pad(guides, ((0, 0), (2 * step, 2 * step), (2 * step, 2 * step)), constant_values=1e9)
-    offsets = [(y * y + x * x) / 4 for y in range(-2, 3) for x in range(-2, 3)]
-    weights = np.stack(
-        [
-            np.exp(-np.square(around - guides).sum(axis=0) - np.float32(offset / 2))
-            for around, offset in zip(_around(padded, step), offsets, strict=True)
-        ]
-    )
+    height, width = guides.shape[1:]
+    offsets = [(y * step, x * step) for y in range(-2, 3) for x in range(-2, 3)]
+    weights = np.zeros((len(offsets), height, width), np.float32)
+    weights[12] = 1
+
+    def weigh(part: slice) -> None:
+        # Two pixels differ by as much, whichever of them is in the centre.
+        for i, (y, x) in list(enumerate(offsets[:12]))[part]:
+            if -y < height and abs(x) < width:
+                here = slice(-y, height), slice(max(-x, 0), width - max(x, 0))
+                there = slice(0, height + y), slice(max(x, 0), width - max(-x, 0))
+                distance = np.square(guides[:, here[0], here[1]] - guides[:, there[0], there[1]]).sum(axis=0)
+                distance += np.float32((y * y + x * x) / (8 * step * step))
+                weights[i][here] = weights[24 - i][there] = np.exp(-distance)
+
+    for_row_blocks(weigh, 12, guides.size)
     weights /= weights.sum(axis=0)
     return weights
 
@@ -568,32 +599,37 @@ class _Nearby:
         height, width = rows.stop - rows.start, low.shape[2]
         self._weights = np.empty((scale, scale, 4, height, width), np.float32)
         full = full[:, rows.start * scale : rows.stop * scale]
+        corners = self._corners(low)
         for y, x in np.ndindex(scale, scale):
             weights, here = self._weights[y, x], full[:, y::scale, x::scale]
-            around = zip(self._corners(low, y, x), _bilinear(y, x, scale), strict=True)
+            around = zip(corners(y, x), _bilinear(y, x, scale), strict=True)
             for weight, (there, share) in zip(weights, around, strict=True):
                 distance = np.square(there - here).sum(axis=0) * np.float32(SHARPER**2)
                 weight[:] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(share)
             weights /= weights.sum(axis=0)
 
-    def mean(self, plane: Array) -> Array:
-        """A plane (h, w) at full resolution, its chosen rows."""
+    def mean(self, planes: Array) -> Array:
+        """Planes (n, h, w) at full resolution, the chosen rows."""
         height, width = self._weights.shape[-2:]
-        result = np.empty((height * self._scale, width * self._scale), np.float32)
+        result = np.empty((len(planes), height * self._scale, width * self._scale), np.float32)
+        corners = self._corners(planes)
         for y, x in np.ndindex(self._scale, self._scale):
-            corners = zip(self._weights[y, x], self._corners(plane[None], y, x), strict=True)
-            result[y :: self._scale, x :: self._scale] = sum(weight * corner[0] for weight, corner in corners)
+            _add_up(self._weights[y, x], corners(y, x), result[:, y :: self._scale, x :: self._scale])
         return result
 
-    def _corners(self, planes: Array, y: int, x: int) -> list[Array]:
-        """The four pixels of ``planes`` (n, h, w) around the pixel in row ``y`` and column ``x`` of each pixel."""
+    def _corners(self, planes: Array) -> Callable[[int, int], list[Array]]:
+        """The four pixels of ``planes`` (n, h, w) around the pixel in row y and column x of each pixel."""
         rows = slice(max(self._rows.start - 1, 0), self._rows.stop + 1)
         top = 1 - (self._rows.start - rows.start)
         bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
         padded = np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
         height, width = self._weights.shape[-2:]
-        down, right = (2 if 2 * i + 1 > self._scale else 0 for i in (y, x))
-        return [padded[:, i : i + height, j : j + width] for i in (1, down) for j in (1, right)]
+
+        def around(y: int, x: int) -> list[Array]:
+            down, right = (2 if 2 * i + 1 > self._scale else 0 for i in (y, x))
+            return [padded[:, i : i + height, j : j + width] for i in (1, down) for j in (1, right)]
+
+        return around
 
 
 def _bilinear(y: int, x: int, scale: int) -> list[float]:
@@ -607,10 +643,14 @@ def _smoothed(planes: Array, log: Array) -> Array:
     mean = _blurred(log)
     variance = _blurred(log * log) - mean * mean + np.float32(FLAT)
     result = np.empty_like(planes)
-    for plane, out in zip(planes, result, strict=True):
-        average = _blurred(plane)
-        slope = (_blurred(plane * log) - average * mean) / variance
-        np.add(average, slope * (log - mean), out=out)
+
+    def smooth(part: slice) -> None:
+        for plane, out in zip(planes[part], result[part], strict=True):
+            average = _blurred(plane)
+            slope = (_blurred(plane * log) - average * mean) / variance
+            np.add(average, slope * (log - mean), out=out)
+
+    for_row_blocks(smooth, len(planes), log.size)
     return result
 
 

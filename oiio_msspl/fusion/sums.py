@@ -12,6 +12,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.render import Window
+from oiio_msspl.parallel import one_ahead
 
 #: Largest part of the beauty's light that may be wrong in a sum: what half floats round, and a few repaired pixels.
 TOLERANCE = 2e-3
@@ -55,8 +56,8 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
     layers = with_layers(render, additive_set)
     names = [RGB, *layer_keys(additive_set)]
     light = wrong = missing = surplus = 0.0
-    for y in _strips(window):
-        pixels = layers.read(Window(window.x0, y, window.x1, min(y + ROWS, window.y1)), names)
+    strips = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _strips(window))
+    for pixels in one_ahead(layers.read(strip, names) for strip in strips):
         beauty = pixels[RGB].astype(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
             rest = beauty - sum(pixels[name] for name in names[1:])

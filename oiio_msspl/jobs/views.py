@@ -27,6 +27,7 @@ from oiio_msspl.fusion.tiling import STRIPS_SHARE, require_memory
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.model.session import Session
+from oiio_msspl.parallel import limit_threads
 
 #: Rows of a fused view that are stored at a time.
 ROWS_PER_PUT = 256
@@ -209,18 +210,19 @@ def fuse_frame_passes(
     if sets:
         session.release_memory()
         cache_bytes = max(0, int((max_memory - fused.nbytes) * STRIPS_SHARE))
-        fused.passes = fuse_passes(
-            lr,
-            hr,
-            fused.rgb,
-            fused.alignment,
-            sets,
-            cache_bytes=cache_bytes,
-            pixels=fused.replaced,
-            guides=fused.clean_aovs,
-            fuse_layer=layer_fuser(session, fused),
-            progress=progress,
-        )
+        with limit_threads(session.threads):
+            fused.passes = fuse_passes(
+                lr,
+                hr,
+                fused.rgb,
+                fused.alignment,
+                sets,
+                cache_bytes=cache_bytes,
+                pixels=fused.replaced,
+                guides=fused.clean_aovs,
+                fuse_layers=layer_fuser(session, fused),
+                progress=progress,
+            )
         fused.replaced = fused.passes.pixels
         if session.layer_session is not None:
             session.layer_session.release_memory()

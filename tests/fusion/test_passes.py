@@ -133,7 +133,7 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
             beauty.rgb,
             beauty.alignment,
             pair[1].additive_sets,
-            fuse_layer=fuser,
+            fuse_layers=fuser,
             progress=lambda *told: steps.append(told),
         )
         channels = result.sets[0].layers[0].channels

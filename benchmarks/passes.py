@@ -12,6 +12,8 @@ the albedo and the normal:
 - "OIDN": Open Image Denoise on each layer of the HRLS, the plain call. Its layers do not sum to a denoised beauty.
 - "OIDN, rescaled": the same, scaled so that they sum to the fused beauty.
 - "OIDN, prefiltered, rescaled": the same with the call that OIDN's documentation recommends.
+- "OIDN, prefiltered, stored": the same, but light of a layer that is stored as light and colour is left out where the
+  colour is black, because no file can hold it. The layers are then scaled to the sum.
 - "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
   so that they sum to the beauty that OIDN makes of this render.
 - "msspl": :mod:`oiio_msspl.fusion.passes`.
@@ -25,8 +27,8 @@ part of the sum, but is not scored: every method has a high PSNR there.
 
 "Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
 "Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
-beauty, as a multiple of OIDN's plain call on the beauty. The gain is the PSNR of a method minus that of `PEER`, with a
-95 % interval by :mod:`benchmarks.versus`; a win is a layer with more PSNR than that of `PEER`.
+beauty, as a multiple of OIDN's plain call on the beauty. The gain is the PSNR of a method minus that of one of `GAINS`,
+with a 95 % interval by :mod:`benchmarks.versus`; a win is a layer with more PSNR than that of `PEER`.
 """
 
 from __future__ import annotations
@@ -54,7 +56,7 @@ from oiio_msspl.colour import srgb
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.fuse import layer_fuser
-from oiio_msspl.fusion.passes import fuse_passes
+from oiio_msspl.fusion.passes import DARKEST_COLOUR, fuse_passes
 from oiio_msspl.fusion.sums import layer_keys, with_layers
 from oiio_msspl.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import load_model
@@ -71,6 +73,12 @@ FAINT = 0.01
 BALANCED, BEST = "joint", "ensemble"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
+#: The same as a file can hold it.
+STORED_PEER = "OIDN, prefiltered, stored"
+#: The set whose layers are products of light and colour in some renderers.
+COMPONENTS = "components"
+#: Column of the gain -> over which method.
+GAINS = {"gain": PEER, "gain_stored": STORED_PEER}
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
@@ -138,6 +146,8 @@ def methods(
     yield "OIDN", plain
     yield "OIDN, rescaled", lambda: rescaled(plain(), beauty)
     yield PEER, lambda: rescaled(recommended(noisy, guides), beauty)
+    if layers.name == COMPONENTS:
+        yield STORED_PEER, lambda: rescaled(recommended(noisy, guides) * (colours >= DARKEST_COLOUR), beauty)
     if ordinary is not None:
         theirs = layers_of(ordinary, layers_like(ordinary, layers))
         pixels = ordinary.load().layers
@@ -237,19 +247,18 @@ def means(rows: list[Row]) -> list[Row]:
     totals = [row for row in rows if row["layer"] == ALL]
     for key in dict.fromkeys(tuple(row[k] for k in KEYS[1:]) for row in totals):
         same = [row for row in totals if tuple(row[k] for k in KEYS[1:]) == key]
-        peers = [row for row in totals if (row["set"], row["spp"], row["method"]) == (*key[:2], PEER)]
-        if len(same) < len(peers):
+        if len(same) < sum((row["set"], row["spp"], row["method"]) == (*key[:2], PEER) for row in totals):
             continue
         numbers = {k: float(np.mean([row[k] for row in same])) for k, v in same[0].items() if isinstance(v, float)}
-        gains = np.array([row["psnr"] - peer["psnr"] for row, peer in zip(same, peers, strict=True)])
-        gain, low, high = with_interval(gains)
-        won = [
-            row["psnr"] > peer["psnr"]
-            for row, peer in zip(*(_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER)), strict=True)
-        ]
         mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
-        mean |= {"gain": gain, "gain_low": low, "gain_high": high, "wins": sum(won), "layers": len(won)}
-        found.append(mean)
+        for column, peer in GAINS.items():
+            peers = [row for row in totals if (row["set"], row["spp"], row["method"]) == (*key[:2], peer)]
+            if peers:
+                gains = np.array([row["psnr"] - other["psnr"] for row, other in zip(same, peers, strict=True)])
+                mean |= dict(zip((column, f"{column}_low", f"{column}_high"), with_interval(gains), strict=True))
+        layers = [_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER)]
+        won = [row["psnr"] > other["psnr"] for row, other in zip(*layers, strict=True)]
+        found.append(mean | {"wins": sum(won), "layers": len(won)})
     return found
 
 
@@ -269,11 +278,14 @@ def layout(rows: list[Row]) -> str:
         for row in shown
     ]
     head = ["set", "spp", "method", *titles.values()]
-    if all("gain" in row for row in shown):
-        head += [f"gain over {PEER}, dB", "better on"]
+    for column, peer in GAINS.items():
+        head.append(f"gain over {peer}, dB")
         for line, row in zip(body, shown, strict=True):
-            gain = cell((row["gain"], row["gain_low"], row["gain_high"]), "+.2f")
-            line += [gain, f"{row['wins']:.0f} of {row['layers']:.0f}"]
+            gain = tuple(row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
+            line.append("" if gain[0] in (None, "") else cell(gain, "+.2f"))
+    head.append("better on")
+    for line, row in zip(body, shown, strict=True):
+        line.append(f"{row['wins']:.0f} of {row['layers']:.0f}")
     return results.markdown(head, body)
 
 

@@ -25,6 +25,7 @@ from oiio_msspl.fusion.guards import (
     dim_fireflies,
     is_noise_free,
     lights_above_ceiling,
+    lit_window,
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, bounded_luminance, check_pair
 from oiio_msspl.fusion.passes import FusedPasses, LayerFuser
@@ -295,6 +296,7 @@ class _Pair:
         self.exposure = find_exposure(self._lrhs_rgb) if beauty is None else beauty.exposure
         reach = FAR if beauty is None else max(LAYER_REACH // alignment.scale - 1, 1)
         self._empty_regions = EmptyRegions(self._lrhs[RGB], reach)
+        self._part = None if beauty is None else self._lit_part(reach)
         self._averages = HrlsAverages(alignment) if beauty is None else None
         self._memory = ReusedMemory() if memory is None else memory
 
@@ -313,8 +315,8 @@ class _Pair:
         return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
 
     def tiles(self) -> list[Tile]:
-        """The tiles in which the pair is fused."""
-        return plan_tiles(self.grid, self._session.contract, self._session.stride)
+        """The tiles in which the pair is fused. A layer is black where none of them is."""
+        return plan_tiles(self.grid, self._session.contract, self._session.stride, self._part)
 
     def prepare(self, tile: Tile) -> _PreparedTile:
         """Read a tile, dim fireflies and encode its features."""
@@ -328,6 +330,18 @@ class _Pair:
         lit = empty is None or not empty.all() or bool(self._aovs)
         pictures = [self._prepare_picture(place, part, lit=lit) for place, part in self._pictures(pair)]
         return _PreparedTile(pair.hrls_area, pair.hrls_target, empty, pictures)
+
+    def _lit_part(self, reach: int) -> Window | None:
+        """The part of the grid beyond which both renders are black, and as far from light as ``reach``, see
+        :class:`EmptyRegions`; None if all is black."""
+        scale, data = self._alignment.scale, self._alignment.hr_data_window
+        low = lit_window(self._lrhs[RGB], self.grid, reach)
+        high = lit_window(self._hr.read(self._hr.data_window, [RGB])[RGB], data, 0)
+        if low is None or high is None:
+            return None
+        whole = Window(high.x0 // scale, high.y0 // scale, -(-high.x1 // scale), -(-high.y1 // scale))
+        both = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
+        return Window(*both).intersect(self.grid)
 
     def release(self, tile: _PreparedTile) -> None:
         """Use the memory of a tile, which is fused, for another one."""

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.errors import MssplError
+from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import MAX_RADIANCE, encode_radiance
 from oiio_msspl.model.session import Session
@@ -176,6 +177,20 @@ class EmptyRegions:
         empty = holds_around(self._black[window], hrls_black, pair.scale)
         empty &= _shows_no_surface(pair.hrls) | _enlarge(self._black_far_around[window], pair.scale)
         return empty
+
+
+def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
+    """The smallest rectangle with all pixels that are not black, and ``margin`` pixels around; None if all are.
+
+    Args:
+        rgb: (h, w, 3) over ``window``.
+    """
+    rows = np.flatnonzero(rgb.any(axis=(1, 2)))
+    if not rows.size:
+        return None
+    columns = np.flatnonzero(rgb[rows[0] : rows[-1] + 1].any(axis=(0, 2)))
+    x0, x1, y0, y1 = columns[0] - margin, columns[-1] + 1 + margin, rows[0] - margin, rows[-1] + 1 + margin
+    return Window(int(x0), int(y0), int(x1), int(y1)).shift(window.x0, window.y0)
 
 
 def holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:

@@ -38,7 +38,7 @@ class Tile:
     """Two windows in LRHS pixels; ``core`` is inside ``area``."""
 
     core: Window
-    """The pixels that the tile contributes to the frame. The cores cover the grid once."""
+    """The pixels that the tile contributes to the frame. The cores cover the grid, or a part of it, once."""
     area: Window
     """The pixels that the network reads: the core plus the overlap, cut at the borders of the grid."""
 
@@ -49,7 +49,7 @@ def aligned_grid(grid: Window, alignment: int) -> Window:
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
 
-def plan_tiles(grid: Window, contract: Contract, stride: int = 1) -> list[Tile]:
+def plan_tiles(grid: Window, contract: Contract, stride: int = 1, part: Window | None = None) -> list[Tile]:
     """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
     There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
@@ -58,13 +58,18 @@ def plan_tiles(grid: Window, contract: Contract, stride: int = 1) -> list[Tile]:
 
     Args:
         stride: :attr:`oiio_msspl.model.session.Session.stride` of the model.
+        part: the part of the grid that is to be covered, which the tiles may exceed; None for all of it.
     """
     alignment = contract.tile_alignment * stride
     overlap = -(-contract.overlap * stride // alignment) * alignment
     largest = TILE_MEMORY // (_bytes_per_pixel(contract, stride) * contract.scale**2)
+    part = grid if part is None else _aligned_part(part, grid, alignment)
     # The fewest pixels that are computed, in the fewest tiles; where even the smallest tile is too large, that one.
     columns, rows = min(
-        itertools.product(_splits(grid.x0, grid.x1, overlap, alignment), _splits(grid.y0, grid.y1, overlap, alignment)),
+        itertools.product(
+            _splits((part.x0, part.x1), (grid.x0, grid.x1), overlap, alignment),
+            _splits((part.y0, part.y1), (grid.y0, grid.y1), overlap, alignment),
+        ),
         key=lambda split: (
             max(1.0, split[0].largest * split[1].largest / largest),
             split[0].computed * split[1].computed,
@@ -76,6 +81,16 @@ def plan_tiles(grid: Window, contract: Contract, stride: int = 1) -> list[Tile]:
         for y0, y1 in rows.cores
         for x0, x1 in columns.cores
     ]
+
+
+def _aligned_part(part: Window, grid: Window, alignment: int) -> Window:
+    """Extend a part of a grid until its offset in the grid and its size are multiples of ``alignment``, or it ends with
+    the grid."""
+    x0, y0 = (
+        (start - first) // alignment * alignment + first for start, first in ((part.x0, grid.x0), (part.y0, grid.y0))
+    )
+    x1, y1 = (start - (start - end) // alignment * alignment for start, end in ((x0, part.x1), (y0, part.y1)))
+    return Window(x0, y0, x1, y1).intersect(grid)
 
 
 def sample_bands(grid: Window, scale: int) -> list[Window]:
@@ -134,10 +149,12 @@ class _Split:
     """Length of all ranges with their overlap."""
 
 
-def _splits(start: int, end: int, overlap: int, alignment: int) -> Iterator[_Split]:
-    """All ways to cut a side into equal steps that are multiples of ``alignment``; the last one may be shorter."""
+def _splits(side: tuple[int, int], grid: tuple[int, int], overlap: int, alignment: int) -> Iterator[_Split]:
+    """All ways to cut a side, from start to end, into equal steps that are multiples of ``alignment``; the last one may
+    be shorter. ``grid``: start and end of the grid's side."""
+    start, end = side
     units = -(-(end - start) // alignment)
     for step in sorted({-(-units // count) * alignment for count in range(1, units + 1)}):
         cores = [(a, min(a + step, end)) for a in range(start, end, step)]
-        lengths = [min(b + overlap, end) - max(a - overlap, start) for a, b in cores]
+        lengths = [min(b + overlap, grid[1]) - max(a - overlap, grid[0]) for a, b in cores]
         yield _Split(cores, max(lengths), sum(lengths))

@@ -2,6 +2,7 @@
 """Layers that sum to the beauty are fused, and still sum to it."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import fuse, layer_fuser
+from oiio_msspl.fusion.fuse import _Pair, fuse, layer_fuser
 from oiio_msspl.fusion.passes import fuse_passes, pass_steps
 from oiio_msspl.jobs import frame
 from oiio_msspl.model.catalogue import load_model
@@ -142,6 +143,32 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
         assert done == count == pass_steps(beauty.alignment, result.sets, by_network=fuser is not None)
     errors = [np.abs(each - clean["light_a"]).mean() for each in found]
     assert errors[1] < 0.7 * errors[0] if low else errors[1] == errors[0]
+
+
+def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_path, monkeypatch):
+    """It gives what it gives for the whole frame, and takes fewer pixels."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    corner = ((y - 50) ** 2 + (x - 100) ** 2 < 100)[..., None] * np.ones(3)
+    pair = write_pair(tmp_path, {"light_a": 0.5 * picture(HEIGHT, WIDTH), "light_b": corner})
+    pair = [map_render(open_exr(file)) for file in pair]
+    session = load_model(4, "best", threads=1)
+    beauty = fuse(*pair, session)
+    layers = session.layer_session
+    monkeypatch.setattr(layers, "contract", replace(layers.contract, overlap=0))
+    run, sizes, found = layers.run, [], []
+    monkeypatch.setattr(
+        layers, "run", lambda lrhs, *args, **options: sizes.append(lrhs.size) or run(lrhs, *args, **options)
+    )
+    for whole in (False, True):
+        if whole:
+            monkeypatch.setattr(_Pair, "_lit_part", lambda *_: None)
+        fuser = layer_fuser(session, beauty)
+        result = fuse_passes(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, fuse_layers=fuser)
+        channels = result.sets[0].layers[1].channels
+        found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
+    assert sizes[0] == sizes[2] == sizes[3] == 2 * sizes[1]
+    assert np.abs(found[0] - found[1]).max() < 0.05
+    assert found[0][50, 100].min() > 0.5
 
 
 def test_all_else_is_what_it_is_without_passes(tmp_path, model):

@@ -41,6 +41,25 @@ def test_cores_cover_the_grid_once_and_areas_fit(monkeypatch, grid, largest, ali
     assert (covered == 1).all()
 
 
+@pytest.mark.parametrize("part", [(30, 40, 31, 41), (0, 0, 40, 200), (77, 9, 400, 300)])
+@pytest.mark.parametrize("largest", [4096, 10**9])
+def test_a_part_of_the_grid_is_covered_with_few_pixels_around(monkeypatch, part, largest):
+    """The network sees what is around the part, up to the borders of the grid."""
+    monkeypatch.setattr(tiling, "TILE_MEMORY", largest * 2**2 * 100)
+    alignment, overlap = 8, 24
+    grid = Window(-16, 8, 384, 304)
+    part = Window(*part).shift(grid.x0, grid.y0).intersect(grid)
+    covered = np.zeros((grid.height, grid.width), int)
+    for tile in plan_tiles(grid, contract_of(alignment, overlap), part=part):
+        covered[tile.core.slices(grid)] += 1
+        assert (tile.area.x0, tile.area.y0) == (max(tile.core.x0 - overlap, -16), max(tile.core.y0 - overlap, 8))
+        assert (tile.area.x1, tile.area.y1) == (min(tile.core.x1 + overlap, 384), min(tile.core.y1 + overlap, 304))
+        for length in (tile.area.x0 + 16, tile.area.y0 - 8, tile.area.width, tile.area.height):
+            assert length % alignment == 0
+    assert (covered[part.slices(grid)] == 1).all() and covered.max() == 1
+    assert covered.sum() <= (part.width + 2 * alignment) * (part.height + 2 * alignment)
+
+
 @pytest.mark.parametrize("grid", GRIDS)
 def test_the_grid_grows_to_the_right_and_to_the_bottom(grid):
     wider = aligned_grid(grid, 8)

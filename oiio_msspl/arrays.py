@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import mmap
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import reduce
@@ -74,7 +75,14 @@ def kept(values: NDArray[T]) -> NDArray[T]:
         return values
     on_disk = blank(values.shape, values.dtype)
     on_disk[:] = values
+    unload(on_disk)
     return on_disk
+
+
+def unload(values: NDArray[Any]) -> None:
+    """Give the memory of an image in a temporary file back to the system. Its pixels stay in the file."""
+    if isinstance(values.base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+        values.base.madvise(mmap.MADV_DONTNEED)
 
 
 def map_rows(function: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:

@@ -6,6 +6,7 @@ import warnings
 import numpy as np
 import pytest
 
+from oiio_msspl import arrays
 from oiio_msspl.arrays import box_downsample, filled
 
 
@@ -39,3 +40,15 @@ def test_without_any_known_pixel_nothing_is_filled():
     image = np.zeros((5, 7, 3), np.float32)
     assert filled(image, np.ones((5, 7), bool)) is image
     assert filled(image, np.zeros((5, 7), bool)) is image
+
+
+def test_unloaded_images_keep_their_pixels(monkeypatch):
+    monkeypatch.setattr(arrays, "MOST_PIXELS", 10)
+    image = np.random.default_rng(0).random((64, 64, 3), np.float32)
+    on_disk = arrays.kept(image)
+    assert on_disk is not image and isinstance(on_disk, np.memmap)
+    for _ in range(2):
+        arrays.unload(on_disk)
+        np.testing.assert_array_equal(on_disk, image)
+    arrays.unload(image)  # in memory: nothing happens
+    np.testing.assert_array_equal(on_disk, image)

@@ -28,7 +28,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, upsample_linear
+from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, unload, upsample_linear
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -147,6 +147,8 @@ def fuse_passes(
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1
                 tell(done, steps)
+            for light in fused_light.values():
+                unload(light)
     return fused
 
 
@@ -173,7 +175,7 @@ def _fused_layers(
     waiting = in_background(partial(_decoded, lr, job.lrhs))
     high, low = _decoded(hr, job.layers), waiting()
     keys = dict(zip(job.layers.layers, layer_keys(job.layers), strict=True))
-    lit = {layer: [bool(each.layers[keys[layer]].any()) for each in (low, high)] for layer in job.fitted}
+    lit = {layer: [_is_lit(each.layers[keys[layer]]) for each in (low, high)] for layer in job.fitted}
     fused = fuse_layers(
         (_as_beauty(low, keys[layer]), _as_beauty(high, keys[layer])) for layer in job.fitted if all(lit[layer])
     )
@@ -182,6 +184,14 @@ def _fused_layers(
             yield layer, kept(next(fused))
         else:
             yield layer, None if any(lit[layer]) else np.zeros_like(high.layers[keys[layer]])
+        for render in (low, high):
+            unload(render.layers[keys[layer]])
+
+
+def _is_lit(image: Array) -> bool:
+    lit = bool(image.any())
+    unload(image)
+    return lit
 
 
 def _decoded(render: MappedRender, layers: AdditiveSet) -> Render:
@@ -196,6 +206,7 @@ def _decoded(render: MappedRender, layers: AdditiveSet) -> Render:
             if name not in pixels:
                 pixels[name] = blank((window.height, window.width, rows.shape[-1]))
             pixels[name][part.slices(window)] = rows
+            unload(pixels[name])
     return Render(pixels, window, render.display_window, render.pixel_aspect, name=render.name)
 
 

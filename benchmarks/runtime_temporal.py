@@ -1,0 +1,145 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Time of a shot whose frames are averaged with their neighbours, beside the same shot frame by frame.
+
+    python -m benchmarks.runtime_temporal --table benchmarks/results/runtime_temporal.csv
+
+A shot of real size is written to a temporary folder: a textured wall past which the camera moves, with noise of 1 spp,
+albedo, normal, depth and exact motion vectors, as half-float EXRs. Both ways take turns for each quality, file to file,
+each in its own process; the median of all rounds counts. The ratio depends on the number of frames: the first and the
+last ones have fewer neighbours. Peak memory is that of the largest round.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import statistics
+import tempfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import OpenEXR
+
+from benchmarks import results
+from benchmarks.results import Row
+from benchmarks.runtime import in_process, peak_mb, processor
+from oiio_msspl.arrays import Array, box_downsample, enlarged
+
+#: How many pixels the wall moves to the left from one frame to the next.
+STEP = 3
+#: Size of the wall's stains in pixels.
+STAIN = 8
+OFF, AUTO = "off", "auto"
+
+
+def wall(height: int, width: int) -> Array:
+    """Its colour (height, width, 3), in [0.1, 0.9]."""
+    stains = np.random.default_rng(0).random((-(-height // STAIN), -(-width // STAIN), 3), np.float32)
+    return (0.1 + 0.8 * enlarged(stains, STAIN)[:height, :width]).astype(np.float32)
+
+
+def write_shot(folder: Path, count: int, width: int, height: int, scale: int) -> None:
+    """Write the frames of both renders."""
+    whole = wall(height, width + STEP * count)
+    for name in ("lr", "hr"):
+        (folder / name).mkdir()
+    for number in range(1, count + 1):
+        colour = whole[:, STEP * number :][:, :width]
+        for name, factor, spp in (("lr", scale, scale**2), ("hr", 1, 1)):
+            albedo = box_downsample(colour, factor)
+            rng = np.random.default_rng([number, factor])
+            light = rng.gamma(spp, 0.5 / spp, (*albedo.shape[:2], 1)).astype(np.float32)
+            layers = {"": (albedo * light, "RGB"), "albedo": (albedo, "RGB")}
+            layers["N"] = (np.full_like(albedo, (0, 0, 1)), "XYZ")
+            if name == "hr":
+                back = np.full((height, width, 2), (STEP, 0), np.float32)
+                layers |= {"depth": (np.full((height, width, 1), 5, np.float32), "Z")}
+                layers |= {"motionBack": (back, "XY"), "motionFore": (-back, "XY")}
+            channels = {
+                f"{layer}.{letter}".lstrip("."): np.ascontiguousarray(image[..., i], np.float16)
+                for layer, (image, letters) in layers.items()
+                for i, letter in enumerate(letters)
+            }
+            header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+            with OpenEXR.File(header, channels) as file:
+                file.write(str(folder / name / f"{name}.{number:04d}.exr"))
+
+
+def measure(folder: Path, quality: str, frames: str) -> dict[str, Any]:
+    """Fuse the shot in this process."""
+    from oiio_msspl import fuse_shot
+    from oiio_msspl.jobs.temporal import TemporalOptions
+
+    report = fuse_shot(
+        *(folder / name for name in ("lr", "hr", "out")),
+        model=quality,
+        temporal=TemporalOptions(frames),
+        overwrite=True,
+    )
+    if report.exit_code:
+        raise SystemExit(next(result.message for result in report.results.values() if result.message))
+    return {"seconds": report.seconds, "peak_mb": peak_mb()}
+
+
+def layout(rows: list[Row]) -> str:
+    """A line for each quality and way."""
+    alone = {row["quality"]: row["seconds"] for row in rows if row["temporal"] == OFF}
+    body = [
+        [
+            f"`--quality {row['quality']} --temporal {row['temporal']}`",
+            f"{row['seconds'] / row['frames']:.2f}",
+            f"{row['seconds'] / alone[row['quality']]:.2f}",
+            f"{row['peak_mb']:.0f}",
+        ]
+        for row in rows
+    ]
+    first = rows[0]
+    head = f"{first['frames']} frames, {first['size'].replace('x', ' x ')}, x{first['scale']}, {first['cores']} cores"
+    return results.markdown([f"{head}, {first['machine']}", "seconds a frame", "ratio", "peak MB"], body)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--size", default="1920x1080")
+    parser.add_argument("--scale", type=int, default=2)
+    parser.add_argument("--qualities", nargs="+", default=["fast", "balanced", "best"])
+    parser.add_argument("--rounds", type=int, default=2, help="times that both ways are measured, in turn")
+    parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
+    results.add_option(parser)
+    args = parser.parse_args()
+    if args.measure:
+        folder, quality, frames = args.measure
+        (Path(folder) / "out").mkdir(exist_ok=True)
+        print(json.dumps(measure(Path(folder), quality, frames)))
+        return
+    width, height = (int(v) for v in args.size.split("x"))
+    ways = [(quality, frames) for quality in args.qualities for frames in (OFF, AUTO)]
+    measured: dict[tuple[str, str], list[dict[str, Any]]] = {way: [] for way in ways}
+    with tempfile.TemporaryDirectory() as folder:
+        write_shot(Path(folder), args.frames, width, height, args.scale)
+        for _ in range(args.rounds):
+            for way in ways:
+                measured[way].append(in_process("benchmarks.runtime_temporal", "--measure", folder, *way))
+    shot = {name: getattr(args, name) for name in ("frames", "size", "scale")}
+    machine = {"machine": processor(), "cores": os.cpu_count()}
+    rows: list[Row] = [
+        {
+            "quality": quality,
+            "temporal": frames,
+            **shot,
+            **machine,
+            "seconds": statistics.median(found["seconds"] for found in measured[quality, frames]),
+            "peak_mb": max(found["peak_mb"] for found in measured[quality, frames]),
+        }
+        for quality, frames in ways
+    ]
+    print(layout(rows))
+    if args.table:
+        results.write(args.table, rows)
+
+
+if __name__ == "__main__":
+    main()

@@ -4,9 +4,10 @@
     python -m benchmarks.runtime_temporal --table benchmarks/results/runtime_temporal.csv
 
 A shot of real size is written to a temporary folder: a textured wall past which the camera moves, with noise of 1 spp,
-albedo, normal, depth and exact motion vectors, as half-float EXRs. Both ways take turns for each quality, file to file,
-each in its own process; the median of all rounds counts. The ratio depends on the number of frames: the first and the
-last ones have fewer neighbours. Peak memory is that of the largest round.
+albedo, normal, depth and exact motion vectors, as half-float EXRs. All ways (`WAYS`) take turns for each quality, file
+to file, each in its own process; the median of all rounds counts. The ratio depends on the number of frames: the first
+and the last ones have fewer neighbours, and how motion is stored is found out once. Peak memory is that of the largest
+round.
 """
 
 from __future__ import annotations
@@ -31,7 +32,9 @@ from oiio_msspl.arrays import Array, box_downsample, enlarged
 STEP = 3
 #: Size of the wall's stains in pixels.
 STAIN = 8
-OFF, AUTO = "off", "auto"
+#: Values of ``--temporal``: the first one is what the others are compared with.
+OFF = "off"
+WAYS = (OFF, "2", "auto")
 
 
 def wall(height: int, width: int) -> Array:
@@ -106,7 +109,7 @@ def main() -> None:
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--scale", type=int, default=2)
     parser.add_argument("--qualities", nargs="+", default=["fast", "balanced", "best"])
-    parser.add_argument("--rounds", type=int, default=2, help="times that both ways are measured, in turn")
+    parser.add_argument("--rounds", type=int, default=2, help="times that all ways are measured, in turn")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     results.add_option(parser)
     args = parser.parse_args()
@@ -116,7 +119,7 @@ def main() -> None:
         print(json.dumps(measure(Path(folder), quality, frames)))
         return
     width, height = (int(v) for v in args.size.split("x"))
-    ways = [(quality, frames) for quality in args.qualities for frames in (OFF, AUTO)]
+    ways = [(quality, frames) for quality in args.qualities for frames in WAYS]
     measured: dict[tuple[str, str], list[dict[str, Any]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:
         write_shot(Path(folder), args.frames, width, height, args.scale)

@@ -30,23 +30,28 @@ LARGEST_DIFFERENCE = 3.0
 DARKEST = 0.02
 #: Relative squared difference below which two frames are equal.
 EQUAL = 1e-4
-#: Rows of the frame that are averaged at a time, which bounds memory; a multiple of every scale.
-BAND_ROWS = 512
+#: Rows of the frame that are averaged at a time, which bounds memory; a multiple of every scale. Narrow frames may have
+#: more, up to so many pixels, because the rows around a band are averaged twice.
+BAND_ROWS, BAND_PIXELS = 512, 1 << 22
 
 
 def bands(alignment: Alignment) -> Iterator[tuple[Window, Window]]:
     """Rows of the data window, and the area around them that decides on them."""
     window, scale = alignment.hr_data_window, alignment.scale
-    halo = -(-max(RADII) // scale) * scale + 2 * scale
-    for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, BAND_ROWS):
-        core = Window(window.x0, max(top, window.y0), window.x1, min(top + BAND_ROWS, window.y1))
-        area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + BAND_ROWS + halo, window.y1))
+    halo, rows = -(-max(RADII) // scale) * scale + 2 * scale, _band_rows(window)
+    for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, rows):
+        core = Window(window.x0, max(top, window.y0), window.x1, min(top + rows, window.y1))
+        area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + rows + halo, window.y1))
         yield core, area
 
 
-def rows_in_bands(height: int) -> int:
-    """The most rows of an area of :func:`bands`, in a data window of this height."""
-    return min(height, BAND_ROWS + 4 * max(RADII))
+def _band_rows(window: Window) -> int:
+    return max(BAND_ROWS, BAND_PIXELS // window.width // BAND_ROWS * BAND_ROWS)
+
+
+def rows_in_bands(window: Window) -> int:
+    """The most rows of an area of :func:`bands`, in this data window."""
+    return min(window.height, _band_rows(window) + 4 * max(RADII))
 
 
 def grid_rows(alignment: Alignment, area: Window) -> slice:

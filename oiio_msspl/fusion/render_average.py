@@ -7,18 +7,19 @@ frames no longer has. A neighbour counts where it shows the same surface in the 
 
 - The HRLS's pixels are fetched from the nearest pixel of the neighbour. Interpolation would spread their noise, which
   networks take for texture.
-- The LRHS has less noise, and its pixels are large. They are interpolated.
+- The LRHS has less noise, and its pixels are large. Its light is interpolated. Other layers, such as the albedo, have
+  hardly any noise to remove, and are fetched from the nearest pixel, which takes a fifth of the time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
-from oiio_msspl.aovs.features import RGB, VARIANCE
+from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.arrays import Array, blank, repair
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
@@ -135,7 +136,7 @@ def memory_to_average(window: Window, channels: int) -> int:
         window: the HRLS's data window.
         channels: of the HRLS's features.
     """
-    return rows_in_bands(window.height) * window.width * (BYTES_PER_PIXEL + 2 * 4 * channels)
+    return rows_in_bands(window) * window.width * (BYTES_PER_PIXEL + 2 * 4 * channels)
 
 
 class _Sum:
@@ -246,11 +247,17 @@ class _Band:
         if path.x is None:
             rows, columns = y[:, 0].astype(int), x[0].astype(int)
             return {name: values[rows].take(columns, axis=1) for name, values in stored.items()}, usable
-        result = {}
-        for name, values in stored.items():
-            planes = np.moveaxis(values, -1, 0)
+
+        def positions(rows: slice) -> tuple[Array, Array]:
+            return x[rows], y[rows]
+
+        light = {
+            name: np.moveaxis(stored.pop(name), -1, 0) for name in (*RADIANCE_FEATURES, VARIANCE) if name in stored
+        }
+        result = _nearest_pixels(stored, positions, x.shape)
+        for name, planes in light.items():
             with np.errstate(invalid="ignore"):  # NaN is sorted out later
-                result[name] = np.moveaxis(sample(planes, lambda rows: (x[rows], y[rows]), x.shape), 0, -1)
+                result[name] = np.moveaxis(sample(planes, positions, x.shape), 0, -1)
         return result, usable
 
 
@@ -260,16 +267,30 @@ def _fetch_nearest(frame: RenderPair, path: Path, features: Sequence[str] | None
     stored = _read(frame.hr, place, features)
     if path.x is None:
         return stored
-    height, width = path.valid.shape
-    flat = {name: np.ascontiguousarray(v).reshape(-1, v.shape[-1]) for name, v in stored.items()}
-    result = {name: np.empty((height, width, v.shape[-1]), np.float32) for name, v in stored.items()}
+
+    def positions(rows: slice) -> tuple[Array, Array]:
+        x, y = path.positions(rows)
+        return x - place.x0, y - place.y0
+
+    return _nearest_pixels(stored, positions, path.valid.shape)
+
+
+def _nearest_pixels(
+    features: Features, positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]
+) -> Features:
+    """The pixels of features that are nearest to positions in them; the arguments are those of
+    :func:`oiio_msspl.fusion.warp.sample`."""
+    height, width = size
+    flat = {name: np.ascontiguousarray(v).reshape(-1, v.shape[-1]) for name, v in features.items()}
+    result = {name: np.empty((height, width, v.shape[-1]), np.float32) for name, v in features.items()}
+    window = Window(0, 0, *next((v.shape[1::-1] for v in features.values()), (1, 1)))
 
     def work(rows: slice) -> None:
-        at = nearest(*path.positions(rows), place)
+        at = nearest(*positions(rows), window)
         for name, values in flat.items():
             values.take(at, axis=0, out=result[name][rows], mode="wrap")  # "wrap" writes straight into the result
 
-    for_row_blocks(work, height, width * sum(v.shape[-1] for v in flat.values()))
+    for_row_blocks(work, height if flat else 0, width * sum(v.shape[-1] for v in flat.values()))
     return result
 
 

@@ -74,7 +74,7 @@ def accumulate(frame: FusedFrame, before: Sequence[Step[FusedFrame]], after: Seq
 
 def memory_to_accumulate(window: Window) -> int:
     """Bytes that :func:`accumulate` needs beside its arguments and its result, for a frame of this data window."""
-    return rows_in_bands(window.height) * window.width * BYTES_PER_PIXEL
+    return rows_in_bands(window) * window.width * BYTES_PER_PIXEL
 
 
 def _light_of(frame: FusedFrame) -> Light:

@@ -183,24 +183,31 @@ def sample(planes: Array, positions: Callable[[slice], tuple[Array, Array]], siz
         x = np.clip(x, -1, columns_in - 0.01)
         y = np.clip(y, -1, rows_in - 0.01)
         left, top = np.floor(x), np.floor(y)
-        first = (top.astype(np.intp) + 2) * stride + left.astype(np.intp) + 2
+        # The pixel above and to the left of the four nearest ones.
+        first = (top.astype(np.intp) + 1) * stride + left.astype(np.intp) + 1
         across, down = _keys(x - left), _keys(y - top)
+        line, low, high, values = np.empty((4, *x.shape), np.float32)
         for plane, out in zip(padded, result, strict=True):
-            total, values = np.zeros(x.shape, np.float32), np.empty(x.shape, np.float32)
-            low, high = np.full(x.shape, np.inf, np.float32), np.full(x.shape, -np.inf, np.float32)
-            for dy, weight_y in zip(range(-1, 3), down, strict=True):
-                row = np.zeros_like(total)
-                for dx, weight_x in zip(range(-1, 3), across, strict=True):
-                    # "wrap" makes NumPy write straight into `values`; no index needs it.
-                    plane.take(first + (dy * stride + dx), out=values, mode="wrap")
-                    if {dx, dy} <= {0, 1}:
-                        np.minimum(low, values, out=low)
-                        np.maximum(high, values, out=high)
-                    values *= weight_x
-                    row += values
-                row *= weight_y
-                total += row
-            np.clip(total, low, high, out=out[rows])
+            total = out[rows]
+            for i, weight_y in enumerate(down):
+                for j, weight_x in enumerate(across):
+                    pixels = values if j else line
+                    # "wrap" makes NumPy write straight into `pixels`; no index needs it.
+                    plane[i * stride + j :].take(first, out=pixels, mode="wrap")
+                    if (i, j) == (1, 1):
+                        low[:] = high[:] = pixels
+                    elif {i, j} <= {1, 2}:
+                        np.minimum(low, pixels, out=low)
+                        np.maximum(high, pixels, out=high)
+                    pixels *= weight_x
+                    if j:
+                        line += pixels
+                if i:
+                    line *= weight_y
+                    total += line
+                else:
+                    np.multiply(line, weight_y, out=total)
+            np.clip(total, low, high, out=total)
 
     for_row_blocks(work, height, width)
     return result

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -18,6 +19,7 @@ from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Mask, Placed,
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session
+from oiio_msspl.parallel import in_background
 
 if TYPE_CHECKING:
     from oiio_msspl.jobs.stages import LoadedFrame
@@ -179,13 +181,11 @@ class FrameWindow:
                 there = self._placed(outcomes[n], placed)
                 _check_alike(here, there)
                 if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
-                    # This also reads all pixels, so a damaged file is found before it is averaged.
-                    correlation = shared_noise(here[1], there[1])
-                    if abs(n - number) == 1 and correlation > SAME_NOISE:
+                    _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
+                    if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {number} and {n} {SAME_SEED}")
-                (vectors, valid), (back, back_valid) = (
-                    self._read_vectors(start, end) for start, end in ((n - step, n), (n, n - step))
-                )
+                way_back = in_background(partial(self._read_vectors, n, n - step))
+                (vectors, valid), (back, back_valid) = self._read_vectors(n - step, n), way_back()
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
                 break

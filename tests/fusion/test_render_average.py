@@ -145,6 +145,7 @@ def test_bands_of_rows_agree(monkeypatch):
 
     def result(rows):
         monkeypatch.setattr(light, "BAND_ROWS", rows)
+        monkeypatch.setattr(light, "BAND_PIXELS", 1)
         fresh = [RenderPair(pair.lr, pair.hr) for pair in pairs]
         return average_renders(fresh[1], [moved(fresh[0], -0.7, 0.4)], [moved(fresh[2], 0.7, -3.3)])
 

@@ -175,6 +175,7 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
 
     def result(rows):
         monkeypatch.setattr(light, "BAND_ROWS", rows)
+        monkeypatch.setattr(light, "BAND_PIXELS", 1)
         return accumulate(frames[1], [moved(frames[0], -0.7, 0.4)], [moved(frames[2], 0.7, -3.3)])
 
     whole, parts = result(1024), result(16)

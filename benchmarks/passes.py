@@ -253,7 +253,7 @@ def means(rows: list[Row]) -> list[Row]:
         mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
         for column, peer in GAINS.items():
             peers = [row for row in totals if (row["set"], row["spp"], row["method"]) == (*key[:2], peer)]
-            if peers:
+            if len(peers) == len(same):
                 gains = np.array([row["psnr"] - other["psnr"] for row, other in zip(same, peers, strict=True)])
                 mean |= dict(zip((column, f"{column}_low", f"{column}_high"), with_interval(gains), strict=True))
         layers = [_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER)]

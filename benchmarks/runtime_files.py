@@ -2,8 +2,10 @@
 """Time and peak memory of a whole job from file to file, by default of an 8K frame at x4.
 
     python -m benchmarks.runtime_files --table benchmarks/results/runtime_files.csv
+    python -m benchmarks.runtime_files --size 4096x2160 --scale 2 --model best --light-groups 9
 
-The files are half-float EXRs of random pixels with the layers of a Cycles render. The job also writes the preview.
+The files are half-float EXRs of random pixels with the layers of a Cycles render. With light groups, which are fused,
+they hold 32-bit floats. The job also writes the preview.
 """
 
 from __future__ import annotations
@@ -23,18 +25,19 @@ from benchmarks.runtime import frame, in_process, peak_mb, processor
 LAYERS = {"rgb": "RGB", "albedo": "RGB", "normal": "XYZ", "diffuse": "RGB", "specular": "RGB"}
 
 
-def write_frame(path: Path, width: int, height: int) -> None:
-    """Write an EXR file with random `LAYERS`."""
+def write_frame(path: Path, width: int, height: int, groups: int = 0) -> None:
+    """Write an EXR file with random `LAYERS`, and light groups that sum to the beauty."""
     import numpy as np
     import OpenEXR
 
     pixels = frame(height, width)
-    channels = {}
-    for layer, suffixes in LAYERS.items():
-        source = pixels.get(layer, pixels["rgb"])
+    lights = {f"light_{i}": pixels["rgb"] / groups for i in range(groups)}
+    channels, stored = {}, np.float32 if groups else np.float16
+    for layer, suffixes in (LAYERS | dict.fromkeys(lights, "RGB")).items():
+        source = (pixels | lights).get(layer, pixels["rgb"])
         for i, suffix in enumerate(suffixes):
             name = suffix if layer == "rgb" else f"{layer}.{suffix}"
-            channels[name] = np.ascontiguousarray(source[..., i].astype(np.float16))
+            channels[name] = np.ascontiguousarray(source[..., i].astype(stored))
     header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
     with OpenEXR.File(header, channels) as file:
         file.write(str(path))
@@ -68,6 +71,7 @@ def main() -> None:
     parser.add_argument("--size", default="8192x4320")
     parser.add_argument("--scale", type=int, default=4)
     parser.add_argument("--model", default="auto")
+    parser.add_argument("--light-groups", type=int, default=0)
     parser.add_argument("--max-memory", type=int, default=3 << 30, help="bytes")
     parser.add_argument("--measure", type=Path, help=argparse.SUPPRESS)
     results.add_option(parser)
@@ -80,9 +84,9 @@ def main() -> None:
     width, height = (int(v) for v in args.size.split("x"))
     name = Session(find_model(args.scale, args.model)).contract.name
     with tempfile.TemporaryDirectory() as folder:
-        write_frame(Path(folder, "lr.exr"), width // args.scale, height // args.scale)
-        write_frame(Path(folder, "hr.exr"), width, height)
-        options = "--model", name, "--max-memory", str(args.max_memory)
+        write_frame(Path(folder, "lr.exr"), width // args.scale, height // args.scale, args.light_groups)
+        write_frame(Path(folder, "hr.exr"), width, height, args.light_groups)
+        options = "--model", args.model, "--max-memory", str(args.max_memory)
         row = in_process("benchmarks.runtime_files", "--measure", folder, *options)
     rows = [{"method": name, "size": args.size, "machine": processor(), "cores": os.cpu_count(), **row}]
     print(layout(rows))

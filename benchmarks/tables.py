@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import confidence, quality, results, runtime_files, runtime_passes, versus
+from benchmarks import confidence, quality, results, runtime_files, runtime_passes, runtime_temporal, versus
 from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
@@ -73,8 +73,12 @@ SETS = {
     "Cycles": "quality_cycles",
 }
 
-#: Tables of times that were measured on one machine: of methods, and of rendering.
-MACHINES = (("runtime_vnni", "render_time_vnni"), ("runtime", "render_time"))
+#: Instructions of a processor for networks -> tables of times that were measured on it: of methods, and of rendering.
+MACHINES = {
+    "AMX": ("runtime_amx", "render_time_amx"),
+    "VNNI": ("runtime_vnni", "render_time_vnni"),
+    "neither": ("runtime", "render_time"),
+}
 
 Found = Mapping[Hashable, Row]
 #: Methods of README's table of spread noise, and their titles.
@@ -111,17 +115,18 @@ def means_of(rows: Iterable[Row]) -> Found:
 def when_it_pays() -> str:
     """Accuracy at 2 and 8 spp on average, and time, of what a user can choose from."""
     rows = results.read("quality")
-    runs = [results.index(results.read(table), "method") for table, _ in MACHINES]
+    runs = [results.index(results.read(table), "method") for table, _ in MACHINES.values()]
     means = means_of(rows)
     body = []
     for method, (name, needs) in WHEN_IT_PAYS.items():
         relative = []
         for times in runs:
             time = times.get(SAME_WORK.get(method, method.partition(", ")[0]))
-            relative.append(f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "not measured")
+            relative.append(f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "")
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
         body.append([name, needs, *cells, *relative])
-    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "time / OIDN's", "without VNNI"]
+    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE"]
+    head += [f"time / OIDN's, {name}" for name in MACHINES]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
 
@@ -169,8 +174,8 @@ def scenes() -> str:
 
 
 def runtime() -> str:
-    """Time and memory of a frame on arrays, on two processors, and of one from file to file."""
-    frames = "\n".join(runtimes.layout(results.read(table)) for table, _ in MACHINES)
+    """Time and memory of a frame on arrays, on several processors, and of one from file to file."""
+    frames = "\n".join(runtimes.layout(results.read(table)) for table, _ in MACHINES.values())
     return f"{frames}\n{runtime_files.layout(results.read('runtime_files'))}"
 
 
@@ -268,7 +273,7 @@ def total() -> str:
     the logarithm of its measured ones.
     """
     rows = results.read("quality")
-    body = [line for machine in MACHINES for line in _total(rows, *(results.read(table) for table in machine))]
+    body = [line for machine in MACHINES.values() for line in _total(rows, *(results.read(table) for table in machine))]
     head = ["PSNR gained", "over", "spp", "gains if a sample costs", MEAN, f"without {versus.TOO_EASY}", "better on"]
     return results.markdown(["on", *head], body)
 
@@ -353,6 +358,11 @@ def passes_time() -> str:
     return runtime_passes.layout(results.read("runtime_passes"))
 
 
+def temporal_time() -> str:
+    """Time of shots whose frames are averaged with their neighbours."""
+    return runtime_temporal.layout(results.read("runtime_temporal"))
+
+
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
@@ -370,14 +380,15 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         pair_checks,
     ),
     ROOT / "docs/design/passes.md": (passes, passes_time),
+    ROOT / "docs/design/temporal.md": (temporal_time,),
 }
 
 
 def measured_models() -> str:
     """The table of :func:`oiio_msspl.model.catalogue.measured`, which ``msspl models`` prints."""
     means = means_of(results.read("quality"))
-    runs = [results.index(results.read(table), "method") for table, _ in MACHINES]
-    lines = ["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp,time,time_without_vnni"]
+    runs = [results.index(results.read(table), "method") for table, _ in MACHINES.values()]
+    lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
         cells = [
             f"{means[spp, name][m]:.4g}" if (spp, name) in means else "" for spp in (2, 8) for m in ("psnr", "relmse")

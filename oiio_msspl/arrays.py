@@ -138,17 +138,22 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
     return (fixed if signed else np.maximum(fixed, 0.0)).astype(np.float32), bad
 
 
-def box_downsample(image: NDArray[Any], scale: int) -> Array:
+def box_downsample(image: NDArray[Any], scale: int, change: Callable[[Array], object] | None = None) -> Array:
     """Mean over ``scale`` x ``scale`` pixels, of half or float: (H, W, ...) to (H/s, W/s, ...).
 
     It is finite if the pixels are.
+
+    Args:
+        change: changes a copy of some rows in place, before they are averaged.
     """
     height, width, *channels = image.shape
     result = np.empty((height // scale, width // scale, *channels), np.float32)
 
     def work(rows: slice) -> None:
         # Sums of strided views are ten times as fast as np.mean over short axes. Sums of half floats would be rounded.
-        block = image[rows].astype(np.float32, copy=False)
+        block = image[rows].astype(np.float32, copy=change is not None)
+        if change is not None:
+            change(block)
         with np.errstate(over="ignore"):
             row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
             sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))

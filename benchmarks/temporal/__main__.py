@@ -34,6 +34,7 @@ from oiio_msspl import map_render, open_exr
 from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.jobs.temporal import AUTO, TemporalOptions
 
 KEYS = ("sequence", "scale", "method")
 #: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
@@ -64,6 +65,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="the sequences")
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
+    parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated WebP")
@@ -94,7 +96,7 @@ def run(args: argparse.Namespace) -> None:
     rows: list[Row] = []
     for index, name in enumerate(names):
         sequence = load(args.folder / name, args.motion_format)
-        made = list(all_methods(sequence, args.motion_format))
+        made = list(all_methods(sequence, TemporalOptions(args.temporal, args.motion_format)))
         of_sequence = list(measure(sequence, made, with_jod=args.jod))
         print(layout(of_sequence), flush=True)
         rows += of_sequence

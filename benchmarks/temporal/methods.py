@@ -42,18 +42,18 @@ class Made:
     """How the motion is known; empty for single frames."""
 
 
-def all_methods(sequence: Sequence, motion_format: str | None = None) -> Iterator[Made]:
+def all_methods(sequence: Sequence, options: TemporalOptions = TemporalOptions()) -> Iterator[Made]:
     """Each method on a sequence.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
-    are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``motion_format`` is that of
-    `msspl-fuse`.
+    are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``options`` say which
+    neighbours are averaged.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
     yield Made(OIDN, 1, np.stack([oidn(render) for render in full]))
     yield Made(OIDN_BEST, 1, np.stack([oidn_prefiltered(render) for render in full]))
     for scale in SCALES:
-        yield from _by_scale(sequence, scale, TemporalOptions(motion_format=motion_format))
+        yield from _by_scale(sequence, scale, options)
 
 
 def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Iterator[Made]:

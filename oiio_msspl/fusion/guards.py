@@ -185,10 +185,11 @@ def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
     Args:
         rgb: (h, w, 3) over ``window``.
     """
-    rows = np.flatnonzero(rgb.any(axis=(1, 2)))
+    values = rgb.reshape(len(rgb), -1)  # NumPy is several times as fast along one axis as along two
+    rows = np.flatnonzero(values.any(axis=1))
     if not rows.size:
         return None
-    columns = np.flatnonzero(rgb[rows[0] : rows[-1] + 1].any(axis=(0, 2)))
+    columns = np.flatnonzero(values[rows[0] : rows[-1] + 1].any(axis=0)) // rgb.shape[2]
     x0, x1, y0, y1 = columns[0] - margin, columns[-1] + 1 + margin, rows[0] - margin, rows[-1] + 1 + margin
     return Window(int(x0), int(y0), int(x1), int(y1)).shift(window.x0, window.y0)
 

@@ -16,6 +16,7 @@ from oiio_msspl.arrays import Array, box_downsample, mean_around, upsample_linea
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.tile_features import mirrored_pixels
+from oiio_msspl.parallel import for_row_blocks
 
 #: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
 #: shadow, the large one a faint change of all the light.
@@ -129,10 +130,34 @@ class Light:
 def _wide_mean(plane: Array, radius: int) -> Array:
     """Mean over the pixels up to ``radius`` rows and columns away that exist, in a time that does not depend on it."""
     for axis in (0, 1):
-        size = plane.shape[axis]
-        sums = np.insert(np.cumsum(plane, axis=axis, dtype=np.float64), 0, 0, axis=axis)
-        start, stop = (np.clip(np.arange(size) + offset, 0, size) for offset in (-radius, radius + 1))
-        count = stop - start
-        total = sums.take(stop, axis) - sums.take(start, axis)
-        plane = (total / (count[:, None] if axis == 0 else count)).astype(np.float32)
+        plane = _mean_along(plane, radius, axis)
     return plane
+
+
+def _mean_along(plane: Array, radius: int, axis: int) -> Array:
+    """The same along one axis."""
+    size = plane.shape[axis]
+    start, stop = (np.clip(np.arange(size) + offset, 0, size) for offset in (-radius, radius + 1))
+    count = (stop - start)[:, None] if axis == 0 else stop - start
+    result = np.empty_like(plane)
+
+    def lines(which: slice) -> tuple[slice, ...]:
+        return (which, slice(None)) if axis == 0 else (slice(None), which)
+
+    def work(part: slice) -> None:
+        block = plane[:, part] if axis == 0 else plane[part]
+        sums = np.zeros([n + (i == axis) for i, n in enumerate(block.shape)])
+        np.cumsum(block, axis=axis, out=sums[lines(slice(1, None))])
+        if size > 2 * radius:  # slices are read much faster than by index
+            total = np.empty(block.shape)
+            first, last = lines(slice(0, radius)), lines(slice(size - radius, size))
+            total[first] = sums[lines(slice(radius + 1, 2 * radius + 1))]
+            inner = lines(slice(2 * radius + 1, None)), lines(slice(0, size - 2 * radius))
+            np.subtract(sums[inner[0]], sums[inner[1]], out=total[lines(slice(radius, size - radius))])
+            total[last] = sums[lines(slice(size, None))] - sums[lines(slice(size - 2 * radius, size - radius))]
+        else:
+            total = sums.take(stop, axis) - sums.take(start, axis)
+        (result[:, part] if axis == 0 else result[part])[:] = total / count
+
+    for_row_blocks(work, plane.shape[1 - axis], 4 * size)
+    return result

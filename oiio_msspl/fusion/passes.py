@@ -173,33 +173,30 @@ def _fused_layers(
         yield from ((layer, None) for layer in job.fitted)
         return
     waiting = in_background(partial(_decoded, lr, job.lrhs))
-    high, low = _decoded(hr, job.layers), waiting()
+    (high, high_lit), (low, low_lit) = _decoded(hr, job.layers), waiting()
     keys = dict(zip(job.layers.layers, layer_keys(job.layers), strict=True))
-    lit = {layer: [_is_lit(each.layers[keys[layer]]) for each in (low, high)] for layer in job.fitted}
+    lit = low_lit & high_lit
     fused = fuse_layers(
-        (_as_beauty(low, keys[layer]), _as_beauty(high, keys[layer])) for layer in job.fitted if all(lit[layer])
+        (_as_beauty(low, keys[layer]), _as_beauty(high, keys[layer])) for layer in job.fitted if keys[layer] in lit
     )
     for layer in job.fitted:
-        if all(lit[layer]):
+        key = keys[layer]
+        if key in lit:
             yield layer, kept(next(fused))
         else:
-            yield layer, None if any(lit[layer]) else np.zeros_like(high.layers[keys[layer]])
+            yield layer, None if key in low_lit | high_lit else np.zeros_like(high.layers[key])
         for render in (low, high):
-            unload(render.layers[keys[layer]])
+            unload(render.layers[key])
 
 
-def _is_lit(image: Array) -> bool:
-    lit = bool(image.any())
-    unload(image)
-    return lit
-
-
-def _decoded(render: MappedRender, layers: AdditiveSet) -> Render:
-    """The light of a set's layers, albedo and normal. A file is decoded once, because it has all layers together."""
+def _decoded(render: MappedRender, layers: AdditiveSet) -> tuple[Render, set[str]]:
+    """The light of a set's layers, albedo and normal; and the names of those that are not black. A file is decoded
+    once, because it has all layers together."""
     guides = {name: render.features[name] for name in (ALBEDO, NORMAL) if name in render.features}
     source, window = with_layers(render, layers), render.data_window
     source = replace(source, features=source.features | guides)
     pixels: dict[str, Array] = {}
+    lit: set[str] = set()
     for y in range(window.y0, window.y1, BAND_ROWS):
         part = Window(window.x0, y, window.x1, min(y + BAND_ROWS, window.y1))
         for name, rows in source.read(part, [*layer_keys(layers), *guides]).items():
@@ -207,7 +204,9 @@ def _decoded(render: MappedRender, layers: AdditiveSet) -> Render:
                 pixels[name] = blank((window.height, window.width, rows.shape[-1]))
             pixels[name][part.slices(window)] = rows
             unload(pixels[name])
-    return Render(pixels, window, render.display_window, render.pixel_aspect, name=render.name)
+            if name not in lit and rows.any():
+                lit.add(name)
+    return Render(pixels, window, render.display_window, render.pixel_aspect, name=render.name), lit
 
 
 def _as_beauty(render: Render, layer: str) -> Render:
@@ -253,8 +252,8 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        same_layers = in_background(partial(_same_layers, lr, layers))
-        check = check_sum(hr, layers)
+        waiting = in_background(partial(_same_layers, lr, layers))
+        check, same_layers = check_sum(hr, layers), waiting()
         if check.problem:
             refused[layers.name] = check.text
             continue
@@ -265,7 +264,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        jobs.append(_Job(layers, same_layers(), check.remainder, known))
+        jobs.append(_Job(layers, same_layers, check.remainder, known))
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
@@ -584,7 +583,8 @@ def _kernel(guides: Array, step: int) -> Array:
             if -y < height and abs(x) < width:
                 here = slice(-y, height), slice(max(-x, 0), width - max(x, 0))
                 there = slice(0, height + y), slice(max(x, 0), width - max(-x, 0))
-                distance = np.square(guides[:, here[0], here[1]] - guides[:, there[0], there[1]]).sum(axis=0)
+                with np.errstate(over="ignore", invalid="ignore"):
+                    distance = np.square(guides[:, here[0], here[1]] - guides[:, there[0], there[1]]).sum(axis=0)
                 distance += np.float32((y * y + x * x) / (8 * step * step))
                 weights[i][here] = weights[24 - i][there] = np.exp(-distance)
 

@@ -229,11 +229,10 @@ class _Band:
         x, y = np.broadcast_arrays(
             np.arange(grid.x0, grid.x1, dtype=np.float32), np.arange(grid.y0, grid.y1, dtype=np.float32)[:, None]
         )
-        if path.x is not None:
+        if path.x is not None and path.y is not None:
             area = self._area
-            there = path.positions(slice(0, area.height))
-            home = np.arange(area.x0, area.x1), np.arange(area.y0, area.y1)[:, None]
-            moved = [np.where(valid, to - at, 0).astype(np.float32) for to, at in zip(there, home, strict=True)]
+            here = Path(area, area).positions(slice(0, area.height))
+            moved = [_difference(to, at, valid) for to, at in zip((path.x, path.y), here, strict=True)]
             pixels = np.maximum(share, 1e-6) * np.float32(scale)
             x, y = (
                 own + to_grid(self._alignment, each, area) / pixels for own, each in zip((x, y), moved, strict=True)
@@ -259,6 +258,18 @@ class _Band:
             with np.errstate(invalid="ignore"):  # NaN is sorted out later
                 result[name] = np.moveaxis(sample(planes, positions, x.shape), 0, -1)
         return result, usable
+
+
+def _difference(to: Array, at: Array, valid: Mask) -> Array:
+    """``to - at`` where it is valid, otherwise 0, (h, w)."""
+    result = np.empty(to.shape, np.float32)
+
+    def work(rows: slice) -> None:
+        np.subtract(to[rows], at[rows], out=result[rows])
+        result[rows] *= valid[rows]
+
+    for_row_blocks(work, len(to), to[0].size)
+    return result
 
 
 def _fetch_nearest(frame: RenderPair, path: Path, features: Sequence[str] | None) -> Features:

@@ -15,7 +15,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array, box_downsample, clip
-from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.encoding import decode_in_place, decode_radiance, encode_radiance
 
 #: Images that a denoiser reads: ``colour`` (h, w, 3), log-encoded at exposure 1; ``albedo`` (h, w, 3) in [0, 1];
 #: ``normal`` (h, w, 3) in [-1, 1]; ``noise`` (h, w, 1) in [0, 1].
@@ -114,7 +114,7 @@ def mean_of_renders(
 
 def _box_averages(hrls_images: Images, scale: int) -> tuple[Array, Images]:
     """The HRLS at the LRHS's resolution: its radiance at exposure 1, and all images."""
-    radiance = box_downsample(decode_radiance(hrls_images["colour"], 1.0), scale)
+    radiance = box_downsample(hrls_images["colour"], scale, lambda rows: decode_in_place(rows, 1.0))
     aovs = {name: box_downsample(hrls_images[name], scale) for name in (ALBEDO, NORMAL) if name in hrls_images}
     return radiance, {"colour": encode_radiance(radiance, 1.0), **aovs}
 

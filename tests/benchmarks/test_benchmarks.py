@@ -203,15 +203,20 @@ def test_a_finding_that_the_measures_dispute_is_no_agreement():
 
 @pytest.mark.parametrize(
     ("flags", "name"),
-    [("flags\t\t: fpu avx2", "X without VNNI"), ("flags\t\t: fpu avx_vnni", "X with VNNI"), ("", "X")],
+    [
+        ("flags\t\t: fpu avx2", "X without VNNI"),
+        ("flags\t\t: fpu avx_vnni", "X with VNNI"),
+        ("flags\t\t: fpu avx_vnni amx_int8", "X with AMX"),
+        ("", "X"),
+    ],
 )
-def test_a_time_says_whether_the_processor_has_vnni(flags, name):
+def test_a_time_says_what_the_processor_has_for_networks(flags, name):
     assert runtime.named(f"model name\t: X\n{flags}\n") == name
 
 
 def test_times_of_different_machines_are_not_mixed():
     """Times of methods and of rendering come from the same machine, and each line of the comparison names it."""
-    for methods, _ in tables.MACHINES:
+    for methods, _ in tables.MACHINES.values():
         (machine,) = {row["machine"] for row in results.read(methods)}
         assert f"\n| {machine} |" in tables.total()
     assert "OIDN prefiltered" in {row["method"] for row in results.read("runtime")}

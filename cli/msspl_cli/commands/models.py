@@ -20,8 +20,8 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
     """List the models in the package, and the devices on which they can run.
 
     PSNR and RelMSE are those of five scenes with 2 and 8 samples per pixel in all.
-    Time is a multiple of that of Open Image Denoise, on processors with VNNI and
-    without. Layers are those that a model reads beside the beauty.
+    Time is a multiple of that of Open Image Denoise, on processors with AMX, with
+    VNNI and with neither. Layers are those that a model reads beside the beauty.
     """
     from oiio_msspl.aovs.features import RGB
     from oiio_msspl.model.catalogue import QUALITIES, measured, shipped_models
@@ -68,7 +68,7 @@ def _cells(row: dict[str, Any]) -> tuple[str, ...]:
         row["quality"] or "",
         both("{:.2f}", "psnr_2spp", "psnr_8spp"),
         both("{:.4f}", "relmse_2spp", "relmse_8spp"),
-        both("{:.2g}", "time", "time_without_vnni"),
+        both("{:.2g}", "time_amx", "time_vnni", "time_neither"),
         ", ".join(row["layers"]),
         "the same" if same_file else "half floats",
     )

@@ -57,6 +57,8 @@ FLAT = 0.001
 DARK = 0.3
 #: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
 FIREFLY = 4.0
+#: A layer has no sample where its brightest pixel around is below this share of its mean over pixels that look alike.
+NO_SAMPLE = 0.25
 #: A render whose logarithm of light differs by this much from that of the fused beauty has 1/e of the weight.
 OTHER_LIGHT = 1.0
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
@@ -482,14 +484,16 @@ class _Band:
                     fit_layer(noisy[i], fitted[i])
 
         def fit_layer(layer: Array, out: Array) -> None:
-            lines = self._nearby.mean(self._fit.lines(layer))
+            lines, means = self._fit.lines(layer)
+            lines = self._nearby.mean(lines)
             np.multiply(lines[:3], beauty, out=out)
             out += lines[3:]
-            # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
-            for channel, plane in enumerate(layer):
-                bounds = (
-                    upsample_linear(each, self._scale, self._core_rows) for each in (-max_3x3(-plane), max_3x3(plane))
-                )
+            # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
+            # light has no sample by chance, the mean over pixels that look alike is the bound.
+            for channel, (plane, mean) in enumerate(zip(layer, means, strict=True)):
+                lowest, highest = -max_3x3(-plane), max_3x3(plane)
+                highest = np.where(highest < mean * np.float32(NO_SAMPLE), mean, highest)
+                bounds = (upsample_linear(each, self._scale, self._core_rows) for each in (lowest, highest))
                 np.clip(out[channel], *bounds, out=out[channel])
 
         for_row_blocks(fit, len(lit), beauty.size)
@@ -543,12 +547,13 @@ class _Fit:
         variances = np.maximum(means[3:] - self._means**2, 0)
         self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
 
-    def lines(self, layer: Array) -> Array:
-        """The slopes of a layer (3, h, w) in each channel, and then the offsets, (6, h, w)."""
+    def lines(self, layer: Array) -> tuple[Array, Array]:
+        """The slopes of a layer (3, h, w) in each channel, and then the offsets, (6, h, w); and the layer's means
+        (3, h, w)."""
         means = self._mean(np.concatenate([layer, layer * self._beauty]))
         mean, products = means[:3], means[3:]
         slopes = (products - mean * self._means) / self._variances
-        return np.concatenate([slopes, mean - slopes * self._means])
+        return np.concatenate([slopes, mean - slopes * self._means]), mean
 
     def _mean(self, planes: Array) -> Array:
         """Means (n, h, w) over pixels around that look alike."""

@@ -145,6 +145,23 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
     assert errors[1] < 0.7 * errors[0] if low else errors[1] == errors[0]
 
 
+def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
+    """A lamp of which one sample in fifty knows, on a white wall."""
+    rng, files = np.random.default_rng(3), []
+    for name, size, samples in (("lr", (23, 31), 16), ("hr", (HEIGHT, WIDTH), 1)):
+        rare = 0.1 * rng.binomial(samples, 0.02, (*size, 1)) / (samples * 0.02)
+        layers = {"light_a.": np.full((*size, 3), 0.5), "light_b.": rare.repeat(3, axis=-1)}
+        channels = rgb(sum(layers.values()).astype(np.float32))
+        for layer_name, values in layers.items():
+            channels |= rgb(values.astype(np.float32), layer_name)
+        files.append(write_exr(tmp_path / f"{name}.exr", channels))
+    low, high = (map_render(open_exr(file)) for file in files)
+    beauty = np.full((HEIGHT, WIDTH, 3), 0.6, np.float32)
+    result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets)
+    found = result.pixels.get(result.sets[0].layers[1].channels[0], 0, HEIGHT)
+    assert found.min() > 0.1 * np.median(found)
+
+
 def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_path, monkeypatch):
     """It gives what it gives for the whole frame, and takes fewer pixels."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]

@@ -19,6 +19,7 @@ from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import encode_alpha, fuse_alpha
 from oiio_msspl.fusion.guards import (
     FAR,
+    LAYER_REACH,
     EmptyRegions,
     Mask,
     check_finite,
@@ -46,10 +47,6 @@ from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_fe
 from oiio_msspl.model.render_mean import Images, MeanSettings, mean_settings
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import limit_threads, one_ahead
-
-#: HRLS pixels around a surface over which a layer without light makes it black. Black layers are common, and a network
-#: leaves a trace of light in them.
-LAYER_REACH = 16
 
 
 @dataclass

@@ -147,6 +147,9 @@ def check_finite(session: Session, *images: Array) -> None:
 
 #: LRHS pixels around a surface that are black where it becomes black: as far as networks look.
 FAR = 15
+#: HRLS pixels around a surface over which a layer without light makes it black. Black layers are common, and a network
+#: leaves a trace of light in them.
+LAYER_REACH = 16
 
 
 class EmptyRegions:
@@ -163,7 +166,7 @@ class EmptyRegions:
 
     def __init__(self, lrhs_rgb: Array, reach: int = FAR) -> None:
         self._black = np.all(lrhs_rgb == 0, axis=-1, keepdims=True)
-        self._black_far_around = _all_within(self._black, reach) if self._black.any() else self._black
+        self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
 
     def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
         """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
@@ -204,7 +207,7 @@ def _enlarge(lrhs: Mask, scale: int) -> Mask:
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
-def _all_within(mask: Mask, reach: int) -> Mask:
+def all_within(mask: Mask, reach: int) -> Mask:
     """Where a mask holds for all pixels up to ``reach`` rows and columns away."""
     distance = 1
     while reach > 0:

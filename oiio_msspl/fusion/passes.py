@@ -33,7 +33,7 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.guards import max_3x3
+from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
 from oiio_msspl.fusion.sums import check_sum, is_sum_of, layer_keys, with_layers
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks, in_background, one_ahead
@@ -490,9 +490,12 @@ class _Band:
             out += lines[3:]
             # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
             # light has no sample by chance, the mean over pixels that look alike is the bound.
+            black = np.all(layer == 0, axis=0)[..., None]
+            near_light = ~all_within(black, LAYER_REACH // self._scale - 2)[..., 0]
             for channel, (plane, mean) in enumerate(zip(layer, means, strict=True)):
                 lowest, highest = -max_3x3(-plane), max_3x3(plane)
-                highest = np.where(highest < mean * np.float32(NO_SAMPLE), mean, highest)
+                no_sample = near_light & (highest < mean * np.float32(NO_SAMPLE))
+                highest = np.where(no_sample, mean, highest)
                 bounds = (upsample_linear(each, self._scale, self._core_rows) for each in (lowest, highest))
                 np.clip(out[channel], *bounds, out=out[channel])
 

@@ -146,10 +146,10 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
 
 
 def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
-    """A lamp of which one sample in fifty knows, on a white wall."""
+    """A lamp of which one sample in eighty knows, on a white wall."""
     rng, files = np.random.default_rng(3), []
     for name, size, samples in (("lr", (23, 31), 16), ("hr", (HEIGHT, WIDTH), 1)):
-        rare = 0.1 * rng.binomial(samples, 0.02, (*size, 1)) / (samples * 0.02)
+        rare = 0.1 * rng.binomial(samples, 0.012, (*size, 1)) / (samples * 0.012)
         layers = {"light_a.": np.full((*size, 3), 0.5), "light_b.": rare.repeat(3, axis=-1)}
         channels = rgb(sum(layers.values()).astype(np.float32))
         for layer_name, values in layers.items():

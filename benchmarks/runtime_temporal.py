@@ -105,11 +105,11 @@ def layout(rows: list[Row]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=16)
+    parser.add_argument("--frames", type=int, default=12)
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--scale", type=int, default=2)
-    parser.add_argument("--qualities", nargs="+", default=["fast", "balanced", "best"])
-    parser.add_argument("--rounds", type=int, default=2, help="times that all ways are measured, in turn")
+    parser.add_argument("--qualities", nargs="+", default=["balanced", "best"])
+    parser.add_argument("--rounds", type=int, default=1, help="times that all ways are measured, in turn")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
     results.add_option(parser)
     args = parser.parse_args()

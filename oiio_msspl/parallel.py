@@ -22,6 +22,7 @@ from typing import TypeVar, cast
 BLOCK_VALUES = 1 << 17
 
 T = TypeVar("T")
+U = TypeVar("U")
 
 _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
 
@@ -70,6 +71,18 @@ def in_background(work: Callable[[], T]) -> Callable[[], T]:
     if (_thread_limit.get() or available_cores()) == 1:
         return work
     return _background_pool().submit(contextvars.copy_context().run, work).result
+
+
+def in_parallel(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
+    """The results of two functions that run at the same time. Both have ended when this returns or raises."""
+    waiting = in_background(second)
+    try:
+        result = first()
+    except BaseException:
+        with contextlib.suppress(Exception):
+            waiting()
+        raise
+    return result, waiting()
 
 
 def one_ahead(items: Iterable[T]) -> Iterator[T]:

@@ -136,6 +136,7 @@ def fuse(
                 frame.tiles = step.count
                 if progress is not None:
                     progress(step.done, step.count)
+                del step  # or its memory would be held while the next one is fused
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
@@ -158,6 +159,8 @@ def fuse_layers(
         session: a model for the scale of the pair.
         frame: the fused beauty. Layers are exposed as this is, because networks tell light from noise by brightness.
 
+    The caller limits the threads of NumPy, see :func:`oiio_msspl.parallel.limit_threads`.
+
     Yields:
         The fused layers, (height, width, 3) over the HRLS's data window, finite and >= 0.
 
@@ -173,8 +176,10 @@ def fuse_layers(
             yield from _steps(pair, _blank_frame(frame.alignment, frame.exposure, error=False, half=False))
 
     for step in _run(steps(), session):
-        if step.done == step.count:
-            yield step.result.rgb
+        finished = step.result.rgb if step.done == step.count else None
+        del step  # or its memory would be held while the next one is fused
+        if finished is not None:
+            yield finished
 
 
 def layer_fuser(session: Session, frame: FusedFrame) -> LayerFuser | None:
@@ -330,7 +335,7 @@ class _Pair:
 
     def _lit_part(self, reach: int) -> Window | None:
         """The part of the grid beyond which both renders are black, and as far from light as ``reach``, see
-        :class:`EmptyRegions`; None if all is black."""
+        :class:`EmptyRegions`; None, for all of it, if a render is black everywhere."""
         scale, data = self._alignment.scale, self._alignment.hr_data_window
         low = lit_window(self._lrhs[RGB], self.grid, reach)
         high = lit_window(self._hr.read(self._hr.data_window, [RGB])[RGB], data, 0)

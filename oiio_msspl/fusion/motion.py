@@ -95,6 +95,11 @@ class MotionSource:
                 known[:] = False
         return vectors, known
 
+    @property
+    def reads_one_frame(self) -> bool:
+        """Whether :meth:`read` opens the file of ``frame`` alone, so that both ways can be read at the same time."""
+        return self.kind == VECTORS and all(self._field(step) is not None for step in (-1, 1))
+
     def _read_vectors(self, render: MappedRender, neighbour: MappedRender, step: int) -> tuple[Array, Mask]:
         direct = self._field(step)
         if direct is not None:

@@ -36,7 +36,7 @@ from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
 from oiio_msspl.fusion.sums import check_sum, is_sum_of, layer_keys, with_layers
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
-from oiio_msspl.parallel import for_row_blocks, in_background, one_ahead
+from oiio_msspl.parallel import for_row_blocks, in_parallel, one_ahead
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
@@ -174,8 +174,8 @@ def _fused_layers(
     if job.lrhs is None:
         yield from ((layer, None) for layer in job.fitted)
         return
-    waiting = in_background(partial(_decoded, lr, job.lrhs))
-    (high, high_lit), (low, low_lit) = _decoded(hr, job.layers), waiting()
+    decode_both = partial(_decoded, hr, job.layers), partial(_decoded, lr, job.lrhs)
+    (high, high_lit), (low, low_lit) = in_parallel(*decode_both)
     keys = dict(zip(job.layers.layers, layer_keys(job.layers), strict=True))
     lit = low_lit & high_lit
     fused = fuse_layers(
@@ -187,8 +187,8 @@ def _fused_layers(
             yield layer, kept(next(fused))
         else:
             yield layer, None if key in low_lit | high_lit else np.zeros_like(high.layers[key])
-        for render in (low, high):
-            unload(render.layers[key])
+        for image in (*low.layers.values(), *high.layers.values()):
+            unload(image)
 
 
 def _decoded(render: MappedRender, layers: AdditiveSet) -> tuple[Render, set[str]]:
@@ -254,8 +254,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        waiting = in_background(partial(_same_layers, lr, layers))
-        check, same_layers = check_sum(hr, layers), waiting()
+        check = check_sum(hr, layers)
         if check.problem:
             refused[layers.name] = check.text
             continue
@@ -266,7 +265,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        jobs.append(_Job(layers, same_layers, check.remainder, known))
+        jobs.append(_Job(layers, _same_layers(lr, layers), check.remainder, known))
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
@@ -490,6 +489,7 @@ class _Band:
             out += lines[3:]
             # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
             # light has no sample by chance, the mean over pixels that look alike is the bound.
+            # Bounds are interpolated, so light reaches a little further than that.
             black = np.all(layer == 0, axis=0)[..., None]
             near_light = ~all_within(black, LAYER_REACH // self._scale - 2)[..., 0]
             for channel, (plane, mean) in enumerate(zip(layer, means, strict=True)):

@@ -7,8 +7,8 @@ frames no longer has. A neighbour counts where it shows the same surface in the 
 
 - The HRLS's pixels are fetched from the nearest pixel of the neighbour. Interpolation would spread their noise, which
   networks take for texture.
-- The LRHS has less noise, and its pixels are large. Its light is interpolated. Other layers, such as the albedo, have
-  hardly any noise to remove, and are fetched from the nearest pixel, which takes a fifth of the time.
+- The LRHS has less noise, and its pixels are large. Its light and alpha are interpolated. Other layers, such as the
+  albedo, have hardly any noise to remove, and are fetched from the nearest pixel, which takes a fifth of the time.
 """
 
 from __future__ import annotations
@@ -250,11 +250,13 @@ class _Band:
         def positions(rows: slice) -> tuple[Array, Array]:
             return x[rows], y[rows]
 
-        light = {
-            name: np.moveaxis(stored.pop(name), -1, 0) for name in (*RADIANCE_FEATURES, VARIANCE) if name in stored
+        smooth = {
+            name: np.moveaxis(stored.pop(name), -1, 0)
+            for name in (*RADIANCE_FEATURES, VARIANCE, "alpha")
+            if name in stored
         }
         result = _nearest_pixels(stored, positions, x.shape)
-        for name, planes in light.items():
+        for name, planes in smooth.items():
             with np.errstate(invalid="ignore"):  # NaN is sorted out later
                 result[name] = np.moveaxis(sample(planes, positions, x.shape), 0, -1)
         return result, usable

@@ -19,7 +19,7 @@ from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Mask, Placed,
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import in_background
+from oiio_msspl.parallel import in_parallel
 
 if TYPE_CHECKING:
     from oiio_msspl.jobs.stages import LoadedFrame
@@ -184,8 +184,7 @@ class FrameWindow:
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {number} and {n} {SAME_SEED}")
-                way_back = in_background(partial(self._read_vectors, n, n - step))
-                (vectors, valid), (back, back_valid) = self._read_vectors(n - step, n), way_back()
+                (vectors, valid), (back, back_valid) = self._read_both_ways(n - step, n)
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
                 break
@@ -196,6 +195,16 @@ class FrameWindow:
         if isinstance(outcome, Exception):
             raise outcome
         return placed(outcome)
+
+    def _read_both_ways(
+        self, start: int, end: int
+    ) -> tuple[tuple[Array | None, Mask | None], tuple[Array | None, Mask | None]]:
+        """Motion from one frame to the next or the previous one, and back."""
+        there, back = partial(self._read_vectors, start, end), partial(self._read_vectors, end, start)
+        assert self._temporal.motion is not None
+        if self._temporal.motion.reads_one_frame:
+            return in_parallel(there, back)
+        return there(), back()
 
     def _read_vectors(self, start: int, end: int) -> tuple[Array | None, Mask | None]:
         """Motion from one frame to the next or the previous one."""

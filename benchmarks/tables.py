@@ -26,6 +26,8 @@ from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
 from benchmarks.temporal import report as temporal_report
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, QUALITIES
+from benchmarks.temporal.methods import SCALES as TEMPORAL_SCALES
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SCALES
 
@@ -363,6 +365,24 @@ def temporal_time() -> str:
     return runtime_temporal.layout(results.read("runtime_temporal"))
 
 
+def temporal_counts() -> str:
+    """What averaging gains over single frames with two frames on each side, and with `auto`."""
+    tables = {"2": results.read("temporal_2"), "auto": results.read("temporal")}
+    sequences = dict.fromkeys(row["sequence"] for row in tables["2"])
+    body = []
+    for (name, prefix), (frames, rows) in itertools.product(QUALITIES.items(), tables.items()):
+        found = results.index(rows, "sequence", "scale", "method")
+        pairs = [
+            [found[sequence, scale, prefix + way] for way in (NEIGHBOURS, ALONE)]
+            for sequence, scale in itertools.product(sequences, TEMPORAL_SCALES)
+        ]
+        gain = np.mean([averaged["psnr"] - alone["psnr"] for averaged, alone in pairs])
+        flicker = np.mean([averaged["flicker"] / alone["flicker"] for averaged, alone in pairs])
+        body.append([f"`--quality {name} --temporal {frames}`", f"{gain:+.2f}", f"{flicker:.2f}"])
+    head = [f"mean of {', '.join(sequences)} at x2 and x4", "PSNR gained, dB", "flicker, of single frames'"]
+    return results.markdown(head, body)
+
+
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
@@ -380,7 +400,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         pair_checks,
     ),
     ROOT / "docs/design/passes.md": (passes, passes_time),
-    ROOT / "docs/design/temporal.md": (temporal_time,),
+    ROOT / "docs/design/temporal.md": (temporal_time, temporal_counts),
 }
 
 

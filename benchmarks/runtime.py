@@ -85,9 +85,14 @@ def measure(call: Callable[[], Any], repeats: int) -> dict[str, Any]:
 
 
 def peak_mb() -> float:
-    """Largest resident set of this process so far, in MB (Linux counts in KiB, macOS in bytes)."""
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    return peak / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    """Largest resident set of this process so far, in MB.
+
+    On Linux, `getrusage` would also count the program that started this one, so the kernel's own mark is read.
+    """
+    status = Path("/proc/self/status")
+    if status.exists() and (found := re.search(r"VmHWM:\s+(\d+) kB", status.read_text())):
+        return int(found[1]) / (1 << 10)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
 
 
 def processor() -> str:

@@ -282,7 +282,7 @@ def layout(rows: list[Row]) -> str:
         head.append(f"gain over {peer}, dB")
         for line, row in zip(body, shown, strict=True):
             gain = tuple(row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
-            line.append("" if gain[0] in (None, "") else cell(gain, "+.2f"))
+            line.append("" if gain[0] is None else cell(gain, "+.2f"))
     head.append("better on")
     for line, row in zip(body, shown, strict=True):
         line.append(f"{row['wins']:.0f} of {row['layers']:.0f}")

@@ -488,8 +488,8 @@ class _Band:
             np.multiply(lines[:3], beauty, out=out)
             out += lines[3:]
             # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
-            # light has no sample by chance, the mean over pixels that look alike is the bound.
-            # Bounds are interpolated, so light reaches a little further than that.
+            # light has no sample by chance, the mean over pixels that look alike is the bound. This ends two LRHS
+            # pixels before LAYER_REACH, because the bounds are interpolated.
             black = np.all(layer == 0, axis=0)[..., None]
             near_light = ~all_within(black, LAYER_REACH // self._scale - 2)[..., 0]
             for channel, (plane, mean) in enumerate(zip(layer, means, strict=True)):

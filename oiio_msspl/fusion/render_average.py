@@ -8,7 +8,7 @@ frames no longer has. A neighbour counts where it shows the same surface in the 
 - The HRLS's pixels are fetched from the nearest pixel of the neighbour. Interpolation would spread their noise, which
   networks take for texture.
 - The LRHS has less noise, and its pixels are large. Its light and alpha are interpolated. Other layers, such as the
-  albedo, have hardly any noise to remove, and are fetched from the nearest pixel, which takes a fifth of the time.
+  albedo, have hardly any noise to remove, and are fetched from the nearest pixel, which takes less time.
 """
 
 from __future__ import annotations

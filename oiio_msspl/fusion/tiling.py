@@ -2,9 +2,8 @@
 """Cuts a frame into overlapping tiles, so that memory depends on the tile and not on the frame.
 
 The tiles depend on the model and on the size of the frame, and those of a pass on where it has light, but never on
-memory. A network sees only a part of the frame in each tile,
-so other tiles would give slightly other pixels. Frames of one shot must not differ because machines have more or less
-memory.
+memory. A network sees only a part of the frame in each tile, so other tiles would give slightly other pixels. Frames of
+one shot must not differ because machines have more or less memory.
 """
 
 from __future__ import annotations

@@ -22,13 +22,14 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, unload, upsample_linear
+from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, unload
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -254,7 +255,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        check = check_sum(hr, layers)
+        check, lrhs = in_parallel(partial(check_sum, hr, layers), partial(_same_layers, lr, layers))
         if check.problem:
             refused[layers.name] = check.text
             continue
@@ -265,7 +266,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        jobs.append(_Job(layers, _same_layers(lr, layers), check.remainder, known))
+        jobs.append(_Job(layers, lrhs, check.remainder, known))
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
@@ -360,6 +361,7 @@ class _Band:
         with np.errstate(over="ignore", invalid="ignore"):
             self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
+        self._beauty_core = self._nearby.phases(self._beauty[:, self._hrls_rows])
 
     def _read(
         self, lr: MappedRender, hr: MappedRender, jobs: Sequence[_Job], to_fit: Sequence[_Job]
@@ -472,7 +474,6 @@ class _Band:
             chosen: those to fit.
             fitted: gets them, (layers, 3, h, w), over the core.
         """
-        beauty = self._beauty[:, self._hrls_rows]
         fitted[chosen] = 0
         lit = [i for i in chosen if noisy[i].any()]
 
@@ -484,22 +485,17 @@ class _Band:
 
         def fit_layer(layer: Array, out: Array) -> None:
             lines, means = self._fit.lines(layer)
-            lines = self._nearby.mean(lines)
-            np.multiply(lines[:3], beauty, out=out)
-            out += lines[3:]
             # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
             # light has no sample by chance, the mean over pixels that look alike is the bound. This ends two LRHS
             # pixels before LAYER_REACH, because the bounds are interpolated.
             black = np.all(layer == 0, axis=0)[..., None]
             near_light = ~all_within(black, LAYER_REACH // self._scale - 2)[..., 0]
-            for channel, (plane, mean) in enumerate(zip(layer, means, strict=True)):
-                lowest, highest = -max_3x3(-plane), max_3x3(plane)
-                no_sample = near_light & (highest < mean * np.float32(NO_SAMPLE))
-                highest = np.where(no_sample, mean, highest)
-                bounds = (upsample_linear(each, self._scale, self._core_rows) for each in (lowest, highest))
-                np.clip(out[channel], *bounds, out=out[channel])
+            lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
+            highest = np.where(near_light & (highest < means * np.float32(NO_SAMPLE)), means, highest)
+            self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty_core, out)
 
-        for_row_blocks(fit, len(lit), beauty.size)
+        if lit:
+            for_row_blocks(fit, len(lit), self._beauty_core.size)
 
     def _average(self, job: _Job) -> Array:
         """The mean of both renders' layers at low resolution, (layers, 3, h, w), of those that are fitted.
@@ -561,25 +557,30 @@ class _Fit:
     def _mean(self, planes: Array) -> Array:
         """Means (n, h, w) over pixels around that look alike."""
         for kernel, step in zip(self._kernels, self._steps, strict=True):
-            padded = np.pad(planes, [(0, 0), (2 * step, 2 * step), (2 * step, 2 * step)])
-            planes = np.empty_like(planes)
-            _add_up(kernel, list(_around(padded, step)), planes)
+            planes = _mean_around(planes, kernel, step)
         return planes
 
 
-def _add_up(weights: Array, images: Sequence[Array], out: Array) -> None:
-    """Sum of k images (n, h, w), times weights (k, h, w)."""
-    for start in range(0, out.shape[1], CACHED_ROWS):
+def _mean_around(planes: Array, weights: Array, step: int) -> Array:
+    """Means of planes (n, h, w) over 5 x 5 pixels, ``step`` pixels apart, with the weights (5, 5, h, w) of
+    :func:`_kernel`."""
+    count, height, width = planes.shape
+    reach = 2 * step
+    padded = np.zeros((count, height + 2 * reach, width + 2 * reach), np.float32)
+    padded[:, reach : reach + height, reach : reach + width] = planes
+    around = sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1), axis=(1, 2))[..., ::step, ::step]
+    # NumPy would add up adjacent columns pixel by pixel, which takes three times as long as row by row.
+    columns = [slice(0, 5, 2), slice(1, 5, 2)] if step == 1 else [slice(0, 5)]
+    result = np.empty_like(planes)
+    for start in range(0, height, CACHED_ROWS):
         rows = slice(start, start + CACHED_ROWS)
-        total = weights[0, rows] * images[0][:, rows]
-        product = np.empty_like(total)
-        for weight, image in zip(weights[1:], images[1:], strict=True):
-            total += np.multiply(weight[rows], image[:, rows], out=product)
-        out[:, rows] = total
+        sums = [np.einsum("ijhw,nhwij->nhw", weights[:, c, rows], around[:, rows, :, :, c]) for c in columns]
+        result[:, rows] = sum(sums)
+    return result
 
 
 def _kernel(guides: Array, step: int) -> Array:
-    """Weights (25, h, w) of the pixels of :func:`_around`, which sum to 1. Pixels outside weigh nothing."""
+    """Weights (5, 5, h, w) of 5 x 5 pixels, ``step`` pixels apart, which sum to 1. Pixels outside weigh nothing."""
     height, width = guides.shape[1:]
     offsets = [(y * step, x * step) for y in range(-2, 3) for x in range(-2, 3)]
     weights = np.zeros((len(offsets), height, width), np.float32)
@@ -598,63 +599,99 @@ def _kernel(guides: Array, step: int) -> Array:
 
     for_row_blocks(weigh, 12, guides.size)
     weights /= weights.sum(axis=0)
-    return weights
-
-
-def _around(padded: Array, step: int) -> Iterator[Array]:
-    """5 x 5 views of an image (..., h, w) that is padded by two steps, each shifted by some steps."""
-    height, width = (side - 4 * step for side in padded.shape[-2:])
-    for y in range(0, 5 * step, step):
-        for x in range(0, 5 * step, step):
-            yield padded[..., y : y + height, x : x + width]
+    return weights.reshape(5, 5, height, width)
 
 
 class _Nearby:
-    """Interpolates at full resolution among the four low-resolution pixels around that look most alike."""
+    """Applies lines at full resolution: those of the four low-resolution pixels around, by how much they look alike.
+
+    All pixels that lie in the same place of a low-resolution pixel, a *phase*, are computed together. They are as many
+    as low-resolution pixels, so all arrays are contiguous.
+    """
 
     def __init__(self, low: Array, full: Array, scale: int, rows: slice) -> None:
         """``low``, ``full``: guides (guides, h, w) in units of their spread. ``rows``: of ``low``, to interpolate."""
         self._rows, self._scale = rows, scale
         height, width = rows.stop - rows.start, low.shape[2]
-        self._weights = np.empty((scale, scale, 4, height, width), np.float32)
-        full = full[:, rows.start * scale : rows.stop * scale]
-        corners = self._corners(low)
+        #: For each phase, the weights of the two rows and two columns of corners.
+        self._weights = np.empty((scale, scale, 2, 2, height, width), np.float32)
+        whole = self.phases(full[:, rows.start * scale : rows.stop * scale])
+        padded = self._padded(low)
         for y, x in np.ndindex(scale, scale):
-            weights, here = self._weights[y, x], full[:, y::scale, x::scale]
-            around = zip(corners(y, x), _bilinear(y, x, scale), strict=True)
-            for weight, (there, share) in zip(weights, around, strict=True):
-                distance = np.square(there - here).sum(axis=0) * np.float32(SHARPER**2)
-                weight[:] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(share)
-            weights /= weights.sum(axis=0)
+            weights, (top, left) = self._weights[y, x], self._corner(y, x)
+            for i, j in np.ndindex(2, 2):
+                there = padded[:, top + i : top + i + height, left + j : left + j + width]
+                distance = np.square(there - whole[y, x]).sum(axis=0) * np.float32(SHARPER**2)
+                share = self._share(y, i) * self._share(x, j)
+                weights[i, j] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(share)
+            weights /= weights.sum(axis=(0, 1))
 
-    def mean(self, planes: Array) -> Array:
-        """Planes (n, h, w) at full resolution, the chosen rows."""
+    def phases(self, planes: Array) -> Array:
+        """Planes (n, h, w) at full resolution as phases (scale, scale, n, h, w)."""
+        n, height, width = planes.shape
+        parts = planes.reshape(n, height // self._scale, self._scale, width // self._scale, self._scale)
+        return np.ascontiguousarray(parts.transpose(2, 4, 0, 1, 3))
+
+    def apply(self, lines: Array, bounds: Array, guide: Array, out: Array) -> None:
+        """The values of lines at full resolution, within interpolated bounds.
+
+        Args:
+            lines: slopes and offsets (2 n, h, w) at low resolution.
+            bounds: lowest and highest values (2 n, h, w) at low resolution.
+            guide: the values that the lines are functions of, as :meth:`phases` over the chosen rows.
+            out: gets the chosen rows (n, h, w) at full resolution.
+        """
+        n, scale = len(out), self._scale
         height, width = self._weights.shape[-2:]
-        result = np.empty((len(planes), height * self._scale, width * self._scale), np.float32)
-        corners = self._corners(planes)
-        for y, x in np.ndindex(self._scale, self._scale):
-            _add_up(self._weights[y, x], corners(y, x), result[:, y :: self._scale, x :: self._scale])
-        return result
+        lines, bounds = self._padded(lines), self._padded(bounds)
+        for start in range(0, height, CACHED_ROWS):
+            stop = min(start + CACHED_ROWS, height)
+            target = out[:, start * scale : stop * scale]
+            for y in range(scale):
+                top = self._corner(y, 0)[0] + start
+                rows = slice(top, top + stop - start + 1)
+                between = _between(bounds[:, rows][:, :-1], bounds[:, rows][:, 1:], self._share(y, 1))
+                pairs = sliding_window_view(lines[:, rows], 2, axis=1)
+                for x in range(scale):
+                    left = self._corner(y, x)[1]
+                    weights = self._weights[y, x, :, :, start:stop]
+                    line, right = (
+                        np.einsum("ihw,nhwi->nhw", weights[:, j], pairs[:, :, left + j : left + j + width])
+                        for j in (0, 1)
+                    )
+                    line += right
+                    values = line[:n]
+                    values *= guide[y, x, :, start:stop]
+                    values += line[n:]
+                    limits = _between(
+                        between[..., left : left + width], between[..., left + 1 : left + 1 + width], self._share(x, 1)
+                    )
+                    np.clip(values, limits[:n], limits[n:], out=target[:, y::scale, x::scale])
 
-    def _corners(self, planes: Array) -> Callable[[int, int], list[Array]]:
-        """The four pixels of ``planes`` (n, h, w) around the pixel in row y and column x of each pixel."""
+    def _padded(self, planes: Array) -> Array:
+        """The chosen rows of planes (n, h, w), and one pixel more on each side; the edge is repeated."""
         rows = slice(max(self._rows.start - 1, 0), self._rows.stop + 1)
         top = 1 - (self._rows.start - rows.start)
         bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
-        padded = np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
-        height, width = self._weights.shape[-2:]
+        return np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
 
-        def around(y: int, x: int) -> list[Array]:
-            down, right = (2 if 2 * i + 1 > self._scale else 0 for i in (y, x))
-            return [padded[:, i : i + height, j : j + width] for i in (1, down) for j in (1, right)]
+    def _corner(self, y: int, x: int) -> tuple[int, int]:
+        """Row and column of the first corner of a phase's first pixel, in :meth:`_padded`."""
+        return int(2 * y + 1 > self._scale), int(2 * x + 1 > self._scale)
 
-        return around
+    def _share(self, phase: int, corner: int) -> float:
+        """How much the first (0) or second (1) corner of a phase counts in linear interpolation."""
+        position = (phase + 0.5) / self._scale - 0.5
+        second = position if position > 0 else 1 + position
+        return second if corner else 1 - second
 
 
-def _bilinear(y: int, x: int, scale: int) -> list[float]:
-    """The weights of the corners of :meth:`_Nearby.mean` in linear interpolation."""
-    down, right = (abs((i + 0.5) / scale - 0.5) for i in (y, x))
-    return [i * j for i in (1 - down, down) for j in (1 - right, right)]
+def _between(first: Array, second: Array, share: float) -> Array:
+    """Linear interpolation; ``share`` is that of the second."""
+    result = second - first
+    result *= np.float32(share)
+    result += first
+    return result
 
 
 def _smoothed(planes: Array, log: Array) -> Array:
@@ -690,12 +727,16 @@ def _make_sum(layers: Array, beauty: Array) -> None:
 
 
 def _blurred(plane: Array) -> Array:
-    """Mean over 3 x 3 pixels with the weights 1, 2, 1 in rows and in columns."""
+    """Mean over 3 x 3 pixels with the weights 1, 2, 1 in rows and in columns; the edge is repeated."""
     for axis in (0, 1):
-        padded = np.pad(plane, [(1, 1) if i == axis else (0, 0) for i in (0, 1)], mode="edge")
-        before, after = (padded[i : i + len(plane)] if axis == 0 else padded[:, i : i + plane.shape[1]] for i in (0, 2))
-        total: Array = before + after + 2 * plane
-        plane = total / np.float32(4)
+        lines = plane.swapaxes(0, axis)
+        total = 2 * lines
+        total[1:] += lines[:-1]
+        total[:-1] += lines[1:]
+        total[0] += lines[0]
+        total[-1] += lines[-1]
+        total *= np.float32(1 / 4)
+        plane = total.swapaxes(0, axis)
     return plane
 
 

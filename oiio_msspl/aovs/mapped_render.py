@@ -121,8 +121,14 @@ class MappedRender:
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
         """
+        return self._read_with(window, features, ())[0]
+
+    def _read_with(
+        self, window: Window, features: Iterable[str] | None, more: Sequence[Channel]
+    ) -> tuple[dict[str, Array], Array]:
+        """What :meth:`read` returns, and more channels as they are stored, (height, width, channels)."""
         wanted = [f for f in (features or (*FEATURES, "alpha")) if f in self.features or (f == "alpha" and self.alpha)]
-        channels = self._channels(wanted)
+        channels = list(dict.fromkeys([*self._channels(wanted), *more]))
         pixels = self.file.read(channels, window)
         place = {channel: i for i, channel in enumerate(channels)}
 
@@ -141,7 +147,7 @@ class MappedRender:
                     result[name] = self.features[name].evaluate_variance(take, mean, self.spp)
                 else:
                     result[name] = self.features[name].evaluate(take)
-        return result
+        return result, take(more) if more else pixels[..., :0]
 
     def _channels(self, names: list[str]) -> list[Channel]:
         """The channels that some features, or ``alpha``, are computed from; each once."""
@@ -162,15 +168,27 @@ class MappedRender:
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
         """
+        return self.load_with(())[0]
+
+    def load_with(self, channels: Sequence[Channel]) -> tuple[Render, Array]:
+        """The whole render in memory, and some channels as they are stored, float32 (height, width, channels).
+
+        Layers of one part are decoded together, so this is faster than to read the channels later.
+
+        Raises:
+            InputError: pixels can't be decoded, because a file is truncated or corrupt.
+        """
         whole = self.data_window
         layers: dict[str, Array] = {}
+        stored = np.empty((len(channels), whole.height, whole.width), np.float32).transpose(1, 2, 0)
         for y0 in range(whole.y0, whole.y1, ROWS_PER_LOAD):
             window = Window(whole.x0, y0, whole.x1, min(y0 + ROWS_PER_LOAD, whole.y1))
-            for name, rows in self.read(window).items():
+            features, stored[window.slices(whole)] = self._read_with(window, None, channels)
+            for name, rows in features.items():
                 if name not in layers:
                     layers[name] = np.empty((whole.height, whole.width, rows.shape[-1]), dtype=np.float32)
                 layers[name][window.slices(whole)] = rows
-        return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name)
+        return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored
 
 
 def _row(feature: str, status: str, source: str = "", note: str = "") -> dict[str, str]:

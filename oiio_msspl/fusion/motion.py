@@ -12,8 +12,8 @@ for any frame and neighbour. The best source comes first:
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -21,10 +21,12 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionField, user_fields
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion_check import FieldCheck, check_field
 from oiio_msspl.fusion.motion_guides import Pair, open_pair, still_and_moved
-from oiio_msspl.fusion.motion_vectors import Mask, invert, read_vectors
+from oiio_msspl.fusion.motion_vectors import Mask, channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
 
 #: Kinds of sources.
@@ -42,6 +44,8 @@ class MotionFrame:
     hr: MappedRender
     rgb: Array | None = None
     """Fused beauty (h, w, 3) over the data window; only optical flow needs it."""
+    vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
+    """What :meth:`MotionSource.vectors_of` returns, if the frame is in memory."""
 
 
 @dataclass(frozen=True)
@@ -77,7 +81,7 @@ class MotionSource:
             ValueError: the source is optical flow, and a frame has no ``rgb``.
         """
         if self.kind == VECTORS:
-            return self._read_vectors(frame.hr, neighbour.hr, step)
+            return self._read_vectors(frame, neighbour, step)
         if self.kind == CAMERA and self.projection is not None:
             return camera_vectors(frame.hr, neighbour.hr, self.projection)
         if self.kind == FLOW:
@@ -100,23 +104,53 @@ class MotionSource:
         """Whether :meth:`read` opens the file of ``frame`` alone, so that both ways can be read at the same time."""
         return self.kind == VECTORS and all(self._field(step) is not None for step in (-1, 1))
 
-    def _read_vectors(self, render: MappedRender, neighbour: MappedRender, step: int) -> tuple[Array, Mask]:
-        direct = self._field(step)
-        if direct is not None:
-            return _read(render, direct)
-        opposite = self._field(-step)
-        assert opposite is not None
-        own, _ = _read(render, opposite)
-        other, known = _read(neighbour, opposite)
-        return invert(own, other, known, render.data_window, neighbour.data_window)
+    def channels(self, hr: MappedRender) -> list[Channel]:
+        """The channels of a frame that hold its motion vectors, and what is read with them; empty without vectors."""
+        found = [channels_to_read(hr, channels) for _, channels in self._stored_in(hr)]
+        return list(dict.fromkeys(channel for channels in found for channel in channels))
+
+    def vectors_of(self, hr: MappedRender, pixels: ReadableRender, stored: Array) -> dict[int, tuple[Array, Mask]]:
+        """The motion vectors of a frame, for :class:`MotionFrame`, by the step to the frame that they lead to.
+
+        Args:
+            hr: the frame.
+            pixels: its features.
+            stored: its :meth:`channels` (h, w, n).
+        """
+        place = {channel: i for i, channel in enumerate(self.channels(hr))}
+        return {
+            each.format.step: judged_vectors(
+                hr, stored[..., [place[c] for c in channels_to_read(hr, channels)]], channels, each.format, pixels
+            )
+            for each, channels in self._stored_in(hr)
+        }
+
+    def _stored_in(self, hr: MappedRender) -> list[tuple[MotionField, tuple[Channel, Channel]]]:
+        """The verified layers that a frame has, and their channels in it."""
+        fields = self.fields if self.kind == VECTORS else ()
+        found = [(each, hr.motion.channels(each.layer, each.components)) for each in fields]
+        return [(each, channels) for each, channels in found if channels]
+
+    def _read_vectors(self, frame: MotionFrame, neighbour: MotionFrame, step: int) -> tuple[Array, Mask]:
+        if self._field(step) is not None:
+            return self._vectors(frame, step)
+        own, _ = self._vectors(frame, -step)
+        other, known = self._vectors(neighbour, -step)
+        return invert(own, other, known, frame.hr.data_window, neighbour.hr.data_window)
 
     def _field(self, step: int) -> MotionField | None:
         return next((each for each in self.fields if each.format.step == step), None)
 
-
-def _read(render: MappedRender, verified: MotionField) -> tuple[Array, Mask]:
-    channels = render.motion.channels(verified.layer, verified.components)
-    return read_vectors(render, channels, verified.format) if channels else _nothing(render)
+    def _vectors(self, frame: MotionFrame, step: int) -> tuple[Array, Mask]:
+        """The vectors of a frame in one direction."""
+        if step in frame.vectors:
+            return frame.vectors[step]
+        hr = frame.hr
+        for each, channels in self._stored_in(hr):
+            if each.format.step == step:
+                stored = hr.file.read(channels_to_read(hr, channels), hr.data_window)
+                return judged_vectors(hr, stored, channels, each.format, hr)
+        return _nothing(hr)
 
 
 def _nothing(render: MappedRender) -> tuple[Array, Mask]:

@@ -15,7 +15,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionFormat
 from oiio_msspl.arrays import Array
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.parallel import for_row_blocks
 
 Mask = NDArray[np.bool_]
@@ -26,27 +26,31 @@ NO_MOTION = 1e-3
 ROUNDS, ROUND_TRIP = 3, 0.5
 
 
-def read_vectors(
-    render: MappedRender, channels: tuple[Channel, Channel], form: MotionFormat, *, judge: bool = True
+def channels_to_read(render: MappedRender, channels: tuple[Channel, Channel]) -> list[Channel]:
+    """The channels that :func:`judged_vectors` needs: two with vectors, and the alpha."""
+    return [*channels, *([render.alpha] if render.alpha else [])]
+
+
+def judged_vectors(
+    render: MappedRender, stored: Array, channels: tuple[Channel, Channel], form: MotionFormat, pixels: ReadableRender
 ) -> tuple[Array, Mask]:
-    """Read motion vectors over the data window.
+    """Motion vectors over the data window, and where they can be believed.
 
     Args:
         render: the frame.
+        stored: :func:`channels_to_read` over its data window, (h, w, 2 or 3).
         channels: the two that hold the vectors.
         form: how they are stored.
-        judge: whether zeros of the background are doubted, see :func:`_doubtful_zeros`.
+        pixels: the frame's features.
 
     Returns:
         Vectors (h, w, 2), 0 where they can't be believed; and where they can (h, w): they are finite, shorter than the
-        frame, not clamped, and alpha is not 0.
+        frame, not clamped, alpha is not 0, and they are not zeros of a background, see :func:`_doubtful_zeros`.
 
     Raises:
         InputError: pixels can't be decoded.
     """
     window, frame = render.data_window, render.display_window
-    names = [*channels, *([render.alpha] if render.alpha else [])]
-    stored = render.file.read(names, window)
     alpha = stored[..., 2] if render.alpha else None
     vectors, known = decode(stored[..., :2], form, frame.width, frame.height, alpha)
     inside = window.intersect(render.file.parts[channels[0].part].data_window)
@@ -54,8 +58,7 @@ def read_vectors(
         rendered = np.zeros_like(known)
         rendered[inside.slices(window)] = True
         known &= rendered
-    if judge:
-        known &= ~_doubtful_zeros(render, vectors, known)
+    known &= ~_doubtful_zeros(pixels, vectors, known)
     vectors[~known] = 0
     return vectors, known
 
@@ -93,7 +96,7 @@ def decode(
     return vectors, known
 
 
-def _doubtful_zeros(render: MappedRender, vectors: Array, known: Mask) -> Mask:
+def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask:
     """Where a vector of 0 may mean that the renderer knows none.
 
     Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
@@ -101,8 +104,8 @@ def _doubtful_zeros(render: MappedRender, vectors: Array, known: Mask) -> Mask:
     """
     still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
     surface = known
-    if still.any() and NORMAL in render.features:
-        normal = render.read(render.data_window, [NORMAL])[NORMAL]
+    normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
+    if normal is not None:
         surface = known & (normal != 0).any(axis=-1)
     count = np.count_nonzero(surface)
     camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count

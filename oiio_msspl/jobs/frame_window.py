@@ -218,9 +218,9 @@ class FrameWindow:
     def _motion_frame(self, number: int) -> MotionFrame:
         fused, loaded = self._fused.get(number), self._loaded.get(number)
         if isinstance(fused, FusedAlone):
-            return MotionFrame(fused.loaded.hr, fused.fused.rgb)
+            return MotionFrame(fused.loaded.hr, fused.fused.rgb, fused.loaded.vectors)
         assert loaded is not None and not isinstance(loaded, Exception)
-        return MotionFrame(loaded.hr)
+        return MotionFrame(loaded.hr, vectors=loaded.vectors)
 
 
 def _fused_frame(alone: FusedAlone) -> tuple[LoadedFrame, FusedFrame]:

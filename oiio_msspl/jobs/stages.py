@@ -7,11 +7,13 @@ A shot runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`); a Dask worker 
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import Array, kept
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.render import ReadableRender
@@ -20,6 +22,7 @@ from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
+from oiio_msspl.fusion.warp import Mask
 from oiio_msspl.jobs.frame import check_frame_memory, require_outputs, write_frame, write_frame_preview
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
@@ -53,6 +56,8 @@ class LoadedFrame:
     """Wall time of reading."""
     others: OtherViews
     """Views beside the first one. Their pixels are read when they are fused."""
+    vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
+    """Motion vectors that are read with the pixels, see :class:`oiio_msspl.fusion.motion.MotionFrame`."""
 
 
 @dataclass(frozen=True)
@@ -123,7 +128,11 @@ class Stages:
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
         if self._fits(lr, hr):
-            return LoadedFrame(frame, lr, hr, lr.load(), hr.load(), time.perf_counter() - start, others)
+            motion = self.temporal.motion if self.temporal.count else None
+            pixels, stored = hr.load_with(motion.channels(hr) if motion else [])
+            vectors = motion.vectors_of(hr, pixels, stored) if motion else {}
+            waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
+            return LoadedFrame(frame, lr, hr, lr.load(), pixels, time.perf_counter() - start, others, waiting)
         return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
 
     def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:

@@ -102,6 +102,17 @@ def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):
     np.testing.assert_array_equal(loaded.layers["rgb"], values)
 
 
+def test_a_render_is_loaded_with_further_channels_as_they_are_stored(tmp_path):
+    """A channel may be that of a feature, too. Pixels that a feature would clamp or scale keep their values."""
+    values = picture(ROWS_PER_LOAD + 30, 20)
+    path = write_exr(tmp_path / "hr.exr", rgb(values) | rgb(values * 2, "albedo.") | {"Z": values[..., 0] - 7})
+    render = map_render(open_exr(path))
+    channels = {channel.name: channel for part in render.file.parts for channel in part.channels}
+    loaded, stored = render.load_with([channels["Z"], channels["G"]])
+    np.testing.assert_array_equal(loaded.layers["rgb"], values)
+    np.testing.assert_array_equal(stored, np.stack([values[..., 0] - 7, values[..., 1]], axis=-1))
+
+
 def test_features_of_neighbouring_channels_are_not_copied(tmp_path):
     """Each channel is contiguous, as the network wants it, whatever the order of the file."""
     values = picture(H, W)

@@ -417,3 +417,18 @@ def test_a_format_may_describe_two_layers(tmp_path):
     source = find_motion(frames[0], frames[1], "layer=there+layer=back,to=previous")
     assert [each.layer for each in source.fields] == ["there", "back"]
     assert [right_share(source, frames, 1, step) for step in (1, -1)] == [1, 1]
+
+
+@pytest.mark.parametrize("step", [1, -1])
+def test_vectors_that_are_read_with_the_pixels_are_those_of_the_file(tmp_path, step):
+    """Those of the other direction are inverted, from the vectors of both frames."""
+    frames = shot(tmp_path, MotionFormat(), "forward")
+    source = find_motion(frames[0], frames[1])
+    loaded = []
+    for hr in frames:
+        pixels, stored = hr.load_with(source.channels(hr))
+        loaded.append(MotionFrame(hr, vectors=source.vectors_of(hr, pixels, stored)))
+    assert all(each.vectors.keys() == {1} for each in loaded)
+    for ours, theirs in zip(source.read(loaded[1], loaded[1 + step], step), read(source, frames, 1, step), strict=True):
+        assert theirs.any()
+        np.testing.assert_array_equal(ours, theirs)

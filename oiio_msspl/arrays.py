@@ -70,7 +70,7 @@ class ReusedMemory:
 
 
 def kept(values: NDArray[T]) -> NDArray[T]:
-    """An image that waits for others: itself, or a copy in a temporary file if it has many pixels."""
+    """An image that waits for others: itself, or a copy in a temporary file if it has many pixels and is in none."""
     if values.shape[0] * values.shape[1] <= MOST_PIXELS or isinstance(values.base, mmap.mmap):
         return values
     on_disk = blank(values.shape, values.dtype)

@@ -335,7 +335,8 @@ class _Band:
         self._hrls_rows = in_hrls_pixels(core, alignment.scale).slices(self._hrls_area)[0]
         window = alignment.hr_data_window
         rows, columns = mirrored_pixels(self._hrls_area, window)
-        self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1))
+        # A frame that is stored as half is fused as half. Variances would be lost in its rounding.
+        self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1)).astype(np.float32)
         self._low_beauty = _downsampled(self._beauty, self._scale)
         to_fit = [job for job in jobs if job.remainder or any(each not in fused_light for each in job.fitted)]
         read = self._read(lr, hr, jobs, to_fit)

@@ -101,6 +101,20 @@ def test_an_albedo_without_noise_sharpens_components(tmp_path):
     assert errors[1] < 0.5 * errors[0]
 
 
+def test_a_beauty_of_halves_is_fitted_in_32_bits(tmp_path):
+    """Where light is dark and even, halves would leave nothing of its variance but rounding."""
+    clean = {name: np.float32(0.05) * values.astype(np.float32) for name, values in lights().items()}
+    noise = np.random.default_rng(0).random((HEIGHT, WIDTH, 3), np.float32)
+    low, high = (map_render(open_exr(file)) for file in write_pair(tmp_path, clean, extra=rgb(noise, "albedo.")))
+    half = sum(clean.values()).astype(np.float16)
+    found = []
+    for beauty in (half, half.astype(np.float32)):
+        result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets)
+        channels = [c for layer in result.sets[0].layers for c in layer.channels]
+        found.append(np.stack([result.pixels.get(channel, 0, HEIGHT) for channel in channels]))
+    np.testing.assert_array_equal(*found)
+
+
 def test_lamps_are_told_apart_by_albedos_above_1(tmp_path):
     """Two emitters side by side, one in either light group. Networks that denoise the albedo know it up to 1."""
     left = (np.arange(WIDTH) % 10 < 5)[None, :, None] * np.ones((HEIGHT, 1, 3), np.float32)

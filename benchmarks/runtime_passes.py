@@ -33,7 +33,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.fusion.fuse import layer_fuser
 from oiio_msspl.fusion.passes import fuse_passes
-from oiio_msspl.fusion.tiling import MAX_MEMORY, STRIPS_SHARE
+from oiio_msspl.fusion.tiling import MAX_MEMORY, strips_memory
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 
@@ -83,7 +83,7 @@ def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> 
             denoise_with_clean(noisy, clean)
 
     def passes(session: Session, beauty: FusedFrame) -> None:
-        cache_bytes = int((MAX_MEMORY - beauty.nbytes) * STRIPS_SHARE)  # as in the job of a frame
+        cache_bytes = strips_memory(MAX_MEMORY, beauty.nbytes)  # as in the job of a frame
         fuser = layer_fuser(session, beauty)
         done = fuse_passes(lr, hr, beauty.rgb, beauty.alignment, [lights], cache_bytes, fuse_layers=fuser)
         assert not done.refused

@@ -34,13 +34,13 @@ from oiio_msspl.fusion.spread import Place, join, split, without_grid
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
     MAX_MEMORY,
-    STRIPS_SHARE,
     Tile,
     aligned_grid,
     memory_for_tiles,
     plan_tiles,
     require_memory,
     sample_bands,
+    strips_memory,
 )
 from oiio_msspl.model.contract import NO_DENOISER
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
@@ -131,7 +131,7 @@ def fuse(
     with limit_threads(session.threads):
         pair = _Pair(lr, hr, alignment, session, session.clean_aovs if clean_aovs else ())
         frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
-        with hr.cache_strips(int((max_memory - held) * STRIPS_SHARE)):
+        with hr.cache_strips(strips_memory(max_memory, held)):
             for step in _run(_steps(pair, frame), session):
                 frame.tiles = step.count
                 if progress is not None:

@@ -105,9 +105,9 @@ class MotionSource:
         return self.kind == VECTORS and all(self._field(step) is not None for step in (-1, 1))
 
     def channels(self, hr: MappedRender) -> list[Channel]:
-        """The channels of a frame that hold its motion vectors, and what is read with them; empty without vectors."""
-        found = [channels_to_read(hr, channels) for _, channels in self._stored_in(hr)]
-        return list(dict.fromkeys(channel for channels in found for channel in channels))
+        """The channels of a frame that hold its motion vectors, each pair followed by the alpha if there is one; empty
+        without vectors."""
+        return [channel for _, channels in self._stored_in(hr) for channel in channels_to_read(hr, channels)]
 
     def vectors_of(self, hr: MappedRender, pixels: ReadableRender, stored: Array) -> dict[int, tuple[Array, Mask]]:
         """The motion vectors of a frame, for :class:`MotionFrame`, by the step to the frame that they lead to.
@@ -117,12 +117,11 @@ class MotionSource:
             pixels: its features.
             stored: its :meth:`channels` (h, w, n).
         """
-        place = {channel: i for i, channel in enumerate(self.channels(hr))}
+        layers = self._stored_in(hr)
+        parts = np.split(stored, len(layers), axis=-1) if layers else []
         return {
-            each.format.step: judged_vectors(
-                hr, stored[..., [place[c] for c in channels_to_read(hr, channels)]], channels, each.format, pixels
-            )
-            for each, channels in self._stored_in(hr)
+            each.format.step: judged_vectors(hr, part, channels, each.format, pixels)
+            for (each, channels), part in zip(layers, parts, strict=True)
         }
 
     def _stored_in(self, hr: MappedRender) -> list[tuple[MotionField, tuple[Channel, Channel]]]:

@@ -572,11 +572,11 @@ def _mean_around(planes: Array, weights: Array, step: int) -> Array:
     around = sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1), axis=(1, 2))[..., ::step, ::step]
     # NumPy would add up adjacent columns pixel by pixel, which takes three times as long as row by row.
     columns = [slice(0, 5, 2), slice(1, 5, 2)] if step == 1 else [slice(0, 5)]
-    result = np.empty_like(planes)
+    result = np.zeros_like(planes)
     for start in range(0, height, CACHED_ROWS):
         rows = slice(start, start + CACHED_ROWS)
-        sums = [np.einsum("ijhw,nhwij->nhw", weights[:, c, rows], around[:, rows, :, :, c]) for c in columns]
-        result[:, rows] = sum(sums)
+        for part in columns:
+            result[:, rows] += np.einsum("ijhw,nhwij->nhw", weights[:, part, rows], around[:, rows, :, :, part])
     return result
 
 
@@ -619,9 +619,10 @@ class _Nearby:
         whole = self.phases(full[:, rows.start * scale : rows.stop * scale])
         padded = self._padded(low)
         for y, x in np.ndindex(scale, scale):
-            weights, (top, left) = self._weights[y, x], self._corner(y, x)
+            weights = self._weights[y, x]
             for i, j in np.ndindex(2, 2):
-                there = padded[:, top + i : top + i + height, left + j : left + j + width]
+                top, left = self._corner(y) + i, self._corner(x) + j
+                there = padded[:, top : top + height, left : left + width]
                 distance = np.square(there - whole[y, x]).sum(axis=0) * np.float32(SHARPER**2)
                 share = self._share(y, i) * self._share(x, j)
                 weights[i, j] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(share)
@@ -649,12 +650,11 @@ class _Nearby:
             stop = min(start + CACHED_ROWS, height)
             target = out[:, start * scale : stop * scale]
             for y in range(scale):
-                top = self._corner(y, 0)[0] + start
-                rows = slice(top, top + stop - start + 1)
+                rows = slice(self._corner(y) + start, self._corner(y) + stop + 1)
                 between = _between(bounds[:, rows][:, :-1], bounds[:, rows][:, 1:], self._share(y, 1))
                 pairs = sliding_window_view(lines[:, rows], 2, axis=1)
                 for x in range(scale):
-                    left = self._corner(y, x)[1]
+                    left = self._corner(x)
                     weights = self._weights[y, x, :, :, start:stop]
                     line, right = (
                         np.einsum("ihw,nhwi->nhw", weights[:, j], pairs[:, :, left + j : left + j + width])
@@ -676,9 +676,9 @@ class _Nearby:
         bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
         return np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
 
-    def _corner(self, y: int, x: int) -> tuple[int, int]:
-        """Row and column of the first corner of a phase's first pixel, in :meth:`_padded`."""
-        return int(2 * y + 1 > self._scale), int(2 * x + 1 > self._scale)
+    def _corner(self, phase: int) -> int:
+        """Row or column, in :meth:`_padded`, of the first corner of a phase's first pixel."""
+        return int(2 * phase + 1 > self._scale)
 
     def _share(self, phase: int, corner: int) -> float:
         """How much the first (0) or second (1) corner of a phase counts in linear interpolation."""

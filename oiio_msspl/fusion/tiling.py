@@ -129,6 +129,11 @@ def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int
     return FIXED_MEMORY + frame_bytes + pixels * _bytes_per_pixel(contract, stride)
 
 
+def strips_memory(max_memory: int, held: int) -> int:
+    """Bytes for decoded rows that neighbouring tiles or bands read, beside ``held`` bytes."""
+    return max(0, int((max_memory - held) * STRIPS_SHARE))
+
+
 def require_memory(needed: int, contract: Contract, max_memory: int, hint: str = "") -> None:
     """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else would help."""
     if needed > max_memory:

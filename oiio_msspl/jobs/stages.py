@@ -40,6 +40,9 @@ from oiio_msspl.jobs.views import (
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 
+#: Bytes of a pixel for each channel of motion vectors that is read: as stored, decoded, and compared with zero.
+READ_VECTOR_BYTES = 12
+
 
 @dataclass(frozen=True)
 class LoadedFrame:
@@ -128,7 +131,7 @@ class Stages:
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
         if self._fits(lr, hr):
-            motion = self.temporal.motion if self.temporal.count else None
+            motion = self.temporal.motion
             pixels, stored = hr.load_with(motion.channels(hr) if motion else [])
             vectors = motion.vectors_of(hr, pixels, stored) if motion else {}
             waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
@@ -140,12 +143,16 @@ class Stages:
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
         other = FIXED_MEMORY + TILE_MEMORY + 2 * result_bytes + _pixel_bytes(lr)
         other += self.temporal.memory(hr.data_window, _channels(hr))
-        return self._frames_held * (_pixel_bytes(lr) + _pixel_bytes(hr)) <= self.max_memory - other
+        return self._loaded_bytes(lr, hr) <= self.max_memory - other
 
-    @property
-    def _frames_held(self) -> int:
-        """Frames whose pixels are in memory: the one that is fused, its neighbours, and the next one to come."""
-        return 2 * self.temporal.renders + 2
+    def _loaded_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Memory of the pixels that are held: of the frame that is fused, its neighbours, and the next one to come,
+        with its motion vectors."""
+        motion = self.temporal.motion
+        vectors = READ_VECTOR_BYTES * (len(motion.channels(hr)) if motion else 0)
+        frames = 2 * self.temporal.renders + 2
+        pixels = hr.data_window.width * hr.data_window.height
+        return frames * (_pixel_bytes(lr) + _pixel_bytes(hr)) + vectors * pixels
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -224,7 +231,7 @@ class Stages:
         result_channels = 5 if self.write_options.error_layer else 4
         held = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
         if self._fits(loaded.lr, loaded.hr):
-            held += self._frames_held * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+            held += self._loaded_bytes(loaded.lr, loaded.hr)
         read = sum(HRLS_FEATURES.get(name, 1) for name in _features_read(session))
         return held + self.temporal.memory(loaded.hr.data_window, min(_channels(loaded.hr), read))
 

@@ -23,7 +23,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, layer_fuser, memory_to_fuse, tile_count
 from oiio_msspl.fusion.passes import fuse_passes, pass_steps
-from oiio_msspl.fusion.tiling import STRIPS_SHARE, require_memory
+from oiio_msspl.fusion.tiling import require_memory, strips_memory
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.model.session import Session
@@ -209,7 +209,6 @@ def fuse_frame_passes(
     sets = sets_to_fuse(hr, write)
     if sets:
         session.release_memory()
-        cache_bytes = max(0, int((max_memory - fused.nbytes) * STRIPS_SHARE))
         with limit_threads(session.threads):
             fused.passes = fuse_passes(
                 lr,
@@ -217,7 +216,7 @@ def fuse_frame_passes(
                 fused.rgb,
                 fused.alignment,
                 sets,
-                cache_bytes=cache_bytes,
+                cache_bytes=strips_memory(max_memory, fused.nbytes),
                 pixels=fused.replaced,
                 guides=fused.clean_aovs,
                 fuse_layers=layer_fuser(session, fused),

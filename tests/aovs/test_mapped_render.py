@@ -103,7 +103,7 @@ def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):
 
 
 def test_a_render_is_loaded_with_further_channels_as_they_are_stored(tmp_path):
-    """A channel may be that of a feature, too. Pixels that a feature would clamp or scale keep their values."""
+    """A channel may be one that a feature is read from."""
     values = picture(ROWS_PER_LOAD + 30, 20)
     path = write_exr(tmp_path / "hr.exr", rgb(values) | rgb(values * 2, "albedo.") | {"Z": values[..., 0] - 7})
     render = map_render(open_exr(path))

@@ -7,7 +7,7 @@ A shot runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`); a Dask worker 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -16,6 +16,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, kept
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
+from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
@@ -130,29 +131,35 @@ class Stages:
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
-        if self._fits(lr, hr):
-            motion = self.temporal.motion
-            pixels, stored = hr.load_with(motion.channels(hr) if motion else [])
-            vectors = motion.vectors_of(hr, pixels, stored) if motion else {}
-            waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
-            return LoadedFrame(frame, lr, hr, lr.load(), pixels, time.perf_counter() - start, others, waiting)
-        return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
+        if not self._fits(lr, hr):
+            return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
+        channels, motion = self._read_ahead(lr, hr), self.temporal.motion
+        pixels, stored = hr.load_with(channels)
+        vectors = motion.vectors_of(hr, pixels, stored) if motion and channels else {}
+        waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
+        return LoadedFrame(frame, lr, hr, lr.load(), pixels, time.perf_counter() - start, others, waiting)
 
     def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:
         """Whether the pixels of all frames that are held fit into memory, beside a tile and two results."""
+        return self._room(lr, hr) >= 0
+
+    def _room(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Memory that is left beside these; negative if they don't fit."""
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
         other = FIXED_MEMORY + TILE_MEMORY + 2 * result_bytes + _pixel_bytes(lr)
         other += self.temporal.memory(hr.data_window, _channels(hr))
-        return self._loaded_bytes(lr, hr) <= self.max_memory - other
+        return self.max_memory - other - self._frames_held * (_pixel_bytes(lr) + _pixel_bytes(hr))
 
-    def _loaded_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Memory of the pixels that are held: of the frame that is fused, its neighbours, and the next one to come,
-        with its motion vectors."""
+    @property
+    def _frames_held(self) -> int:
+        """Frames whose pixels are in memory: the one that is fused, its neighbours, and the next one to come."""
+        return 2 * self.temporal.renders + 2
+
+    def _read_ahead(self, lr: MappedRender, hr: MappedRender) -> list[Channel]:
+        """The motion vectors that are read with the pixels, if they fit beside these. Otherwise they are read later."""
         motion = self.temporal.motion
-        vectors = READ_VECTOR_BYTES * (len(motion.channels(hr)) if motion else 0)
-        frames = 2 * self.temporal.renders + 2
-        pixels = hr.data_window.width * hr.data_window.height
-        return frames * (_pixel_bytes(lr) + _pixel_bytes(hr)) + vectors * pixels
+        channels = motion.channels(hr) if motion else []
+        return channels if _vector_bytes(hr, channels) <= self._room(lr, hr) else []
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -231,7 +238,8 @@ class Stages:
         result_channels = 5 if self.write_options.error_layer else 4
         held = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
         if self._fits(loaded.lr, loaded.hr):
-            held += self._loaded_bytes(loaded.lr, loaded.hr)
+            held += self._frames_held * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+            held += _vector_bytes(loaded.hr, self._read_ahead(loaded.lr, loaded.hr))
         read = sum(HRLS_FEATURES.get(name, 1) for name in _features_read(session))
         return held + self.temporal.memory(loaded.hr.data_window, min(_channels(loaded.hr), read))
 
@@ -278,6 +286,11 @@ def _features_read(session: Session) -> list[str]:
 def _channels(render: MappedRender) -> int:
     """Channels of a render's features."""
     return sum(HRLS_FEATURES[name] for name in render.features) + (render.alpha is not None)
+
+
+def _vector_bytes(render: MappedRender, channels: Sequence[Channel]) -> int:
+    """Memory of motion vectors while they are read."""
+    return READ_VECTOR_BYTES * len(channels) * render.data_window.width * render.data_window.height
 
 
 def _pixel_bytes(render: MappedRender) -> int:

@@ -8,7 +8,14 @@ import pytest
 from oiio_msspl import parallel
 from oiio_msspl.arrays import ReusedMemory, box_downsample
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
-from oiio_msspl.parallel import _thread_limit, for_row_blocks, in_background, limit_threads, one_ahead
+from oiio_msspl.parallel import (
+    _thread_limit,
+    for_row_blocks,
+    in_background,
+    limit_threads,
+    one_ahead,
+    two_at_a_time,
+)
 from tests.conftest import picture
 
 
@@ -101,6 +108,35 @@ def test_work_begins_aside_if_there_are_threads_for_it(count):
         thread, threads = result()
     assert (thread is threading.current_thread()) == (count == 1)
     assert threads == count
+
+
+@pytest.mark.parametrize("count", [1, 2, 4])
+def test_two_items_at_a_time_share_the_threads(count):
+    met = threading.Barrier(min(count, 2), timeout=10)  # each thread waits until both are at work
+    limits = set()
+
+    def square(item):
+        if item < 2:
+            met.wait()
+        limits.add(_thread_limit.get())
+        return item * item
+
+    with limit_threads(count):
+        assert two_at_a_time(square, range(5)) == [0, 1, 4, 9, 16]
+        assert two_at_a_time(square, [3]) == [9]
+        assert two_at_a_time(square, []) == []
+        assert limits == {count, max(count // 2, 1)}
+
+
+@pytest.mark.parametrize("bad", [0, 1])
+def test_what_one_of_two_items_raises_is_raised(bad):
+    def work(item):
+        if item == bad:
+            raise ValueError(f"item {item}")
+        return item
+
+    with limit_threads(2), pytest.raises(ValueError, match=f"item {bad}"):
+        two_at_a_time(work, [0, 1])
 
 
 @pytest.mark.parametrize("count", [1, 2])

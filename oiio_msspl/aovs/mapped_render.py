@@ -162,18 +162,24 @@ class MappedRender:
         """Keep decoded rows between reads, see :meth:`oiio_msspl.exr.reader.ExrFile.cache_strips`."""
         return self.file.cache_strips(max_bytes)
 
-    def load(self) -> Render:
+    def load(self, features: Iterable[str] | None = None) -> Render:
         """The whole render in memory.
+
+        Args:
+            features: as for :meth:`read`.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
         """
-        return self.load_with(())[0]
+        return self.load_with((), features)[0]
 
-    def load_with(self, channels: Sequence[Channel]) -> tuple[Render, Array]:
+    def load_with(self, channels: Sequence[Channel], features: Iterable[str] | None = None) -> tuple[Render, Array]:
         """The whole render in memory, and some channels as they are stored, float32 (height, width, channels).
 
         Layers of one part are decoded together, so this is faster than to read the channels later.
+
+        Args:
+            features: as for :meth:`read`.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
@@ -183,8 +189,8 @@ class MappedRender:
         stored = np.empty((len(channels), whole.height, whole.width), np.float32).transpose(1, 2, 0)
         for y0 in range(whole.y0, whole.y1, ROWS_PER_LOAD):
             window = Window(whole.x0, y0, whole.x1, min(y0 + ROWS_PER_LOAD, whole.y1))
-            features, stored[window.slices(whole)] = self._read_with(window, None, channels)
-            for name, rows in features.items():
+            strips, stored[window.slices(whole)] = self._read_with(window, features, channels)
+            for name, rows in strips.items():
                 if name not in layers:
                     layers[name] = np.empty((whole.height, whole.width, rows.shape[-1]), dtype=np.float32)
                 layers[name][window.slices(whole)] = rows

@@ -83,7 +83,10 @@ class Part:
 
 @dataclass(frozen=True)
 class ExrFile:
-    """An EXR file whose headers were read by :func:`open_exr`. Read it from one thread at a time."""
+    """An EXR file whose headers were read by :func:`open_exr`.
+
+    Inside :meth:`cache_strips`, read it from one thread at a time.
+    """
 
     path: Path
     parts: tuple[Part, ...]

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.motion_guides import Pair, steepness
+from oiio_msspl.fusion.motion_guides import Pair
 from oiio_msspl.fusion.motion_vectors import Mask, sample
 from oiio_msspl.parallel import for_row_blocks
 
@@ -145,7 +145,7 @@ def _left(pair: Pair, vectors: Array, known: Mask) -> float:
     for guide in pair.guides:
         here, there = guide.images
         height, width = here.shape[:2]
-        steep = steepness(here)
+        steep = guide.steepness[0]
         use = known[:height, :width] & (steep > 0) & (steep >= np.quantile(steep, 0.75))
         still = np.abs(there - here).mean(axis=-1)[use]
         if use.any() and np.median(still) > 0:

@@ -8,7 +8,8 @@ noise of the renders. (Zheng et al. 2021 estimate errors from two independent bu
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from typing import TypeVar
 
 import numpy as np
 
@@ -16,7 +17,10 @@ from oiio_msspl.arrays import Array, box_downsample, mean_around, upsample_linea
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.tile_features import mirrored_pixels
-from oiio_msspl.parallel import for_row_blocks
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.parallel import for_row_blocks, two_at_a_time
+
+T = TypeVar("T")
 
 #: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
 #: shadow, the large one a faint change of all the light.
@@ -31,28 +35,38 @@ LARGEST_DIFFERENCE = 3.0
 DARKEST = 0.02
 #: Relative squared difference below which two frames are equal.
 EQUAL = 1e-4
-#: Rows of the frame that are averaged at a time, which bounds memory; a multiple of every scale. Narrow frames may have
-#: more, up to so many pixels, because the rows around a band are averaged twice.
-BAND_ROWS, BAND_PIXELS = 512, 1 << 22
+#: A frame is averaged in bands of rows, two at a time. Two together have at most so many pixels, which bounds memory,
+#: unless they have fewer rows than that each: the rows around a band are computed twice.
+BAND_PIXELS, BAND_ROWS = 1 << 22, 128
+#: The rows of a band are a multiple of every scale.
+ROW_MULTIPLE = max(SCALES)
 
 
-def bands(alignment: Alignment) -> Iterator[tuple[Window, Window]]:
-    """Rows of the data window, and the area around them that decides on them."""
+def for_bands(alignment: Alignment, work: Callable[[Window, Window], T]) -> list[T]:
+    """The results of ``work(core, area)`` for each band, from top to bottom; two are computed at the same time.
+
+    ``core`` has the rows of the data window that are to be computed, ``area`` also those around that decide on them.
+    """
     window, scale = alignment.hr_data_window, alignment.scale
     halo, rows = -(-max(RADII) // scale) * scale + 2 * scale, _band_rows(window)
+    bands = []
     for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, rows):
         core = Window(window.x0, max(top, window.y0), window.x1, min(top + rows, window.y1))
         area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + rows + halo, window.y1))
-        yield core, area
+        bands.append((core, area))
+    return two_at_a_time(lambda band: work(*band), bands)
 
 
 def _band_rows(window: Window) -> int:
-    return max(BAND_ROWS, BAND_PIXELS // window.width // BAND_ROWS * BAND_ROWS)
+    pairs = -(-window.width * window.height // BAND_PIXELS)
+    rows = max(-(-window.height // max(2 * pairs, 1)), BAND_ROWS)
+    return -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE
 
 
 def rows_in_bands(window: Window) -> int:
-    """The most rows of an area of :func:`bands`, in this data window."""
-    return min(window.height, _band_rows(window) + 4 * max(RADII))
+    """The most rows of the areas of :func:`for_bands` that are worked on at the same time, in this data window."""
+    halos = 4 * max(RADII)
+    return min(window.height + halos, 2 * (_band_rows(window) + halos))
 
 
 def grid_rows(alignment: Alignment, area: Window) -> slice:

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -28,6 +29,7 @@ from oiio_msspl.fusion.motion_check import FieldCheck, check_field
 from oiio_msspl.fusion.motion_guides import Pair, open_pair, still_and_moved
 from oiio_msspl.fusion.motion_vectors import Mask, channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
+from oiio_msspl.parallel import in_parallel
 
 #: Kinds of sources.
 VECTORS, STATIC, CAMERA, FLOW, NONE = "vectors", "static", "camera", "flow", "none"
@@ -193,7 +195,7 @@ def _find(first: MappedRender, second: MappedRender, wanted: str | None) -> Moti
 
 def _check(pair: Pair, each: MotionField) -> FieldCheck:
     """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
-    stored = [_stored(pair, frame, each) for frame in (0, 1)]
+    stored = in_parallel(*(partial(_stored, pair, frame, each) for frame in (0, 1)))
     if stored[0] is None or stored[1] is None:
         return FieldCheck(each, f"{pair.second.name} lacks it")
     check = check_field(pair, each, (stored[0], stored[1]))

@@ -10,13 +10,15 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.motion_guides import POSITION, Guide, Pair, steepness
+from oiio_msspl.fusion.motion_guides import POSITION, Guide, Pair
 from oiio_msspl.fusion.motion_vectors import Mask, sample
+from oiio_msspl.parallel import in_parallel
 
 #: The best format must fit so many times as well as no motion, and as the runner-up.
 MARGIN = 1.5
@@ -121,8 +123,8 @@ def _offsets(field: MotionField, stored: tuple[Array, Array]) -> tuple[float, ..
 
 def _moving(stored: Array, offset: float) -> Mask:
     """Where (h, w) vectors are not 0."""
-    result: Mask = (np.abs(stored - np.float32(offset)) > 1e-6).any(axis=-1)
-    return result
+    x, y = (np.abs(stored[..., i] - np.float32(offset)) > 1e-6 for i in (0, 1))
+    return x | y
 
 
 def _formats(field: MotionField, *, encoded: bool, scales: Iterable[float] = ()) -> Iterator[MotionFormat]:
@@ -164,9 +166,13 @@ class _Trial:
     def __init__(self, pair: Pair, field: MotionField, stored: tuple[Array, Array], offset: float) -> None:
         self._frame = (pair.first.display_window.width, pair.first.display_window.height)
         self._reduction = pair.reduction
-        self._places = [
-            place for frame in (0, 1) for guide in pair.guides if (place := _place(guide, frame, stored[frame], offset))
-        ]
+        self._places: list[_Place] = []
+        for guide in pair.guides:
+            first, second = (
+                partial(_place, guide, frame, guide.steepness[frame], stored[frame], offset) for frame in (0, 1)
+            )
+            both = in_parallel(first, second)
+            self._places += [place for place in both if place]
 
     @property
     def usable(self) -> bool:
@@ -269,8 +275,13 @@ def _median(errors: Array) -> float:
     return float(np.median(finite)) if finite.size else float("inf")
 
 
-def _place(guide: Guide, frame: int, stored: Array, offset: float) -> _Place | None:
-    """The pixels of a frame where a guide tells most: where it is steep, and where surfaces move."""
+def _place(guide: Guide, frame: int, steep: Array, stored: Array, offset: float) -> _Place | None:
+    """The pixels of a frame where a guide tells most: where it is steep, and where surfaces move.
+
+    Args:
+        steep: :attr:`Guide.steepness` of this frame.
+        stored: vectors (h, w, 2) of this frame.
+    """
     here, other = guide.images[frame], guide.images[1 - frame]
     length = np.hypot(*np.moveaxis(stored - np.float32(offset), -1, 0))
     moving = np.isfinite(length) & _moving(stored, offset)
@@ -278,7 +289,6 @@ def _place(guide: Guide, frame: int, stored: Array, offset: float) -> _Place | N
         return None
     # Less than that is nearly still beside the rest, and says little of the format.
     moving &= length >= 0.25 * np.median(length[moving])
-    steep = steepness(here)
     moving &= steep > 1e-6 * float(np.abs(here).max(initial=0.0))
     if np.count_nonzero(moving) < FEWEST:
         return None

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +19,10 @@ from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion_vectors import Mask
+from oiio_msspl.parallel import in_parallel
+
+#: Reads a window of a frame, (h, w, c).
+Reader = Callable[[Window], Array]
 
 POSITION = "position"
 #: Larger frames are averaged down to fewer pixels than this, which bounds memory.
@@ -40,6 +44,11 @@ class Guide:
     name: str
     images: tuple[Array, Array]
     """(h, w, c) of the first and the second frame."""
+
+    @cached_property
+    def steepness(self) -> tuple[Array, Array]:
+        """How steeply both rise or fall at each pixel, (h, w) each."""
+        return in_parallel(*(partial(_steepness, image) for image in self.images))
 
 
 @dataclass(frozen=True)
@@ -80,31 +89,34 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
     reduction = 1
     while window.width * window.height > MAX_PIXELS * reduction**2:
         reduction += 1
-    guides = []
-    for name, reads in _readers(first, second):
-        images = [reduced(read, window, reduction) for read in reads]
-        if name != POSITION:
-            images = [smooth(image) for image in images]
-        guides.append(Guide(name, (images[0], images[1])))
+
+    def image(name: str, read: Reader) -> Array:
+        values = reduced(read, window, reduction)
+        return values if name == POSITION else smooth(values)
+
+    guides = [
+        Guide(name, in_parallel(*(partial(image, name, read) for read in reads)))
+        for name, reads in _readers(first, second)
+    ]
     return Pair(first, second, window, reduction, tuple(guides))
 
 
-def _readers(first: MappedRender, second: MappedRender) -> Iterator[tuple[str, list[Callable[[Window], Array]]]]:
+def _readers(first: MappedRender, second: MappedRender) -> Iterator[tuple[str, tuple[Reader, Reader]]]:
     """The guides that both frames have, and how to read them from each."""
     for name in (ALBEDO, NORMAL):
         formulas = [render.features.get(name) for render in (first, second)]
         if all(f is not None and "camera" not in f.note and "screen" not in f.note for f in formulas):
-            yield name, [partial(_read_feature, render, name) for render in (first, second)]
-    positions = [(render, render.motion.position) for render in (first, second)]
-    if all(channels for _, channels in positions):
-        yield POSITION, [partial(render.file.read, channels or ()) for render, channels in positions]
+            yield name, (partial(_read_feature, first, name), partial(_read_feature, second, name))
+    positions = first.motion.position, second.motion.position
+    if positions[0] and positions[1]:
+        yield POSITION, (partial(first.file.read, positions[0]), partial(second.file.read, positions[1]))
 
 
 def _read_feature(render: MappedRender, name: str, window: Window) -> Array:
     return render.read(window, [name])[name]
 
 
-def reduced(read: Callable[[Window], Array], window: Window, reduction: int) -> Array:
+def reduced(read: Reader, window: Window, reduction: int) -> Array:
     """What ``read(window)`` gives over a window, in strips of rows and averaged down. NaN and infinities become 0."""
     height, width = window.height // reduction, window.width // reduction
     result: Array | None = None
@@ -130,12 +142,12 @@ def smooth(image: Array) -> Array:
     return image
 
 
-def steepness(image: Array) -> Array:
-    """How steeply (h, w, c) rises or falls at each pixel, (h, w)."""
+def _steepness(image: Array) -> Array:
     total = np.zeros(image.shape[:2], np.float32)
-    for axis in (0, 1):
-        total += np.abs(np.gradient(image, axis=axis)).mean(axis=-1)
-    return total
+    for plane in np.moveaxis(image, -1, 0):
+        for slope in np.gradient(plane):
+            total += np.abs(slope)
+    return total / np.float32(image.shape[-1])
 
 
 def still_and_moved(pair: Pair) -> tuple[Mask, Mask]:

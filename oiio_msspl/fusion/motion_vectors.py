@@ -7,6 +7,8 @@ surface in another frame. Pixels count in the display window, so frames may have
 
 from __future__ import annotations
 
+import functools
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -76,21 +78,21 @@ def decode(
     """
     vectors = np.empty(stored.shape, np.float32)
     known = np.empty(stored.shape[:2], np.bool_)
-    factors = np.array(form.pixels_per_unit(width, height), np.float32)
 
     def work(rows: slice) -> None:
-        values = stored[rows]
-        good = np.isfinite(values).all(axis=-1)
-        if form.offset:  # encoded as a colour, so the ends of its range may stand for anything beyond
-            good &= ((values > 0) & (values < 2 * form.offset)).all(axis=-1)
+        good = np.ones(known[rows].shape, np.bool_) if alpha is None else alpha[rows] > 0
+        squares = np.zeros(good.shape, np.float32)
         with np.errstate(all="ignore"):
-            if form.premultiplied and alpha is not None:
-                values = values / alpha[rows, :, None]
-            decoded = (values - np.float32(form.offset)) * factors
-            good &= np.hypot(decoded[..., 0], decoded[..., 1]) < np.hypot(width, height)
-        if alpha is not None:
-            good &= alpha[rows] > 0
-        vectors[rows], known[rows] = decoded, good
+            for i, factor in enumerate(form.pixels_per_unit(width, height)):
+                values = stored[rows, :, i]
+                if form.offset:  # encoded as a colour, so the ends of its range may stand for anything beyond
+                    good &= (values > 0) & (values < 2 * form.offset)
+                if form.premultiplied and alpha is not None:
+                    values = values / alpha[rows]
+                values = (values - np.float32(form.offset)) * np.float32(factor)
+                vectors[rows, :, i] = values
+                squares += np.square(values)
+            known[rows] = good & (squares < width**2 + height**2)  # false for NaN and infinities, too
 
     for_row_blocks(work, len(stored), stored[0].size)
     return vectors, known
@@ -102,14 +104,19 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
     Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
     surfaces do not move either.
     """
-    still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
+    still = known & _all_planes(np.abs(vectors) < NO_MOTION)
     surface = known
     normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
     if normal is not None:
-        surface = known & (normal != 0).any(axis=-1)
+        surface = known & ~_all_planes(normal == 0)
     count = np.count_nonzero(surface)
     camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count
     return np.zeros_like(known) if camera_stands else still
+
+
+def _all_planes(mask: Mask) -> Mask:
+    """Where a mask (h, w, c) is true in all channels: several times as fast as NumPy's ``all`` along the last axis."""
+    return functools.reduce(np.logical_and, np.moveaxis(mask, -1, 0))
 
 
 def invert(own: Array, other: Array, other_known: Mask, window: Window, other_window: Window) -> tuple[Array, Mask]:

@@ -23,16 +23,17 @@ from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.arrays import Array, blank, repair
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.light import Light, bands, from_grid, grid_rows, rows_in_bands, to_grid
+from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
 from oiio_msspl.fusion.warp import Mask, Path, Step, nearest, sample
+from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 from oiio_msspl.parallel import for_row_blocks
 
 #: An LRHS pixel of a neighbour counts if this share of its HRLS pixels shows the same surface.
 COVERED = 0.9
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
-BYTES_PER_PIXEL = 80
+BYTES_PER_PIXEL = 44
 
 Features = dict[str, Array]
 
@@ -54,7 +55,9 @@ class RenderPair:
         """Luminance of the LRHS, and of the HRLS averaged over its pixels, (h, w) each over the alignment's grid."""
         alignment = self.alignment
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts())[RGB]
-        high = [to_grid(alignment, _luminance(_read(self.hr, core, [RGB])), core) for core, _ in bands(alignment)]
+        high = for_bands(
+            alignment, lambda core, _: to_grid(alignment, _luminance(_read(self.hr, core, [RGB])[RGB]), core)
+        )
         return bounded_luminance(lrhs), np.concatenate(high)
 
 
@@ -93,19 +96,18 @@ def average_renders(
     lrhs, hrls = pair.luminances
     light = Light(alignment, lrhs, hrls, lrhs)
     low = {name: values.copy() for name, values in _read(pair.lr, alignment.lr_data_window, features).items()}
-    high: Features = {}
+    row = _read(pair.hr, Window(window.x0, window.y0, window.x1, window.y0 + 1), features)
+    high: Features = {name: blank((window.height, window.width, values.shape[-1])) for name, values in row.items()}
     frames: Array = blank((window.height, window.width, 1))
-    for core, area in bands(alignment):
-        band = _Band(pair, area, light, features)
+
+    def average(core: Window, area: Window) -> None:
+        target = core.slices(window)
+        band = _Band(pair, core, area, light, {name: image[target] for name, image in high.items()}, low)
         for steps in (before, after):
             band.add(steps)
-        inside, target = core.slices(area), core.slices(window)
-        for name, values in band.high.means(inside).items():
-            if name not in high:
-                high[name] = blank((window.height, window.width, values.shape[-1]))
-            high[name][target] = values
-        frames[target] = band.high.frames(inside)
-        band.put_low(low, core)
+        frames[target] = band.finish()
+
+    for_bands(alignment, average)
     return AveragedPair(_replaced(pair.lr, low), _replaced(pair.hr, high), frames)
 
 
@@ -136,63 +138,39 @@ def memory_to_average(window: Window, channels: int) -> int:
         window: the HRLS's data window.
         channels: of the HRLS's features.
     """
-    return rows_in_bands(window) * window.width * (BYTES_PER_PIXEL + 2 * 4 * channels)
-
-
-class _Sum:
-    """Weighted sums of features over a rectangle, and of their weights."""
-
-    def __init__(self, own: Features) -> None:
-        self._totals = {name: values.copy() for name, values in own.items()}
-        shape = next(iter(own.values())).shape[:2]
-        self._weights = np.ones(shape, np.float32)
-        self._squares = np.ones_like(self._weights)
-
-    def add(self, features: Features, weight: Array) -> None:
-        """Add finite features with a weight (h, w)."""
-        width = sum(values.shape[-1] for values in features.values())
-
-        def work(rows: slice) -> None:
-            part = weight[rows]
-            square = np.square(part)
-            self._weights[rows] += part
-            self._squares[rows] += square
-            with np.errstate(over="ignore", invalid="ignore"):  # the frame's own pixels may be NaN or infinite
-                for name, total in self._totals.items():
-                    total[rows] += (square if name == VARIANCE else part)[..., None] * features[name][rows]
-
-        for_row_blocks(work, len(weight), weight.shape[1] * width)
-
-    def means(self, part: tuple[slice, slice]) -> Features:
-        """Means over a part. The variance of a mean is a mean with squared weights."""
-        weights = self._weights[part][..., None]
-        return {
-            name: np.divide(total[part], np.square(weights) if name == VARIANCE else weights, dtype=np.float32)
-            for name, total in self._totals.items()
-        }
-
-    def frames(self, part: tuple[slice, slice]) -> Array:
-        """(h, w, 1), see :class:`AveragedPair`."""
-        return np.divide(np.square(self._weights[part]), self._squares[part], dtype=np.float32)[..., None]
+    return rows_in_bands(window) * window.width * (BYTES_PER_PIXEL + 4 * channels)
 
 
 class _Band:
     """Some rows of a frame."""
 
-    def __init__(self, pair: RenderPair, area: Window, light: Light, features: Sequence[str] | None) -> None:
-        self._area, self._light, self._features = area, light, features
+    def __init__(
+        self, pair: RenderPair, core: Window, area: Window, light: Light, high: Features, low: Features
+    ) -> None:
+        """
+        Args:
+            core, area: see :func:`oiio_msspl.fusion.light.for_bands`.
+            high: gets the HRLS's features over ``core``.
+            low: the LRHS's features over its data window; the rows of ``core`` are changed.
+        """
+        self._area, self._light, self._features = area, light, list(high)
         self._alignment = alignment = pair.alignment
-        rows = grid_rows(alignment, area)
+        #: The rows of ``core`` in the area.
+        self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         grid = alignment.grid
+        rows, core_rows = (grid_rows(alignment, each) for each in (area, core))
         #: The grid pixels of the area.
         self._grid = Window(grid.x0, grid.y0 + rows.start, grid.x1, grid.y0 + rows.stop)
-        own = _read(pair.hr, area, features)
-        self.high = _Sum(own)
-        self._luminance = _luminance(own)
+        for name, values in _read(pair.hr, core, self._features).items():
+            high[name][:] = values
+        self._high = WeightedSum(high)
+        self._luminance = _luminance(_read(pair.hr, area, [RGB])[RGB])
         self._low_luminance = pair.luminances[0][rows]
+        core_grid = Window(grid.x0, grid.y0 + core_rows.start, grid.x1, grid.y0 + core_rows.stop)
         #: The LRHS may lack a row or a column of the grid.
-        self._low_place = self._grid.intersect(alignment.lr_data_window)
-        self._low = _Sum(_read(pair.lr, self._low_place, features))
+        self._low_place = core_grid.intersect(alignment.lr_data_window)
+        inside = self._low_place.slices(alignment.lr_data_window)
+        self._low = WeightedSum({name: image[inside] for name, image in low.items()})
 
     def add(self, steps: Sequence[Step[RenderPair]]) -> None:
         """Add the neighbours on one side."""
@@ -200,27 +178,26 @@ class _Band:
         trusted: Array | None = None
         for step in steps:
             path.follow(step)
-            high = _fetch_nearest(step.frame, path, self._features)
-            valid = path.valid & _make_finite(high)
+            high = _Nearest(step.frame.hr, path, step.frame.alignment.hr_data_window, self._features)
+            valid = high.finite() & path.valid
             share = to_grid(self._alignment, valid.astype(np.float32), self._area)
             low, usable = self._fetch_low(step.frame, path, valid, share)
             usable &= _make_finite(low) & (share >= COVERED)
             own = self._luminance
-            hrls = to_grid(self._alignment, np.where(valid, _luminance(high), own), self._area)
-            lrhs = np.where(usable, _luminance(low), self._low_luminance)
+            hrls = to_grid(self._alignment, np.where(valid, high.luminance(), own), self._area)
+            lrhs = np.where(usable, _luminance(low[RGB]), self._low_luminance)
             trust = self._light.trust(lrhs, hrls, self._area)
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = trust if trusted is None else np.minimum(trusted, trust)
-            self.high.add(high, from_grid(self._alignment, trusted, self._area) * valid)
+            weight = from_grid(self._alignment, trusted, self._area) * valid
+            self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)
-            self._low.add({name: values[place] for name, values in low.items()}, (trusted * usable)[place])
+            self._low.add(rows_of({name: values[place] for name, values in low.items()}), (trusted * usable)[place])
 
-    def put_low(self, low: Features, core: Window) -> None:
-        """Write the LRHS's pixels of some rows ``core`` into ``low``, which covers its data window."""
-        rows, grid = grid_rows(self._alignment, core), self._alignment.grid
-        place = Window(grid.x0, grid.y0 + rows.start, grid.x1, grid.y0 + rows.stop).intersect(self._low_place)
-        for name, values in self._low.means(place.slices(self._low_place)).items():
-            low[name][place.slices(self._alignment.lr_data_window)] = values
+    def finish(self) -> Array:
+        """Turn the sums into means. Returns the number of frames of each pixel, as :attr:`AveragedPair.frames`."""
+        self._low.divide()
+        return self._high.divide()
 
     def _fetch_low(self, frame: RenderPair, path: Path, valid: Mask, share: Array) -> tuple[Features, Mask]:
         """The neighbour's LRHS over the grid pixels, and which of them lie in it: moved as their HRLS pixels are on
@@ -250,16 +227,10 @@ class _Band:
         def positions(rows: slice) -> tuple[Array, Array]:
             return x[rows], y[rows]
 
-        smooth = {
-            name: np.moveaxis(stored.pop(name), -1, 0)
-            for name in (*RADIANCE_FEATURES, VARIANCE, "alpha")
-            if name in stored
-        }
-        result = _nearest_pixels(stored, positions, x.shape)
-        for name, planes in smooth.items():
-            with np.errstate(invalid="ignore"):  # NaN is sorted out later
-                result[name] = np.moveaxis(sample(planes, positions, x.shape), 0, -1)
-        return result, usable
+        names = [name for name in (*RADIANCE_FEATURES, VARIANCE, "alpha") if name in stored]
+        with np.errstate(invalid="ignore"):  # NaN is sorted out later
+            smooth = sample([stored.pop(name) for name in names], positions, x.shape)
+        return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable
 
 
 def _difference(to: Array, at: Array, valid: Mask) -> Array:
@@ -274,18 +245,59 @@ def _difference(to: Array, at: Array, valid: Mask) -> Array:
     return result
 
 
-def _fetch_nearest(frame: RenderPair, path: Path, features: Sequence[str] | None) -> Features:
-    """The neighbour's HRLS at the pixels that are nearest to the positions of a path."""
-    place = path.place_in(frame.alignment.hr_data_window)
-    stored = _read(frame.hr, place, features)
-    if path.x is None:
-        return stored
+class _Nearest:
+    """A neighbour's HRLS at the pixels that are nearest to the positions of a path.
 
-    def positions(rows: slice) -> tuple[Array, Array]:
-        x, y = path.positions(rows)
-        return x - place.x0, y - place.y0
+    Args:
+        render: the neighbour's HRLS.
+        path: its positions (h, w).
+        window: the neighbour's data window.
+        features: names.
+    """
 
-    return _nearest_pixels(stored, positions, path.valid.shape)
+    def __init__(self, render: ReadableRender, path: Path, window: Window, features: Sequence[str]) -> None:
+        place = path.place_in(window)
+        self._size = path.valid.shape
+        self._flat = {
+            name: np.ascontiguousarray(values).reshape(-1, values.shape[-1])
+            for name, values in _read(render, place, features).items()
+        }
+        self._at = np.empty(self._size, np.intp)
+
+        def work(rows: slice) -> None:
+            x, y = path.positions(rows)
+            self._at[rows] = nearest(x, y, place)
+
+        for_row_blocks(work, *self._size)
+        # The extremes of an image are found ten times as fast as its pixels are tested.
+        doubtful = [v for v in self._flat.values() if not np.isfinite([v.min(), v.max()]).all()]
+        self._finite = np.logical_and.reduce([np.isfinite(v).all(axis=-1) for v in doubtful]) if doubtful else None
+
+    def finite(self) -> Mask:
+        """Where all features are finite, (h, w)."""
+        return np.ones(self._size, bool) if self._finite is None else self._finite.take(self._at)
+
+    def luminance(self) -> Array:
+        """Luminance (h, w) of the beauty, finite and >= 0."""
+        result = np.empty(self._size, np.float32)
+
+        def work(rows: slice) -> None:
+            result[rows] = _luminance(self._pixels(RGB, rows))
+
+        for_row_blocks(work, self._size[0], 3 * self._size[1])
+        return result
+
+    def below(self, first: int) -> Callable[[str, slice], Array]:
+        """What :meth:`WeightedSum.add` takes, where rows are counted from ``first`` on."""
+        return lambda name, rows: self._pixels(name, slice(first + rows.start, first + rows.stop))
+
+    def _pixels(self, name: str, rows: slice) -> Array:
+        """A feature at some rows (n, w, c). Pixels that are not finite are 0."""
+        at = self._at[rows]
+        values = self._flat[name].take(at, axis=0)
+        if self._finite is not None:
+            values[~self._finite.take(at)] = 0
+        return values
 
 
 def _nearest_pixels(
@@ -320,9 +332,9 @@ def _make_finite(features: Features) -> Mask:
     return finite
 
 
-def _luminance(features: Features) -> Array:
-    """Luminance (h, w) of the beauty, finite and >= 0."""
-    return bounded_luminance(repair(features[RGB])[0])
+def _luminance(rgb: Array) -> Array:
+    """Luminance (h, w) of a beauty (h, w, 3), finite and >= 0."""
+    return bounded_luminance(repair(rgb)[0])
 
 
 def _read(render: ReadableRender, window: Window, features: Sequence[str] | None = None) -> Features:

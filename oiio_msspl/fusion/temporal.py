@@ -18,18 +18,22 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oiio_msspl.arrays import Array, planes_of
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.arrays import Array
 from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.light import Light, bands, from_grid, rows_in_bands, to_grid
+from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, to_grid
 from oiio_msspl.fusion.warp import Mask, Path, Step, near_borders, sample
-from oiio_msspl.parallel import for_row_blocks
+from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
+ALPHA = "alpha"
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
 DIFFERENT_MIX = 0.3
 #: Memory for each pixel of the rows that are averaged at a time.
 BYTES_PER_PIXEL = 96
+
+Images = dict[str, Array]
 
 
 @dataclass(frozen=True)
@@ -54,22 +58,25 @@ def accumulate(frame: FusedFrame, before: Sequence[Step[FusedFrame]], after: Seq
         after: steps to the frames after it, the nearest first.
     """
     window = frame.alignment.hr_data_window
-    rgb = np.empty_like(frame.rgb)
-    alpha = None if frame.alpha is None else np.empty_like(frame.alpha)
+    own = _images(frame, window)
+    images = {name: np.empty(image.shape, np.float32) for name, image in own.items()}
     frames = np.empty((window.height, window.width, 1), np.float32)
     light = _light_of(frame)
-    for core, area in bands(frame.alignment):
-        total, weights, squares = _accumulate_band(frame, before, after, light, area)
-        total /= weights
-        inside, target = core.slices(area), core.slices(window)
-        rgb[target] = np.moveaxis(total[:3], 0, -1)[inside]
-        if alpha is not None:
-            alpha[target] = total[3][inside][..., None]
-        frames[target] = (np.square(weights) / squares)[inside][..., None]
+
+    def average(core: Window, area: Window) -> None:
+        target = core.slices(window)
+        for name, image in images.items():
+            image[target] = own[name][target]
+        total = WeightedSum({name: image[target] for name, image in images.items()})
+        for steps in (before, after):
+            _add_side(total, frame, steps, light, core, area)
+        frames[target] = total.divide()
+
+    for_bands(frame.alignment, average)
     if frame.frames is not None:
         # Averages of averages. If all weights are equal, this is the exact number within 7 percent.
         frames = np.sqrt(np.square(frames) + np.square(frame.frames) - 1)
-    return Accumulated(rgb, alpha, frames)
+    return Accumulated(images[RGB], images.get(ALPHA), frames)
 
 
 def memory_to_accumulate(window: Window) -> int:
@@ -79,37 +86,35 @@ def memory_to_accumulate(window: Window) -> int:
 
 def _light_of(frame: FusedFrame) -> Light:
     alignment = frame.alignment
-    fused = [to_grid(alignment, _luminance(_channels(frame, core)), core) for core, _ in bands(alignment)]
+    fused = for_bands(alignment, lambda core, _: to_grid(alignment, _luminance(_images(frame, core)[RGB]), core))
     return Light(alignment, frame.lrhs_luminance, frame.hrls_luminance, np.concatenate(fused))
 
 
-def _accumulate_band(
-    frame: FusedFrame, before: Sequence[Step[FusedFrame]], after: Sequence[Step[FusedFrame]], light: Light, area: Window
-) -> tuple[Array, Array, Array]:
-    """The weighted sum of colour and alpha (3 or 4, h, w), the weights (h, w), and their squares."""
-    window = frame.alignment.hr_data_window
-    total = _channels(frame, area)
-    weights = np.ones(total.shape[1:], np.float32)
-    squares = np.ones_like(weights)
-    own = _luminance(total)
-    for steps in (before, after):
-        path = Path(area, window)
-        trusted: Array | None = None
-        borders = _borders(steps, area, window)
-        for step in steps:
-            path.follow(step)
-            warped = _warp(step.frame, path)
-            low = to_grid(frame.alignment, np.where(path.valid, _luminance(warped), own), area)
-            weight = light.trust(low, low, area)
-            # A light that has changed in the nearer frame has changed in the farther one.
-            trusted = weight if trusted is None else np.minimum(trusted, weight)
-            if len(warped) < len(total):  # the neighbour has no alpha
-                warped = np.concatenate([warped, _channels(frame, area)[3:]])
-            weight = from_grid(frame.alignment, trusted, area) * path.valid
-            if borders is not None:
-                weight[borders] *= _likeness(own[borders], _luminance(warped)[borders], light.darkest)
-            _add(total, weights, squares, warped, weight)
-    return total, weights, squares
+def _add_side(
+    total: WeightedSum, frame: FusedFrame, steps: Sequence[Step[FusedFrame]], light: Light, core: Window, area: Window
+) -> None:
+    """Add the neighbours on one side to ``core``, the rows of ``area`` that are computed."""
+    alignment = frame.alignment
+    window = alignment.hr_data_window
+    path = Path(area, window)
+    own = _images(frame, area)
+    luminance = _luminance(own[RGB])
+    borders = _borders(steps, area, window)
+    inside = core.slices(area)
+    trusted: Array | None = None
+    for step in steps:
+        path.follow(step)
+        warped = _warp(step.frame, path)
+        other = _luminance(warped[RGB])
+        low = to_grid(alignment, np.where(path.valid, other, luminance), area)
+        weight = light.trust(low, low, area)
+        # A light that has changed in the nearer frame has changed in the farther one.
+        trusted = weight if trusted is None else np.minimum(trusted, weight)
+        weight = from_grid(alignment, trusted, area) * path.valid
+        if borders is not None:
+            weight[borders] *= _likeness(luminance[borders], other[borders], light.darkest)
+        # A neighbour may have no alpha.
+        total.add(rows_of({name: warped.get(name, image)[inside] for name, image in own.items()}), weight[inside])
 
 
 def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) -> Mask | None:
@@ -130,40 +135,29 @@ def _likeness(own: Array, other: Array, darkest: float) -> Array:
     return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
 
 
-def _warp(frame: FusedFrame, path: Path) -> Array:
-    """Colour and alpha (3 or 4, h, w) of another frame at the positions of a path."""
+def _warp(frame: FusedFrame, path: Path) -> Images:
+    """Colour and alpha of another frame at the positions of a path, (h, w, c) each."""
     place = path.place_in(frame.alignment.hr_data_window)
-    planes = _channels(frame, place)
+    images = _images(frame, place)
     if path.x is None:
-        return planes
+        return images
 
     def positions(rows: slice) -> tuple[Array, Array]:
         x, y = path.positions(rows)
         return x - place.x0, y - place.y0
 
-    return sample(planes, positions, path.valid.shape)
+    return dict(zip(images, sample(list(images.values()), positions, path.valid.shape), strict=True))
 
 
-def _luminance(planes: Array) -> Array:
-    """Luminance (h, w) of colour (3 or more, h, w)."""
-    red, green, blue = (np.float32(w) * plane for w, plane in zip(LUMINANCE_WEIGHTS, planes, strict=False))
+def _luminance(rgb: Array) -> Array:
+    """Luminance (h, w) of colour (h, w, 3)."""
+    red, green, blue = (
+        np.float32(w) * plane for w, plane in zip(LUMINANCE_WEIGHTS, np.moveaxis(rgb, -1, 0), strict=True)
+    )
     return np.asarray(red + green + blue, np.float32)
 
 
-def _channels(frame: FusedFrame, area: Window) -> Array:
-    """Colour and alpha, if there is one, over an area of the data window, as planes (3 or 4, h, w)."""
+def _images(frame: FusedFrame, area: Window) -> Images:
+    """Colour and alpha, if there is one, over an area of the data window, (h, w, c) each."""
     part = area.slices(frame.alignment.hr_data_window)
-    colour = planes_of(frame.rgb[part])
-    return colour if frame.alpha is None else np.concatenate([colour, frame.alpha[part][None, ..., 0]])
-
-
-def _add(total: Array, weights: Array, squares: Array, warped: Array, weight: Array) -> None:
-    """Add weighted planes (c, h, w) to the totals."""
-
-    def work(rows: slice) -> None:
-        for plane, values in zip(total, warped, strict=False):  # this frame may lack the alpha
-            plane[rows] += weight[rows] * values[rows]
-        weights[rows] += weight[rows]
-        squares[rows] += np.square(weight[rows])
-
-    for_row_blocks(work, len(weights), weights.shape[1] * len(total))
+    return {RGB: frame.rgb[part]} | ({} if frame.alpha is None else {ALPHA: frame.alpha[part]})

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, Protocol, TypeVar
 
@@ -161,22 +161,30 @@ def nearest(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
     return row * window.width + column
 
 
-def sample(planes: Array, positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]) -> Array:
+def sample(
+    images: Sequence[Array], positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]
+) -> list[Array]:
     """Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
 
     Args:
-        planes: (c, h, w).
-        positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of ``planes``.
+        images: (h, w, c) each, of one size.
+        positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of the images.
         size: height and width of the result.
 
     Returns:
-        (c, *size)
+        (*size, c) each; their channels are contiguous in memory.
     """
-    padded = np.pad(planes, [(0, 0), (2, 2), (2, 2)], mode="edge").reshape(len(planes), -1)
-    rows_in, columns_in = planes.shape[1:]
+    rows_in, columns_in = images[0].shape[:2]
+    counts = [image.shape[-1] for image in images]
+    padded = np.empty((sum(counts), rows_in + 4, columns_in + 4), np.float32)
+    for target, image in zip(np.split(padded, np.cumsum(counts)[:-1]), images, strict=True):
+        target[:, 2:-2, 2:-2] = np.moveaxis(image, -1, 0)
+    padded[:, :2, 2:-2], padded[:, -2:, 2:-2] = padded[:, 2:3, 2:-2], padded[:, -3:-2, 2:-2]
+    padded[..., :2], padded[..., -2:] = padded[..., 2:3], padded[..., -3:-2]
+    planes = padded.reshape(len(padded), -1)
     stride = columns_in + 4
     height, width = size
-    result = np.empty((len(planes), height, width), np.float32)
+    result = np.empty((len(padded), height, width), np.float32)
 
     def work(rows: slice) -> None:
         x, y = positions(rows)
@@ -187,7 +195,7 @@ def sample(planes: Array, positions: Callable[[slice], tuple[Array, Array]], siz
         first = (top.astype(np.intp) + 1) * stride + left.astype(np.intp) + 1
         across, down = _keys(x - left), _keys(y - top)
         line, low, high, values = np.empty((4, *x.shape), np.float32)
-        for plane, out in zip(padded, result, strict=True):
+        for plane, out in zip(planes, result, strict=True):
             total = out[rows]
             for i, weight_y in enumerate(down):
                 for j, weight_x in enumerate(across):
@@ -209,8 +217,8 @@ def sample(planes: Array, positions: Callable[[slice], tuple[Array, Array]], siz
                     np.multiply(line, weight_y, out=total)
             np.clip(total, low, high, out=total)
 
-    for_row_blocks(work, height, width)
-    return result
+    for_row_blocks(work, height, 2 * width)  # the dozen arrays of a block then nearly fit into a core's cache
+    return [np.moveaxis(part, 0, -1) for part in np.split(result, np.cumsum(counts)[:-1])]
 
 
 def _keys(t: Array) -> list[Array]:

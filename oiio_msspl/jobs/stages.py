@@ -14,6 +14,7 @@ from pathlib import Path
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, kept
+from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.reader import Channel
@@ -133,11 +134,11 @@ class Stages:
         check_passes(hr, others, self.write_options)
         if not self._fits(lr, hr):
             return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
-        channels, motion = self._read_ahead(lr, hr), self.temporal.motion
-        pixels, stored = hr.load_with(channels)
+        features, channels, motion = self._features(lr, hr), self._read_ahead(lr, hr), self.temporal.motion
+        pixels, stored = hr.load_with(channels, features)
         vectors = motion.vectors_of(hr, pixels, stored) if motion and channels else {}
         waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
-        return LoadedFrame(frame, lr, hr, lr.load(), pixels, time.perf_counter() - start, others, waiting)
+        return LoadedFrame(frame, lr, hr, lr.load(features), pixels, time.perf_counter() - start, others, waiting)
 
     def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:
         """Whether the pixels of all frames that are held fit into memory, beside a tile and two results."""
@@ -145,10 +146,12 @@ class Stages:
 
     def _room(self, lr: MappedRender, hr: MappedRender) -> int:
         """Memory that is left beside these; negative if they don't fit."""
+        features = self._features(lr, hr)
+        low, high = (_pixel_bytes(render, features) for render in (lr, hr))
         result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
-        other = FIXED_MEMORY + TILE_MEMORY + 2 * result_bytes + _pixel_bytes(lr)
-        other += self.temporal.memory(hr.data_window, _channels(hr))
-        return self.max_memory - other - self._frames_held * (_pixel_bytes(lr) + _pixel_bytes(hr))
+        other = FIXED_MEMORY + TILE_MEMORY + 2 * result_bytes + low
+        other += self.temporal.memory(hr.data_window, _channels(hr, features))
+        return self.max_memory - other - self._frames_held * (low + high)
 
     @property
     def _frames_held(self) -> int:
@@ -167,12 +170,23 @@ class Stages:
         Raises:
             InputError: there is no such model, or it does not make a layer that is asked for.
         """
-        scale = align(loaded.lr_pixels, loaded.hr_pixels).scale
+        session = self._session(loaded.lr, loaded.hr)
+        require_outputs(session, self.write_options)
+        return session
+
+    def _session(self, lr: MappedRender, hr: MappedRender) -> Session:
+        scale = align(lr, hr).scale
         session = self.sessions.get((scale, self.model))
         if session is None:
             session = self.sessions[scale, self.model] = load_model(scale, self.model, self.device, self.threads)
-        require_outputs(session, self.write_options)
         return session
+
+    def _features(self, lr: MappedRender, hr: MappedRender) -> list[str]:
+        """The features of a pair that are read: a file may have many more, and to decode and keep these takes long."""
+        try:
+            return _features_read(self._session(lr, hr))
+        except InputError:  # which `session` raises, too, when the frame's turn has come
+            return [*HRLS_FEATURES, "alpha"]
 
     def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours = ((), ())) -> FusedAlone:
         """Fuse the beauty of a pair.
@@ -237,11 +251,11 @@ class Stages:
         """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
         result_channels = 5 if self.write_options.error_layer else 4
         held = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
+        features = _features_read(session)
         if self._fits(loaded.lr, loaded.hr):
-            held += self._frames_held * (_pixel_bytes(loaded.lr) + _pixel_bytes(loaded.hr))
+            held += self._frames_held * sum(_pixel_bytes(render, features) for render in (loaded.lr, loaded.hr))
             held += _vector_bytes(loaded.hr, self._read_ahead(loaded.lr, loaded.hr))
-        read = sum(HRLS_FEATURES.get(name, 1) for name in _features_read(session))
-        return held + self.temporal.memory(loaded.hr.data_window, min(_channels(loaded.hr), read))
+        return held + self.temporal.memory(loaded.hr.data_window, _channels(loaded.hr, features))
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
         """Write preview and EXR.
@@ -283,9 +297,9 @@ def _features_read(session: Session) -> list[str]:
     return list(dict.fromkeys([*session.contract.features, *session.lrhs_aovs, ALBEDO, NORMAL, "alpha"]))
 
 
-def _channels(render: MappedRender) -> int:
-    """Channels of a render's features."""
-    return sum(HRLS_FEATURES[name] for name in render.features) + (render.alpha is not None)
+def _channels(render: MappedRender, features: Sequence[str]) -> int:
+    """Channels of the features that a render has of these."""
+    return sum(HRLS_FEATURES[name] for name in render.features if name in features) + (render.alpha is not None)
 
 
 def _vector_bytes(render: MappedRender, channels: Sequence[Channel]) -> int:
@@ -293,6 +307,6 @@ def _vector_bytes(render: MappedRender, channels: Sequence[Channel]) -> int:
     return READ_VECTOR_BYTES * len(channels) * render.data_window.width * render.data_window.height
 
 
-def _pixel_bytes(render: MappedRender) -> int:
-    """Bytes of a render's features in memory."""
-    return render.data_window.width * render.data_window.height * _channels(render) * 4
+def _pixel_bytes(render: MappedRender, features: Sequence[str]) -> int:
+    """Bytes of a render's features in memory, those that it has of these."""
+    return render.data_window.width * render.data_window.height * _channels(render, features) * 4

@@ -102,6 +102,14 @@ def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):
     np.testing.assert_array_equal(loaded.layers["rgb"], values)
 
 
+def test_only_the_features_that_are_asked_for_are_loaded(tmp_path):
+    values = picture(30, 20)
+    path = write_exr(tmp_path / "hr.exr", rgb(values) | rgb(values, "albedo.") | rgb(values, "specular."))
+    render = map_render(open_exr(path))
+    assert {"albedo", "specular"} <= render.features.keys()
+    assert render.load(["rgb", "albedo", "normal"]).layers.keys() == {"rgb", "albedo"}
+
+
 def test_a_render_is_loaded_with_further_channels_as_they_are_stored(tmp_path):
     """A channel may be one that a feature is read from."""
     values = picture(ROWS_PER_LOAD + 30, 20)

@@ -4,11 +4,14 @@
 import numpy as np
 import pytest
 
+from oiio_msspl import map_render, open_exr
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion import light
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, shared_noise
 from oiio_msspl.fusion.warp import Step
+from oiio_msspl.parallel import limit_threads
+from tests.conftest import rgb, write_exr
 from tests.fusion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
 
 NOISE = 0.5
@@ -153,6 +156,27 @@ def test_bands_of_rows_agree(monkeypatch):
     assert np.allclose(whole.hr.layers["rgb"], parts.hr.layers["rgb"], rtol=1e-5)
     assert np.allclose(whole.lr.layers["rgb"], parts.lr.layers["rgb"], rtol=1e-5)
     assert np.allclose(whole.frames, parts.frames, rtol=1e-5)
+
+
+def test_bands_read_a_file_at_the_same_time(monkeypatch, tmp_path):
+    """As for frames that don't fit into memory."""
+    monkeypatch.setattr(light, "BAND_ROWS", 16)
+    monkeypatch.setattr(light, "BAND_PIXELS", 1)
+    pairs = [pair_of(texture(0.7 * seed), seed) for seed in range(3)]
+
+    def on_disk(render, name):
+        layers = rgb(render.layers["rgb"]) | rgb(render.layers.get("albedo", render.layers["rgb"]), "albedo.")
+        return map_render(open_exr(write_exr(tmp_path / name, layers)))
+
+    files = [RenderPair(on_disk(p.lr, f"lr{i}.exr"), on_disk(p.hr, f"hr{i}.exr")) for i, p in enumerate(pairs)]
+    loaded = [RenderPair(pair.lr.load(), pair.hr.load()) for pair in files]
+    with limit_threads(2):
+        from_files, in_memory = (
+            average_renders(each[1], [moved(each[0], -0.7, 0.4)], [moved(each[2], 0.7, -3.3)])
+            for each in (files, loaded)
+        )
+    for name, image in in_memory.hr.layers.items():
+        assert np.array_equal(from_files.hr.layers[name], image)
 
 
 def test_frames_with_one_seed_share_their_noise():

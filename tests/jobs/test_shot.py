@@ -12,6 +12,7 @@ import OpenImageIO as oiio
 import pytest
 
 from oiio_msspl import InputError, InputOptions, MssplError, fuse_files, fuse_shot
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs import shot, stages
@@ -53,10 +54,28 @@ def test_frames_without_room_in_memory_are_read_as_they_are_fused(tmp_path, bili
     folder = make_shot(tmp_path, 2)
     assert run(folder, bilinear_models[4]).exit_code == 0
     whole = contents(folder / "out")
-    monkeypatch.setattr(stages, "_pixel_bytes", lambda render: 1 << 40)
+    monkeypatch.setattr(stages, "_pixel_bytes", lambda render, features: 1 << 40)
     monkeypatch.setattr("oiio_msspl.aovs.mapped_render.MappedRender.load", pytest.fail)
     assert run(folder, bilinear_models[4], overwrite=True).exit_code == 0
     assert contents(folder / "out") == whole
+
+
+def test_layers_that_the_model_does_not_read_are_not_loaded(tmp_path, monkeypatch):
+    folder = make_shot(tmp_path, 2)
+    for path in folder.glob("?r/*.exr"):
+        values = picture(*((HEIGHT, WIDTH) if path.parent.name == "hr" else (HEIGHT // 4, WIDTH // 4)))
+        write_exr(path, rgb(values) | rgb(values, "albedo.") | rgb(values, "specular."))
+    loaded = []
+    real = MappedRender.load_with
+
+    def load_with(self, *arguments):
+        result = real(self, *arguments)
+        loaded.append(set(result[0].layers))
+        return result
+
+    monkeypatch.setattr(MappedRender, "load_with", load_with)
+    assert run(folder, "fast").exit_code == 0
+    assert loaded == [{"rgb", "albedo"}] * 4
 
 
 def test_the_three_stages_overlap_and_hold_one_frame_each(tmp_path, bilinear_models, monkeypatch):

@@ -1,0 +1,70 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Weighted means of frames, summed up in the arrays that hold the result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from oiio_msspl.aovs.features import VARIANCE
+from oiio_msspl.arrays import Array
+from oiio_msspl.parallel import for_row_blocks
+
+#: Takes a name and rows, and returns the image there, (n, w, c).
+Rows = Callable[[str, slice], Array]
+
+
+class WeightedSum:
+    """Adds weighted features to images, in place, and then divides these by the sum of the weights."""
+
+    def __init__(self, images: dict[str, Array]) -> None:
+        """``images`` (h, w, c) count with a weight of 1."""
+        self._images = images
+        self._weights: Array = np.ones(next(iter(images.values())).shape[:2], np.float32)
+        self._squares = np.ones_like(self._weights)
+
+    def add(self, feature: Rows, weight: Array) -> None:
+        """Add features with a weight (h, w).
+
+        Args:
+            feature: the features that are added; finite.
+        """
+
+        def work(rows: slice) -> None:
+            part = weight[rows]
+            square = np.square(part)
+            self._weights[rows] += part
+            self._squares[rows] += square
+            with np.errstate(over="ignore", invalid="ignore"):  # the frame's own pixels may be NaN or infinite
+                for name, image in self._images.items():
+                    image[rows] += (square if name == VARIANCE else part)[..., None] * feature(name, rows)
+
+        self._for_blocks(work)
+
+    def divide(self) -> Array:
+        """Turn the sums into means.
+
+        Returns:
+            (h, w, 1): the number of images with equal weight whose mean would have as little noise, 1 where nothing
+            was added.
+        """
+
+        def work(rows: slice) -> None:
+            weights = self._weights[rows][..., None]
+            with np.errstate(over="ignore", invalid="ignore"):
+                for name, image in self._images.items():
+                    # The variance of a mean is a mean with squared weights.
+                    image[rows] /= np.square(weights) if name == VARIANCE else weights
+
+        self._for_blocks(work)
+        return np.divide(np.square(self._weights), self._squares, dtype=np.float32)[..., None]
+
+    def _for_blocks(self, work: Callable[[slice], None]) -> None:
+        width = sum(image.shape[-1] for image in self._images.values())
+        for_row_blocks(work, len(self._weights), self._weights.shape[1] * width)
+
+
+def rows_of(images: Mapping[str, Array]) -> Rows:
+    """What :meth:`WeightedSum.add` takes, of images in memory."""
+    return lambda name, rows: images[name][rows]

@@ -130,7 +130,9 @@ class BandWeights(nn.Module):
         for band, weight in zip(bands, torch.sigmoid(logits).split(1, dim=1), strict=True):
             fused = fused + weight * band
         fused = torch.clamp(fused, AGREED[0] * torch.minimum(joint, large), AGREED[1] * torch.maximum(joint, large))
-        lowest, highest = (sign * highest_allowed(sign * low, sign * mean, sign * samples) for sign in (-1.0, 1.0))
+        lowest, highest = (
+            upsample(sign * highest_allowed(sign * low, sign * mean, sign * samples), 2) for sign in (-1.0, 1.0)
+        )
         return torch.clamp(fused, lowest, highest), log_error
 
 

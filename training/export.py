@@ -156,8 +156,9 @@ def joint_to_onnx(
     lrhs, hrls = example(network, scale, 4 * alignment, 6 * alignment)
     levels = range(scale.bit_length())
     sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
-    inputs = (lrhs, hrls, hrls[:, :3], [torch.rand(1, *size) for size in sizes])
-    names = ["lrhs", "hrls", "denoised", *(f"logits{level}" for level in levels)]
+    image = hrls[:, :3]
+    inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
+    names = [*joint.Blend.inputs, *(f"logits{level}" for level in levels)]
     mixing = traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
     model = joint.to_onnx(network, scale, pairs, mixing)
     helper.set_model_props(model, {METADATA_KEY: contract.to_json()})

@@ -180,7 +180,7 @@ class JointFusion(nn.Module):
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))
-        return blend(lrhs, hrls, denoised, logits), log_error
+        return blend(lrhs, samples, albedo, denoised, logits), log_error
 
 
 def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
@@ -193,12 +193,12 @@ def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
     return functools.reduce(torch.add, (rest * weight * image for weight, image in zip(weights, images, strict=True)))
 
 
-def blend(lrhs: Tensor, hrls: Tensor, denoised: Tensor, logits: Sequence[Tensor]) -> Tensor:
+def blend(lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor]) -> Tensor:
     """Blend the candidates with the softmax of the logits.
 
     Args:
         lrhs: (N, 6, h, w): the LRHS and the denoised mean of both renders, log-encoded.
-        hrls: (N, 6 or more, s*h, s*w): the HRLS's colour and albedo.
+        samples, albedo: (N, 3, s*h, s*w): the HRLS's colour, log-encoded, and its albedo.
         denoised: (N, 3, s*h, s*w), the denoised HRLS, log-encoded.
         logits: of the levels H, H/2, ..., (N, 8, H/2^i, W/2^i): the first four choose between the candidates of a fine
             level, the others between those of the LRHS's level. At H, the fifth is the share of the albedo.
@@ -206,8 +206,7 @@ def blend(lrhs: Tensor, hrls: Tensor, denoised: Tensor, logits: Sequence[Tensor]
     Returns:
         The fused image (N, 3, s*h, s*w), log-encoded.
     """
-    first = log2_scale(lrhs, hrls)
-    samples, albedo = hrls[:, :3], hrls[:, 3:6]
+    first = log2_scale(lrhs, samples)
     means = pyramid(log_decode(samples), 0, first + 1)
     filtered = pyramid(log_decode(denoised), 0, first + 1)
     share = torch.sigmoid(logits[0][:, len(FINER) :])
@@ -235,12 +234,14 @@ def blend(lrhs: Tensor, hrls: Tensor, denoised: Tensor, logits: Sequence[Tensor]
             ],
         )
     low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
-    lowest, highest = (sign * highest_allowed(sign * low, sign * mean, sign * samples) for sign in (-1.0, 1.0))
+    lowest, highest = (
+        upsample(sign * highest_allowed(sign * low, sign * mean, sign * samples), 2) for sign in (-1.0, 1.0)
+    )
     return torch.clamp(fused, lowest, highest)
 
 
 def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
-    """The largest value that a pixel may have.
+    """The largest value that each 2x2 HRLS pixels may have.
 
     It is the highest sample of either render close around. Where light is rare, all of these may be too dark. So the
     denoised mean of both renders counts, too, as far as some sample within ``FAR`` LRHS pixels is as bright.
@@ -250,14 +251,14 @@ def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
         samples: (N, 3, s*h, s*w), the HRLS.
 
     Returns:
-        (N, 3, s*h, s*w)
+        (N, 3, s*h/2, s*w/2)
     """
     scale = 2 ** log2_scale(lrhs, samples)
     brightest = torch.maximum(lrhs, F.max_pool2d(samples.contiguous(), scale))
     for _ in range(FAR // 4):
         brightest = F.max_pool2d(brightest, 9, stride=1, padding=4)
     expected = F.max_pool2d(torch.minimum(mean, brightest), 3, stride=1, padding=1)
-    return torch.maximum(upsample(highest_around(lrhs, samples), 2), upsample(expected, scale))
+    return torch.maximum(highest_around(lrhs, samples), upsample(expected, scale // 2))
 
 
 def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:

@@ -60,7 +60,9 @@ def test_every_fine_candidate_can_be_chosen(scale: int) -> None:
         HRLS: hrls[:, :3],
     }
     for choice, image in expected.items():
-        torch.testing.assert_close(blend(lrhs, hrls, denoised, preferring(choice)), image, atol=0.01, rtol=0)
+        torch.testing.assert_close(
+            blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, preferring(choice)), image, atol=0.01, rtol=0
+        )
 
 
 @pytest.mark.parametrize("scale", SCALES)
@@ -71,7 +73,7 @@ def test_every_coarse_candidate_can_be_chosen(scale: int) -> None:
     for choice, value in {DENOISED_MEAN: 0.35, DENOISED_HRLS: 0.3, HRLS_MEAN: 0.2, LRHS: 0.4}.items():
         expected = torch.full((1, 3, HEIGHT, WIDTH), value)
         torch.testing.assert_close(
-            blend(lrhs, hrls, denoised, preferring(RESCALED, choice)), expected, atol=0.01, rtol=0
+            blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, preferring(RESCALED, choice)), expected, atol=0.01, rtol=0
         )
 
 
@@ -81,7 +83,7 @@ def test_it_never_leaves_the_range_of_its_inputs() -> None:
     denoised, lrhs[:, 3:] = 4.0 * denoised, 4.0 * lrhs[:, 3:]
     lrhs[:, :3, :8], hrls[:, :3, :32], lrhs[:, 3:, :8] = 0.1, 0.2, 0.15
     logits = [5 * torch.randn(1, 8 if level else 5, HEIGHT >> level, WIDTH >> level) for level in range(4)]
-    fused = blend(lrhs, hrls, denoised, logits)
+    fused = blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, logits)
     assert fused[:, :, :20].min() >= 0.1 and fused[:, :, :20].max() <= 0.2
     assert fused.max() <= 1.0
 
@@ -91,8 +93,8 @@ def test_where_all_samples_around_are_black_the_denoised_mean_counts(scale: int)
     """As far as a sample nearby is as bright; without any light nearby the result is black."""
     lrhs, hrls, denoised = (torch.zeros_like(image) for image in images(scale))
     lrhs[:, 3:] = denoised[:] = 0.3
-    assert blend(lrhs, hrls, denoised, preferring(DENOISED)).max() == 0
+    assert blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, preferring(DENOISED)).max() == 0
     lrhs[:, :3, 2, 2] = 0.2
-    fused = blend(lrhs, hrls, denoised, preferring(DENOISED))
+    fused = blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, preferring(DENOISED))
     row = 6 * scale  # beyond the LRHS pixels beside the lit one
     torch.testing.assert_close(fused[:, :, row, : 4 * scale], torch.full((1, 3, 4 * scale), 0.2))

@@ -18,7 +18,7 @@ onnx = pytest.importorskip("onnx")
 
 from training.oidn import LARGE, run_unet  # noqa: E402
 from training.quantise import gptq  # noqa: E402
-from training.quantise.graph import Graph  # noqa: E402
+from training.quantise.graph import COPIES, Graph, Nodes  # noqa: E402
 
 
 def layers(height, width, seed=0):
@@ -31,6 +31,21 @@ def layers(height, width, seed=0):
         "normal": normal,
         "noise": noise,
     }
+
+
+@pytest.mark.parametrize("shape", [(1, 3, 16, 16), (1, 16, 32, 3)])
+def test_a_table_is_looked_up_for_every_pixel(tmp_path, shape):
+    table = np.linspace(5, 7, 100, dtype=np.float32)
+    entries = np.random.default_rng(0).integers(0, len(table), shape).astype(np.int32)
+    assert entries.size % COPIES == 0
+    nodes = Nodes()
+    nodes.look_up(nodes.constant("table", table), "entries", "found")
+    info = onnx.helper.make_tensor_value_info
+    kinds = onnx.TensorProto.INT32, onnx.TensorProto.FLOAT
+    ends = [info(name, kind, [None] * 4) for name, kind in zip(("entries", "found"), kinds, strict=True)]
+    onnx.save(nodes.finished("table", ends[:1], ends[1:]), tmp_path / "table.onnx")
+    found = load_network(tmp_path / "table.onnx", 2).run(["found"], {"entries": entries})[0]
+    np.testing.assert_array_equal(found, table[entries])
 
 
 def test_gptq_beats_rounding_to_the_nearest_step():

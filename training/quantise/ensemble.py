@@ -110,23 +110,25 @@ class Results(Nodes):
         self._embed(onnx.load(find_model(scale, "joint")), "joint.", {"fused": "joint", "log_error": "joint_error"})
         # OIDN denoises an albedo in sRGB, and reads it linear beside the colour.
         self.constant("srgb", srgb(torch.linspace(0, 1, ENTRIES)).numpy())
-        albedo = self._denoised(networks["albedo"], "albedo", self.table(self.part("hrls", 3, 6), 1.0, "srgb"))
+        colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
+        zeros = self.zeros(colour)
+        albedo = self._denoised(networks["albedo"], "albedo", self.table(albedo, 1.0, "srgb"), zeros)
         half = self.constant("half", np.float32(0.5))
-        scaled = self.add("Mul", [self.part("hrls", 6, 9), half], "normal.scaled")
-        normal = self._denoised(networks["normal"], "normal", self.add("Add", [scaled, half], "normal.shifted"))
-        colour = self.slices(self.log_to_pu(self.part("hrls", 0, 3)), COLOUR_SLICES)
+        scaled = self.add("Mul", [normal, half], "normal.scaled")
+        normal = self._denoised(networks["normal"], "normal", self.add("Add", [scaled, half], "normal.shifted"), zeros)
+        slices = self.slices(self.log_to_pu(colour), COLOUR_SLICES)
         step = self.constant("step", np.float32(1 / 255))
         rounded = [self.add("QuantizeLinear", [image, step, "zero"], f"{image}.rounded") for image in (albedo, normal)]
-        packed = self.packed([*colour, *rounded, self.zeros("hrls")], "colour.layers")
-        pixels = self.add("Gather", ["unseen", self._run(networks["colour"], "colour", packed)], "large.pixels")
+        packed = self.packed([*slices, *rounded, zeros], "colour.layers")
+        pixels = self.look_up("unseen", self._run(networks["colour"], "colour", packed), "large.pixels")
         self.add("Transpose", [pixels], "large", perm=[0, 3, 1, 2])
 
-    def _denoised(self, network: onnx.ModelProto, name: str, noisy: str) -> str:
+    def _denoised(self, network: onnx.ModelProto, name: str, noisy: str, zeros: str) -> str:
         """Add the network of an albedo or a normal; return the denoised image, (1, 3, H, W) in [0, 1]."""
-        packed = self.packed([*self.slices(noisy, AUXILIARY_SLICES), self.zeros(noisy)], f"{name}.layers")
+        packed = self.packed([*self.slices(noisy, AUXILIARY_SLICES), zeros], f"{name}.layers")
         values = torch.linspace(0, 1, 255 * AUXILIARY_SLICES + 1)
         table = self.constant(f"{name}.table", (from_srgb(values) if name == "albedo" else values).numpy())
-        pixels = self.add("Gather", [table, self._run(network, name, packed)], f"{name}.pixels")
+        pixels = self.look_up(table, self._run(network, name, packed), f"{name}.pixels")
         return self.add("Transpose", [pixels], name, perm=[0, 3, 1, 2])
 
     def _run(self, network: onnx.ModelProto, name: str, layers: str) -> str:

@@ -18,6 +18,8 @@ from training.quantise.gptq import COLOURS, Fit
 
 #: Entries of the table from log-encoded to PU-encoded radiance.
 ENTRIES = 1 << 16
+#: Rows into which entries of a table are divided. The number of pixels of a tile is a multiple of it.
+COPIES = 16
 
 
 class Nodes:
@@ -46,9 +48,15 @@ class Nodes:
         bounds = [self.constant(f"at{n}", np.array([n])) for n in (start, stop, axis)]
         return self.add("Slice", [values, *bounds], output)
 
-    def part(self, image: str, start: int, stop: int) -> str:
-        """Some channels of an image."""
-        return self.cut(image, start, stop, f"{image}.{start}")
+    def split(self, image: str, names: dict[str, int]) -> list[str]:
+        """Cut an image into parts, whose names and numbers of channels are given.
+
+        Slices would do the same. But ONNX Runtime would quantise the whole image for each of them before it cuts it.
+        """
+        sizes = self.constant(f"{image}.sizes", np.array(list(names.values())))
+        parts = [f"{image}.{name}" for name in names]
+        self.nodes.append(helper.make_node("Split", [image, sizes], parts, name=f"{image}.parts", axis=1))
+        return parts
 
     def table(self, values: str, largest: float, table: str) -> str:
         """Replace values in [0, ``largest``] by those of a table with ``ENTRIES`` entries."""
@@ -57,7 +65,20 @@ class Nodes:
         entries = self.add("Mul", [values, scale], f"{values}.entries")
         entries = self.add("Clip", [entries, *ends], f"{values}.clipped")
         entries = self.add("Cast", [entries], f"{values}.entry", to=TensorProto.INT32)
-        return self.add("Gather", [table, entries], f"{values}.{table}")
+        return self.look_up(table, entries, f"{values}.{table}")
+
+    def look_up(self, table: str, entries: str, output: str) -> str:
+        """Replace integers (any shape, a multiple of ``COPIES`` in all) by the entries of a table.
+
+        ONNX Runtime's GatherElements takes a third of the time of its Gather. It reads one table for each row of
+        entries, and the rows on several cores.
+        """
+        rows, one = self.constant("rows", np.array([COPIES, -1])), self.constant("copies", np.array([COPIES, 1]))
+        # When the file is loaded, the copies are computed once.
+        tables = self.add("Expand", [table, one], f"{output}.tables")
+        flat = self.add("Reshape", [entries, rows], f"{output}.rows")
+        found = self.add("GatherElements", [tables, flat], f"{output}.found", axis=1)
+        return self.add("Reshape", [found, self.add("Shape", [entries], f"{output}.shape")], output)
 
     def log_to_pu(self, values: str) -> str:
         """Log-encoded to PU-encoded radiance, by a table."""

@@ -38,15 +38,18 @@ from training.quantise.graph import Graph
 PAIRS, PATCH = 64, 256
 #: Slices of the HRLS's colour, the denoised mean, the LRHS and the output.
 HRLS_SLICES, MEAN_SLICES, LRHS_SLICES, SLICES_OUT = 3, 3, 2, 9
-#: Channels of the input ``lrhs``: the denoised mean, and the LRHS.
-MEAN, LRHS = slice(LRHS_CHANNELS, 2 * LRHS_CHANNELS), slice(0, LRHS_CHANNELS)
 
 
 class Blend(nn.Module):
     """The blending after the U-Net, as a module for the exporter."""
 
-    def forward(self, lrhs: Tensor, hrls: Tensor, denoised: Tensor, logits: Sequence[Tensor]) -> Tensor:
-        return blend(lrhs, hrls, denoised, logits)
+    #: Names of its inputs in the whole graph, except those of the logits.
+    inputs = ("lrhs", "hrls.colour", "hrls.albedo", "denoised")
+
+    def forward(
+        self, lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor]
+    ) -> Tensor:
+        return blend(lrhs, samples, albedo, denoised, logits)
 
 
 # The U-Net's inputs as codes
@@ -83,8 +86,9 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Acti
         full = torch.cat(
             [sliced(log_to_pu(hrls[:, :3]), HRLS_SLICES), albedo.round(), normal.round().clamp(0, 255)], dim=1
         )
-        mean, low = (
-            sliced(log_to_pu(lrhs[:, part]), count) for part, count in ((MEAN, MEAN_SLICES), (LRHS, LRHS_SLICES))
+        low, mean = (
+            sliced(log_to_pu(image), count)
+            for image, count in zip(lrhs.split(LRHS_CHANNELS, dim=1), (LRHS_SLICES, MEAN_SLICES), strict=True)
         )
         half = upsample(torch.cat([mean, low], dim=1), scale // 2)
         for images, image in zip(codes, (full, half), strict=True):
@@ -149,39 +153,31 @@ class JointGraph(Graph):
         self, mixing: onnx.ModelProto, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
         """The model with the graph of :class:`Blend`, whose inputs have the names of tensors that are made here."""
+        colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
+        step, half_step = self.constant("step", np.float32(1 / 255)), self.constant("half_step", np.float32(1 / 127.5))
+        middle = self.constant("middle", np.uint8(SIGNED_ZERO))
         full = self.packed(
             [
-                *self.slices(self.log_to_pu(self.part("hrls", 0, 3)), HRLS_SLICES),
-                self.add(
-                    "QuantizeLinear",
-                    [self.part("hrls", 3, 6), self.constant("step", np.float32(1 / 255)), "zero"],
-                    "albedo",
-                ),
-                self.add(
-                    "QuantizeLinear",
-                    [
-                        self.part("hrls", 6, 9),
-                        self.constant("half_step", np.float32(1 / 127.5)),
-                        self.constant("middle", np.uint8(SIGNED_ZERO)),
-                    ],
-                    "normal",
-                ),
-                self.zeros("hrls"),
+                *self.slices(self.log_to_pu(colour), HRLS_SLICES),
+                self.add("QuantizeLinear", [albedo, step, "zero"], "albedo"),
+                self.add("QuantizeLinear", [normal, half_step, middle], "normal"),
+                self.zeros(albedo),
             ],
             "full",
         )
+        low, mean = self.split("lrhs", {"colour": LRHS_CHANNELS, "mean": LRHS_CHANNELS})
         half = self.packed(
             [
-                *self.slices(self.log_to_pu(self.part("lrhs", MEAN.start, MEAN.stop)), MEAN_SLICES),
-                *self.slices(self.log_to_pu(self.part("lrhs", LRHS.start, LRHS.stop)), LRHS_SLICES),
-                self.zeros("lrhs"),
+                *self.slices(self.log_to_pu(mean), MEAN_SLICES),
+                *self.slices(self.log_to_pu(low), LRHS_SLICES),
+                self.zeros(low),
             ],
             "half",
         )
         if self._scale > 2:
             half = self.repeat(half, 16, self._scale // 2)
         sums = self.colours([full, half], "sums")
-        pixels = self.add("Gather", ["unseen", sums], "denoised.pixels")
+        pixels = self.look_up("unseen", sums, "denoised.pixels")
         self.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
         count = len(self.fit.layers[BASE.last].step) - COLOURS
         self.add("Identity", [self._planes(BASE.last, COLOURS * SLICES_OUT, count)], "logits0")
@@ -199,11 +195,12 @@ class JointGraph(Graph):
 
     def _planes(self, layer: str, start: int, count: int) -> str:
         """Dequantise signed outputs of a layer, as (1, C, H, W)."""
-        part = self.cut(layer, start, start + count, f"{layer}.beside", axis=3)
-        planes = self.add("Transpose", [part], f"{layer}.planes", perm=[0, 3, 1, 2])
+        # To transpose all channels and cut them then takes half of the time of the other order.
+        planes = self.add("Transpose", [layer], f"{layer}.planes", perm=[0, 3, 1, 2])
+        part = self.cut(planes, start, start + count, f"{layer}.beside")
         step = self.constant("signed_step", np.float32(2 * SIGNED_RANGE / 255))
         middle = self.constant("middle", np.uint8(SIGNED_ZERO))
-        return self.add("DequantizeLinear", [planes, step, middle], f"{layer}.values")
+        return self.add("DequantizeLinear", [part, step, middle], f"{layer}.values")
 
 
 def embedded(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
@@ -223,8 +220,7 @@ def to_onnx(
 
     Args:
         pairs: calibration pairs, see :func:`calibration_pairs`.
-        mixing: the graph of :class:`Blend` with inputs ``lrhs``, ``hrls``, ``denoised``, ``logits0`` ... and output
-            ``fused``.
+        mixing: the graph of :class:`Blend` with its ``inputs``, ``logits0`` ... and the output ``fused``.
     """
     mixing = embedded(mixing, "mix.")
     info = helper.make_tensor_value_info

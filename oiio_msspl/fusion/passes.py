@@ -29,7 +29,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, unload
+from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, repair, unload
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -185,7 +185,10 @@ def _fused_layers(
     for layer in job.fitted:
         key = keys[layer]
         if key in lit:
-            yield layer, kept(next(fused))
+            light = next(fused)
+            if layer in job.noise_free:
+                _keep_in_range(light, high.layers[key])
+            yield layer, kept(light)
         else:
             yield layer, None if key in low_lit | high_lit else np.zeros_like(high.layers[key])
         for image in (*low.layers.values(), *high.layers.values()):
@@ -218,6 +221,26 @@ def _as_beauty(render: Render, layer: str) -> Render:
     return replace(render, layers={RGB: render.layers[layer], **guides})
 
 
+def _keep_in_range(light: Array, samples: Array) -> None:
+    """Bound each pixel of a layer without noise by the 3 x 3 pixels of the HRLS around. Both are (height, width, 3).
+
+    The LRHS's pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the edge.
+    """
+
+    def work(rows: slice) -> None:
+        around = slice(max(rows.start - 1, 0), rows.stop + 1)
+        lowest, highest = _range_around(repair(samples[around])[0])
+        inside = slice(rows.start - around.start, rows.stop - around.start)
+        np.clip(light[rows], lowest[inside], highest[inside], out=light[rows])
+
+    for_row_blocks(work, len(light), light[0].size)
+
+
+def _range_around(samples: Array) -> tuple[Array, Array]:
+    """The lowest and highest values of 3 x 3 pixels, (h, w, 3)."""
+    return -max_3x3(-samples), max_3x3(samples)
+
+
 #: Layers, each with the layers that it is the sum of.
 _Sums = dict[AdditiveLayer, tuple[AdditiveLayer, ...]]
 
@@ -234,6 +257,8 @@ class _Job:
     known: _Sums
     """Layers of this set that are sums of layers of an earlier set, or that both sets have. The other layers are
     fitted, and share what these leave of the beauty."""
+    noise_free: frozenset[AdditiveLayer] = frozenset()
+    """See :attr:`oiio_msspl.fusion.sums.SumCheck.noise_free`."""
     coarser: _Sums = field(default_factory=dict)
     """Layers outside of all sets that are sums of layers of this one."""
 
@@ -266,7 +291,7 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        jobs.append(_Job(layers, lrhs, check.remainder, known))
+        jobs.append(_Job(layers, lrhs, check.remainder, known, check.noise_free))
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
@@ -388,6 +413,13 @@ class _Band:
             features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
         self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in names.items()}
         guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
+        #: For each layer without noise that is fitted, the range of the HRLS around each pixel of the core.
+        self._ranges: dict[AdditiveLayer, list[Array]] = {}
+        for i, job in enumerate(to_fit):
+            for layer, name in zip(job.layers.layers, layer_keys(job.layers), strict=True):
+                if layer in job.noise_free and layer in job.fitted and layer not in self._fused_light:
+                    both = _range_around(features[f"{i} {name}"])
+                    self._ranges[layer] = [planes_of(values[self._hrls_rows]) for values in both]
         low = {name: box_downsample(values, self._scale) for name, values in features.items()}
         self._low_layers = {
             job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
@@ -448,6 +480,9 @@ class _Band:
         missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
         noisy = self._average(job) if missing else fitted
         self._fit_layers(noisy, missing, fitted)
+        for planes, layer in zip(fitted, layers, strict=False):
+            if layer in self._ranges:
+                np.clip(planes, *self._ranges[layer], out=planes)
         # The squares of light beyond 1e19 overflow, so there is no fit there.
         fitted[:, ~np.isfinite(fitted).all(axis=0)] = 0
         np.clip(fitted, 0, BRIGHTEST, out=fitted)

@@ -11,6 +11,7 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import Array
 from oiio_msspl.exr.render import Window
 from oiio_msspl.parallel import one_ahead
 
@@ -19,6 +20,11 @@ TOLERANCE = 2e-3
 #: What a sum is compared on: so many strips of rows, evenly spaced. A quarter of a 1080p frame. Files are mostly
 #: compressed in blocks of 16 rows, so each strip is one block.
 STRIPS, ROWS = 17, 16
+#: A layer has no noise if at least this share of its lit pixels equals a pixel beside it, within this share of their
+#: light. Layers with noise have few such pixels.
+NOISE_FREE, EQUAL = 2 / 3, 0.01
+#: A layer with fewer lit pixels is not judged.
+FEWEST = 64
 
 
 @dataclass(frozen=True)
@@ -31,6 +37,8 @@ class SumCheck:
     """The layers lack some of the light, such as lights in no group. The rest is nowhere negative."""
     problem: str = ""
     """Why the layers do not sum to the beauty; empty if they do."""
+    noise_free: frozenset[AdditiveLayer] = frozenset()
+    """Layers without noise, but for that of edges: they show lamps or the background themselves."""
 
     @property
     def text(self) -> str:
@@ -56,6 +64,7 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
     layers = with_layers(render, additive_set)
     names = [RGB, *layer_keys(additive_set)]
     light = wrong = missing = surplus = 0.0
+    alike = np.zeros((len(additive_set.layers), 2), np.int64)
     strips = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _strips(window))
     for pixels in one_ahead(layers.read(strip, names) for strip in strips):
         beauty = pixels[RGB].astype(np.float64)
@@ -64,18 +73,38 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
         rest, beauty = rest[np.isfinite(rest)], beauty[np.isfinite(rest)]
         light, wrong = light + np.abs(beauty).sum(), wrong + np.abs(rest).sum()
         missing, surplus = missing + np.maximum(rest, 0).sum(), surplus + np.maximum(-rest, 0).sum()
+        alike += [_equal_pixels(pixels[name]) for name in names[1:]]
     if light == 0:
         return SumCheck(0.0, problem="the beauty is black")
     residual = float(wrong / light)
+    noise_free = frozenset(
+        layer
+        for layer, (equal, lit) in zip(additive_set.layers, alike, strict=True)
+        if lit >= FEWEST and equal >= NOISE_FREE * lit
+    )
     if residual <= TOLERANCE:
-        return SumCheck(residual)
+        return SumCheck(residual, noise_free=noise_free)
     if surplus / light <= TOLERANCE:
-        return SumCheck(residual, remainder=True)
+        return SumCheck(residual, remainder=True, noise_free=noise_free)
     if abs(missing - surplus) < wrong / 4:
         return SumCheck(
             residual, problem=f"they differ by {residual:.1%} both ways; is the beauty denoised, or stored lossily?"
         )
     return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; some layers overlap")
+
+
+def _equal_pixels(pixels: Array) -> tuple[int, int]:
+    """How many lit pixels of a layer (h, w, 3) equal one of the four next to them, and how many are lit."""
+    red, green, blue = np.moveaxis(pixels, -1, 0)
+    light = red + green + blue
+    lit = light > 0
+    equal = np.zeros_like(lit)
+    for here, found in ((light, equal), (light.T, equal.T)):
+        with np.errstate(invalid="ignore", over="ignore"):
+            same = np.abs(here[1:] - here[:-1]) <= np.float32(EQUAL / 2) * (here[1:] + here[:-1])
+        found[1:] |= same
+        found[:-1] |= same
+    return int(np.count_nonzero(equal & lit)), int(np.count_nonzero(lit))
 
 
 def is_sum_of(render: MappedRender, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:

@@ -14,6 +14,7 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import _Pair, fuse, layer_fuser
 from oiio_msspl.fusion.passes import fuse_passes, pass_steps
+from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.jobs import frame
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
@@ -30,12 +31,15 @@ def lights():
     return {"light_key": colour * (1 - 0.8 * x)[..., None], "light_spot": np.float32(2) * disk * (0.2, 0.5, 1.0)}
 
 
-def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=None):
+def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=None, noise_free=()):
     """An LRHS of 16 spp at x4 and an HRLS of 1 spp whose ``layers`` (clean, by name) sum to the beauty."""
     small = {name: downsample(np.pad(v, ((0, 2), (0, 2), (0, 0)), "edge"), 4) for name, v in layers.items()}
     paths = []
     for name, clean, spp in (("lr", small, 16), ("hr", layers, 1)):
-        samples = {n: noisy(v.astype(np.float32), spp, seed).astype(dtype) for seed, (n, v) in enumerate(clean.items())}
+        samples = {
+            n: (v if n in noise_free else noisy(v.astype(np.float32), spp, seed)).astype(dtype)
+            for seed, (n, v) in enumerate(clean.items())
+        }
         total = sum(v.astype(np.float64) for v in samples.values()) if beauty is None else beauty(samples)
         channels = rgb(np.asarray(total).astype(dtype))
         if name == "hr":
@@ -241,6 +245,21 @@ def test_a_layer_stays_black_where_it_has_no_light(tmp_path, model):
     near = sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1)).any(axis=(-1, -2))
     assert not layer(out, "light_spot")[~near].any()
     assert (~near).any()
+
+
+def test_light_of_a_layer_without_noise_does_not_leak_over_its_edge(tmp_path, model):
+    """A bright window in a dim room, whose edges lie within LRHS pixels."""
+    window = np.zeros((HEIGHT, WIDTH, 3), np.float32)
+    window[21:58, 42:87] = 3.0
+    room = np.where(window > 0, 0, 0.1 * picture(HEIGHT, WIDTH))
+    pair = write_pair(tmp_path, {"light_key": room, "light_sky": window}, noise_free=["light_sky"])
+    (lamps,) = map_render(open_exr(pair[1])).additive_sets
+    assert [each.name for each in check_sum(map_render(open_exr(pair[1])), lamps).noise_free] == ["light_sky"]
+    _, out = fused(pair, tmp_path / "out.exr", model)
+    outside = np.ones((HEIGHT, WIDTH), bool)
+    outside[20:59, 41:88] = False
+    assert layer(out, "light_sky")[outside].max() == 0
+    assert layer(out, "light_key")[outside].min() > 0
 
 
 def test_light_in_no_layer_is_left_out(tmp_path, model):

@@ -27,7 +27,7 @@ from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
 from oiio_msspl.fusion.warp import Mask, Path, Step, nearest, sample
-from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
+from oiio_msspl.fusion.weighted_sum import Rows, WeightedSum, rows_of
 from oiio_msspl.parallel import for_row_blocks
 
 #: An LRHS pixel of a neighbour counts if this share of its HRLS pixels shows the same surface.
@@ -153,7 +153,8 @@ class _Band:
             high: gets the HRLS's features over ``core``.
             low: the LRHS's features over its data window; the rows of ``core`` are changed.
         """
-        self._area, self._light, self._features = area, light, list(high)
+        self._area, self._light = area, light
+        self._features, self._low_features = list(high), list(low)
         self._alignment = alignment = pair.alignment
         #: The rows of ``core`` in the area.
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
@@ -218,7 +219,7 @@ class _Band:
         x, y = np.clip(x, data.x0, data.x1 - 1), np.clip(y, data.y0, data.y1 - 1)
         top, bottom = max(int(y.min()) - 1, data.y0), min(int(y.max()) + 3, data.y1)
         place = Window(data.x0, top, data.x1, bottom)
-        stored = _read(frame.lr, place, self._features)
+        stored = _read(frame.lr, place, self._low_features)
         x, y = x - place.x0, y - place.y0
         if path.x is None:
             rows, columns = y[:, 0].astype(int), x[0].astype(int)
@@ -287,8 +288,8 @@ class _Nearest:
         for_row_blocks(work, self._size[0], 3 * self._size[1])
         return result
 
-    def below(self, first: int) -> Callable[[str, slice], Array]:
-        """What :meth:`WeightedSum.add` takes, where rows are counted from ``first`` on."""
+    def below(self, first: int) -> Rows:
+        """The pixels, with rows that are counted from ``first`` on."""
         return lambda name, rows: self._pixels(name, slice(first + rows.start, first + rows.stop))
 
     def _pixels(self, name: str, rows: slice) -> Array:

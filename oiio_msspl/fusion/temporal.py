@@ -27,7 +27,6 @@ from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, 
 from oiio_msspl.fusion.warp import Mask, Path, Step, near_borders, sample
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
-ALPHA = "alpha"
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
 DIFFERENT_MIX = 0.3
 #: Memory for each pixel of the rows that are averaged at a time.
@@ -76,7 +75,7 @@ def accumulate(frame: FusedFrame, before: Sequence[Step[FusedFrame]], after: Seq
     if frame.frames is not None:
         # Averages of averages. If all weights are equal, this is the exact number within 7 percent.
         frames = np.sqrt(np.square(frames) + np.square(frame.frames) - 1)
-    return Accumulated(images[RGB], images.get(ALPHA), frames)
+    return Accumulated(images[RGB], images.get("alpha"), frames)
 
 
 def memory_to_accumulate(window: Window) -> int:
@@ -160,4 +159,4 @@ def _luminance(rgb: Array) -> Array:
 def _images(frame: FusedFrame, area: Window) -> Images:
     """Colour and alpha, if there is one, over an area of the data window, (h, w, c) each."""
     part = area.slices(frame.alignment.hr_data_window)
-    return {RGB: frame.rgb[part]} | ({} if frame.alpha is None else {ALPHA: frame.alpha[part]})
+    return {RGB: frame.rgb[part]} | ({} if frame.alpha is None else {"alpha": frame.alpha[part]})

@@ -47,6 +47,17 @@ def test_neighbours_are_found_where_their_surfaces_are():
     assert np.allclose(result.hr.layers["albedo"][inside], texture()[inside], rtol=1e-5)
 
 
+def test_renders_may_have_different_layers():
+    pairs = []
+    for seed in range(3):
+        pair = pair_of(texture(), seed)
+        alpha = np.ones((HEIGHT // SCALE, WIDTH // SCALE, 1), np.float32)
+        pairs.append(RenderPair(Render.from_arrays("lr", rgb=pair.lr.layers["rgb"], alpha=alpha), pair.hr))
+    result = average_renders(pairs[1], [still(pairs[0])], [still(pairs[2])])
+    assert result.lr.layers.keys() == {"rgb", "alpha"} and result.hr.layers.keys() == {"rgb", "albedo"}
+    assert (result.lr.layers["alpha"] == 1).all()
+
+
 def test_pixels_do_not_share_their_noise():
     """A surface moves by a third of a pixel. Interpolated noise would be correlated from pixel to pixel."""
     truth = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)

@@ -270,9 +270,7 @@ class _Nearest:
             self._at[rows] = nearest(x, y, place)
 
         for_row_blocks(work, *self._size)
-        # The extremes of an image are found ten times as fast as its pixels are tested.
-        doubtful = [v for v in self._flat.values() if not np.isfinite([v.min(), v.max()]).all()]
-        self._finite = np.logical_and.reduce([np.isfinite(v).all(axis=-1) for v in doubtful]) if doubtful else None
+        self._finite = _finite_pixels(self._flat)
 
     def finite(self) -> Mask:
         """Where all features are finite, (h, w)."""
@@ -322,15 +320,19 @@ def _nearest_pixels(
 
 def _make_finite(features: Features) -> Mask:
     """Where all features are finite, (h, w). Other pixels are set to 0."""
-    finite = np.ones(next(iter(features.values())).shape[:2], bool)
+    finite = _finite_pixels(features)
+    if finite is None:
+        return np.ones(next(iter(features.values())).shape[:2], bool)
+    for name, values in features.items():
+        features[name] = np.where(finite[..., None], values, np.float32(0))
+    return finite
+
+
+def _finite_pixels(features: Features) -> Mask | None:
+    """Where all features (..., c) are finite, (...); None if they are everywhere."""
     # The extremes of an image are found ten times as fast as its pixels are tested.
     doubtful = [values for values in features.values() if not np.isfinite([values.min(), values.max()]).all()]
-    for values in doubtful:
-        finite &= np.isfinite(values).all(axis=-1)
-    if doubtful:
-        for name, values in features.items():
-            features[name] = np.where(finite[..., None], values, np.float32(0))
-    return finite
+    return np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in doubtful]) if doubtful else None
 
 
 def _luminance(rgb: Array) -> Array:

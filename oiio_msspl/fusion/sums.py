@@ -38,7 +38,7 @@ class SumCheck:
     problem: str = ""
     """Why the layers do not sum to the beauty; empty if they do."""
     noise_free: frozenset[AdditiveLayer] = frozenset()
-    """Layers without noise, but for that of edges: they show lamps or the background themselves."""
+    """Layers without noise, but for that of edges: they show a lamp or the sky directly."""
 
     @property
     def text(self) -> str:

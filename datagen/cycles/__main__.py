@@ -7,13 +7,17 @@ import logging
 import os
 import sys
 
-from datagen import command_line
+from datagen import command_line, views
 
 
 def main() -> int:
-    args = command_line.parser(
-        "datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32
-    ).parse_args()
+    parser = command_line.parser("datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32)
+    parser.add_argument(
+        "--filter",
+        choices=views.FILTERS,
+        help="pixel filter of both renders; without it, the LRHS has a box filter and every fourth HRLS a wider one",
+    )
+    args = parser.parse_args()
     from .assets import Assets
     from .render import render_scene
 
@@ -25,7 +29,7 @@ def main() -> int:
 
     assets = Assets(args.assets)
     return command_line.render_all(
-        args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.threads)
+        args, lambda seed: render_scene(args.out, seed, assets, args.views, args.ref_spp, args.threads, args.filter)
     )
 
 

@@ -13,6 +13,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from datagen import quality, views
+from oiio_msspl.model.contract import SCALES
 
 from . import scenes
 from .assets import Assets
@@ -139,11 +140,22 @@ def _reference(
 
 
 def render_view(
-    renderer: Renderer, stage: scenes.Stage, camera: dict[str, object], seed: int, view: int, ref_spp: int
+    renderer: Renderer,
+    stage: scenes.Stage,
+    camera: dict[str, object],
+    seed: int,
+    view: int,
+    ref_spp: int,
+    filter_name: str | None,
 ) -> dict[str, np.ndarray] | None:
     """Render all arrays of one view, see :mod:`datagen.views`; None if the reference stays too noisy."""
     rng = np.random.default_rng([seed, view, 7])
     pixel_filter = "BLACKMAN_HARRIS" if seed % 4 == 3 else "BOX"
+    lr_filter = "BOX"
+    if filter_name is not None:
+        pixel_filter = lr_filter = next(each for each, name in _FILTERS.items() if name == filter_name)
+    # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
+    scales = (1,) if lr_filter == "BOX" else SCALES
 
     good, worst, steps = _REFERENCE[views.split_of(seed)]
 
@@ -151,10 +163,15 @@ def render_view(
         return int(rng.integers(2**31))
 
     renderer.layers(False)
-    lr = np.stack([_color(renderer.render(views.SIZE, spp, some_seed())) for spp in views.LR_SPP])
+
+    def lrhs(scale: int, spp: int) -> np.ndarray:
+        return _color(renderer.render(views.SIZE // scale, scale**2 * spp, some_seed(), lr_filter))
+
+    lr = {scale: np.stack([lrhs(scale, spp) for spp in views.LR_SPP]) for scale in scales}
     # The noise of the LR passes tells whether the reference can become clean enough.
-    first = np.average(lr[:-1], axis=0, weights=views.LR_SPP[:-1])
-    if quality.psnr_of_mean(first, lr[-1]) + 10 * np.log10(steps * ref_spp / sum(views.LR_SPP)) < worst:
+    passes = lr[scales[0]]
+    first = np.average(passes[:-1], axis=0, weights=views.LR_SPP[:-1])
+    if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(steps * ref_spp / (scales[0] ** 2 * sum(views.LR_SPP))) < worst:
         return None
     found = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
     if found is None:
@@ -171,17 +188,24 @@ def render_view(
         "renderer": f"Blender {bpy.app.version_string} Cycles",
         **renderer.settings,
         "filter": _FILTERS[pixel_filter],
-        "lr_filter": "box",
+        "lr_filter": _FILTERS[lr_filter],
         "ref_spp": spent,
         "ref_psnr": psnr,
         "assets": sorted(stage.sources),
         "camera": camera,
     }
-    return views.pack(hr, {1: lr}, ref, rng, meta)
+    return views.pack(hr, lr, ref, rng, meta)
 
 
-def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int, threads: int) -> tuple[int, str]:
-    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene."""
+def render_scene(
+    out: Path, seed: int, assets: Assets, count: int, ref_spp: int, threads: int, filter_name: str | None
+) -> tuple[int, str]:
+    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene.
+
+    Args:
+        filter_name: pixel filter of both renders. If None, the LRHS has a box filter, and the HRLS of every fourth
+            seed a wider one.
+    """
     missing = [v for v in range(count) if not views.path_of(out, "cycles", seed, v).exists()]
     if not missing:
         return 0, "done before"
@@ -192,7 +216,7 @@ def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int,
         renderer = Renderer(Path(scratch), stage, threads)
         for view in missing:
             cameras = find_cameras(renderer, stage, seed, view)
-            renders = (render_view(renderer, stage, c, seed, view, ref_spp) for c in cameras)
+            renders = (render_view(renderer, stage, c, seed, view, ref_spp, filter_name) for c in cameras)
             arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
             if arrays is not None:
                 views.save(views.path_of(out, "cycles", seed, view), arrays)

@@ -31,8 +31,11 @@ def lights():
     return {"light_key": colour * (1 - 0.8 * x)[..., None], "light_spot": np.float32(2) * disk * (0.2, 0.5, 1.0)}
 
 
-def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=None, noise_free=()):
-    """An LRHS of 16 spp at x4 and an HRLS of 1 spp whose ``layers`` (clean, by name) sum to the beauty."""
+def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=None, noise_free=(), firefly=None):
+    """An LRHS of 16 spp at x4 and an HRLS of 1 spp whose ``layers`` (clean, by name) sum to the beauty.
+
+    ``firefly``: file, layer and pixel that has one.
+    """
     small = {name: downsample(np.pad(v, ((0, 2), (0, 2), (0, 0)), "edge"), 4) for name, v in layers.items()}
     paths = []
     for name, clean, spp in (("lr", small, 16), ("hr", layers, 1)):
@@ -40,6 +43,8 @@ def write_pair(folder, layers, dtype=np.float32, low=True, extra=None, beauty=No
             n: (v if n in noise_free else noisy(v.astype(np.float32), spp, seed)).astype(dtype)
             for seed, (n, v) in enumerate(clean.items())
         }
+        if firefly is not None and firefly[0] == name:
+            samples[firefly[1]][firefly[2]] = 1e4, 5e3, 1e3
         total = sum(v.astype(np.float64) for v in samples.values()) if beauty is None else beauty(samples)
         channels = rgb(np.asarray(total).astype(dtype))
         if name == "hr":
@@ -245,6 +250,20 @@ def test_a_layer_stays_black_where_it_has_no_light(tmp_path, model):
     near = sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1)).any(axis=(-1, -2))
     assert not layer(out, "light_spot")[~near].any()
     assert (~near).any()
+
+
+@pytest.mark.parametrize("model", ["balanced", "best"])
+@pytest.mark.parametrize(("file", "pixel"), [("hr", (44, 74)), ("lr", (11, 18))])
+def test_a_firefly_in_one_layer_leaves_no_speck_in_any(tmp_path, model, file, pixel):
+    """Neither a bright one where it is, nor a dark one in the layers that share its pixel."""
+    without, out = (
+        fused(write_pair(tmp_path, lights(), firefly=each), tmp_path / "out.exr", model)[1]
+        for each in (None, (file, "light_key", pixel))
+    )
+    around = slice(34, 54), slice(64, 84)  # inside the spot
+    for name in ("", "light_key", "light_spot"):
+        ratio = layer(out, name)[around] / layer(without, name)[around]
+        assert 0.7 < ratio.min() and ratio.max() < 1.5
 
 
 def test_light_of_a_layer_without_noise_does_not_leak_over_its_edge(tmp_path, model):

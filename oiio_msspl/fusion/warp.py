@@ -47,7 +47,7 @@ class Step(Generic[F]):
     valid: Mask | None
     """(h, w): which of them can be believed; None if all can."""
     back: Array | None
-    """(h, w, 2) over the data window of ``frame``: the way back."""
+    """(h, w, 2) over the data window of ``frame``: the way back. None: it stays."""
     back_valid: Mask | None
     tolerance: float = ROUND_TRIP
     """How far the way back may miss the pixel, in HRLS pixels."""
@@ -89,11 +89,12 @@ class Path:
                 to_x = np.where(good, from_x + vector.real, from_x)
                 to_y = np.where(good, from_y + vector.imag, from_y)
             good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
-            if (vectors is not None and back is not None) or step.back_valid is not None:
+            if vectors is not None or back is not None or step.back_valid is not None:
                 there = nearest(to_x, to_y, end)
-                if vectors is not None and back is not None:
-                    home = vector + back.reshape(-1).take(there)
-                    good &= np.square(home.real) + np.square(home.imag) < step.tolerance**2  # false for NaN, too
+                home = np.complex64(0) if vectors is None else vector
+                if back is not None:
+                    home = home + back.reshape(-1).take(there)
+                good &= np.square(home.real) + np.square(home.imag) < step.tolerance**2  # false for NaN, too
                 if step.back_valid is not None:
                     good &= step.back_valid.reshape(-1).take(there)
             if x is not None and y is not None and (moves or start != end):

@@ -60,7 +60,7 @@ def test_another_mix_of_two_surfaces_hardly_counts():
     vectors[:, WIDTH // 2 :] = (0.5, 0)
     frame, neighbour = (frame_of(truth, seed, error=0) for seed in (1, 2))
     frame.rgb[edge], neighbour.rgb[edge] = 0.1, 0.3
-    steps = [Step(neighbour, motion, None, None, None) for motion in (np.zeros_like(vectors), vectors)]
+    steps = [Step(neighbour, motion, None, -motion, None) for motion in (np.zeros_like(vectors), vectors)]
     without, with_borders = (accumulate(frame, [step], []).rgb[edge] - 0.1 for step in steps)
     assert 0 < 3 * with_borders.mean() < without.mean()
 
@@ -81,6 +81,22 @@ def test_a_way_back_that_misses_by_more_than_the_tolerance_does_not_count():
     for tolerance, counts in ((ROUND_TRIP, False), (ROUND_TRIP_OF_FLOW, True)):
         step = Step(neighbour, vectors, None, vectors + np.float32(0.5), None, tolerance)
         assert np.array_equal(accumulate(frame, [step], []).rgb, frame.rgb) != counts
+
+
+@pytest.mark.parametrize("arrives", [True, False])
+def test_a_thing_that_covers_what_stands_still_is_not_averaged(arrives):
+    """The vectors that are all zero, of what stands still or of a frame without the thing, may be left out."""
+    frame, neighbour = frame_of(texture(), 1), frame_of(texture(), 2)
+    place = np.s_[20:40, 30:60]
+    (neighbour if arrives else frame).rgb[place] = frame.rgb[place][..., ::-1]
+    none = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    away = none.copy()
+    away[place] = (-40, 0)
+    vectors, back = (none, away) if arrives else (away, none)
+    for ways in ((vectors, back), tuple(way if way.any() else None for way in (vectors, back))):
+        result = accumulate(frame, [Step(neighbour, ways[0], None, ways[1], None)], [])
+        assert np.array_equal(result.rgb[place], frame.rgb[place])
+        assert not np.array_equal(result.rgb, frame.rgb)
 
 
 def test_without_neighbours_every_bit_stays():

@@ -13,7 +13,7 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar
 from functools import partial
 from typing import TypeVar, cast
@@ -46,7 +46,8 @@ def for_row_blocks(work: Callable[[slice], object], rows: int, row_size: int, mu
     """Call ``work`` with slices that together cover ``rows`` rows, several at a time.
 
     Args:
-        work: takes a slice of rows; what it raises is raised here.
+        work: takes a slice of rows; what it raises is raised here, when no thread works any more. Inside of it, rows
+            are worked on by one thread.
         row_size: values in a row.
         multiple: the height of each slice, except the last, is a multiple of this.
     """
@@ -57,7 +58,10 @@ def for_row_blocks(work: Callable[[slice], object], rows: int, row_size: int, mu
     # Each thread gets its slices at once: to hand over a single slice takes a third of the time to compute it.
     shares = [slices[len(slices) * i // count : len(slices) * (i + 1) // count] for i in range(count)]
     others = [_row_pool(count).submit(_run_all, work, share) for share in shares[1:]]
-    _run_all(work, shares[0] if shares else [])
+    try:
+        _run_all(work, shares[0] if shares else [])
+    finally:
+        wait(others)
     for other in others:
         other.result()
 
@@ -68,9 +72,7 @@ def in_background(work: Callable[[], T]) -> Callable[[], T]:
     Returns:
         A function that waits for the result and returns it.
     """
-    if (_thread_limit.get() or available_cores()) == 1:
-        return work
-    return _background_pool().submit(contextvars.copy_context().run, work).result
+    return work if _one_thread() else _start(work).result
 
 
 def in_parallel(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
@@ -114,19 +116,36 @@ def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
 def one_ahead(items: Iterable[T]) -> Iterator[T]:
     """Yield the items; while the caller uses one, the next one is computed in the background.
 
-    ``items`` never computes two at the same time.
+    ``items`` never computes two at the same time. Nothing is computed any more when the caller has stopped.
     """
+    if _one_thread():
+        yield from items
+        return
     remaining = iter(items)
     end = object()
-    pending = in_background(partial(next, remaining, end))
-    while (item := pending()) is not end:
-        pending = in_background(partial(next, remaining, end))
-        yield cast(T, item)
+    pending = _start(partial(next, remaining, end))
+    try:
+        while (item := pending.result()) is not end:
+            pending = _start(partial(next, remaining, end))
+            yield cast(T, item)
+    finally:
+        wait([pending])
+
+
+def _one_thread() -> bool:
+    return (_thread_limit.get() or available_cores()) == 1
+
+
+def _start(work: Callable[[], T]) -> Future[T]:
+    """Start ``work`` in the background, with the thread limit of the caller."""
+    return _background_pool().submit(contextvars.copy_context().run, work)
 
 
 def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
-    for rows in slices:
-        work(rows)
+    # A thread of a pool must not wait for the pool: all of its threads might do so.
+    with limit_threads(1):
+        for rows in slices:
+            work(rows)
 
 
 def _yield_to_network() -> None:

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 import os
 import threading
+import time
 
 import numpy as np
 import pytest
@@ -61,6 +62,39 @@ def test_what_a_band_raises_is_raised(monkeypatch):
 
     with limit_threads(2), pytest.raises(ValueError, match="band 9"):
         for_row_blocks(work, 10, 1)
+
+
+def test_nobody_works_any_more_when_a_band_has_raised(monkeypatch):
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 1)
+    ended = threading.Event()
+
+    def work(part):
+        if part.start == 0:
+            raise ValueError("band 0")
+        time.sleep(0.05)
+        if part.start == 3:
+            ended.set()
+
+    with limit_threads(2), pytest.raises(ValueError, match="band 0"):
+        for_row_blocks(work, 4, 1)
+    assert ended.is_set()
+
+
+def test_rows_inside_of_rows_are_worked_on_by_one_thread(monkeypatch):
+    """Otherwise all threads of the pool could wait for the pool."""
+    monkeypatch.setattr(parallel, "BLOCK_VALUES", 1)
+    threads = []
+
+    def work(_):
+        for_row_blocks(lambda part: threads[-1].add(threading.get_ident()), 8, 1)
+
+    def outer(_):
+        threads.append(set())
+        work(None)
+
+    with limit_threads(2):
+        for_row_blocks(outer, 1, 1)
+    assert threads == [{threading.get_ident()}]
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
@@ -156,6 +190,24 @@ def test_one_ahead_computes_the_next_item_and_never_two_at_once(count):
         results = one_ahead(map(square, iter([7, 8, 9])))
         assert next(results) == 49
     assert 9 not in started[5:]
+
+
+def test_one_ahead_has_ended_when_its_caller_fails():
+    ended = threading.Event()
+
+    def items():
+        yield 0
+        time.sleep(0.05)
+        ended.set()
+        yield 1
+
+    def fail():
+        for _ in one_ahead(items()):
+            raise ValueError("no tile")
+
+    with limit_threads(2), pytest.raises(ValueError, match="no tile"):
+        fail()
+    assert ended.is_set()
 
 
 def test_memory_is_used_again_by_images_that_fit():

@@ -105,15 +105,15 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     def work(rows: slice) -> None:
         points = positions[rows]
         y, x = np.mgrid[rows.start : rows.stop, 0 : window.width].astype(np.float32)
-        now = projection.project(points, here)
-        way = projection.project(points, there) - now
-        distances[rows] = np.hypot(now[..., 0] - x - window.x0, now[..., 1] - y - window.y0)
         limit = np.hypot(render.display_window.width, render.display_window.height)
-        known[rows] = (np.hypot(way[..., 0], way[..., 1]) < limit) & (points != 0).any(axis=-1)
+        with np.errstate(invalid="ignore"):  # NumPy's settings for errors belong to the thread
+            now = projection.project(points, here)
+            way = projection.project(points, there) - now
+            distances[rows] = np.hypot(now[..., 0] - x - window.x0, now[..., 1] - y - window.y0)
+            known[rows] = (np.hypot(way[..., 0], way[..., 1]) < limit) & (points != 0).any(axis=-1)
         vectors[rows] = np.where(known[rows, :, None], way, 0)
 
-    with np.errstate(invalid="ignore"):
-        for_row_blocks(work, window.height, window.width * 12)
+    for_row_blocks(work, window.height, window.width * 12)
     # A lens that zooms changes the scale, which a matrix to the camera alone does not say.
     if not known.any() or np.median(distances[known]) > CLOSE:
         known[:] = False

@@ -758,8 +758,9 @@ def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer
 def _make_sum(layers: Array, beauty: Array) -> None:
     """Scale layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w)."""
     total = layers.sum(axis=0)
-    lit = total > 0
-    layers *= np.where(lit, beauty / np.where(lit, total, 1), 0)
+    # Shares of the total never overflow, but what the beauty exceeds a tiny total by does.
+    layers /= np.where(total > 0, total, 1)
+    layers *= beauty
 
 
 def _blurred(plane: Array) -> Array:

@@ -27,6 +27,7 @@ from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
+from oiio_msspl.parallel import limit_threads
 
 if TYPE_CHECKING:
     from dask.distributed import Client
@@ -94,7 +95,8 @@ def fuse_shot(
     report_path = None if report_path is None else Path(report_path)
     pngs = [frame.output.with_suffix(".png") for frame in shot.frames] if previews else []
     prepare_output(shot, inputs, model, [*pngs, *([report_path] if report_path else [])])
-    over_time = plan_temporal(shot, inputs, temporal, model)
+    with limit_threads(threads):
+        over_time = plan_temporal(shot, inputs, temporal, model)
     report = ShotReport(shot, temporal=over_time.text)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
 
@@ -146,7 +148,8 @@ def fuse_shot(
             result = replace(result, **entry | {"warnings": warnings})
         finish(result)
     if to_fuse:
-        stages = replace(stages, model=model_of_shot(shot, inputs, model))
+        with limit_threads(threads):
+            stages = replace(stages, model=model_of_shot(shot, inputs, model))
     targets = [path for frame in shot.frames for path in (frame.output, frame.output.with_suffix(".png"))]
     remove_leftovers([*targets, report_path] if report_path else targets)
     try:

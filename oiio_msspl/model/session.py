@@ -168,16 +168,16 @@ class Session:
         if pixels > self._largest:
             self.release_memory()  # it is divided for smaller pictures, and would be held beside that of this one
             self._largest = pixels
-        if self._denoiser is not None:
-            if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
-                self._denoiser.fill(lrhs, hrls, lrhs_aovs, mean)
-            else:
-                lrhs, hrls = self._denoiser(lrhs, hrls[..., : len(self.contract.hrls)], lrhs_aovs, mean)
-        feed: dict[str, Any] = {
-            "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
-            "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
-        }
         try:
+            if self._denoiser is not None:
+                if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
+                    self._denoiser.fill(lrhs, hrls, lrhs_aovs, mean)
+                else:
+                    lrhs, hrls = self._denoiser(lrhs, hrls[..., : len(self.contract.hrls)], lrhs_aovs, mean)
+            feed: dict[str, Any] = {
+                "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
+                "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
+            }
             wanted = ["fused", *(["log_error"] if error else []), *aovs]
             results = dict(zip(wanted, self._session.run(wanted, feed), strict=True))
         except Exception as cause:

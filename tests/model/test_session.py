@@ -4,11 +4,12 @@ import os
 import sys
 from dataclasses import fields
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS, usable_devices
@@ -30,6 +31,22 @@ def test_shipped_models_load_and_say_where_they_come_from(scale):
     values = session.run(np.zeros((*size, 3), np.float32), np.zeros((*high, 16), np.float32))["fused"]
     assert values.shape == (*high, 3)
     assert np.isfinite(values).all()
+
+
+@pytest.mark.parametrize("part", ["_denoiser", "_session"])
+def test_a_network_that_fails_is_named(monkeypatch, part):
+    """Either of the two of `joint`."""
+    session = Session(find_model(2))
+    pair = np.zeros((16, 16, 3), np.float32), np.zeros((32, 32, 16), np.float32)
+    session.run(*pair)
+    network = session._denoiser if part == "_denoiser" else session
+
+    def fail(*_):
+        raise RuntimeError("out of memory\nand more")
+
+    monkeypatch.setattr(network, "_session", SimpleNamespace(run=fail))
+    with pytest.raises(MssplError, match=r"^joint-x2 failed on CPUExecutionProvider \(out of memory\); try --device"):
+        session.run(*pair)
 
 
 def test_a_contract_survives_its_json():

@@ -33,9 +33,9 @@ def quantile(values: NDArray[Any], share: float) -> float:
 
 
 def blank(shape: tuple[int, ...], dtype: type[T] | np.dtype[T] = np.float32) -> NDArray[T]:  # type: ignore[assignment]
-    """An image (h, w, ...) that is to be filled: in memory, or in a temporary file if it has many pixels."""
+    """A black image (h, w, ...) that is to be filled: in memory, or in a temporary file if it has many pixels."""
     if shape[0] * shape[1] <= MOST_PIXELS:
-        return np.empty(shape, dtype)
+        return np.zeros(shape, dtype)
     with tempfile.TemporaryFile(prefix="msspl-") as file:
         return np.memmap(file, dtype, "w+", shape=shape)
 

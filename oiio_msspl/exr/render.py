@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, unload
 
 
 @dataclass(frozen=True)
@@ -104,6 +104,11 @@ class Render:
         rows, columns = window.slices(self.data_window)
         names = self.layers if features is None else [f for f in features if f in self.layers]
         return {name: self.layers[name][rows, columns] for name in names}
+
+    def unload(self) -> None:
+        """Give the memory of layers that wait in temporary files back to the system."""
+        for image in self.layers.values():
+            unload(image)
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
         """Nothing to do: the layers are in memory already. See :meth:`ReadableRender.cache_strips`."""

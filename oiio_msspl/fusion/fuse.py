@@ -11,9 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import HALF_MAX, Array, ReusedMemory, blank, planes
+from oiio_msspl.arrays import HALF_MAX, Array, ReusedMemory, blank, planes, unload
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.alpha import encode_alpha, fuse_alpha
@@ -134,6 +134,8 @@ def fuse(
         with hr.cache_strips(strips_memory(max_memory, held)):
             for step in _run(_steps(pair, frame), session):
                 frame.tiles = step.count
+                for image in frame.clean_aovs.values():
+                    unload(image)
                 if progress is not None:
                     progress(step.done, step.count)
                 del step  # or its memory would be held while the next one is fused
@@ -149,7 +151,7 @@ def fuse(
 
 
 def fuse_layers(
-    pairs: Iterable[tuple[ReadableRender, ReadableRender]], session: Session, frame: FusedFrame
+    pairs: Iterable[tuple[Render, Render]], session: Session, frame: FusedFrame
 ) -> Iterator[Array]:
     """Fuse layers of both renders of a frame, such as the light of each lamp.
 
@@ -162,7 +164,8 @@ def fuse_layers(
     The caller limits the threads of NumPy, see :func:`oiio_msspl.parallel.limit_threads`.
 
     Yields:
-        The fused layers, (height, width, 3) over the HRLS's data window, finite and >= 0.
+        The fused layers, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files, if they
+        have many pixels.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -173,9 +176,14 @@ def fuse_layers(
     def steps() -> Iterator[_Step]:
         for lr, hr in pairs:
             pair = _Pair(lr, hr, frame.alignment, session, (), frame, memory)
-            yield from _steps(pair, _blank_frame(frame.alignment, frame.exposure, error=False, half=False))
+            result = FusedFrame(blank(frame.rgb.shape), None, None, frame.alignment, frame.exposure, {})
+            for step in _steps(pair, result):
+                for render in (lr, hr):
+                    render.unload()
+                yield step
 
     for step in _run(steps(), session):
+        unload(step.result.rgb)
         finished = step.result.rgb if step.done == step.count else None
         del step  # or its memory would be held while the next one is fused
         if finished is not None:

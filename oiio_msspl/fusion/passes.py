@@ -29,7 +29,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, box_downsample, kept, planes_of, repair, unload
+from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -150,8 +150,8 @@ def fuse_passes(
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1
                 tell(done, steps)
-            for light in fused_light.values():
-                unload(light)
+            for image in (*fused_light.values(), *guides.values()):
+                unload(image)
     return fused
 
 
@@ -188,11 +188,10 @@ def _fused_layers(
             light = next(fused)
             if layer in job.noise_free:
                 _keep_in_range(light, high.layers[key])
-            yield layer, kept(light)
+            unload(light)
+            yield layer, light
         else:
             yield layer, None if key in low_lit | high_lit else np.zeros_like(high.layers[key])
-        for image in (*low.layers.values(), *high.layers.values()):
-            unload(image)
 
 
 def _decoded(render: MappedRender, layers: AdditiveSet) -> tuple[Render, set[str]]:

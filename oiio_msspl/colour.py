@@ -16,8 +16,6 @@ from oiio_msspl.arrays import Array
 #: Rec. 709 luminance weights of linear RGB.
 LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
 
-_WEIGHTS = np.asarray(LUMINANCE_WEIGHTS, dtype=np.float32)
-
 #: The cone responses of the Bradford chromatic adaptation (Lam 1985), which ACES and ICC use.
 _BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
 
@@ -72,8 +70,12 @@ _SAME = 0.003
 
 
 def luminance(rgb: Array) -> Array:
-    """Rec. 709 luminance of linear RGB: (..., 3) to (...)."""
-    return rgb @ _WEIGHTS
+    """Rec. 709 luminance of linear RGB: (..., 3) to (...).
+
+    The sum is written out. A matrix product rounds differently for pictures that lie differently in memory.
+    """
+    red, green, blue = (np.float32(weight) * rgb[..., i] for i, weight in enumerate(LUMINANCE_WEIGHTS))
+    return np.asarray(red + green + blue)
 
 
 def srgb(linear: Array) -> Array:

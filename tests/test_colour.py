@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.colour import ACES2065, ACESCG, REC709, REC2020, SPACES, conversion, named_space, space_of
+from oiio_msspl.colour import ACES2065, ACESCG, REC709, REC2020, SPACES, conversion, luminance, named_space, space_of
 
 #: Published matrices: of the ACES project's CTL and OpenColorIO's configurations (Bradford), and of ITU-R BT.2087.
 PUBLISHED = {
@@ -25,6 +25,15 @@ PUBLISHED = {
     ],
     (REC709, REC2020): [[0.6274, 0.3293, 0.0433], [0.0691, 0.9195, 0.0114], [0.0164, 0.0880, 0.8956]],
 }
+
+
+@pytest.mark.parametrize("width", [156, 157, 159, 160])
+def test_luminance_does_not_depend_on_how_the_picture_lies_in_memory(width):
+    """Frames that are read from a file lie otherwise than frames in memory, and the result must be the same."""
+    image = np.random.default_rng(width).gamma(1, 1, (64, width, 3)).astype(np.float32)
+    planar = np.ascontiguousarray(image.transpose(2, 0, 1)).transpose(1, 2, 0)
+    np.testing.assert_array_equal(luminance(image), luminance(planar))
+    np.testing.assert_array_equal(luminance(image)[:, 5:50], luminance(image[:, 5:50]))
 
 
 @pytest.mark.parametrize("pair", PUBLISHED, ids=lambda pair: f"{pair[0].name} to {pair[1].name}")

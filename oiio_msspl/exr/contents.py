@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -72,6 +73,17 @@ class FileContents:
     def home(self) -> Part:
         """The HRLS's part that holds the beauty."""
         return self.source.parts[self.beauty[0].part]
+
+    @cached_property
+    def layers(self) -> dict[Channel, Layer]:
+        """The layer of each channel of the HRLS. A channel may be in none."""
+        return {c: layer for layer in layers_of(self.source) for c in layer.channels.values()}
+
+    @property
+    def view(self) -> str:
+        """The view of the fused beauty; empty in a file without views."""
+        layer = self.layers.get(self.beauty[0])
+        return layer.view if layer else ""
 
     @property
     def compression(self) -> str:

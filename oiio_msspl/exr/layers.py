@@ -99,6 +99,8 @@ def _split_name(name: str, part: Part, views: list[str], *, several: bool) -> tu
 
 
 def _part_layer(part: Part) -> str:
-    """The layer that a part's name means: without the view at its end, and empty for names such as ``rgba``."""
-    name = re.sub(rf"[._ -]?{re.escape(part.view)}$", "", part.name) if part.view else part.name
+    """The layer that a part's name means: without the view at its end or in front, and empty for names such as
+    ``rgba``."""
+    view = re.escape(part.view)
+    name = re.sub(rf"[._ -]?{view}$|^{view}[._ -]", "", part.name) if view else part.name
     return "" if _PLAIN_PART.fullmatch(name) else name

@@ -13,7 +13,6 @@ from typing import Any
 import OpenImageIO as oiio
 
 from oiio_msspl.exr.contents import FileContents, lossless
-from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, Part
 from oiio_msspl.exr.write_options import COMPONENTS
 
@@ -85,7 +84,7 @@ def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedO
         contents: what is written.
         taken: names of the parts so far; those of the new parts are added.
     """
-    layer_of = {c: layer for layer in layers_of(contents.source) for c in layer.channels.values()}
+    layer_of = contents.layers
     for part in contents.source.parts:
         if part.deep:
             continue
@@ -144,13 +143,21 @@ def _layer_part(
 ) -> PassedOnPart:
     """A part for the channels of one layer and pixel type."""
     nuke = contents.options.layout == "nuke"
-    plain = layer or ("depth" if [c.name for c in channels] == ["Z"] else "other")
-    name = _unique(_nuke_name(plain, view) if nuke else plain, taken)
-    names = [c.name.rpartition(".")[2] for c in channels] if nuke else [c.name for c in channels]
+    components = [c.name.rpartition(".")[2] for c in channels]
+    is_beauty = not layer and view and {"R", "G", "B"} <= {*components}  # of another view
+    plain = layer or ("rgba" if is_beauty else "depth" if components == ["Z"] else "other")
+    if nuke:
+        plain = _nuke_name(plain, view)
+    elif is_beauty and part.name and len(contents.source.parts) > 1:
+        plain = part.name
+    elif view and view != contents.view:
+        plain = f"{plain}.{view}"
+    name = _unique(plain, taken)
+    names = components if nuke else [c.name for c in channels]
     spec = _spec(part, name, names, channels[0].type)
     if repeats_metadata:
         _drop_repeated_attributes(spec)
-    if nuke and view:
+    if view:
         spec.attribute("view", view)
     return PassedOnPart(spec, part, tuple(runs(channels)))
 

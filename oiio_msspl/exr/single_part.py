@@ -95,7 +95,11 @@ def _planes(contents: FileContents, run: Sequence[Channel], channels: dict[str, 
 
 
 def _name(contents: FileContents, channel: Channel) -> str:
-    """The channel's own name, or the part's name in front of it if only that names the layer."""
+    """The channel's own name, or the part's name in front of it if only that names the layer. Another view than that of
+    the beauty is named behind the layer, as OpenEXR wants it."""
+    layer = contents.layers.get(channel)
+    if layer is not None and layer.view not in ("", contents.view):
+        return ".".join(name for name in (layer.name, layer.view, channel.name.rpartition(".")[2]) if name)
     if "." in channel.name or channel.part == contents.home.index:
         return channel.name
     part = contents.source.parts[channel.part]
@@ -116,6 +120,10 @@ def _header(contents: FileContents) -> dict[str, Any]:
         ) from error
     for key in _STRUCTURE:
         header.pop(key, None)
+    views = [contents.view, *(layer.view for layer in contents.layers.values())]
+    if len(several := list(dict.fromkeys(view for view in views if view))) > 1:
+        header.pop("view", None)
+        header["multiView"] = several
     name = "NO" if contents.compression == "none" else contents.compression.upper()
     header["compression"] = getattr(OpenEXR, f"{name}_COMPRESSION")
     header["type"] = OpenEXR.scanlineimage

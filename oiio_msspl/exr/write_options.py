@@ -60,3 +60,8 @@ class WriteOptions:
             raise InputError(f"--layout {self.layout!r}: use one of {', '.join(LAYOUTS)}")
         if self.compression is not None and self.compression not in COMPRESSIONS:
             raise InputError(f"--compression {self.compression!r}: use one of {', '.join(COMPRESSIONS)}")
+        if self.layout == "multilayer" and self.compression not in (None, *LOSSLESS) and self.layers != ("none",):
+            raise InputError(
+                f"--compression {self.compression}: with --layout multilayer all layers would lose bits, such as depth "
+                f"and Cryptomatte; use --layout spec, or one of {', '.join(LOSSLESS)}"
+            )

@@ -150,9 +150,7 @@ def fuse(
     return frame
 
 
-def fuse_layers(
-    pairs: Iterable[tuple[Render, Render]], session: Session, frame: FusedFrame
-) -> Iterator[Array]:
+def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame: FusedFrame) -> Iterator[Array]:
     """Fuse layers of both renders of a frame, such as the light of each lamp.
 
     Args:

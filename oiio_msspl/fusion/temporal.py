@@ -20,7 +20,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.colour import LUMINANCE_WEIGHTS
+from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, to_grid
@@ -85,7 +85,7 @@ def memory_to_accumulate(window: Window) -> int:
 
 def _light_of(frame: FusedFrame) -> Light:
     alignment = frame.alignment
-    fused = for_bands(alignment, lambda core, _: to_grid(alignment, _luminance(_images(frame, core)[RGB]), core))
+    fused = for_bands(alignment, lambda core, _: to_grid(alignment, luminance(_images(frame, core)[RGB]), core))
     return Light(alignment, frame.lrhs_luminance, frame.hrls_luminance, np.concatenate(fused))
 
 
@@ -97,21 +97,21 @@ def _add_side(
     window = alignment.hr_data_window
     path = Path(area, window)
     own = _images(frame, area)
-    luminance = _luminance(own[RGB])
+    here = luminance(own[RGB])
     borders = _borders(steps, area, window)
     inside = core.slices(area)
     trusted: Array | None = None
     for step in steps:
         path.follow(step)
         warped = _warp(step.frame, path)
-        other = _luminance(warped[RGB])
-        low = to_grid(alignment, np.where(path.valid, other, luminance), area)
+        there = luminance(warped[RGB])
+        low = to_grid(alignment, np.where(path.valid, there, here), area)
         weight = light.trust(low, low, area)
         # A light that has changed in the nearer frame has changed in the farther one.
         trusted = weight if trusted is None else np.minimum(trusted, weight)
         weight = from_grid(alignment, trusted, area) * path.valid
         if borders is not None:
-            weight[borders] *= _likeness(luminance[borders], other[borders], light.darkest)
+            weight[borders] *= _likeness(here[borders], there[borders], light.darkest)
         # A neighbour may have no alpha.
         total.add(rows_of({name: warped.get(name, image)[inside] for name, image in own.items()}), weight[inside])
 
@@ -146,14 +146,6 @@ def _warp(frame: FusedFrame, path: Path) -> Images:
         return x - place.x0, y - place.y0
 
     return dict(zip(images, sample(list(images.values()), positions, path.valid.shape), strict=True))
-
-
-def _luminance(rgb: Array) -> Array:
-    """Luminance (h, w) of colour (h, w, 3)."""
-    red, green, blue = (
-        np.float32(w) * plane for w, plane in zip(LUMINANCE_WEIGHTS, np.moveaxis(rgb, -1, 0), strict=True)
-    )
-    return np.asarray(red + green + blue, np.float32)
 
 
 def _images(frame: FusedFrame, area: Window) -> Images:

@@ -123,6 +123,40 @@ def test_tiled_parts_of_mixed_types_are_passed_on(tmp_path):
     assert same_bits(after[("m", "id")], plain(2))
 
 
+@pytest.mark.parametrize("stored", ["one part", "left, right", "left.rgba, right.rgba", "rgba.left, rgba.right"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_every_layout_keeps_all_views(tmp_path, layout, stored):
+    """They are found in the result as in the HRLS, with layers of one name in each, of several pixel types."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    views = {}
+    for seed, view in enumerate(("left", "right")):
+        layers = rgb(plain(seed).astype(np.float16)[..., None].repeat(3, axis=-1))
+        views[view] = layers | {"N.X": plain(seed + 5), "N.Y": plain(seed + 6), "N.Z": plain(seed + 7)}
+        views[view] |= {"Z": plain(seed + 9)}
+    if stored == "one part":
+        named = {".".join([*key.split(".")[:-1], "right", key[-1]]): v for key, v in views["right"].items()}
+        parts = [OpenEXR.Part(header | {"multiView": ["left", "right"]}, views["left"] | named)]
+    else:
+        names = zip(stored.split(", "), views, strict=True)
+        parts = [OpenEXR.Part(header | {"view": view}, views[view], name) for name, view in names]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "hr.exr"))
+    hr = map_render(open_exr(tmp_path / "hr.exr"))
+    fused = np.ones((H, W, 3), np.float32)
+    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, fused, None, {}, WriteOptions(layout))
+    assert (hr.view, hr.other_views) == ("left", ["right"])
+    for view in views:
+        before, after = (map_render(open_exr(tmp_path / name), view=view) for name in ("hr.exr", "out.exr"))
+        assert (after.view, after.other_views) == (view, before.other_views)
+        expected, pixels = (each.read(each.data_window) for each in (before, after))
+        if view == "left":
+            expected["rgb"] = fused
+        assert expected.keys() == pixels.keys() == {"rgb", "normal"}
+        assert all(same_bits(pixels[name], expected[name]) for name in expected)
+    names = [part.name for part in open_exr(tmp_path / "out.exr").parts]
+    assert len(set(names)) == len(names) and not any(name.endswith("2") for name in names)
+
+
 def test_nuke_layout_keeps_views_apart(tmp_path):
     _, out, _ = written(tmp_path, stereo(), WriteOptions(layout="nuke"), multiView=["right", "left"])
     views = {part.name: part.view for part in open_exr(out).parts}

@@ -79,7 +79,7 @@ class AdditiveSet:
 def find_additive_sets(
     renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, sums: Sequence[str] = (), path: str = ""
 ) -> list[AdditiveSet]:
-    """The candidates of a file, those of the user first.
+    """The candidates of a file, those of the user first. A set of the user replaces one of the same name.
 
     Args:
         renderer: entry of the table.
@@ -89,11 +89,16 @@ def find_additive_sets(
         path: of the file, for messages.
 
     Raises:
-        InputError: a sum of the user can't be read, or names a layer that is not there.
+        InputError: a sum of the user can't be read, names a layer that is not there, or has the name of another.
     """
     finder = _Finder(layers, beauty)
     sets = [_user_set(finder, text, path) for text in sums]
+    names = [each.name for each in sets]
+    if twice := [name for name in names if names.count(name) > 1]:
+        raise InputError(f"--sum: two sets are called {twice[0]!r}; give each a name of its own")
     for entry in renderer.get("sets", ()):
+        if entry["name"] in names:
+            continue
         found = tuple(dict.fromkeys(layer for candidate in entry["layers"] for layer in finder.find(candidate)))
         unwanted = entry.get("except", ())
         found = tuple(each for each in found if not any(fnmatchcase(each.name.lower(), p) for p in unwanted))

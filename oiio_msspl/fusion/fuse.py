@@ -309,11 +309,6 @@ class _Pair:
         self._memory = ReusedMemory() if memory is None else memory
 
     @property
-    def nbytes(self) -> int:
-        """Memory of the LRHS."""
-        return sum(values.nbytes for values in self._lrhs.values())
-
-    @property
     def lrhs_has_alpha(self) -> bool:
         return "alpha" in self._lrhs
 

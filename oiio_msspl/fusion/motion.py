@@ -59,7 +59,7 @@ class MotionSource:
     text: str
     """One sentence for the user."""
     fields: tuple[MotionField, ...] = ()
-    """``vectors``: verified layers. ``static``: layers that were 0 where the shot was examined."""
+    """``vectors``: verified layers. ``static``: all layers of vectors; a pixel where one is not 0 is not followed."""
     projection: Projection | None = None
     """``camera``: how the matrices are to be read."""
 

@@ -109,22 +109,13 @@ def _bytes_per_pixel(contract: Contract, stride: int) -> int:
     return contract.bytes_per_pixel if stride == 1 else contract.bytes_per_pixel // stride**2 + SPLIT_BYTES
 
 
-def check_memory(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, max_memory: int) -> None:
-    """Check that the largest of the tiles fits into memory.
+def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, stride: int = 1) -> int:
+    """Memory of a process that fuses a frame in these tiles.
 
     Args:
         frame_bytes: memory for the whole frame: the result, the LRHS, and what the caller holds.
-        max_memory: memory for the whole process.
-
-    Raises:
-        InputError: it does not fit.
+        stride: as for :func:`plan_tiles`.
     """
-    require_memory(memory_for_tiles(contract, tiles, frame_bytes), contract, max_memory)
-
-
-def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, stride: int = 1) -> int:
-    """Memory with which a frame can be fused in these tiles; ``frame_bytes`` as for :func:`check_memory`, ``stride`` as
-    for :func:`plan_tiles`."""
     pixels = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
     return FIXED_MEMORY + frame_bytes + pixels * _bytes_per_pixel(contract, stride)
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -224,13 +224,19 @@ def _frame_preview(report: FrameReport, fused: FusedFrame, view: str | None, *, 
         yield  # the old preview stays until the EXR has been replaced
         write_frame_preview(report, fused, view, overwrite=overwrite)
         return
-    wait = in_background(lambda: write_frame_preview(report, fused, view, overwrite=overwrite))
+
+    def write() -> None:
+        write_frame_preview(report, fused, view, overwrite=overwrite)
+
+    wait = in_background(write)
     try:
         yield
     except BaseException:
-        wait()
-        if report.preview is not None:  # None if it was not written, because somebody else's file came first
-            report.preview.unlink(missing_ok=True)
+        if wait is not write:  # with one thread, it has not begun
+            with suppress(Exception):
+                wait()
+            if report.preview is not None:  # None if it was not written, because somebody else's file came first
+                report.preview.unlink(missing_ok=True)
         raise
     wait()
 

@@ -30,6 +30,8 @@ T = TypeVar("T")
 #: Frames have the same noise above this correlation. Independent ones stay below 0.1.
 SAME_NOISE = 0.5
 SAME_SEED = "have the same noise, which no average removes; let the renderer change its seed from frame to frame"
+#: Vectors of frames with more pixels are read one way after the other.
+LARGEST_READ = 1 << 22
 
 #: The ways to the neighbours whose renders are averaged: those before a frame, and those after it.
 Neighbours = tuple[Sequence[Step[RenderPair]], Sequence[Step[RenderPair]]]
@@ -144,7 +146,8 @@ class FrameWindow:
         outcome = self._fuse(loaded, (steps[0], steps[1]))
         if isinstance(outcome, FusedAlone) and self._temporal.results:
             fused = outcome.fused
-            fused.rgb, fused.alpha = kept(fused.rgb), None if fused.alpha is None else kept(fused.alpha)
+            fused.rgb = kept(fused.rgb)
+            fused.alpha, fused.error = (None if image is None else kept(image) for image in (fused.alpha, fused.error))
         return outcome
 
     def _pair(self, loaded: LoadedFrame) -> tuple[LoadedFrame, RenderPair]:
@@ -202,7 +205,9 @@ class FrameWindow:
         """Motion from one frame to the next or the previous one, and back."""
         there, back = partial(self._read_vectors, start, end), partial(self._read_vectors, end, start)
         assert self._temporal.motion is not None
-        if self._temporal.motion.reads_one_frame:
+        window = self._motion_frame(start).hr.data_window
+        # To decode vectors takes several times their memory.
+        if self._temporal.motion.reads_one_frame and window.width * window.height <= LARGEST_READ:
             return in_parallel(there, back)
         return there(), back()
 

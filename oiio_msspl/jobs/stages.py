@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The three stages of a frame: read the pair, fuse it, write the result.
 
-A shot runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`); a Dask worker runs them one after the other.
+A shot, and each chunk of frames on a Dask worker, runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`).
 """
 
 from __future__ import annotations
@@ -87,18 +87,6 @@ class Stages:
     """Which neighbours each frame is fused with."""
     sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
     """Models that are loaded, by scale and ``model``."""
-
-    def run(self, frame: Frame) -> FrameReport:
-        """Take a frame through all stages, one after the other, without its neighbours.
-
-        Raises:
-            InputError, MssplError: see the stages.
-        """
-        loaded = self.read(frame)
-        alone = self.fuse(loaded, self.session(loaded))
-        report = self.complete(alone, alone.fused)
-        self.write(report, alone.fused)
-        return report
 
     def skips(self, frame: Frame) -> bool:
         """Whether a frame counts as done: its EXR exists, and with ``update`` none of its inputs is newer."""
@@ -188,7 +176,7 @@ class Stages:
         except InputError:  # which `session` raises, too, when the frame's turn has come
             return [*HRLS_FEATURES, "alpha"]
 
-    def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours = ((), ())) -> FusedAlone:
+    def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours) -> FusedAlone:
         """Fuse the beauty of a pair.
 
         Args:

@@ -36,6 +36,8 @@ MOST_RESULTS = 2
 MOST = 8
 #: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
+#: The same of the luminance of both renders at the LRHS's resolution, of each frame that is held; largest at x2.
+LUMINANCE_BYTES = 2
 
 
 @dataclass(frozen=True)
@@ -119,7 +121,8 @@ class Temporal:
         in_memory = pixels <= MOST_PIXELS
         held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
         working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
-        return (held * in_memory + RESULT_BYTES) * pixels + working
+        luminance = LUMINANCE_BYTES * (2 * self.count + 2)
+        return (held * in_memory + luminance + RESULT_BYTES) * pixels + working
 
     def missing(self, number: int) -> list[int]:
         """The numbers next to a frame that lie within the shot, and of which a render is missing."""

@@ -166,10 +166,12 @@ def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
 
 
 def check_passes(hr: MappedRender, others: OtherViews, write: WriteOptions) -> None:
-    """Raise InputError if the user asks for additive sets by a name that no view has, or for data passes that the first
-    one lacks."""
+    """Raise InputError if the user asks for additive sets by a name that no view has, names a sum that is not to be
+    fused, or asks for data passes that the first view lacks."""
     if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
         raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
+    if write.passes == ("none",) and any(each.by_user for each in hr.additive_sets):
+        raise InputError("--sum and --passes none exclude each other: fuse the layers of the sum, or leave it out")
     views = [hr, *(view.hr for view in others.views)]
     if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
         names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))

@@ -339,6 +339,29 @@ def test_a_lamp_whose_square_overflows_stays_finite(tmp_path, model):
     np.testing.assert_allclose(total, layer(out), rtol=1e-5, atol=1e-6)
 
 
+def test_a_lamp_that_is_too_bright_for_half_is_left_out_of_the_sum(tmp_path):
+    clean = lights()
+    for each in clean.values():
+        each[40:44, 72:76] = 5e4  # together more than half can hold
+
+    def clipped(layers):
+        return np.minimum(sum(each.astype(np.float32) for each in layers.values()), 65504)
+
+    pair = write_pair(tmp_path, clean, np.float16, beauty=clipped, noise_free=clean)
+    high = map_render(open_exr(pair[1]))
+    (lamps,) = high.additive_sets
+    assert not check_sum(high, lamps).problem
+
+
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_the_brightest_floats_are_compared_without_a_warning(tmp_path):
+    clean = lights()
+    clean["light_spot"][40:44, 72:76] = 3e38
+    high = map_render(open_exr(write_pair(tmp_path, clean, noise_free=clean)[1]))
+    (lamps,) = high.additive_sets
+    assert check_sum(high, lamps).text.startswith("sums to the beauty")
+
+
 @pytest.mark.parametrize(
     ("beauty", "message"),
     [
@@ -363,6 +386,8 @@ def test_layers_that_do_not_sum_are_passed_on(tmp_path, bilinear_models, beauty,
         (("reflection*",), (), "--passes reflection.*no such set.*'light groups'"),
         ((), ("a=light_key",), "write NAME=LAYER"),
         ((), ("a=light_key+light_none",), "no layer 'light_none'"),
+        ((), 2 * ("a=light_key+light_spot",), "two sets are called 'a'"),
+        (("none",), ("a=light_key+light_spot",), "--sum and --passes none exclude each other"),
     ],
 )
 def test_a_wrong_name_is_one_sentence_before_the_work(tmp_path, bilinear_models, monkeypatch, passes, sums, message):

@@ -7,7 +7,7 @@ import pytest
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion import tiling
-from oiio_msspl.fusion.tiling import aligned_grid, check_memory, plan_tiles, sample_bands
+from oiio_msspl.fusion.tiling import aligned_grid, memory_for_tiles, plan_tiles, require_memory, sample_bands
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.contract import MEAN_DENOISER, MEAN_DENOISER_ALIGNMENT, Contract
 
@@ -77,15 +77,16 @@ def test_overlaps_cost_little_and_the_default_memory_suffices(name, size, cost):
     tiles = plan_tiles(aligned_grid(Window(0, 0, width, height), contract.alignment), contract)
     assert sum(tile.area.width * tile.area.height for tile in tiles) <= cost * width * height
     frame_bytes = 4 * (4 * size[0] * size[1] + 9 * width * height)  # result, and LRHS with albedo and normal
-    check_memory(contract, tiles, frame_bytes, tiling.MAX_MEMORY)
+    assert memory_for_tiles(contract, tiles, frame_bytes) <= tiling.MAX_MEMORY
 
 
 def test_too_little_memory_is_said_with_what_suffices():
     contract = contract_of(1, 8)
     tiles = plan_tiles(Window(0, 0, 1000, 500), contract)
+    needed = memory_for_tiles(contract, tiles, 500 << 20)
     with pytest.raises(InputError, match=r"this frame needs more with model test; allow at least 1\.1G"):
-        check_memory(contract, tiles, 500 << 20, 1 << 30)
-    check_memory(contract, tiles, 500 << 20, int(1.1 * 2**30))
+        require_memory(needed, contract, 1 << 30)
+    require_memory(needed, contract, int(1.1 * 2**30))
 
 
 @pytest.mark.parametrize("scale", [2, 4, 8])

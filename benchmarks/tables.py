@@ -182,11 +182,11 @@ def runtime() -> str:
 
 
 def filters() -> str:
-    """Both pixel filters, with all layers, and the best model against OIDN with the same samples by scene."""
+    """Both pixel filters, with all layers, and two models against OIDN with the same samples by scene."""
     tables = {"box": results.read("quality_box"), "Blackman-Harris": results.read("quality_blackman_harris")}
     means = {name: means_of(rows) for name, rows in tables.items()}
     names = [*PEERS, *models(SCALES[:2], FAMILIES[1:])]
-    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("joint",)) for a, b in quality.UNEVEN]
+    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("joint", "ensemble")) for a, b in quality.UNEVEN]
     head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in tables for spp in quality.AVERAGES)]
     cases = [(name, spp) for name in tables for spp in quality.AVERAGES]
     body = _measured(
@@ -195,14 +195,14 @@ def filters() -> str:
     )
     clean = versus.clean_scenes(tables["box"])
     differences = []
-    for name, rows in tables.items():
-        for spp in quality.AVERAGES:
-            if found := versus.compare(rows, DEFAULT, "OIDN, same samples", spp):
-                by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
-                without = f"{found.without_too_easy:+.2f}"
-                differences.append([f"{name}, {spp}", versus.cell(found.psnr, "+.2f"), without, found.wins, *by_scene])
-    between = f"\nPSNR of `{DEFAULT}` minus that of plain OIDN on full resolution with the same samples:\n\n"
-    columns = ["filter, spp", MEAN, f"without {versus.TOO_EASY}", "better on", *clean]
+    for (name, rows), model, spp in itertools.product(tables.items(), BETTER[:2], quality.AVERAGES):
+        if found := versus.compare(rows, model, "OIDN prefiltered, same samples", spp):
+            by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
+            without = f"{found.without_too_easy:+.2f}"
+            psnr = versus.cell(found.psnr, "+.2f")
+            differences.append([f"{name}, `{model}`, {spp}", psnr, without, found.wins, *by_scene])
+    between = "\nPSNR minus that of prefiltered OIDN on full resolution with the same samples:\n\n"
+    columns = ["filter, model, spp", MEAN, f"without {versus.TOO_EASY}", "better on", *clean]
     return (
         f"{results.markdown(head, body)}\n{quality.mean_note(tables['box'])}\n{between}"
         f"{results.markdown(columns, differences)}"
@@ -210,10 +210,10 @@ def filters() -> str:
 
 
 def cycles() -> str:
-    """Views by Cycles, with both kinds of LRHS."""
+    """Views by Cycles."""
     rows = results.read("quality_cycles")
     means = means_of(rows)
-    names = [*PEERS, *(name for model in models() for name in (model, f"{model}, nearest"))]
+    names = [*PEERS, *models(), *(f"ensemble-x2, {a}:{b}" for a, b in quality.UNEVEN)]
     body = _measured(
         [title(name), *(quality.cell(means.get((spp, name)), "psnr", "relmse", "flip") for spp in quality.AVERAGES)]
         for name in names
@@ -221,15 +221,14 @@ def cycles() -> str:
     head = ["PSNR / RelMSE / FLIP", *(f"{spp} spp" for spp in quality.AVERAGES)]
     clean = versus.clean_scenes(rows)
     differences = []
-    for peer in ("OIDN on the HRLS", "OIDN, same samples"):
-        for spp in quality.AVERAGES:
-            if found := versus.compare(rows, DEFAULT, peer, spp):
-                by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
-                differences.append([f"{peer}, {spp}", versus.cell(found.psnr, "+.2f"), found.wins, *by_scene])
+    for (peer, which), model, spp in itertools.product(AT_ITS_BEST.items(), BETTER[:2], quality.AVERAGES):
+        if found := versus.compare(rows, model, peer, spp):
+            by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
+            differences.append([f"`{model}`, {which}, {spp}", versus.cell(found.psnr, "+.2f"), found.wins, *by_scene])
     return (
         f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
-        f"\nPSNR of `{DEFAULT}` minus that of plain OIDN:\n\n"
-        f"{results.markdown(['OIDN, spp', MEAN, 'better on', *clean], differences)}"
+        "\nPSNR minus that of prefiltered OIDN, which gets the HRLS or as many samples at full resolution:\n\n"
+        f"{results.markdown(['model, OIDN, spp', MEAN, 'better on', *clean], differences)}"
     )
 
 

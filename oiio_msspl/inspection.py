@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
@@ -225,9 +225,8 @@ def _pixel_facts(render: MappedRender) -> list[str]:
         for name, count in not_finite.items()
         if count
     ]
-    counts += [
-        f"{name}: {count} values are negative (colours out of gamut); fusing sets them to 0"
-        for name, count in negative.items()
-        if count
-    ]
+    for name, count in negative.items():
+        reason = " (colours out of gamut)" if name in RADIANCE_FEATURES else ""
+        if count:
+            counts.append(f"{name}: {count} values are negative{reason}; fusing sets them to 0")
     return counts + [f"{name}: all zero" for name, value in brightest.items() if value == 0]

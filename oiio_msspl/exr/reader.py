@@ -278,8 +278,13 @@ def _open(path: Path) -> Any:
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
         reason = reason_of(oiio)
-        hint = "; if its channels are subsampled (luminance and chroma), convert it to RGB" if "twice" in reason else ""
-        raise InputError(f"{path}: can't be opened as an EXR ({reason}){hint}")
+        subsampled = "twice" in reason
+        hint = (
+            "if its channels are subsampled (luminance and chroma), convert it to RGB"
+            if subsampled
+            else "render it again"
+        )
+        raise InputError(f"{path}: can't be opened as an EXR ({reason}); {hint}")
     if handle.format_name() != "openexr":
         raise InputError(
             f"{path}: is a {handle.format_name()} file; give an EXR, other formats lose what the network needs"

@@ -41,7 +41,9 @@ def write_single_part(path: Path, contents: FileContents) -> None:
         with OpenEXR.File(header, channels) as file:
             file.write(str(path))
     except Exception as error:
-        raise MssplError(f"{path.parent}: the result can't be written ({error}); the target is as it was") from error
+        raise MssplError(
+            f"{path.parent}: the result can't be written ({error}); the target is as it was; is the disk full?"
+        ) from error
 
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:

@@ -120,7 +120,9 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     ok = writer.close() and ok
     if not ok or writer.has_error:
         reason = reason_of(writer) if writer.has_error else "disk full?"
-        raise MssplError(f"{path.parent}: the result can't be written ({reason}); the target is as it was")
+        raise MssplError(
+            f"{path.parent}: the result can't be written ({reason}); the target is as it was; is the disk full?"
+        )
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:

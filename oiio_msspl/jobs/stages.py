@@ -21,7 +21,7 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
 from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.fusion.warp import Mask
@@ -136,8 +136,8 @@ class Stages:
         """Memory that is left beside these; negative if they don't fit."""
         features = self._features(lr, hr)
         low, high = (_pixel_bytes(render, features) for render in (lr, hr))
-        result_bytes = 5 * 4 * hr.data_window.width * hr.data_window.height
-        other = FIXED_MEMORY + TILE_MEMORY + 2 * result_bytes + low
+        result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
+        other = FIXED_MEMORY + TILE_MEMORY + 2 * result + low
         other += self.temporal.memory(hr.data_window, _channels(hr, features))
         return self.max_memory - other - self._frames_held * (low + high)
 
@@ -237,8 +237,7 @@ class Stages:
 
     def _held_bytes(self, loaded: LoadedFrame, session: Session) -> int:
         """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
-        result_channels = 5 if self.write_options.error_layer else 4
-        held = loaded.hr.data_window.width * loaded.hr.data_window.height * result_channels * 4
+        held = result_bytes(align(loaded.lr, loaded.hr), error=self.write_options.error_layer)
         features = _features_read(session)
         if self._fits(loaded.lr, loaded.hr):
             held += self._frames_held * sum(_pixel_bytes(render, features) for render in (loaded.lr, loaded.hr))

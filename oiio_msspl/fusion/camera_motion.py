@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.motion_guides import Pair
-from oiio_msspl.fusion.motion_vectors import Mask, sample
+from oiio_msspl.fusion.motion_guides import FramePair
+from oiio_msspl.fusion.motion_vectors import Mask, sample_linear
 from oiio_msspl.parallel import for_row_blocks
 
 #: Header attributes that hold such a matrix, in lower case: by Arnold, Karma, Mantra and RenderMan.
@@ -56,7 +56,7 @@ class Projection:
         return result * np.array(self.scale, np.float32) + np.array(self.shift, np.float32)
 
 
-def find_projection(pair: Pair) -> Projection | None:
+def find_projection(pair: FramePair) -> Projection | None:
     """How the matrices of a shot are to be read; None if there are none, or none fits.
 
     Raises:
@@ -121,7 +121,7 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     return vectors, known
 
 
-def _by_depth(pair: Pair) -> Projection | None:
+def _by_depth(pair: FramePair) -> Projection | None:
     """The matrix to the screen, and the kind of depth, that make the guides of both frames agree."""
     frame = pair.first.display_window
     best, best_left = None, 1.0
@@ -136,7 +136,7 @@ def _by_depth(pair: Pair) -> Projection | None:
     return best if best_left * MARGIN < 1 else None
 
 
-def _left(pair: Pair, vectors: Array, known: Mask) -> float:
+def _left(pair: FramePair, vectors: Array, known: Mask) -> float:
     """What is left of the differences between both frames' guides, geometric mean; 1 without motion."""
     step = pair.reduction
     rows, columns = (slice(s.start + step // 2, s.stop, step) for s in pair.window.slices(pair.first.data_window))
@@ -151,7 +151,7 @@ def _left(pair: Pair, vectors: Array, known: Mask) -> float:
         if use.any() and np.median(still) > 0:
             y, x = np.nonzero(use)
             way = vectors[y, x]
-            found = sample(there, x + way[:, 0], y + way[:, 1])
+            found = sample_linear(there, x + way[:, 0], y + way[:, 1])
             left.append(float(np.median(np.abs(found - here[use]).mean(axis=-1)) / np.median(still)))
     return float(np.exp(np.mean(np.log(np.maximum(left, 1e-9))))) if left else 1.0
 

@@ -26,7 +26,7 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion_check import FieldCheck, check_field
-from oiio_msspl.fusion.motion_guides import Pair, open_pair, still_and_moved
+from oiio_msspl.fusion.motion_guides import FramePair, open_pair, still_and_moved
 from oiio_msspl.fusion.motion_vectors import Mask, channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
 from oiio_msspl.parallel import in_parallel
@@ -193,7 +193,7 @@ def _find(first: MappedRender, second: MappedRender, wanted: str | None) -> Moti
     return source
 
 
-def _check(pair: Pair, each: MotionField) -> FieldCheck:
+def _check(pair: FramePair, each: MotionField) -> FieldCheck:
     """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
     stored = in_parallel(*(partial(_stored, pair, frame, each) for frame in (0, 1)))
     if stored[0] is None or stored[1] is None:
@@ -204,7 +204,7 @@ def _check(pair: Pair, each: MotionField) -> FieldCheck:
     return check
 
 
-def _stored(pair: Pair, frame: int, each: MotionField) -> Array | None:
+def _stored(pair: FramePair, frame: int, each: MotionField) -> Array | None:
     """Stored vectors of a frame, not multiplied by alpha; None if the frame lacks the layer."""
     render = (pair.first, pair.second)[frame]
     channels = render.motion.channels(each.layer, each.components)
@@ -231,7 +231,7 @@ def _vectors(verified: Sequence[FieldCheck]) -> MotionSource:
     return MotionSource(VECTORS, f"motion vectors of {texts}", tuple(check.field for check in verified))
 
 
-def _without_vectors(pair: Pair, checks: Sequence[FieldCheck]) -> MotionSource:
+def _without_vectors(pair: FramePair, checks: Sequence[FieldCheck]) -> MotionSource:
     """The best source that needs no vectors."""
     still, moved = still_and_moved(pair)
     if _camera_stands(still, moved):

@@ -16,8 +16,8 @@ import numpy as np
 
 from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.motion_guides import POSITION, Guide, Pair
-from oiio_msspl.fusion.motion_vectors import Mask, sample
+from oiio_msspl.fusion.motion_guides import POSITION, FramePair, Guide
+from oiio_msspl.fusion.motion_vectors import Mask, sample_linear
 from oiio_msspl.parallel import in_parallel
 
 #: The best format must fit so many times as well as no motion, and as the runner-up.
@@ -63,7 +63,7 @@ class FieldCheck:
         return f"{self.field.name} ({self.field.format}), which explains {1 - self.fit:.0%} of what changes"
 
 
-def check_field(pair: Pair, field: MotionField, stored: tuple[Array, Array]) -> FieldCheck:
+def check_field(pair: FramePair, field: MotionField, stored: tuple[Array, Array]) -> FieldCheck:
     """Find the format of motion vectors.
 
     Args:
@@ -75,7 +75,7 @@ def check_field(pair: Pair, field: MotionField, stored: tuple[Array, Array]) -> 
     return min(checks, key=lambda check: (bool(check.problem), not check.zero, check.fit))
 
 
-def _check_offset(pair: Pair, field: MotionField, stored: tuple[Array, Array], offset: float) -> FieldCheck:
+def _check_offset(pair: FramePair, field: MotionField, stored: tuple[Array, Array], offset: float) -> FieldCheck:
     """Find the format of vectors whose offset is known."""
     field = replace(field, format=replace(field.format, offset=offset))
     if all(not _moving(values, offset).any() for values in stored):
@@ -108,7 +108,7 @@ def _check_offset(pair: Pair, field: MotionField, stored: tuple[Array, Array], o
     return FieldCheck(replace(field, format=best), fit=fits[best])
 
 
-def _no_format(pair: Pair, fit: float) -> str:
+def _no_format(pair: FramePair, fit: float) -> str:
     names = ", ".join(guide.name for guide in pair.guides)
     return f"no known format makes {names} of both frames agree (at best {fit:.0%} of the differences are left)"
 
@@ -163,7 +163,7 @@ class _Place:
 class _Trial:
     """Compares what formats make of the guides."""
 
-    def __init__(self, pair: Pair, field: MotionField, stored: tuple[Array, Array], offset: float) -> None:
+    def __init__(self, pair: FramePair, field: MotionField, stored: tuple[Array, Array], offset: float) -> None:
         self._frame = (pair.first.display_window.width, pair.first.display_window.height)
         self._reduction = pair.reduction
         self._places: list[_Place] = []
@@ -255,7 +255,7 @@ class _Trial:
         with np.errstate(invalid="ignore", over="ignore"):
             x, y = place.x[which] + vectors[:, 0], place.y[which] + vectors[:, 1]
             inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        found = sample(other, np.where(inside, x, 0), np.where(inside, y, 0))
+        found = sample_linear(other, np.where(inside, x, 0), np.where(inside, y, 0))
         errors = np.abs(found - place.here[which]).mean(axis=-1)
         errors[~inside] = np.nan
         return errors

@@ -52,7 +52,7 @@ class Guide:
 
 
 @dataclass(frozen=True)
-class Pair:
+class FramePair:
     """Two frames over the window that both have."""
 
     first: MappedRender
@@ -68,7 +68,7 @@ class Pair:
         return reduced(partial(render.file.read, channels), self.window, self.reduction)
 
 
-def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None) -> Pair:
+def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None) -> FramePair:
     """Read the guides of two frames.
 
     Normals in camera space are left out, because they change with the camera.
@@ -82,7 +82,7 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
     """
     window = first.data_window.intersect(second.data_window)
     if not window.width or not window.height:
-        return Pair(first, second, window, 1, ())
+        return FramePair(first, second, window, 1, ())
     if rows is not None and window.height > rows:
         top = window.y0 + (window.height - rows) // 2
         window = Window(window.x0, top, window.x1, top + rows)
@@ -98,7 +98,7 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
         Guide(name, in_parallel(*(partial(image, name, read) for read in reads)))
         for name, reads in _readers(first, second)
     ]
-    return Pair(first, second, window, reduction, tuple(guides))
+    return FramePair(first, second, window, reduction, tuple(guides))
 
 
 def _readers(first: MappedRender, second: MappedRender) -> Iterator[tuple[str, tuple[Reader, Reader]]]:
@@ -150,7 +150,7 @@ def _steepness(image: Array) -> Array:
     return total / np.float32(image.shape[-1])
 
 
-def still_and_moved(pair: Pair) -> tuple[Mask, Mask]:
+def still_and_moved(pair: FramePair) -> tuple[Mask, Mask]:
     """Tiles of ``TILE`` x ``TILE`` pixels that show the same in both frames, and those whose content has moved.
 
     A tile is still if some guide differs less between the frames than between pixels that are ``NEAR`` pixels apart in

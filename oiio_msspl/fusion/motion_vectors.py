@@ -143,19 +143,21 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
         y, x = np.mgrid[rows.start : rows.stop, 0:width].astype(np.float32)
         way = -own[rows]
         for _ in range(ROUNDS):
-            way = -sample(other, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
+            way = -sample_linear(other, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
         at_x, at_y = x + way[..., 0] + shift_x, y + way[..., 1] + shift_y
-        back = sample(other, at_x, at_y) + way
+        back = sample_linear(other, at_x, at_y) + way
         vectors[rows] = way
         inside = (at_x >= -0.5) & (at_y >= -0.5) & (at_x <= other.shape[1] - 0.5) & (at_y <= other.shape[0] - 0.5)
-        known[rows] = inside & (np.hypot(back[..., 0], back[..., 1]) < ROUND_TRIP) & nearest(other_known, at_x, at_y)
+        known[rows] = (
+            inside & (np.hypot(back[..., 0], back[..., 1]) < ROUND_TRIP) & nearest_values(other_known, at_x, at_y)
+        )
 
     for_row_blocks(work, height, width * 8)
     vectors[~known] = 0
     return vectors, known
 
 
-def sample(image: Array, x: Array, y: Array) -> Array:
+def sample_linear(image: Array, x: Array, y: Array) -> Array:
     """Bilinear samples of an image (h, w, c) at pixel positions; its edge is repeated outside."""
     height, width, channels = image.shape
     # Two floats are fetched as one complex number, which takes half as long.
@@ -176,7 +178,7 @@ def sample(image: Array, x: Array, y: Array) -> Array:
     return samples
 
 
-def nearest(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:
+def nearest_values(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:
     """The pixels (h, w) that are nearest to these positions."""
     height, width = image.shape
     rows = np.clip(np.rint(y), 0, height - 1).astype(np.int32)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from oiio_msspl.arrays import Array
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.motion_vectors import Mask, nearest, sample
+from oiio_msspl.fusion.motion_vectors import Mask, nearest_values, sample_linear
 
 #: A vector is believed if the way there and back ends this close to its pixel, in pixels.
 ROUND_TRIP = 0.75
@@ -43,11 +43,11 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
     back = np.asarray(dis.calc(second, first, None), np.float32)
     y, x = np.mgrid[0 : window.height, 0 : window.width].astype(np.float32)
     at_x, at_y = x + there[..., 0], y + there[..., 1]
-    trip = there + sample(back, at_x, at_y)
+    trip = there + sample_linear(back, at_x, at_y)
     rendered = np.zeros(frame.shape[:2], np.bool_)
     rendered[shared.slices(window)] = True
     inside = (at_x >= 0) & (at_y >= 0) & (at_x <= window.width - 1) & (at_y <= window.height - 1)
-    known = inside & (np.hypot(trip[..., 0], trip[..., 1]) < ROUND_TRIP) & nearest(rendered, at_x, at_y)
+    known = inside & (np.hypot(trip[..., 0], trip[..., 1]) < ROUND_TRIP) & nearest_values(rendered, at_x, at_y)
     there[~known] = 0
     return there, known
 

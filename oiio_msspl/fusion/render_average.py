@@ -26,7 +26,7 @@ from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
-from oiio_msspl.fusion.warp import Mask, Path, Step, nearest, sample
+from oiio_msspl.fusion.warp import Mask, Path, Step, nearest_indices, sample_cubic
 from oiio_msspl.fusion.weighted_sum import Rows, WeightedSum, rows_of
 from oiio_msspl.parallel import for_row_blocks
 
@@ -230,7 +230,7 @@ class _Band:
 
         names = [name for name in (*RADIANCE_FEATURES, VARIANCE, "alpha") if name in stored]
         with np.errstate(invalid="ignore"):  # NaN is sorted out later
-            smooth = sample([stored.pop(name) for name in names], positions, x.shape)
+            smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape)
         return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable
 
 
@@ -267,7 +267,7 @@ class _Nearest:
 
         def work(rows: slice) -> None:
             x, y = path.positions(rows)
-            self._at[rows] = nearest(x, y, place)
+            self._at[rows] = nearest_indices(x, y, place)
 
         for_row_blocks(work, *self._size)
         self._finite = _finite_pixels(self._flat)
@@ -303,14 +303,14 @@ def _nearest_pixels(
     features: Features, positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]
 ) -> Features:
     """The pixels of features that are nearest to positions in them; the arguments are those of
-    :func:`oiio_msspl.fusion.warp.sample`."""
+    :func:`oiio_msspl.fusion.warp.sample_cubic`."""
     height, width = size
     flat = {name: np.ascontiguousarray(v).reshape(-1, v.shape[-1]) for name, v in features.items()}
     result = {name: np.empty((height, width, v.shape[-1]), np.float32) for name, v in features.items()}
     window = Window(0, 0, *next((v.shape[1::-1] for v in features.values()), (1, 1)))
 
     def work(rows: slice) -> None:
-        at = nearest(*positions(rows), window)
+        at = nearest_indices(*positions(rows), window)
         for name, values in flat.items():
             values.take(at, axis=0, out=result[name][rows], mode="wrap")  # "wrap" writes straight into the result
 

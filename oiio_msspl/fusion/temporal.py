@@ -24,7 +24,7 @@ from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, to_grid
-from oiio_msspl.fusion.warp import Mask, Path, Step, near_borders, sample
+from oiio_msspl.fusion.warp import Mask, Path, Step, near_borders, sample_cubic
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
@@ -145,7 +145,7 @@ def _warp(frame: FusedFrame, path: Path) -> Images:
         x, y = path.positions(rows)
         return x - place.x0, y - place.y0
 
-    return dict(zip(images, sample(list(images.values()), positions, path.valid.shape), strict=True))
+    return dict(zip(images, sample_cubic(list(images.values()), positions, path.valid.shape), strict=True))
 
 
 def _images(frame: FusedFrame, area: Window) -> Images:

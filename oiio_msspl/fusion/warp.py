@@ -80,7 +80,7 @@ class Path:
             from_x, from_y = self.positions(rows)
             to_x, to_y = from_x, from_y
             good = valid[rows]
-            at = None if first else nearest(from_x, from_y, start)
+            at = None if first else nearest_indices(from_x, from_y, start)
             if step.valid is not None:
                 good &= self._at_pixels(step.valid, rows) if at is None else step.valid.reshape(-1).take(at)
             if vectors is not None:
@@ -90,7 +90,7 @@ class Path:
                 to_y = np.where(good, from_y + vector.imag, from_y)
             good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
             if vectors is not None or back is not None or step.back_valid is not None:
-                there = nearest(to_x, to_y, end)
+                there = nearest_indices(to_x, to_y, end)
                 home = np.complex64(0) if vectors is None else vector
                 if back is not None:
                     home = home + back.reshape(-1).take(there)
@@ -155,14 +155,14 @@ def _as_complex(vectors: Array) -> NDArray[np.complex64]:
     return np.ascontiguousarray(vectors, np.float32).view(np.complex64)[..., 0]
 
 
-def nearest(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
+def nearest_indices(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
     """Flat indices of the nearest pixels of a window."""
     column = np.clip(np.rint(x - window.x0), 0, window.width - 1).astype(np.intp)
     row = np.clip(np.rint(y - window.y0), 0, window.height - 1).astype(np.intp)
     return row * window.width + column
 
 
-def sample(
+def sample_cubic(
     images: Sequence[Array], positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]
 ) -> list[Array]:
     """Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.

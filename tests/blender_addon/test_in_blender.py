@@ -17,7 +17,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion import motion
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.motion_vectors import sample
+from oiio_msspl.fusion.motion_vectors import sample_linear
 from tests.blender_addon.conftest import posix, render_command
 from tests.conftest import EXAMPLES
 
@@ -148,7 +148,7 @@ def test_cycles_motion_vectors_are_as_the_table_says(results, monkeypatch):
         vectors, known = source.read(motion.MotionFrame(frames[here]), motion.MotionFrame(frames[there]), step)
         places = [each.file.read(each.motion.position, each.data_window) for each in frames]
         y, x = np.mgrid[0:128, 0:192].astype(np.float32)
-        fetched = sample(places[there], x + vectors[..., 0], y + vectors[..., 1])
+        fetched = sample_linear(places[there], x + vectors[..., 0], y + vectors[..., 1])
         cube = known & (places[here][..., 2] > 0.2)
         floor = known & (np.abs(places[here][..., 2]) < 0.01)
         change = np.abs(fetched - places[here]).max(axis=-1)

@@ -105,7 +105,7 @@ def layout(rows: list[Row]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=12)
+    parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--scale", type=int, default=2)
     parser.add_argument("--qualities", nargs="+", default=["balanced", "best"])

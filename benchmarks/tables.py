@@ -252,7 +252,14 @@ def division() -> str:
     columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, DEFAULT + way) in means]
     body = _measured(
         [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
-        for name in ("joint-x2", "joint-x4", "joint-small-x4", "OIDN, same samples", "OIDN prefiltered, same samples")
+        for name in (
+            "ensemble-x2",
+            "joint-x2",
+            "joint-x4",
+            "joint-small-x4",
+            "OIDN, same samples",
+            "OIDN prefiltered, same samples",
+        )
     )
     head = ["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"

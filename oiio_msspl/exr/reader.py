@@ -278,12 +278,9 @@ def _open(path: Path) -> Any:
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
         reason = reason_of(oiio)
-        subsampled = "twice" in reason
-        hint = (
-            "if its channels are subsampled (luminance and chroma), convert it to RGB"
-            if subsampled
-            else "render it again"
-        )
+        hint = "render it again"
+        if "twice" in reason:
+            hint = "if its channels are subsampled (luminance and chroma), convert it to RGB"
         raise InputError(f"{path}: can't be opened as an EXR ({reason}); {hint}")
     if handle.format_name() != "openexr":
         raise InputError(

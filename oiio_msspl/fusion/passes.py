@@ -188,6 +188,7 @@ def _fused_layers(
             light = next(fused)
             if layer in job.noise_free:
                 _keep_in_range(light, high.layers[key])
+                unload(high.layers[key])
             unload(light)
             yield layer, light
         else:

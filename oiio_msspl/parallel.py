@@ -13,10 +13,10 @@ import os
 import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor, wait
+from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
 from contextvars import ContextVar
 from functools import partial
-from typing import TypeVar, cast
+from typing import Any, TypeVar, cast
 
 #: Values of a block: 512 KiB of float32.
 BLOCK_VALUES = 1 << 17
@@ -70,7 +70,7 @@ def in_background(work: Callable[[], T]) -> Callable[[], T]:
     """Start ``work`` on another thread, if more than one may be used.
 
     Returns:
-        A function that waits for the result and returns it.
+        A function that waits for the result and returns it: ``work`` itself if only one thread may be used.
     """
     return work if _one_thread() else _start(work).result
 
@@ -103,7 +103,7 @@ def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
             for i in waiting:
                 results[i] = work(items[i])
 
-    other = _pair_pool().submit(contextvars.copy_context().run, take)
+    other = submit(_pair_pool(), take)
     try:
         take()
     finally:
@@ -136,9 +136,13 @@ def _one_thread() -> bool:
     return (_thread_limit.get() or available_cores()) == 1
 
 
+def submit(pool: Executor, work: Callable[..., T], *arguments: Any) -> Future[T]:
+    """Let a pool do ``work`` with the thread limit of the caller, which the threads of a pool do not know."""
+    return pool.submit(contextvars.copy_context().run, work, *arguments)
+
+
 def _start(work: Callable[[], T]) -> Future[T]:
-    """Start ``work`` in the background, with the thread limit of the caller."""
-    return _background_pool().submit(contextvars.copy_context().run, work)
+    return submit(_background_pool(), work)
 
 
 def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:

@@ -171,8 +171,8 @@ def render_view(
     # The noise of the LR passes tells whether the reference can become clean enough.
     passes = lr[scales[0]]
     first = np.average(passes[:-1], axis=0, weights=views.LR_SPP[:-1])
-    spent = scales[0] ** 2 * sum(views.LR_SPP)
-    if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(steps * ref_spp / spent) < worst:
+    samples = scales[0] ** 2 * sum(views.LR_SPP)
+    if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(steps * ref_spp / samples) < worst:
         return None
     found = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
     if found is None:

@@ -119,7 +119,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
-        reason = reason_of(writer) if writer.has_error else "disk full?"
+        reason = reason_of(writer) if writer.has_error else "no reason given"
         raise MssplError(
             f"{path.parent}: the result can't be written ({reason}); the target is as it was; is the disk full?"
         )

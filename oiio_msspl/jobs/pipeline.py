@@ -7,7 +7,6 @@ at most one frame, and a frame that is fused waits at most for a few neighbours,
 
 from __future__ import annotations
 
-import contextvars
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any
@@ -18,7 +17,7 @@ from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
-from oiio_msspl.parallel import limit_threads
+from oiio_msspl.parallel import limit_threads, submit
 
 
 def run_pipeline(
@@ -88,10 +87,7 @@ def run_pipeline(
         # `writing` is set before the hand-over: a signal may arrive during the hand-over.
         written: Future[None] = Future()
         writing = frame, report, written
-        writer.submit(contextvars.copy_context().run, _write, stages, report, fused, written)
-
-    def start_reading(frame: Frame) -> Future[LoadedFrame]:
-        return reader.submit(contextvars.copy_context().run, stages.read, frame)  # with the limit of threads
+        submit(writer, _write, stages, report, fused, written)
 
     window = FrameWindow(stages.temporal, frames, fuse)
     order = window.order()
@@ -100,11 +96,11 @@ def run_pipeline(
         ThreadPoolExecutor(1, "read") as reader,
         ThreadPoolExecutor(1, "write") as writer,
     ):
-        reads = [start_reading(frame) for frame in order[:1]]
+        reads = [submit(reader, stages.read, frame) for frame in order[:1]]
         try:
             for index, frame in enumerate(order):
                 reading = reads.pop()
-                reads += [start_reading(following) for following in order[index + 1 : index + 2]]
+                reads += [submit(reader, stages.read, following) for following in order[index + 1 : index + 2]]
                 problem = reading.exception()
                 if problem is None and not stages.temporal.count and stages.skips(frame):
                     problem = InputError("another run has fused it")  # is recorded as skipped

@@ -36,7 +36,8 @@ MOST_RESULTS = 2
 MOST = 8
 #: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
-#: The same of the luminance of both renders at the LRHS's resolution, of each frame that is held; largest at x2.
+#: Bytes of a pixel that the luminance of both renders takes for each frame that is held: two planes as small as the
+#: LRHS, which is largest at x2.
 LUMINANCE_BYTES = 2
 
 

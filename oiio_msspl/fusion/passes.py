@@ -758,7 +758,7 @@ def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer
 def _make_sum(layers: Array, beauty: Array) -> None:
     """Scale layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w)."""
     total = layers.sum(axis=0)
-    # Shares of the total never overflow, but what the beauty exceeds a tiny total by does.
+    # The beauty divided by a tiny total would overflow; a layer's share of the total never does.
     layers /= np.where(total > 0, total, 1)
     layers *= beauty
 

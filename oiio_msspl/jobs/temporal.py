@@ -36,8 +36,8 @@ MOST_RESULTS = 2
 MOST = 8
 #: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
-#: Bytes of a pixel that the luminance of both renders takes for each frame that is held: two planes as small as the
-#: LRHS, which is largest at x2.
+#: Bytes of an HRLS pixel that the luminance of both renders takes for each frame that is held. It is stored at the
+#: LRHS's resolution, and this is for x2.
 LUMINANCE_BYTES = 2
 
 

@@ -31,11 +31,11 @@ from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
-from oiio_msspl.fusion.sums import check_sum, is_sum_of, layer_keys, with_layers
+from oiio_msspl.fusion.sums import check_sum, is_sum_of
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks, in_parallel, one_ahead
 
@@ -66,6 +66,9 @@ OTHER_LIGHT = 1.0
 DARKEST_COLOUR = 1e-3
 #: What known layers leave of the beauty counts as rounding below this share of it.
 ROUNDING = np.float32(5e-7)
+#: Channels of a colour that light is multiplied by.
+Factor = tuple[Channel, ...]
+NO_COLOURS: Mapping[Factor, str] = {}
 #: Albedo and normal without noise, of half or float.
 Guides = Mapping[str, NDArray[Any]]
 NO_GUIDES: Guides = {}
@@ -125,14 +128,20 @@ def fuse_passes(
     fused = FusedPasses([replace(job.layers, coarser=tuple(job.coarser)) for job in in_order], pixels, refused)
     later = {part for job in jobs for parts in job.known.values() for part in parts}
     tell = progress or (lambda done, count: None)
-    by_network = fuse_layers is not None
-    steps = pass_steps(alignment, sets, by_network=by_network)
+    by_network = fuse_layers is not None and any(job.lrhs for job in jobs)
+    steps = pass_steps(alignment, sets, by_network=fuse_layers is not None)
     done = steps - len(_bands(alignment)) * sum(1 + by_network * len(job.fitted) for job in jobs)
     tell(done, steps)
     fused_light: dict[AdditiveLayer, Array] = {}
-    if fuse_layers is not None:
+    colours = _colour_names(jobs)
+    high_file = _with_layers_of(hr, {key: layer for job in jobs for layer, key in job.keys.items()}, colours)
+    low_file = _with_layers_of(lr, {key: layer for job in jobs for key, layer in job.lrhs.items()})
+    low: ReadableRender = low_file
+    high: ReadableRender = high_file
+    if fuse_layers is not None and by_network:
+        (low, low_lit), (high, high_lit) = in_parallel(partial(_decoded, low_file), partial(_decoded, high_file))
         for job in jobs:
-            for layer, light in _fused_layers(lr, hr, job, fuse_layers):
+            for layer, light in _fused_layers(low, high, job, low_lit, high_lit, fuse_layers):
                 if light is not None:
                     fused_light[layer] = light
                 done += len(_bands(alignment))
@@ -140,7 +149,10 @@ def fuse_passes(
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
-        bands = (_Band(lr, hr, rgb, alignment, core, dark, jobs, guides, fused_light) for core in _bands(alignment))
+        bands = (
+            _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, fused_light)
+            for core in _bands(alignment)
+        )
         # The next band is read and compared while the layers of this one are fitted.
         for band in one_ahead(bands) if jobs else []:
             lights: dict[AdditiveLayer, Array] = {}
@@ -152,6 +164,9 @@ def fuse_passes(
                 tell(done, steps)
             for image in (*fused_light.values(), *guides.values()):
                 unload(image)
+            for render in (low, high):
+                if isinstance(render, Render):
+                    render.unload()
     return fused
 
 
@@ -168,22 +183,35 @@ def _bands(alignment: Alignment) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
 
 
+def _colour_names(jobs: Iterable[_Job]) -> dict[Factor, str]:
+    """Names, as features, of the colours by which layers that are fitted are multiplied."""
+    factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
+    return {factor: f"colour {i}" for i, factor in enumerate(factors)}
+
+
+def _with_layers_of(
+    render: MappedRender, layers: Mapping[str, AdditiveLayer], colours: Mapping[Factor, str] = NO_COLOURS
+) -> MappedRender:
+    """A render whose features are the beauty, albedo and normal, the light of some layers, and some colours."""
+    formulas = {name: render.features[name] for name in (RGB, ALBEDO, NORMAL) if name in render.features}
+    formulas |= {name: layer.formula for name, layer in layers.items()}
+    formulas |= {name: FeatureFormula((factor,)) for factor, name in colours.items()}
+    return replace(render, features=formulas, alpha=None)
+
+
 def _fused_layers(
-    lr: MappedRender, hr: MappedRender, job: _Job, fuse_layers: LayerFuser
+    low: Render, high: Render, job: _Job, low_lit: set[str], high_lit: set[str], fuse_layers: LayerFuser
 ) -> Iterator[tuple[AdditiveLayer, Array | None]]:
-    """Each layer of a set that is to be fitted, and its light as a network fuses it; None if that can't be done."""
-    if job.lrhs is None:
-        yield from ((layer, None) for layer in job.fitted)
-        return
-    decode_both = partial(_decoded, hr, job.layers), partial(_decoded, lr, job.lrhs)
-    (high, high_lit), (low, low_lit) = in_parallel(*decode_both)
-    keys = dict(zip(job.layers.layers, layer_keys(job.layers), strict=True))
+    """Each layer of a set that is to be fitted, and its light as a network fuses it; None if that can't be done.
+
+    Args:
+        low, high: both renders with the layers, see :func:`_decoded`.
+        low_lit, high_lit: names of their features that are not black.
+    """
     lit = low_lit & high_lit
-    fused = fuse_layers(
-        (_as_beauty(low, keys[layer]), _as_beauty(high, keys[layer])) for layer in job.fitted if keys[layer] in lit
-    )
-    for layer in job.fitted:
-        key = keys[layer]
+    keys = {layer: job.keys[layer] for layer in job.fitted}
+    fused = fuse_layers((_as_beauty(low, key), _as_beauty(high, key)) for key in keys.values() if key in lit)
+    for layer, key in keys.items():
         if key in lit:
             light = next(fused)
             if layer in job.noise_free:
@@ -192,20 +220,20 @@ def _fused_layers(
             unload(light)
             yield layer, light
         else:
-            yield layer, None if key in low_lit | high_lit else np.zeros_like(high.layers[key])
+            black = key in low.layers and key not in low_lit | high_lit
+            yield layer, np.zeros_like(high.layers[key]) if black else None
 
 
-def _decoded(render: MappedRender, layers: AdditiveSet) -> tuple[Render, set[str]]:
-    """The light of a set's layers, albedo and normal; and the names of those that are not black. A file is decoded
-    once, because it has all layers together."""
-    guides = {name: render.features[name] for name in (ALBEDO, NORMAL) if name in render.features}
-    source, window = with_layers(render, layers), render.data_window
-    source = replace(source, features=source.features | guides)
+def _decoded(render: MappedRender) -> tuple[Render, set[str]]:
+    """The features of a render, which wait in temporary files if they have many pixels; and the names of those that
+    are not black. A file is decoded once, because it has all layers together."""
+    window = render.data_window
     pixels: dict[str, Array] = {}
     lit: set[str] = set()
-    for y in range(window.y0, window.y1, BAND_ROWS):
-        part = Window(window.x0, y, window.x1, min(y + BAND_ROWS, window.y1))
-        for name, rows in source.read(part, [*layer_keys(layers), *guides]).items():
+    tops = range(window.y0, window.y1, BAND_ROWS)
+    parts = [Window(window.x0, y, window.x1, min(y + BAND_ROWS, window.y1)) for y in tops]
+    for part, features in zip(parts, one_ahead(render.read(part, render.features) for part in parts), strict=True):
+        for name, rows in features.items():
             if name not in pixels:
                 pixels[name] = blank((window.height, window.width, rows.shape[-1]))
             pixels[name][part.slices(window)] = rows
@@ -250,8 +278,10 @@ class _Job:
     """A set that sums to the beauty."""
 
     layers: AdditiveSet
-    lrhs: AdditiveSet | None
-    """The same layers in the LRHS."""
+    keys: dict[AdditiveLayer, str]
+    """Names, as features, of the light of the layers."""
+    lrhs: dict[str, AdditiveLayer]
+    """The same layers in the LRHS, by these names; empty if it lacks one or they do not sum to its beauty."""
     remainder: bool
     """Some light is in no layer."""
     known: _Sums
@@ -291,7 +321,9 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        jobs.append(_Job(layers, lrhs, check.remainder, known, check.noise_free))
+        keys = {layer: f"layer {len(jobs)}.{i}" for i, layer in enumerate(layers.layers)}
+        theirs = dict(zip(keys.values(), lrhs, strict=False))
+        jobs.append(_Job(layers, keys, theirs, check.remainder, known, check.noise_free))
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
@@ -319,14 +351,14 @@ def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveS
     return sums
 
 
-def _same_layers(lr: MappedRender, layers: AdditiveSet) -> AdditiveSet | None:
-    """The same layers of the LRHS, in the same order; None if it lacks one or they do not sum to its beauty."""
+def _same_layers(lr: MappedRender, layers: AdditiveSet) -> list[AdditiveLayer]:
+    """The same layers of the LRHS, in the same order; none if it lacks one or they do not sum to its beauty."""
     names = [layer.name for layer in layers.layers]
     for found in lr.additive_sets:
         by_name = {layer.name: layer for layer in found.layers}
         if by_name.keys() == set(names) and not check_sum(lr, found).problem:
-            return replace(found, layers=tuple(by_name[name] for name in names))
-    return None
+            return [by_name[name] for name in names]
+    return []
 
 
 class _Band:
@@ -334,8 +366,9 @@ class _Band:
 
     def __init__(
         self,
-        lr: MappedRender,
-        hr: MappedRender,
+        low: ReadableRender,
+        high: ReadableRender,
+        colours: Mapping[Factor, str],
         rgb: Array,
         alignment: Alignment,
         core: Window,
@@ -346,6 +379,8 @@ class _Band:
     ) -> None:
         """
         Args:
+            low, high: both renders with all layers, see :func:`_with_layers_of`.
+            colours: see :func:`_colour_names`.
             dark: light that counts as equal to none in logarithms.
             guides: see :func:`fuse_passes`.
             fused_light: light (height, width, 3) of the layers that a network has fused, over the HRLS's data window.
@@ -363,10 +398,19 @@ class _Band:
         # A frame that is stored as half is fused as half. Variances would be lost in its rounding.
         self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1)).astype(np.float32)
         self._low_beauty = _downsampled(self._beauty, self._scale)
-        to_fit = [job for job in jobs if job.remainder or any(each not in fused_light for each in job.fitted)]
-        read = self._read(lr, hr, jobs, to_fit)
-        if to_fit:
+        self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job, low, high)]
+        read = self._read(low, high, colours)
+        if self._to_fit:
             self._prepare_fit(read, guides)
+
+    def _has_light_to_fit(self, job: _Job, low: ReadableRender, high: ReadableRender) -> bool:
+        """Whether the band has light of a layer that no network has fused."""
+        keys = [job.keys[layer] for layer in job.fitted if layer not in self._fused_light]
+        area = self._area
+        # An LRHS of an odd size is up to a pixel away.
+        low_area = Window(area.x0, area.y0 - 1, area.x1, area.y1 + 1)
+        both = (high, self._hrls_area), (low, low_area)
+        return not all(_is_black(render, key, window) for key in keys for render, window in both)
 
     def _prepare_fit(self, read: Mapping[str, Array], guides: Guides) -> None:
         """Compare pixels by the albedo and normal that are ``read`` from the HRLS, or by the ``guides``."""
@@ -389,47 +433,34 @@ class _Band:
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
         self._beauty_core = self._nearby.phases(self._beauty[:, self._hrls_rows])
 
-    def _read(
-        self, lr: MappedRender, hr: MappedRender, jobs: Sequence[_Job], to_fit: Sequence[_Job]
-    ) -> dict[str, Array]:
-        """Read all layers that the band needs, at once, because a file decodes all of them together.
+    def _read(self, low: ReadableRender, high: ReadableRender, colours: Mapping[Factor, str]) -> dict[str, Array]:
+        """Read all that the band needs, at once, because a file decodes all layers together.
 
         The light of each layer that is fitted stays at low resolution, and the colours of products over the core.
 
         Returns:
             Albedo and normal (height, width, 3), as far as the HRLS has them and a layer is fitted.
         """
-        needed = (RGB, ALBEDO, NORMAL) if to_fit else ()
-        formulas = {name: hr.features[name] for name in needed if name in hr.features}
-        factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
-        names = {factor: f"colour {i}" for i, factor in enumerate(factors)}
-        formulas |= {name: FeatureFormula((factor,)) for factor, name in names.items()}
-        for i, job in enumerate(to_fit):
-            layers = with_layers(hr, job.layers).features
-            formulas |= {f"{i} {name}": formula for name, formula in layers.items() if name != RGB}
+        needed, to_fit = list(colours.values()), self._to_fit
+        if to_fit:
+            needed += [RGB, ALBEDO, NORMAL, *(key for job in to_fit for key in job.keys.values())]
         features: dict[str, Array] = {}
-        if formulas:
-            render = replace(hr, features=formulas, alpha=None)
-            features = read_features(render, self._hrls_area, self._alignment.hr_data_window, formulas)
-        self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in names.items()}
+        if needed:
+            features = read_features(high, self._hrls_area, self._alignment.hr_data_window, needed)
+        self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()}
         guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         #: For each layer without noise that is fitted, the range of the HRLS around each pixel of the core.
         self._ranges: dict[AdditiveLayer, list[Array]] = {}
-        for i, job in enumerate(to_fit):
-            for layer, name in zip(job.layers.layers, layer_keys(job.layers), strict=True):
-                if layer in job.noise_free and layer in job.fitted and layer not in self._fused_light:
-                    both = _range_around(features[f"{i} {name}"])
+        for job in to_fit:
+            for layer in job.fitted:
+                if layer in job.noise_free and layer not in self._fused_light:
+                    both = _range_around(features[job.keys[layer]])
                     self._ranges[layer] = [planes_of(values[self._hrls_rows]) for values in both]
-        low = {name: box_downsample(values, self._scale) for name, values in features.items()}
-        self._low_layers = {
-            job.layers: {RGB: low[RGB]} | {name: low[f"{i} {name}"] for name in layer_keys(job.layers)}
-            for i, job in enumerate(to_fit)
-        }
-        renders = {job.layers: with_layers(lr, job.lrhs) for job in to_fit if job.lrhs is not None}
-        self._lrhs_layers = {
-            layers: read_lrhs(render, self._alignment, self._area, render.features, RepairCounts())
-            for layers, render in renders.items()
-        }
+        self._low_layers = {name: box_downsample(values, self._scale) for name, values in features.items()}
+        theirs = [key for job in to_fit for key in job.lrhs]
+        self._lrhs_layers = {}
+        if theirs:
+            self._lrhs_layers = read_lrhs(low, self._alignment, self._area, [RGB, *theirs], RepairCounts())
         return guides
 
     def fuse(
@@ -473,13 +504,15 @@ class _Band:
     def _fitted(self, job: _Job, light: Array, colours: Mapping[AdditiveLayer, Array]) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that earlier sets do not know."""
         layers = job.fitted
-        fitted = np.empty((len(layers) + job.remainder, *light.shape), np.float32)
+        fitted = np.zeros((len(layers) + job.remainder, *light.shape), np.float32)
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._fused_light:
                 planes[:] = self._over_core(self._fused_light[layer])
-        missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
-        noisy = self._average(job) if missing else fitted
-        self._fit_layers(noisy, missing, fitted)
+        noisy = fitted
+        if job in self._to_fit:
+            missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
+            noisy = self._average(job)
+            self._fit_layers(noisy, missing, fitted)
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._ranges:
                 np.clip(planes, *self._ranges[layer], out=planes)
@@ -508,9 +541,8 @@ class _Band:
         Args:
             noisy: all layers (layers, 3, h, w) at low resolution.
             chosen: those to fit.
-            fitted: gets them, (layers, 3, h, w), over the core.
+            fitted: gets them, (layers, 3, h, w), over the core. Those without light stay as they are.
         """
-        fitted[chosen] = 0
         lit = [i for i in chosen if noisy[i].any()]
 
         def fit(part: slice) -> None:
@@ -538,9 +570,9 @@ class _Band:
 
         The remainder is the last layer.
         """
-        total = self._dimmed(job, self._low_layers[job.layers])
-        if job.layers in self._lrhs_layers:
-            layers = self._dimmed(job, self._lrhs_layers[job.layers])
+        total = self._dimmed(job, self._low_layers)
+        if job.lrhs:
+            layers = self._dimmed(job, self._lrhs_layers)
             weight = self._likeness(layers)
             total += weight * layers
             total /= 1 + weight
@@ -550,7 +582,7 @@ class _Band:
     def _dimmed(self, job: _Job, pixels: Mapping[str, Array]) -> Array:
         """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. The remainder is the last
         layer."""
-        layers = np.stack([planes_of(pixels[name]) for name in layer_keys(job.layers)])
+        layers = np.stack([planes_of(pixels[key]) for key in job.keys.values()])
         if job.remainder:
             rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
             layers = np.concatenate([layers, rest[None]])
@@ -568,6 +600,17 @@ class _Band:
         lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
         ours, fused = (np.log(light + 3 * self._dark) for light in lights)
         return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
+
+
+def _is_black(render: ReadableRender, layer: str, area: Window) -> bool:
+    """Whether a layer that is in memory has no light in an area, relative to the top left of the display window. One
+    in a file would have to be decoded, so it may have some."""
+    if not isinstance(render, Render):
+        return False
+    if layer not in render.layers:
+        return True
+    shifted = area.shift(render.display_window.x0, render.display_window.y0)
+    return not render.read(shifted.intersect(render.data_window), [layer])[layer].any()
 
 
 class _Fit:

@@ -14,7 +14,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.motion import MotionLayers
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, blank, unload
 from oiio_msspl.colour import REC709, ColourSpace
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile
@@ -162,24 +162,31 @@ class MappedRender:
         """Keep decoded rows between reads, see :meth:`oiio_msspl.exr.reader.ExrFile.cache_strips`."""
         return self.file.cache_strips(max_bytes)
 
-    def load(self, features: Iterable[str] | None = None) -> Render:
+    def unload(self) -> None:
+        """Nothing to do: pixels are read from the file."""
+
+    def load(self, features: Iterable[str] | None = None, *, on_disk: bool = False) -> Render:
         """The whole render in memory.
 
         Args:
             features: as for :meth:`read`.
+            on_disk: in temporary files instead, if it has many pixels.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
         """
-        return self.load_with((), features)[0]
+        return self.load_with((), features, on_disk=on_disk)[0]
 
-    def load_with(self, channels: Sequence[Channel], features: Iterable[str] | None = None) -> tuple[Render, Array]:
-        """The whole render in memory, and some channels as they are stored, float32 (height, width, channels).
+    def load_with(
+        self, channels: Sequence[Channel], features: Iterable[str] | None = None, *, on_disk: bool = False
+    ) -> tuple[Render, Array]:
+        """The whole render, as :meth:`load` returns it, and some channels as they are stored, float32 (height, width,
+        channels).
 
         Layers of one part are decoded together, so this is faster than to read the channels later.
 
         Args:
-            features: as for :meth:`read`.
+            features, on_disk: as for :meth:`load`.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
@@ -192,8 +199,10 @@ class MappedRender:
             strips, stored[window.slices(whole)] = self._read_with(window, features, channels)
             for name, rows in strips.items():
                 if name not in layers:
-                    layers[name] = np.empty((whole.height, whole.width, rows.shape[-1]), dtype=np.float32)
+                    shape = (whole.height, whole.width, rows.shape[-1])
+                    layers[name] = blank(shape) if on_disk else np.empty(shape, np.float32)
                 layers[name][window.slices(whole)] = rows
+                unload(layers[name])
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored
 
 

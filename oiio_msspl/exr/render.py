@@ -149,3 +149,6 @@ class ReadableRender(Protocol):
 
         A file stores rows as wide as the frame, so neighbouring tiles share them.
         """
+
+    def unload(self) -> None:
+        """Give the memory of pixels that wait in temporary files back to the system."""

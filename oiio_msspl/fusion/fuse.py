@@ -136,6 +136,8 @@ def fuse(
                 frame.tiles = step.count
                 for image in frame.clean_aovs.values():
                     unload(image)
+                for render in (lr, hr):
+                    render.unload()
                 if progress is not None:
                     progress(step.done, step.count)
                 del step  # or its memory would be held while the next one is fused

@@ -165,8 +165,7 @@ def fuse_passes(
             for image in (*fused_light.values(), *guides.values()):
                 unload(image)
             for render in (low, high):
-                if isinstance(render, Render):
-                    render.unload()
+                render.unload()
     return fused
 
 

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 
 from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB, VARIANCE
-from oiio_msspl.arrays import Array, blank, repair
+from oiio_msspl.arrays import Array, blank, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid
@@ -106,6 +106,10 @@ def average_renders(
         for steps in (before, after):
             band.add(steps)
         frames[target] = band.finish()
+        for image in (*high.values(), frames):
+            unload(image)
+        for render in (pair.lr, pair.hr):
+            render.unload()
 
     for_bands(alignment, average)
     return AveragedPair(_replaced(pair.lr, low), _replaced(pair.hr, high), frames)
@@ -194,6 +198,8 @@ class _Band:
             self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)
             self._low.add(rows_of({name: values[place] for name, values in low.items()}), (trusted * usable)[place])
+            for render in (step.frame.lr, step.frame.hr):
+                render.unload()
 
     def finish(self) -> Array:
         """Turn the sums into means. Returns the number of frames of each pixel, as :attr:`AveragedPair.frames`."""

@@ -13,7 +13,7 @@ from pathlib import Path
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, kept
+from oiio_msspl.arrays import MOST_PIXELS, Array, kept
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
@@ -123,34 +123,47 @@ class Stages:
         if not self._fits(lr, hr):
             return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
         features, channels, motion = self._features(lr, hr), self._read_ahead(lr, hr), self.temporal.motion
-        pixels, stored = hr.load_with(channels, features)
+        on_disk = self._waits_on_disk(lr, hr)
+        pixels, stored = hr.load_with(channels, features, on_disk=on_disk)
         vectors = motion.vectors_of(hr, pixels, stored) if motion and channels else {}
         waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
-        return LoadedFrame(frame, lr, hr, lr.load(features), pixels, time.perf_counter() - start, others, waiting)
+        low = lr.load(features, on_disk=on_disk)
+        return LoadedFrame(frame, lr, hr, low, pixels, time.perf_counter() - start, others, waiting)
 
     def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:
-        """Whether the pixels of all frames that are held fit into memory, beside a tile and two results."""
-        return self._room(lr, hr) >= 0
+        """Whether there is room for the pixels of all frames that are held, beside a tile and two results."""
+        return self._room(lr, hr, self._frames_in_memory(lr, hr)) >= 0
 
-    def _room(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Memory that is left beside these; negative if they don't fit."""
+    def _room(self, lr: MappedRender, hr: MappedRender, frames: int) -> int:
+        """Memory that is left beside the pixels of so many frames; negative if they don't fit."""
         features = self._features(lr, hr)
-        low, high = (_pixel_bytes(render, features) for render in (lr, hr))
         result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
-        other = FIXED_MEMORY + TILE_MEMORY + 2 * result + low
+        other = FIXED_MEMORY + TILE_MEMORY + 2 * result + _pixel_bytes(lr, features)
         other += self.temporal.memory(hr.data_window, _channels(hr, features))
-        return self.max_memory - other - self._frames_held * (low + high)
+        return self.max_memory - other - frames * sum(_pixel_bytes(render, features) for render in (lr, hr))
 
     @property
     def _frames_held(self) -> int:
-        """Frames whose pixels are in memory: the one that is fused, its neighbours, and the next one to come."""
+        """Frames whose pixels are held: the one that is fused, its neighbours, and the next one to come."""
         return 2 * self.temporal.renders + 2
+
+    def _frames_in_memory(self, lr: MappedRender, hr: MappedRender) -> int:
+        return 0 if self._waits_on_disk(lr, hr) else self._frames_held
+
+    def _waits_on_disk(self, lr: MappedRender, hr: MappedRender) -> bool:
+        """Whether renders that wait for their neighbours lie in temporary files: those of large frames that do not fit
+        into memory with their motion vectors."""
+        if not self.temporal.renders or hr.data_window.width * hr.data_window.height <= MOST_PIXELS:
+            return False
+        motion = self.temporal.motion
+        channels = motion.channels(hr) if motion else []
+        return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, channels)
 
     def _read_ahead(self, lr: MappedRender, hr: MappedRender) -> list[Channel]:
         """The motion vectors that are read with the pixels, if they fit beside these. Otherwise they are read later."""
         motion = self.temporal.motion
         channels = motion.channels(hr) if motion else []
-        return channels if _vector_bytes(hr, channels) <= self._room(lr, hr) else []
+        return channels if _vector_bytes(hr, channels) <= self._room(lr, hr, self._frames_in_memory(lr, hr)) else []
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -240,7 +253,9 @@ class Stages:
         held = result_bytes(align(loaded.lr, loaded.hr), error=self.write_options.error_layer)
         features = _features_read(session)
         if self._fits(loaded.lr, loaded.hr):
-            held += self._frames_held * sum(_pixel_bytes(render, features) for render in (loaded.lr, loaded.hr))
+            held += self._frames_in_memory(loaded.lr, loaded.hr) * sum(
+                _pixel_bytes(render, features) for render in (loaded.lr, loaded.hr)
+            )
             held += _vector_bytes(loaded.hr, self._read_ahead(loaded.lr, loaded.hr))
         return held + self.temporal.memory(loaded.hr.data_window, _channels(loaded.hr, features))
 

@@ -68,8 +68,8 @@ def test_layers_that_the_model_does_not_read_are_not_loaded(tmp_path, monkeypatc
     loaded = []
     real = MappedRender.load_with
 
-    def load_with(self, *arguments):
-        result = real(self, *arguments)
+    def load_with(self, *arguments, **options):
+        result = real(self, *arguments, **options)
         loaded.append(set(result[0].layers))
         return result
 

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Shots whose frames are averaged with their neighbours: the same pixels however the shot is cut, resumed or killed."""
 
+import mmap
 import os
 import signal
 import subprocess
@@ -11,6 +12,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputError, fuse_shot, map_render, open_exr, parallel
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
@@ -153,6 +155,29 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     assert [report.results[n].status for n in range(1001, 1005)] == ["fused", "fused", "failed", "fused"]
     assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)
+
+
+@pytest.mark.parametrize("place", ["disk", "files"])
+def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bilinear_models, monkeypatch, place):
+    folder = make_moving_shot(tmp_path, count=4)
+    fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
+    in_memory = contents(folder / "out")
+    loaded = []
+    real = stages.Stages.read
+    monkeypatch.setattr(stages.Stages, "read", lambda self, frame: loaded.append(real(self, frame)) or loaded[-1])
+    monkeypatch.setattr("oiio_msspl.arrays.MOST_PIXELS", 10)
+    if place == "disk":
+        monkeypatch.setattr(stages, "MOST_PIXELS", 10)
+        monkeypatch.setattr(stages, "_vector_bytes", lambda render, channels: 1 << 32)
+    else:
+        monkeypatch.setattr(stages, "_pixel_bytes", lambda render, features: 1 << 40)
+    fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]), overwrite=True)
+    assert contents(folder / "out") == in_memory
+    pixels = [each.hr_pixels for each in loaded]
+    if place == "disk":
+        assert all(isinstance(each.layers["rgb"].base, mmap.mmap) for each in pixels)
+    else:
+        assert all(isinstance(each, MappedRender) for each in pixels)
 
 
 @pytest.mark.parametrize(

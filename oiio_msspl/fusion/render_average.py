@@ -60,6 +60,11 @@ class RenderPair:
         )
         return bounded_luminance(lrhs), np.concatenate(high)
 
+    @cached_property
+    def hr_is_finite(self) -> bool:
+        """Whether all pixels of the HRLS are known to be finite: its layers are in memory, and were looked at."""
+        return isinstance(self.hr, Render) and _finite_pixels(self.hr.layers) is None
+
 
 @dataclass(frozen=True)
 class AveragedPair:
@@ -183,7 +188,7 @@ class _Band:
         trusted: Array | None = None
         for step in steps:
             path.follow(step)
-            high = _Nearest(step.frame.hr, path, step.frame.alignment.hr_data_window, self._features)
+            high = _Nearest(step.frame, path, self._features)
             valid = high.finite() & path.valid
             share = to_grid(self._alignment, valid.astype(np.float32), self._area)
             low, usable = self._fetch_low(step.frame, path, valid, share)
@@ -256,27 +261,24 @@ class _Nearest:
     """A neighbour's HRLS at the pixels that are nearest to the positions of a path.
 
     Args:
-        render: the neighbour's HRLS.
-        path: its positions (h, w).
-        window: the neighbour's data window.
+        frame: the neighbour.
+        path: leads to it.
         features: names.
     """
 
-    def __init__(self, render: ReadableRender, path: Path, window: Window, features: Sequence[str]) -> None:
+    def __init__(self, frame: RenderPair, path: Path, features: Sequence[str]) -> None:
+        window = frame.alignment.hr_data_window
         place = path.place_in(window)
         self._size = path.valid.shape
         self._flat = {
             name: np.ascontiguousarray(values).reshape(-1, values.shape[-1])
-            for name, values in _read(render, place, features).items()
+            for name, values in _read(frame.hr, place, features).items()
         }
-        self._at = np.empty(self._size, np.intp)
-
-        def work(rows: slice) -> None:
-            x, y = path.positions(rows)
-            self._at[rows] = nearest_indices(x, y, place)
-
-        for_row_blocks(work, *self._size)
-        self._finite = _finite_pixels(self._flat)
+        if path.nearest is None:
+            self._at = np.arange(path.valid.size, dtype=np.intp).reshape(self._size)
+        else:
+            self._at = path.nearest - (place.y0 - window.y0) * window.width
+        self._finite = None if frame.hr_is_finite else _finite_pixels(self._flat)
 
     def finite(self) -> Mask:
         """Where all features are finite, (h, w)."""

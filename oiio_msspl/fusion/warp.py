@@ -63,6 +63,8 @@ class Path:
         self.x: Array | None = None
         self.y: Array | None = None
         self.valid: Mask = np.ones((area.height, area.width), bool)
+        #: Flat indices (h, w) of the nearest pixels in the data window of the last frame; None with ``x``.
+        self.nearest: NDArray[np.intp] | None = None
         self._last = window
 
     def follow(self, step: Step[Placed]) -> None:
@@ -72,15 +74,17 @@ class Path:
         moves = step.vectors is not None
         # A complex number is gathered in half the time of two real ones.
         vectors, back = (None if v is None else _as_complex(v) for v in (step.vectors, step.back))
-        x, y = (np.empty(valid.shape, np.float32) for _ in range(2)) if moves or start != end else (self.x, self.y)
-
-        first = self.x is None and start == self._area_window
+        x, y, nearest = self.x, self.y, self.nearest
+        goes_on = moves or start != end
+        if goes_on:
+            x, y = (np.empty(valid.shape, np.float32) for _ in range(2))
+            nearest = np.empty(valid.shape, np.intp)
 
         def work(rows: slice) -> None:
             from_x, from_y = self.positions(rows)
             to_x, to_y = from_x, from_y
             good = valid[rows]
-            at = None if first else nearest_indices(from_x, from_y, start)
+            at = None if self.nearest is None else self.nearest[rows]
             if step.valid is not None:
                 good &= self._at_pixels(step.valid, rows) if at is None else step.valid.reshape(-1).take(at)
             if vectors is not None:
@@ -89,19 +93,21 @@ class Path:
                 to_x = np.where(good, from_x + vector.real, from_x)
                 to_y = np.where(good, from_y + vector.imag, from_y)
             good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
+            if goes_on and x is not None and y is not None and nearest is not None:
+                x[rows], y[rows] = to_x, to_y
+                nearest[rows] = nearest_indices(to_x, to_y, end)
             if vectors is not None or back is not None or step.back_valid is not None:
-                there = nearest_indices(to_x, to_y, end)
+                there = None if nearest is None else nearest[rows]
                 home = np.complex64(0) if vectors is None else vector
                 if back is not None:
-                    home = home + back.reshape(-1).take(there)
+                    home = home + (self._at_pixels(back, rows) if there is None else back.reshape(-1).take(there))
                 good &= np.square(home.real) + np.square(home.imag) < step.tolerance**2  # false for NaN, too
                 if step.back_valid is not None:
-                    good &= step.back_valid.reshape(-1).take(there)
-            if x is not None and y is not None and (moves or start != end):
-                x[rows], y[rows] = to_x, to_y
+                    known = step.back_valid
+                    good &= self._at_pixels(known, rows) if there is None else known.reshape(-1).take(there)
 
         for_row_blocks(work, len(valid), valid.shape[1])
-        self.x, self.y, self.valid, self._last = x, y, valid, end
+        self.x, self.y, self.nearest, self.valid, self._last = x, y, nearest, valid, end
 
     def _at_pixels(self, values: NDArray[Any], rows: slice) -> NDArray[Any]:
         """Values over the data window, at these rows of the area."""

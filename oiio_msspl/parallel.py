@@ -14,6 +14,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Executor, Future, ThreadPoolExecutor, wait
+from contextlib import AbstractContextManager
 from contextvars import ContextVar
 from functools import partial
 from typing import Any, TypeVar, cast
@@ -35,6 +36,11 @@ def limit_threads(count: int) -> Iterator[None]:
         yield
     finally:
         _thread_limit.reset(token)
+
+
+def half_of_the_threads() -> AbstractContextManager[None]:
+    """Use half as many threads inside the ``with`` block, for work beside which other work is done."""
+    return limit_threads(max((_thread_limit.get() or available_cores()) // 2, 1))
 
 
 def available_cores() -> int:
@@ -92,14 +98,13 @@ def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
 
     Work that is made of many short steps gains more by this than by threads within each step.
     """
-    threads = _thread_limit.get() or available_cores()
-    if threads == 1 or len(items) < 2:
+    if _one_thread() or len(items) < 2:
         return [work(item) for item in items]
     results: dict[int, U] = {}
     waiting = iter(range(len(items)))  # next() on it is atomic, so no item is taken twice
 
     def take() -> None:
-        with limit_threads(threads // 2):
+        with half_of_the_threads():
             for i in waiting:
                 results[i] = work(items[i])
 

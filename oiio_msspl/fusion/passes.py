@@ -37,7 +37,7 @@ from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
 from oiio_msspl.fusion.sums import check_sum, is_sum_of
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
-from oiio_msspl.parallel import for_row_blocks, in_parallel, one_ahead
+from oiio_msspl.parallel import for_row_blocks, half_of_the_threads, in_parallel, one_ahead
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
@@ -149,15 +149,18 @@ def fuse_passes(
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
-        bands = (
-            _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, fused_light)
-            for core in _bands(alignment)
-        )
+
+
+        def prepare(core: Window) -> _Band:
+            with half_of_the_threads():
+                return _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, fused_light)
+
         # The next band is read and compared while the layers of this one are fitted.
-        for band in one_ahead(bands) if jobs else []:
+        for band in one_ahead(map(prepare, _bands(alignment))) if jobs else []:
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
-                made = band.fuse(job, pixels, lights)
+                with half_of_the_threads():
+                    made = band.fuse(job, pixels, lights)
                 # Copies, because a layer alone would keep the memory of its whole set.
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1

@@ -2,11 +2,15 @@
 """Time of fused passes on a frame of real size, beside OIDN on each layer.
 
     python -m benchmarks.runtime_passes --table benchmarks/results/runtime_passes.csv
+    python -m benchmarks.runtime_passes --pair LR.exr HR.exr --table benchmarks/results/runtime_passes_cycles.csv
 
-A pair of half-float EXRs has eight light groups of random pixels that sum to the beauty, an albedo and a normal. Ours
-reads the layers from the files. OIDN gets them as arrays in memory. The methods take turns; the median of all rounds
-counts, after one that does not. With ``--quality best``, a network fuses each layer. :mod:`benchmarks.passes` measures
-accuracy, on frames that are much smaller.
+A pair of half-float EXRs has eight light groups of random pixels that sum to the beauty, an albedo and a normal. All of
+them have light everywhere, which takes longest. ``--pair`` measures all sets of a rendered pair instead, such as one of
+``datagen.cycles.passes``: some of its layers are black, or are so in parts.
+
+Ours reads the layers from the files. OIDN gets them as arrays in memory, without those that are black. The methods take
+turns; the median of all rounds counts, after one that does not. With ``--quality best``, a network fuses each layer.
+:mod:`benchmarks.passes` measures accuracy, on frames that are much smaller.
 """
 
 from __future__ import annotations
@@ -26,11 +30,15 @@ import OpenEXR
 
 from benchmarks import results
 from benchmarks.oidn import denoise, denoise_with_clean, prefiltered
+from benchmarks.passes import layers_of
 from benchmarks.results import Row
 from benchmarks.runtime import frame, processor
 from oiio_msspl import FusedFrame, fuse, map_render, open_exr
+from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import box_downsample
+from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import layer_fuser
 from oiio_msspl.fusion.passes import fuse_passes
 from oiio_msspl.fusion.tiling import MAX_MEMORY, strips_memory
@@ -38,8 +46,8 @@ from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 
 LAYERS = 8
-BEAUTY, PASSES, PLAIN = "beauty", "passes", "OIDN on each layer"
-PREFILTERED = "OIDN on each layer, prefiltered once"
+BEAUTY, OURS = "beauty", "ours"
+PLAIN, PREFILTERED = "OIDN on each layer", "OIDN on each layer, prefiltered once"
 ROUNDS = 3
 
 
@@ -67,51 +75,62 @@ def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Mappe
     return found[0], found[1]
 
 
-#: A method, and the model that it is for; no model for a peer.
-Key = tuple[str, str]
+#: A set, a method, and the model that it is for; no set for a beauty, and no model for a peer.
+Key = tuple[str, str, str]
 
 
 def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> dict[Key, Callable[[], Any]]:
     """What is timed."""
-    (lights,) = (each for each in hr.additive_sets if len(each.layers) == LAYERS)
-    pixels = frame(hr.data_window.height, hr.data_window.width)
-    noisy, guides = pixels["rgb"], {name: pixels[name] for name in ("albedo", "normal")}
+    guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
 
-    def each_prefiltered() -> None:
-        clean = prefiltered(guides)
-        for _ in range(LAYERS):
-            denoise_with_clean(noisy, clean)
-
-    def passes(session: Session, beauty: FusedFrame) -> None:
+    def passes(layers: AdditiveSet, session: Session, beauty: FusedFrame) -> None:
         cache_bytes = strips_memory(MAX_MEMORY, beauty.nbytes)  # as in the job of a frame
-        fuser = layer_fuser(session, beauty)
-        done = fuse_passes(lr, hr, beauty.rgb, beauty.alignment, [lights], cache_bytes, fuse_layers=fuser)
+        done = fuse_passes(
+            lr,
+            hr,
+            beauty.rgb,
+            beauty.alignment,
+            [layers],
+            cache_bytes,
+            guides=beauty.clean_aovs,
+            fuse_layers=layer_fuser(session, beauty),
+        )
         assert not done.refused
+
+    def each_plain(noisy: Sequence[Array]) -> None:
+        for layer in noisy:
+            denoise(layer, guides[ALBEDO], guides[NORMAL])
+
+    def each_prefiltered(noisy: Sequence[Array]) -> None:
+        clean = prefiltered(guides)
+        for layer in noisy:
+            denoise_with_clean(layer, clean)
 
     calls: dict[Key, Callable[[], Any]] = {}
     for session in sessions:
-        calls[BEAUTY, session.name] = partial(fuse, lr, hr, session)
-        calls[PASSES, session.name] = partial(passes, session, fuse(lr, hr, session))
-    calls[PLAIN, ""] = lambda: [denoise(noisy, **guides) for _ in range(LAYERS)]
-    calls[PREFILTERED, ""] = each_prefiltered
+        calls["", BEAUTY, session.name] = partial(fuse, lr, hr, session)
+    for layers in hr.additive_sets:
+        noisy = [layer for layer in layers_of(hr, layers) if layer.any()]
+        title = f"{layers.name}: {len(noisy)} of {len(layers.layers)} layers have light"
+        for session in sessions:
+            beauty = fuse(lr, hr, session, clean_aovs=True)
+            calls[title, OURS, session.name] = partial(passes, layers, session, beauty)
+        calls[title, PLAIN, ""] = partial(each_plain, noisy)
+        calls[title, PREFILTERED, ""] = partial(each_prefiltered, noisy)
     return calls
 
 
 def layout(rows: list[Row]) -> str:
-    """A line for each method."""
-    seconds = {(row["method"], row.get("model", "")): row["seconds"] for row in rows}
-    titles = {BEAUTY: "`{}` on the beauty", PASSES: f"{LAYERS} passes with `{{}}`"}
-    body = [
-        [
-            titles.get(name, name).format(model),
-            f"{value:.2f}",
-            *(f"{value / seconds[peer, '']:.2f}" for peer in (PLAIN, PREFILTERED)),
-            f"{value / seconds[BEAUTY, model]:.2f}" if model else "",
-        ]
-        for (name, model), value in seconds.items()
-    ]
+    """A table with a line for each method."""
+    seconds = {(row.get("set") or "", row["method"], row.get("model") or ""): row["seconds"] for row in rows}
+    body = []
+    for (name, method, model), value in seconds.items():
+        title = f"the beauty, `{model}`" if method == BEAUTY else f"{name}, `{model}`" if model else f"{name}, {method}"
+        peers = [f"{value / seconds[name, peer, '']:.2f}" if name else "" for peer in (PLAIN, PREFILTERED)]
+        of_beauty = f"{value / seconds['', BEAUTY, model]:.2f}" if model else ""
+        body.append([title, f"{value:.2f}", *peers, of_beauty])
     first = rows[0]
-    head = [f"{first['size'].replace('x', ' x ')}, {first['cores']} cores, {first['machine']}"]
+    head = [f"{first['size'].replace('x', ' x ')}, x{first['scale']}, {first['cores']} cores, {first['machine']}"]
     return results.markdown([*head, "seconds", "of plain OIDN's", "of prefiltered OIDN's", "of the beauty's"], body)
 
 
@@ -119,23 +138,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--scale", type=int, default=2)
+    parser.add_argument("--pair", type=Path, nargs=2, metavar=("LR.exr", "HR.exr"), help="a rendered pair instead")
     parser.add_argument("--models", nargs="+", default=["balanced", "best"])
     results.add_option(parser)
     args = parser.parse_args()
     width, height = (int(v) for v in args.size.split("x"))
     times: dict[Key, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        lr, hr = write_pair(Path(folder), width, height, args.scale)
-        calls = methods(lr, hr, [load_model(args.scale, model) for model in args.models])
+        if args.pair:
+            lr, hr = (map_render(open_exr(path)) for path in args.pair)
+        else:
+            lr, hr = write_pair(Path(folder), width, height, args.scale)
+        scale, window = align(lr, hr).scale, hr.data_window
+        calls = methods(lr, hr, [load_model(scale, model) for model in args.models])
         for _ in range(ROUNDS + 1):
             for key, call in calls.items():
                 start = time.perf_counter()
                 call()
                 times.setdefault(key, []).append(time.perf_counter() - start)
-    machine = {"size": args.size, "machine": processor(), "cores": os.cpu_count()}
+    size = {"size": f"{window.width}x{window.height}", "scale": scale}
+    machine = {"machine": processor(), "cores": os.cpu_count()}
     rows: list[Row] = [
-        {"method": name, "model": model, **machine, "seconds": statistics.median(found[1:])}
-        for (name, model), found in times.items()
+        {"set": name, "method": method, "model": model, **size, **machine, "seconds": statistics.median(found[1:])}
+        for (name, method, model), found in times.items()
     ]
     print(layout(rows))
     if args.table:

@@ -2,6 +2,9 @@
 """Pairs and references with light groups and all component passes, for :mod:`benchmarks.passes`.
 
     python -m datagen.cycles.passes PASSES
+    python -m datagen.cycles.passes FRAMES --seeds 10121 --size 1920x1080 --reference 0
+
+The second call renders pairs of real size for :mod:`benchmarks.runtime_passes`.
 
 Of every seed a folder ``cycles_SEED_FILTER`` is written, with the files that :mod:`benchmarks.render.passes` describes:
 HRLS of 1, 2 and 4 spp, LRHS with 1 and 2 samples a HRLS pixel, and a reference. Each is the multi-layer EXR of Blender
@@ -59,8 +62,8 @@ def group_lights(scene: bpy.types.Scene) -> None:
         scene.world.lightgroup = groups.add(name="world").name
 
 
-def render(out: Path, seed: int, pixel_filter: str, reference: int, threads: int) -> None:
-    """Render the files of one seed that do not exist yet. ``reference`` is in spp."""
+def render(out: Path, seed: int, pixel_filter: str, size: tuple[int, int], reference: int, threads: int) -> None:
+    """Render the files of one seed that do not exist yet. ``reference`` is in spp; 0 for none."""
     import bpy
 
     from . import scenes
@@ -70,7 +73,8 @@ def render(out: Path, seed: int, pixel_filter: str, reference: int, threads: int
     folder = out / f"cycles_{seed}_{pixel_filter.lower()}"
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in HRLS]
     jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES for spp in LRHS]
-    missing = [job for job in [*jobs, ("ref", 1, reference)] if not (folder / f"{job[0]}.exr").exists()]
+    jobs += [("ref", 1, reference)] if reference else []
+    missing = [job for job in jobs if not (folder / f"{job[0]}.exr").exists()]
     if not missing:
         return
     stage = scenes.build(seed, Assets(None))
@@ -90,7 +94,7 @@ def render(out: Path, seed: int, pixel_filter: str, reference: int, threads: int
     scene.cycles.pixel_filter_type, scene.cycles.filter_width = pixel_filter, 1.5
     for name, scale, spp in missing:
         path = folder / f"{name}.exr"
-        scene.render.resolution_x, scene.render.resolution_y = (side // scale for side in SIZE)
+        scene.render.resolution_x, scene.render.resolution_y = (side // scale for side in size)
         scene.cycles.samples, scene.cycles.seed = spp, zlib.crc32(f"{seed} {name}".encode()) % 2**31
         scene.render.filepath = str(path.with_name(f"{name}.part.exr"))
         bpy.ops.render.render(write_still=True)
@@ -101,14 +105,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path)
     parser.add_argument("--seeds", type=int, nargs="*", help="other seeds, with the filters in turn")
-    parser.add_argument("--reference", type=int, default=512, help="spp")
+    parser.add_argument("--size", default="x".join(map(str, SIZE)), metavar="WIDTHxHEIGHT", help="multiples of 4")
+    parser.add_argument("--reference", type=int, default=512, help="spp; 0 for none")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
+    width, height = (int(side) for side in args.size.split("x"))
     filters = itertools.cycle(pixel_filter for _, pixel_filter in VIEWS)
     views = zip(args.seeds, filters, strict=False) if args.seeds else VIEWS
     for seed, pixel_filter in views:
         start = time.perf_counter()
-        render(args.out, seed, pixel_filter, args.reference, args.threads)
+        render(args.out, seed, pixel_filter, (width, height), args.reference, args.threads)
         print(f"seed {seed}, {pixel_filter}: {time.perf_counter() - start:.0f} s", flush=True)
 
 

@@ -165,7 +165,7 @@ class EmptyRegions:
     """
 
     def __init__(self, lrhs_rgb: Array, reach: int = FAR) -> None:
-        self._black = np.all(lrhs_rgb == 0, axis=-1, keepdims=True)
+        self._black = _is_zero(lrhs_rgb)
         self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
 
     def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
@@ -176,8 +176,7 @@ class EmptyRegions:
         """
         if not self._black[window].any():
             return None
-        hrls_black = np.all(pair.hrls[RGB] == 0, axis=-1, keepdims=True)
-        empty = holds_around(self._black[window], hrls_black, pair.scale)
+        empty = holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
         empty &= _shows_no_surface(pair.hrls) | _enlarge(self._black_far_around[window], pair.scale)
         return empty
 
@@ -216,10 +215,16 @@ def all_within(mask: Mask, reach: int) -> Mask:
     return mask
 
 
+def _is_zero(values: Array) -> Mask:
+    """Where all channels of an image (h, w, c) are 0, (h, w, 1)."""
+    # NumPy takes five times as long to reduce the last axis, which is short.
+    return reduce(np.logical_and, (values[..., c : c + 1] == 0 for c in range(values.shape[-1])))
+
+
 def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
     """Where alpha or normal is zero, or the albedo if there are neither, (h, w, 1); everywhere without any of these."""
     names = [name for name in ("alpha", NORMAL) if name in hrls] or [name for name in (ALBEDO,) if name in hrls]
-    signs = [np.all(hrls[name] == 0, axis=-1, keepdims=True) for name in names]
+    signs = [_is_zero(hrls[name]) for name in names]
     return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)
 
 

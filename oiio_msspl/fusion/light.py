@@ -16,7 +16,7 @@ import numpy as np
 from oiio_msspl.arrays import Array, box_downsample, mean_around, upsample_linear
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.tile_features import mirrored_pixels
+from oiio_msspl.fusion.tile_features import mirrored
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.parallel import for_row_blocks, two_at_a_time
 
@@ -79,8 +79,7 @@ def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
     """A plane (h, w) over ``area`` at the LRHS's resolution, over the width of the grid."""
     whole = _whole_pixels(alignment, area)
     if whole != area:
-        rows, columns = mirrored_pixels(whole, area)
-        plane = plane[rows - area.y0].take(columns - area.x0, axis=1)
+        plane = mirrored(plane, area, whole)
     return box_downsample(plane, alignment.scale)
 
 

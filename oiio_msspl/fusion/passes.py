@@ -36,7 +36,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
 from oiio_msspl.fusion.sums import check_sum, is_sum_of
-from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored_pixels, read_features, read_lrhs
+from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks, half_of_the_threads, in_parallel, one_ahead
 
 #: HRLS rows that are fused at a time.
@@ -149,7 +149,6 @@ def fuse_passes(
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
-
 
         def prepare(core: Window) -> _Band:
             with half_of_the_threads():
@@ -396,9 +395,8 @@ class _Band:
         self._hrls_area = in_hrls_pixels(self._area, alignment.scale)
         self._hrls_rows = in_hrls_pixels(core, alignment.scale).slices(self._hrls_area)[0]
         window = alignment.hr_data_window
-        rows, columns = mirrored_pixels(self._hrls_area, window)
         # A frame that is stored as half is fused as half. Variances would be lost in its rounding.
-        self._beauty = planes_of(rgb[rows - window.y0].take(columns - window.x0, axis=1)).astype(np.float32)
+        self._beauty = planes_of(mirrored(rgb, window, self._hrls_area)).astype(np.float32)
         self._low_beauty = _downsampled(self._beauty, self._scale)
         self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job, low, high)]
         read = self._read(low, high, colours)
@@ -416,15 +414,13 @@ class _Band:
 
     def _prepare_fit(self, read: Mapping[str, Array], guides: Guides) -> None:
         """Compare pixels by the albedo and normal that are ``read`` from the HRLS, or by the ``guides``."""
-        window = self._alignment.hr_data_window
-        rows, columns = mirrored_pixels(self._hrls_area, window)
         log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + self._dark)
         planes = [log[None] / SPREAD[RGB]]
         for name, image in read.items():
             noisy = planes_of(image)
             guide = _smoothed(noisy, log)
             if name in guides:
-                clean = planes_of(guides[name][rows - window.y0].take(columns - window.x0, axis=1))
+                clean = planes_of(mirrored(guides[name], self._alignment.hr_data_window, self._hrls_area))
                 # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
                 guide = np.where((noisy > 1).any(axis=0), guide, clean)
             planes.append(guide / SPREAD[name])
@@ -533,9 +529,8 @@ class _Band:
 
     def _over_core(self, image: Array) -> Array:
         """An image (height, width, 3) over the HRLS's data window, mirrored beyond it, as planes over the core."""
-        window = self._alignment.hr_data_window
-        rows, columns = mirrored_pixels(in_hrls_pixels(self._core, self._scale), window)
-        return planes_of(image[rows - window.y0].take(columns - window.x0, axis=1))
+        core = in_hrls_pixels(self._core, self._scale)
+        return planes_of(mirrored(image, self._alignment.hr_data_window, core))
 
     def _fit_layers(self, noisy: Array, chosen: Sequence[int], fitted: Array) -> None:
         """Fit some layers to the fused beauty.

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass, field
+from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from oiio_msspl.fusion.tiling import Tile
 
 Indices = NDArray[np.int64]
 Mask = NDArray[np.bool_]
+T = TypeVar("T", bound=np.generic)
 
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
@@ -110,7 +112,7 @@ def read_lrhs(
         counts: repaired values are added here.
     """
     data = alignment.lr_data_window
-    hrls_rows, hrls_columns = mirrored_pixels(in_hrls_pixels(grid, alignment.scale), alignment.hr_data_window)
+    hrls_rows, hrls_columns = _mirrored_pixels(in_hrls_pixels(grid, alignment.scale), alignment.hr_data_window)
     rows = np.clip(_lrhs_positions(hrls_rows, alignment.scale, alignment.stretch[1]), data.y0, data.y1 - 1)
     columns = np.clip(_lrhs_positions(hrls_columns, alignment.scale, alignment.stretch[0]), data.x0, data.x1 - 1)
     y0, x0 = int(np.floor(rows.min())), int(np.floor(columns.min()))
@@ -149,7 +151,7 @@ def read_features(
         counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
         broken: gets a mask (h, w) of the pixels that were filled, for each feature that has some.
     """
-    rows, columns = mirrored_pixels(window, data_window)
+    rows, columns = _mirrored_pixels(window, data_window)
     stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
     layers = render.read(stored.shift(render.display_window.x0, render.display_window.y0), features)
     result = {}
@@ -162,21 +164,47 @@ def read_features(
         if missing is not None and missing.any():
             repaired = filled(repaired, missing)
             if broken is not None:
-                broken[name] = missing[rows - stored.y0].take(columns - stored.x0, axis=1)
-        result[name] = repaired if stored == window else repaired[rows - stored.y0].take(columns - stored.x0, axis=1)
+                broken[name] = _at(missing, rows - stored.y0, columns - stored.x0)
+        result[name] = _at(repaired, rows - stored.y0, columns - stored.x0)
     return result
 
 
-def mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
+def mirrored(image: NDArray[T], inside: Window, window: Window) -> NDArray[T]:
+    """An image (h, w, ...) over ``inside`` at the pixels of another window, mirrored where that reaches beyond."""
+    rows, columns = _mirrored_pixels(window, inside)
+    return _at(image, rows - inside.y0, columns - inside.x0)
+
+
+def _at(values: NDArray[T], rows: Indices, columns: Indices) -> NDArray[T]:
+    """Some rows and columns of an image (h, w, ...), in the same layout in memory."""
+    for axis, indices in enumerate((rows, columns)):
+        lines = values.swapaxes(0, axis)
+        # Nearly all lines follow each other. To copy these together is faster than to take each one.
+        starts = np.flatnonzero(np.diff(indices, prepend=indices[0] - 2) != 1)
+        lengths = np.diff(starts, append=len(indices))
+        start, length = starts[lengths.argmax()], lengths.max()
+        run = slice(indices[start], indices[start] + length)
+        if length == len(indices):
+            values = lines[run].swapaxes(0, axis)
+            continue
+        chosen = np.empty_like(lines, shape=(len(indices), *lines.shape[1:]))
+        chosen[start : start + length] = lines[run]
+        for part in (slice(0, start), slice(start + length, None)):
+            chosen[part] = lines[indices[part]]
+        values = chosen.swapaxes(0, axis)
+    return values
+
+
+def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
     """The rows and the columns of ``inside`` that a window shows if the picture is mirrored at the sides of
     ``inside``."""
     return (
-        _mirrored(np.arange(window.y0, window.y1), inside.y0, inside.y1),
-        _mirrored(np.arange(window.x0, window.x1), inside.x0, inside.x1),
+        _mirrored_line(np.arange(window.y0, window.y1), inside.y0, inside.y1),
+        _mirrored_line(np.arange(window.x0, window.x1), inside.x0, inside.x1),
     )
 
 
-def _mirrored(pixels: Indices, start: int, stop: int) -> Indices:
+def _mirrored_line(pixels: Indices, start: int, stop: int) -> Indices:
     """The pixels from ``start`` to ``stop`` that these indices show if the line is mirrored at both ends."""
     length = stop - start
     offsets = (pixels - start) % (2 * length)

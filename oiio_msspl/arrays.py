@@ -3,15 +3,19 @@
 
 from __future__ import annotations
 
+import errno
+import math
 import mmap
+import os
 import tempfile
 from collections.abc import Callable, Sequence
 from functools import reduce
-from typing import Any, TypeVar
+from typing import IO, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from oiio_msspl.errors import MssplError
 from oiio_msspl.parallel import for_row_blocks
 
 Array = NDArray[np.float32]
@@ -33,11 +37,37 @@ def quantile(values: NDArray[Any], share: float) -> float:
 
 
 def blank(shape: tuple[int, ...], dtype: type[T] | np.dtype[T] = np.float32) -> NDArray[T]:  # type: ignore[assignment]
-    """A black image (h, w, ...) that is to be filled: in memory, or in a temporary file if it has many pixels."""
+    """A black image (h, w, ...) that is to be filled: in memory, or in a temporary file if it has many pixels.
+
+    Raises:
+        MssplError: the disk has no room.
+    """
     if shape[0] * shape[1] <= MOST_PIXELS:
         return np.zeros(shape, dtype)
     with tempfile.TemporaryFile(prefix="msspl-") as file:
-        return np.memmap(file, dtype, "w+", shape=shape)
+        reserve(file, math.prod(shape) * np.dtype(dtype).itemsize)
+        return np.memmap(file, dtype, "r+", shape=shape)
+
+
+def reserve(file: IO[bytes], size: int) -> None:
+    """Make a temporary file at least so large, and take the room for that on the disk.
+
+    Otherwise, a disk that becomes full would end the process as soon as pixels are put into a file in memory.
+
+    Raises:
+        MssplError: the disk has no room.
+    """
+    try:
+        if size and hasattr(os, "posix_fallocate"):  # not on macOS and Windows
+            os.posix_fallocate(file.fileno(), 0, size)
+    except OSError as error:
+        if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+            raise MssplError(
+                f"{tempfile.gettempdir()}: no room for {size / 1e6:.0f} MB of temporary files ({error.strerror}); "
+                "free some, or name another folder in the variable TMPDIR"
+            ) from error
+    if os.fstat(file.fileno()).st_size < size:
+        file.truncate(size)
 
 
 def planes(like: Array, channels: int) -> Array:

@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
 """Operations on images."""
 
+import errno
+import os
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from oiio_msspl import arrays
+from oiio_msspl import MssplError, arrays
 from oiio_msspl.arrays import box_downsample, filled
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.replaced import ReplacedChannels
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32])
@@ -52,3 +57,34 @@ def test_unloaded_images_keep_their_pixels(monkeypatch):
         np.testing.assert_array_equal(on_disk, image)
     arrays.unload(image)  # in memory: nothing happens
     np.testing.assert_array_equal(on_disk, image)
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
+def test_a_full_disk_is_an_error_and_does_not_end_the_process(monkeypatch, code):
+    def full(*arguments):
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(os, "posix_fallocate", full, raising=False)
+    monkeypatch.setattr(arrays, "MOST_PIXELS", 10)
+    with pytest.raises(MssplError, match=r"no room for \d+ MB of temporary files .* TMPDIR") as raised:
+        arrays.blank((100, 100, 3))
+    assert raised.value.exit_code == 1
+    pixels = ReplacedChannels()
+    with pytest.raises(MssplError, match="no room"):
+        pixels.add([Channel(Path("a.exr"), 0, 0, "R", "float")], 100, 100)
+
+
+@pytest.mark.parametrize("there", [True, False])
+def test_images_are_black_on_disks_that_can_not_take_room_in_advance(monkeypatch, there):
+    def unknown(*arguments):
+        raise OSError(errno.EOPNOTSUPP, os.strerror(errno.EOPNOTSUPP))
+
+    if there:
+        monkeypatch.setattr(os, "posix_fallocate", unknown, raising=False)
+    else:
+        monkeypatch.delattr(os, "posix_fallocate", raising=False)
+    monkeypatch.setattr(arrays, "MOST_PIXELS", 10)
+    image = arrays.blank((20, 30, 3))
+    assert image.shape == (20, 30, 3) and not image.any()
+    image[19, 29] = 1
+    assert image.sum() == 3

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import FLOAT_MAX, HALF_MAX, Array
+from oiio_msspl.arrays import FLOAT_MAX, HALF_MAX, Array, reserve
 from oiio_msspl.exr.reader import Channel
 
 #: NumPy's type of each pixel type.
@@ -31,12 +31,16 @@ class ReplacedChannels:
         self._file = tempfile.TemporaryFile(prefix="msspl-")  # noqa: SIM115 - it lives as long as this object
 
     def add(self, channels: Sequence[Channel], width: int, height: int) -> None:
-        """Make room for ``channels``, of ``width`` x ``height`` pixels each; a channel that has room keeps it."""
+        """Make room for ``channels``, of ``width`` x ``height`` pixels each; a channel that has room keeps it.
+
+        Raises:
+            MssplError: the disk has no room.
+        """
         for channel in channels:
             if channel not in self._places:
                 self._places[channel] = self._size, width
                 self._size += width * height * np.dtype(DTYPES[channel.type]).itemsize
-        self._file.truncate(self._size)
+        reserve(self._file, self._size)
 
     def __contains__(self, channel: Channel) -> bool:
         return channel in self._places

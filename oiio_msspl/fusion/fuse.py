@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -46,7 +47,7 @@ from oiio_msspl.model.contract import NO_DENOISER
 from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
 from oiio_msspl.model.render_mean import Images, MeanSettings, mean_settings
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import limit_threads, one_ahead
+from oiio_msspl.parallel import half_of_the_threads, limit_threads, one_ahead
 
 
 @dataclass
@@ -175,9 +176,10 @@ def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame:
 
     def steps() -> Iterator[_Step]:
         for lr, hr in pairs:
-            pair = _Pair(lr, hr, frame.alignment, session, (), frame, memory)
+            with half_of_the_threads():
+                pair = _Pair(lr, hr, frame.alignment, session, (), frame, memory)
             result = FusedFrame(blank(frame.rgb.shape), None, None, frame.alignment, frame.exposure, {})
-            for step in _steps(pair, result):
+            for step in _steps(pair, result, half_of_the_threads):
                 for render in (lr, hr):
                     render.unload()
                 yield step
@@ -426,12 +428,16 @@ class _Step:
     """Tiles of the result."""
 
 
-def _steps(pair: _Pair, result: FusedFrame) -> Iterator[_Step]:
-    """Prepare the tiles of a frame, one after the other."""
+def _steps(
+    pair: _Pair, result: FusedFrame, threads: Callable[[], AbstractContextManager[object]] = nullcontext
+) -> Iterator[_Step]:
+    """Prepare the tiles of a frame, one after the other, each inside of ``threads()``."""
     tiles = pair.tiles()
     means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
     for done, tile in enumerate(tiles, start=1):
-        yield _Step(pair, pair.prepare(tile), means, result, done, len(tiles))
+        with threads():
+            prepared = pair.prepare(tile)
+        yield _Step(pair, prepared, means, result, done, len(tiles))
 
 
 def _run(steps: Iterable[_Step], session: Session) -> Iterator[_Step]:

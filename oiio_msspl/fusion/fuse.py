@@ -176,6 +176,7 @@ def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame:
 
     def steps() -> Iterator[_Step]:
         for lr, hr in pairs:
+            # The network works at the same time, and has threads on all cores.
             with half_of_the_threads():
                 pair = _Pair(lr, hr, frame.alignment, session, (), frame, memory)
             result = FusedFrame(blank(frame.rgb.shape), None, None, frame.alignment, frame.exposure, {})

@@ -74,11 +74,10 @@ class Path:
         moves = step.vectors is not None
         # A complex number is gathered in half the time of two real ones.
         vectors, back = (None if v is None else _as_complex(v) for v in (step.vectors, step.back))
-        x, y, nearest = self.x, self.y, self.nearest
-        goes_on = moves or start != end
-        if goes_on:
-            x, y = (np.empty(valid.shape, np.float32) for _ in range(2))
-            nearest = np.empty(valid.shape, np.intp)
+        shape = valid.shape
+        found: tuple[Array, Array, NDArray[np.intp]] | None = None
+        if moves or start != end:
+            found = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.intp)
 
         def work(rows: slice) -> None:
             from_x, from_y = self.positions(rows)
@@ -93,11 +92,11 @@ class Path:
                 to_x = np.where(good, from_x + vector.real, from_x)
                 to_y = np.where(good, from_y + vector.imag, from_y)
             good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
-            if goes_on and x is not None and y is not None and nearest is not None:
-                x[rows], y[rows] = to_x, to_y
-                nearest[rows] = nearest_indices(to_x, to_y, end)
+            there = at
+            if found is not None:
+                there = nearest_indices(to_x, to_y, end)
+                found[0][rows], found[1][rows], found[2][rows] = to_x, to_y, there
             if vectors is not None or back is not None or step.back_valid is not None:
-                there = None if nearest is None else nearest[rows]
                 home = np.complex64(0) if vectors is None else vector
                 if back is not None:
                     home = home + (self._at_pixels(back, rows) if there is None else back.reshape(-1).take(there))
@@ -107,7 +106,9 @@ class Path:
                     good &= self._at_pixels(known, rows) if there is None else known.reshape(-1).take(there)
 
         for_row_blocks(work, len(valid), valid.shape[1])
-        self.x, self.y, self.nearest, self.valid, self._last = x, y, nearest, valid, end
+        if found is not None:
+            self.x, self.y, self.nearest = found
+        self.valid, self._last = valid, end
 
     def _at_pixels(self, values: NDArray[Any], rows: slice) -> NDArray[Any]:
         """Values over the data window, at these rows of the area."""

@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.arrays import Array, blank, repair, unload
@@ -274,15 +275,15 @@ class _Nearest:
             name: np.ascontiguousarray(values).reshape(-1, values.shape[-1])
             for name, values in _read(frame.hr, place, features).items()
         }
-        if path.nearest is None:
-            self._at = np.arange(path.valid.size, dtype=np.intp).reshape(self._size)
-        else:
-            self._at = path.nearest - (place.y0 - window.y0) * window.width
+        #: Flat indices in the data window; these pixels begin at ``_first``.
+        self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
         self._finite = None if frame.hr_is_finite else _finite_pixels(self._flat)
 
     def finite(self) -> Mask:
         """Where all features are finite, (h, w)."""
-        return np.ones(self._size, bool) if self._finite is None else self._finite.take(self._at)
+        if self._finite is None:
+            return np.ones(self._size, bool)
+        return self._finite.take(self._indices(slice(0, self._size[0])))
 
     def luminance(self) -> Array:
         """Luminance (h, w) of the beauty, finite and >= 0."""
@@ -298,9 +299,17 @@ class _Nearest:
         """The pixels, with rows that are counted from ``first`` on."""
         return lambda name, rows: self._pixels(name, slice(first + rows.start, first + rows.stop))
 
+    def _indices(self, rows: slice) -> NDArray[np.intp]:
+        """Flat indices of the nearest pixels at some rows (n, w)."""
+        if self._nearest is not None:
+            return self._nearest[rows] - self._first
+        width = self._size[1]
+        first, last, _ = rows.indices(self._size[0])
+        return np.arange(first * width, last * width, dtype=np.intp).reshape(-1, width)
+
     def _pixels(self, name: str, rows: slice) -> Array:
         """A feature at some rows (n, w, c). Pixels that are not finite are 0."""
-        at = self._at[rows]
+        at = self._indices(rows)
         values = self._flat[name].take(at, axis=0)
         if self._finite is not None:
             values[~self._finite.take(at)] = 0

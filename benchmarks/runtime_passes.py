@@ -107,14 +107,14 @@ def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> 
             denoise_with_clean(layer, clean)
 
     calls: dict[Key, Callable[[], Any]] = {}
+    beauties = {session.name: fuse(lr, hr, session, clean_aovs=True) for session in sessions}
     for session in sessions:
         calls["", BEAUTY, session.name] = partial(fuse, lr, hr, session)
     for layers in hr.additive_sets:
         noisy = [layer for layer in layers_of(hr, layers) if layer.any()]
         title = f"{layers.name}: {len(noisy)} of {len(layers.layers)} layers have light"
         for session in sessions:
-            beauty = fuse(lr, hr, session, clean_aovs=True)
-            calls[title, OURS, session.name] = partial(passes, layers, session, beauty)
+            calls[title, OURS, session.name] = partial(passes, layers, session, beauties[session.name])
         calls[title, PLAIN, ""] = partial(each_plain, noisy)
         calls[title, PREFILTERED, ""] = partial(each_prefiltered, noisy)
     return calls

@@ -217,7 +217,7 @@ def all_within(mask: Mask, reach: int) -> Mask:
 
 def _is_zero(values: Array) -> Mask:
     """Where all channels of an image (h, w, c) are 0, (h, w, 1)."""
-    # NumPy takes five times as long to reduce the last axis, which is short.
+    # NumPy is slow to reduce an axis as short as that of the channels.
     return reduce(np.logical_and, (values[..., c : c + 1] == 0 for c in range(values.shape[-1])))
 
 

@@ -66,6 +66,11 @@ class RenderPair:
         """Whether all pixels of the HRLS are known to be finite: its layers are in memory, and were looked at."""
         return isinstance(self.hr, Render) and _finite_pixels(self.hr.layers) is None
 
+    def unload(self) -> None:
+        """Give the memory of pixels that wait in temporary files back to the system."""
+        self.lr.unload()
+        self.hr.unload()
+
 
 @dataclass(frozen=True)
 class AveragedPair:
@@ -114,8 +119,7 @@ def average_renders(
         frames[target] = band.finish()
         for image in (*high.values(), frames):
             unload(image)
-        for render in (pair.lr, pair.hr):
-            render.unload()
+        pair.unload()
 
     for_bands(alignment, average)
     return AveragedPair(_replaced(pair.lr, low), _replaced(pair.hr, high), frames)
@@ -204,8 +208,7 @@ class _Band:
             self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)
             self._low.add(rows_of({name: values[place] for name, values in low.items()}), (trusted * usable)[place])
-            for render in (step.frame.lr, step.frame.hr):
-                render.unload()
+            step.frame.unload()
 
     def finish(self) -> Array:
         """Turn the sums into means. Returns the number of frames of each pixel, as :attr:`AveragedPair.frames`."""

@@ -155,14 +155,16 @@ class Stages:
         into memory with their motion vectors."""
         if not self.temporal.renders or hr.data_window.width * hr.data_window.height <= MOST_PIXELS:
             return False
+        return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
+
+    def _motion_channels(self, hr: MappedRender) -> list[Channel]:
+        """The channels of the motion vectors; none if the motion is known otherwise."""
         motion = self.temporal.motion
-        channels = motion.channels(hr) if motion else []
-        return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, channels)
+        return motion.channels(hr) if motion else []
 
     def _read_ahead(self, lr: MappedRender, hr: MappedRender) -> list[Channel]:
         """The motion vectors that are read with the pixels, if they fit beside these. Otherwise they are read later."""
-        motion = self.temporal.motion
-        channels = motion.channels(hr) if motion else []
+        channels = self._motion_channels(hr)
         return channels if _vector_bytes(hr, channels) <= self._room(lr, hr, self._frames_in_memory(lr, hr)) else []
 
     def session(self, loaded: LoadedFrame) -> Session:

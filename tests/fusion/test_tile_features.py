@@ -6,7 +6,7 @@ from oiio_msspl import find_model, fuse
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.tile_features import read_lrhs, read_tile
+from oiio_msspl.fusion.tile_features import mirrored, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import Tile, aligned_grid
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
@@ -94,3 +94,17 @@ def test_the_last_rows_are_as_good_as_inside_a_larger_frame(scale, rows):
         error = encode_radiance(fused.rgb, fused.exposure) - encode_radiance(clean, fused.exposure)[: len(fused.rgb)]
         errors.append(np.square(error[height - 8 : height]).mean())
     assert errors[1] < 3 * errors[0]
+
+
+@pytest.mark.parametrize("window", [(0, 0, 9, 7), (2, 1, 5, 6), (-3, -2, 12, 8), (4, 3, 30, 25), (-21, 2, -15, 4)])
+@pytest.mark.parametrize("layout", ["pixels", "planes"])
+def test_images_are_mirrored_as_often_as_a_window_reaches(window, layout):
+    inside, window = Window(0, 0, 9, 7), Window(*window)
+    image = np.random.default_rng(0).random((3, 7, 9), np.float32).transpose(1, 2, 0)
+    image = np.ascontiguousarray(image) if layout == "pixels" else image
+    there = np.pad(image, ((28, 28), (27, 27), (0, 0)), mode="symmetric")[
+        28 + window.y0 : 28 + window.y1, 27 + window.x0 : 27 + window.x1
+    ]
+    result = mirrored(image, inside, window)
+    np.testing.assert_array_equal(result, there)
+    np.testing.assert_array_equal(np.argsort(result.strides), np.argsort(image.strides))

@@ -11,10 +11,11 @@ import math
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, RADIANCE_FEATURES, VARIANCE
 from oiio_msspl.colour import LUMINANCE_WEIGHTS
-from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, MAX_RADIANCE, MU, NO_LIGHT
+from oiio_msspl.model.encoding import BLOCK, KEY, MAX_ALBEDO, MAX_RADIANCE, MIN_BLOCKS, MU, NO_LIGHT, NOISY
 from oiio_msspl.model.pu_curve import (
     BOUNDS,
     EXPONENT,
@@ -94,11 +95,23 @@ def repair(values: Tensor, *, signed: bool = False) -> Tensor:
 
 def exposure_of(lrhs: Tensor) -> Tensor:
     """Exposure of each image of a batch (N, h, w, 3), as :func:`oiio_msspl.model.encoding.find_exposure`: (N,)."""
-    y = luminance(lrhs).flatten(1)
-    y = torch.where(y > 0, y, torch.nan)
-    y = torch.where(y >= NO_LIGHT * y.nanquantile(0.99, dim=1, keepdim=True), y, torch.nan)
-    epsilon = 1e-4 * y.nanmedian(dim=1, keepdim=True).values
-    return torch.nan_to_num(KEY / torch.exp(torch.log(y + epsilon).nanmean(dim=1)), nan=1.0)
+    y = luminance(lrhs)
+    lit = torch.where(y > 0, y, torch.nan).flatten(1)
+    bright = lit.nanquantile(0.99, dim=1, keepdim=True)
+    exposure = KEY / _log_mean(lit, NO_LIGHT * bright)
+    rows, columns = (side // BLOCK for side in y.shape[1:])
+    if rows * columns >= MIN_BLOCKS:
+        means = F.avg_pool2d(torch.minimum(y, bright[..., None]), BLOCK).flatten(1)
+        even = KEY / _log_mean(torch.where(means > 0, means, torch.nan), NO_LIGHT * bright)
+        exposure = torch.fmin(exposure, NOISY * even)  # where no block is lit, it is NaN
+    return torch.nan_to_num(exposure, nan=1.0)
+
+
+def _log_mean(lit: Tensor, darkest: Tensor) -> Tensor:
+    """Log-mean (N,) of the luminances (N, n) that are not below ``darkest`` (N, 1), nor NaN."""
+    lit = torch.where(lit >= darkest, lit, torch.nan)
+    offset = 1e-4 * lit.nanmedian(dim=1, keepdim=True).values
+    return torch.exp(torch.log(lit + offset).nanmean(dim=1))
 
 
 def compress(radiance: Tensor, exposure: Tensor) -> Tensor:

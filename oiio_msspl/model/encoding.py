@@ -12,7 +12,7 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
-from oiio_msspl.arrays import HALF_MAX, Array, clip, map_rows, planes, quantile
+from oiio_msspl.arrays import HALF_MAX, Array, box_downsample, clip, map_rows, planes, quantile
 from oiio_msspl.colour import luminance
 from oiio_msspl.parallel import BLOCK_VALUES
 
@@ -28,6 +28,11 @@ MAX_ALBEDO = 2.0
 EXPOSURE_BOUNDS = (2e-34, 1e38)
 #: Pixels darker than this share of a frame's bright pixels (33 stops below) do not count for its exposure.
 NO_LIGHT = 1e-10
+#: Side, in pixels, of the squares whose means show how bright a noisy frame is, and how many a frame has at least. In
+#: fewer of them, one lamp could decide.
+BLOCK, MIN_BLOCKS = 8, 64
+#: Most that the exposure may exceed that of these means. Frames with little noise are well below.
+NOISY = 5.0
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
 #: Log-encoded ``MAX_RADIANCE``, in the arithmetic of :func:`decode_radiance`.
@@ -37,8 +42,10 @@ _MAX_ENCODED = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
 def find_exposure(rgb: Array) -> float:
     """Factor that brings a render to a log-mean luminance of ``KEY``.
 
-    Only lit pixels count, because a black pixel has no exposure. The offset inside the logarithm keeps a few nearly
-    black pixels from deciding. It follows the median, which a firefly hardly changes.
+    Only lit pixels count, because a black pixel has no exposure. Noise makes most pixels darker than their mean, and a
+    few much brighter. So the log-mean of a very noisy frame is far too dark. The log-mean of ``BLOCK`` x ``BLOCK``
+    pixels' means shows that, and bounds the factor. In these means, the brightest pixels are limited, or small lamps
+    would decide.
 
     Args:
         rgb: (height, width, 3), scene linear, repaired.
@@ -50,13 +57,28 @@ def find_exposure(rgb: Array) -> float:
     lit = y[y > 0]
     if lit.size == 0:
         return 1.0
-    darkest = NO_LIGHT * quantile(lit, 0.99)
-    if lit.min() < darkest:
-        lit = lit[lit >= darkest]
+    bright = quantile(lit, 0.99)
+    darkest = NO_LIGHT * bright
+    exposure = KEY / _log_mean(lit if lit.min() >= darkest else lit[lit >= darkest])
+    rows, columns = (side // BLOCK for side in y.shape)
+    if rows * columns >= MIN_BLOCKS:
+        means = box_downsample(np.minimum(y[: rows * BLOCK, : columns * BLOCK], np.float32(bright)), BLOCK)
+        means = means[(means > 0) & (means >= darkest)]
+        if means.size:
+            exposure = min(exposure, NOISY * KEY / _log_mean(means))
+    return float(np.clip(exposure, *EXPOSURE_BOUNDS))
+
+
+def _log_mean(lit: Array) -> float:
+    """The log-mean of luminances > 0 (n,).
+
+    The offset inside the logarithm keeps a few nearly black pixels from deciding. It follows the median, which a
+    firefly hardly changes.
+    """
     offset = 1e-4 * quantile(lit, 0.5)
     blocks = np.array_split(lit, -(-lit.size // BLOCK_VALUES))  # a block fits into the processor's cache
     log_sum = sum(float(np.log(block.astype(np.float64) + offset).sum()) for block in blocks)
-    return float(np.clip(KEY / np.exp(log_sum / lit.size), *EXPOSURE_BOUNDS))
+    return float(np.exp(log_sum / lit.size))
 
 
 def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) -> Array:

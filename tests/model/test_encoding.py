@@ -5,7 +5,7 @@ import pytest
 from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
 from oiio_msspl.arrays import repair
 from oiio_msspl.colour import srgb
-from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_radiance, find_exposure
+from oiio_msspl.model.encoding import NOISY, decode_radiance, encode_feature, encode_radiance, find_exposure
 from tests.conftest import noisy, picture
 
 
@@ -36,6 +36,23 @@ def test_traces_of_light_do_not_decide_the_exposure():
     assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
 
 
+def test_noise_does_not_make_a_frame_brighter_to_the_network():
+    """With one lit sample in 20 and a little light in all others, the median is far below the mean."""
+    clean = np.full((64, 64, 3), 0.02, np.float32)
+    lit = np.random.default_rng(0).random((64, 64, 1)) < 0.05
+    noise = np.where(lit, 20 * clean, 1e-4 * clean)
+    assert find_exposure(noise) == pytest.approx(NOISY * find_exposure(clean), rel=0.3)
+    assert find_exposure(noisy(clean, 1)) < 2 * find_exposure(clean)
+
+
+@pytest.mark.parametrize("lamps", [1e2, 1e6])
+def test_small_lamps_do_not_darken_a_frame_to_the_network(lamps):
+    scene = picture(64, 64)
+    with_lamps = scene.copy()
+    with_lamps[4::16, 4::16] = lamps
+    assert find_exposure(with_lamps) == pytest.approx(find_exposure(scene), rel=0.1)
+
+
 def test_a_sample_of_a_large_frame_gives_its_exposure(monkeypatch):
     scene = noisy(picture(256, 256), 4)
     whole = find_exposure(scene)
@@ -47,6 +64,13 @@ def test_a_sample_of_a_large_frame_gives_its_exposure(monkeypatch):
 def test_exposure_and_ceiling_are_finite(light):
     exposure = np.float32(find_exposure(np.full((4, 4, 3), light, np.float32)))
     assert np.isfinite([exposure, np.float32(65504) / exposure]).all()
+
+
+def test_light_in_the_last_column_alone_has_an_exposure():
+    """It lies in no whole block."""
+    scene = np.full((64, 65, 3), 1e-40, np.float32)
+    scene[:, -1] = 0.02
+    assert find_exposure(scene) == pytest.approx(9.0, rel=1e-3)
 
 
 def test_exposure_of_black_is_one():

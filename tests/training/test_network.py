@@ -234,10 +234,11 @@ def test_training_transforms_as_inference_does() -> None:
 
 
 def test_exposure_of_training_is_that_of_inference() -> None:
-    """Also of frames with black pixels, with traces of light, and of black ones."""
+    """Also of frames with black pixels, with traces of light, of black ones, and of very noisy ones."""
     rng = np.random.default_rng(0)
-    frames = rng.gamma(1.0, 0.3, (4, 12, 16, 3)).astype(np.float32)
+    frames = rng.gamma(1.0, 0.3, (5, 66, 75, 3)).astype(np.float32)
     frames[1, :4], frames[2, 4:], frames[3] = 0, 1e-20, 0
+    frames[4] *= np.where(rng.random((66, 75, 1)) < 0.05, 1, 1e-4)
     expected = [find_exposure(frame) for frame in frames]
     np.testing.assert_allclose(encoding.exposure_of(torch.from_numpy(frames)), expected, rtol=1e-4)
 

@@ -23,10 +23,10 @@ from oiio_msspl.fusion.guards import (
     LAYER_REACH,
     EmptyRegions,
     Mask,
+    bright_lights,
     check_finite,
     dim_fireflies,
     is_noise_free,
-    lights_above_ceiling,
     lit_window,
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, bounded_luminance, check_pair
@@ -261,7 +261,7 @@ class _Picture:
     """Network input, encoded; None for a tile that is empty everywhere."""
     hrls: Array | None = None
     lights: Array | None = None
-    """See :func:`oiio_msspl.fusion.guards.lights_above_ceiling`."""
+    """See :func:`oiio_msspl.fusion.guards.bright_lights`."""
     noise_free: bool = False
     """There is no noise to remove: the HRLS is the result."""
     aovs: tuple[str, ...] = ()
@@ -371,7 +371,7 @@ class _Pair:
         picture = _Picture(place, replace(pair, hrls=copies), self._lrhs_aovs(pair), aovs=aovs)
         if lit:
             lrhs_rgb, hrls = dim_fireflies(pair)
-            picture.lights = lights_above_ceiling(lrhs_rgb, hrls[RGB], self.exposure)
+            picture.lights = bright_lights(lrhs_rgb, hrls[RGB], self.exposure)
             picture.lrhs = planes(lrhs_rgb, len(contract.lrhs))
             picture.hrls = self._memory.planes(hrls[RGB], len(contract.hrls))
             encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, picture.lrhs)
@@ -467,7 +467,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
         if any(image is not None for _, image in lights):
             dark = np.zeros_like(tile.pictures[0].hrls[..., :3])
             whole = join(((place, dark if image is None else image) for place, image in lights), size)
-            np.maximum(rgb, whole[core], out=rgb)
+            np.copyto(rgb, whole[core], where=whole[core] > 0)
         if empty is not None:
             rgb *= ~empty[core]
         if frame.rgb.dtype == np.float16:

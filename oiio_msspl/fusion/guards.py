@@ -17,7 +17,7 @@ from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tile_features import TilePair
-from oiio_msspl.model.encoding import MAX_RADIANCE, encode_radiance
+from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import for_row_blocks
 
@@ -30,6 +30,9 @@ FIREFLY_FACTOR = 64.0
 #: A tile has no noise to remove if its renders differ nowhere by more than this, log-encoded: half a step of an 8-bit
 #: picture.
 NOISE_FREE = 1 / 512
+#: Exposed radiance above which light that both renders show is that of the HRLS. Noise is hardly ever so bright in
+#: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
+LIGHT = 4096.0
 
 
 def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
@@ -64,35 +67,35 @@ def _limit(hrls: Array, limit: Array, scale: int) -> Array:
     return result
 
 
-def lights_above_ceiling(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
-    """Radiance above the ceiling of the networks, where both renders have it.
+def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
+    """Radiance above ``LIGHT`` divided by the exposure, where both renders have it.
 
-    Networks read radiance up to ``MAX_RADIANCE`` divided by the exposure, so they cannot tell how bright a light is.
-    It is as bright as in the HRLS, and at most as bright as the brightest of the 3 x 3 LRHS pixels around. A light that
-    is smaller than an LRHS pixel may be brighter than that: as bright as what the LRHS exceeds the clipped HRLS by,
-    spread over the clipped pixels. Pixel filters move light between neighbours, so both are counted over 3 x 3 LRHS
-    pixels.
+    Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
+    light, and its rim would be too bright. It is as bright as in the HRLS, and at most as bright as the brightest of
+    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that: as bright as
+    what the LRHS exceeds the clipped HRLS by, spread over the clipped pixels. Pixel filters move light between
+    neighbours, so both are counted over 3 x 3 LRHS pixels.
 
     Args:
         lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
 
     Returns:
-        (s*h, s*w, 3), scene linear; 0 below the ceiling. None if no pixel is above it.
+        (s*h, s*w, 3), scene linear; 0 where it is darker. None if no pixel is as bright.
     """
-    ceiling = np.float32(MAX_RADIANCE / exposure)
-    if hrls_rgb.max() <= ceiling:
+    least = np.float32(LIGHT / exposure)
+    if hrls_rgb.max() <= least:
         return None
     scale = len(hrls_rgb) // len(lrhs_rgb)
-    clipped_share = box_downsample((hrls_rgb > ceiling).astype(np.float32), scale)
-    excess = np.maximum(lrhs_rgb - box_downsample(np.minimum(hrls_rgb, ceiling), scale), 0)
+    clipped_share = box_downsample((hrls_rgb > least).astype(np.float32), scale)
+    excess = np.maximum(lrhs_rgb - box_downsample(np.minimum(hrls_rgb, least), scale), 0)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         light, share = (reduce(np.add, _neighbours(values)) for values in (excess, clipped_share))
-        small_light = ceiling + light / np.maximum(share, np.float32(1 / scale**2))
+        small_light = least + light / np.maximum(share, np.float32(1 / scale**2))
         limit = np.maximum(max_3x3(lrhs_rgb), small_light)
         # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
         limit = np.minimum(limit, lrhs_rgb * np.float32(FIREFLY_FACTOR))
     agreed = _limit(hrls_rgb, _as_wide_as_hrls(limit, scale), scale)
-    agreed[agreed <= ceiling] = 0
+    agreed[agreed <= least] = 0
     return agreed
 
 

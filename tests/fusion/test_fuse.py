@@ -195,7 +195,7 @@ LAMP_ROWS, LAMP_COLUMNS = slice(45, 72), slice(67, 102)  # not along the borders
 
 
 @pytest.mark.parametrize("family", ["joint-small", "paper"])
-@pytest.mark.parametrize(("lamp", "room"), [(5000, 0.002), (60_000, 0.05), (1e7, 0.05)])
+@pytest.mark.parametrize(("lamp", "room"), [(120, 0.002), (5000, 0.002), (60_000, 0.05), (1e7, 0.05)])
 def test_a_lamp_is_as_bright_as_in_both_renders(scale, family, lamp, room):
     """However dark the room is: inside, along the rim, and where it is smaller than an LRHS pixel; without a halo."""
     clean = np.full((144, 192, 3), room, np.float32)

@@ -467,7 +467,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: 
         if any(image is not None for _, image in lights):
             dark = np.zeros_like(tile.pictures[0].hrls[..., :3])
             whole = join(((place, dark if image is None else image) for place, image in lights), size)
-            np.copyto(rgb, whole[core], where=whole[core] > 0)
+            np.copyto(rgb, whole[core], where=np.any(whole[core] > 0, axis=-1, keepdims=True))
         if empty is not None:
             rgb *= ~empty[core]
         if frame.rgb.dtype == np.float16:

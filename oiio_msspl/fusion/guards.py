@@ -68,7 +68,7 @@ def _limit(hrls: Array, limit: Array, scale: int) -> Array:
 
 
 def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
-    """Radiance above ``LIGHT`` divided by the exposure, where both renders have it.
+    """The colour of pixels with radiance above ``LIGHT`` divided by the exposure, where both renders have it.
 
     Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
     light, and its rim would be too bright. It is as bright as in the HRLS, and at most as bright as the brightest of
@@ -80,7 +80,7 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
         lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
 
     Returns:
-        (s*h, s*w, 3), scene linear; 0 where it is darker. None if no pixel is as bright.
+        (s*h, s*w, 3), scene linear; 0 where all channels are darker. None if no pixel is as bright.
     """
     least = np.float32(LIGHT / exposure)
     if hrls_rgb.max() <= least:
@@ -95,7 +95,7 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
         # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
         limit = np.minimum(limit, lrhs_rgb * np.float32(FIREFLY_FACTOR))
     agreed = _limit(hrls_rgb, _as_wide_as_hrls(limit, scale), scale)
-    agreed[agreed <= least] = 0
+    agreed[np.all(agreed <= least, axis=-1)] = 0
     return agreed
 
 

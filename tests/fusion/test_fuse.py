@@ -211,6 +211,16 @@ def test_a_lamp_is_as_bright_as_in_both_renders(scale, family, lamp, room):
     assert fused[~on].max() < 0.2 * 65504 * room / 0.18  # a fifth of the ceiling: what the networks themselves spread
 
 
+def test_a_lamp_keeps_its_colour_where_one_channel_alone_is_bright(session, scale):
+    clean = np.full((96, 128, 3), 0.05, np.float32)
+    high, colour = noisy(clean, 4), np.float32([3000, 300, 0])
+    clean[32:64, 32:64] = high[32:64, 32:64] = colour
+    low = downsample(clean, scale)
+    assert 300 < 4096 / find_exposure(low.astype(np.float32)) < 3000
+    fused = fuse(*renders(low, high), session).rgb[32:64, 32:64]
+    np.testing.assert_allclose(fused, np.broadcast_to(colour, fused.shape), rtol=1e-6)
+
+
 def test_the_rim_of_a_lamp_is_whole_under_a_wide_pixel_filter(session, scale):
     """The LRHS's filter is as wide in its own pixels, so it is darker than the lamp along the rim."""
     lamp = np.zeros((144, 192, 3), np.float32)

@@ -34,6 +34,7 @@ with a 95 % interval by :mod:`benchmarks.versus`; a win is a layer with more PSN
 from __future__ import annotations
 
 import argparse
+import re
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
@@ -79,6 +80,8 @@ STORED_PEER = "OIDN, prefiltered, stored"
 COMPONENTS = "components"
 #: Column of the gain -> over which method.
 GAINS = {"gain": PEER, "gain_stored": STORED_PEER}
+#: Methods in the table of single layers.
+IN_LAYERS = ("HRLS", "ratio", "OIDN", "OIDN, rescaled", PEER, "msspl-x2", "msspl-x2, best", "msspl-x4, best")
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
@@ -287,6 +290,22 @@ def layout(rows: list[Row]) -> str:
     for line, row in zip(body, shown, strict=True):
         line.append(f"{row['wins']:.0f} of {row['layers']:.0f}")
     return results.markdown(head, body)
+
+
+def layout_of_layers(rows: list[Row]) -> str:
+    """PSNR and RelMSE of single layers, means over the scenes that have them. Lamps in groups count as one layer."""
+    single = [row for row in rows if row["scene"] != MEAN and row["layer"] != ALL]
+    kinds = {row["layer"]: re.sub(r"_\d+$", "", row["layer"]) for row in single}
+    body = []
+    for name, spp, kind in dict.fromkeys((row["set"], row["spp"], kinds[row["layer"]]) for row in single):
+        same = [row for row in single if (row["set"], row["spp"], kinds[row["layer"]]) == (name, spp, kind)]
+        cells = []
+        for method in IN_LAYERS:
+            scores = [(row["psnr"], row["relmse"]) for row in same if row["method"] == method]
+            cells.append("{:.2f}, {:.4f}".format(*np.mean(scores, axis=0)))
+        count = sum(row["method"] == PEER for row in same)
+        body.append([name, str(spp), kind, str(count), *cells])
+    return results.markdown(["set", "spp", "layer", "number", *IN_LAYERS], sorted(body))
 
 
 def main() -> None:

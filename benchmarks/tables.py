@@ -361,6 +361,11 @@ def passes() -> str:
     return f"{passes_benchmark.layout(rows)}\nMeans over all layers of these scenes: {scenes}.\n"
 
 
+def single_passes() -> str:
+    """Each fused layer, beside other ways to clean it."""
+    return passes_benchmark.layout_of_layers(results.read("passes"))
+
+
 def passes_time() -> str:
     """Time of fused passes on a frame of real size: light everywhere, at x2 and x4, and a rendered frame."""
     tables = ("runtime_passes", "runtime_passes_x4", "runtime_passes_cycles")
@@ -406,7 +411,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         stability,
         pair_checks,
     ),
-    ROOT / "docs/design/passes.md": (passes, passes_time),
+    ROOT / "docs/design/passes.md": (passes, single_passes, passes_time),
     ROOT / "docs/design/temporal.md": (temporal_time, temporal_counts),
 }
 

@@ -89,6 +89,10 @@ class FusedPasses:
     """Their new pixels, over the HRLS's data window."""
     refused: dict[str, str] = field(default_factory=dict)
     """Why other sets were not fused, by name."""
+    hrls_alone: dict[str, str] = field(default_factory=dict)
+    """By name of a fused set: the layers that were read from the HRLS alone, see :attr:`_Job.hrls_alone`."""
+    warnings: list[str] = field(default_factory=list)
+    """A sentence for each set of which the LRHS has some layers only, or layers that do not sum to its beauty."""
 
 
 def fuse_passes(
@@ -120,12 +124,14 @@ def fuse_passes(
     Raises:
         InputError: pixels can't be decoded.
     """
-    jobs, refused = _checked(lr, hr, sets)
+    jobs, refused, warnings = _checked(lr, hr, sets)
     window = alignment.hr_data_window
     pixels = ReplacedChannels() if pixels is None else pixels
     pixels.add([channel for job in jobs for channel in job.channels], window.width, window.height)
     in_order = sorted(jobs, key=lambda job: sets.index(job.layers))
-    fused = FusedPasses([replace(job.layers, coarser=tuple(job.coarser)) for job in in_order], pixels, refused)
+    fused_sets = [replace(job.layers, coarser=tuple(job.coarser)) for job in in_order]
+    hrls_alone = {job.layers.name: job.hrls_alone for job in in_order if job.hrls_alone}
+    fused = FusedPasses(fused_sets, pixels, refused, hrls_alone, warnings)
     later = {part for job in jobs for parts in job.known.values() for part in parts}
     tell = progress or (lambda done, count: None)
     by_network = fuse_layers is not None and any(job.lrhs for job in jobs)
@@ -282,7 +288,7 @@ class _Job:
     keys: dict[AdditiveLayer, str]
     """Names, as features, of the light of the layers."""
     lrhs: dict[str, AdditiveLayer]
-    """The same layers in the LRHS, by these names; empty if it lacks one or they do not sum to its beauty."""
+    """The same layers in the LRHS, as far as it has them, by these names."""
     remainder: bool
     """Some light is in no layer."""
     known: _Sums
@@ -298,20 +304,29 @@ class _Job:
         return [layer for layer in self.layers.layers if layer not in self.known]
 
     @property
+    def hrls_alone(self) -> str:
+        """Fitted layers that the LRHS lacks: their names, or that it is all; empty if it lacks none."""
+        missing = [layer.name for layer in self.fitted if self.keys[layer] not in self.lrhs]
+        return "all layers" if missing and not self.lrhs else ", ".join(missing)
+
+    @property
     def channels(self) -> list[Channel]:
         """What is written."""
         return [channel for layer in (*self.layers.layers, *self.coarser) for channel in layer.channels]
 
 
-def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[list[_Job], dict[str, str]]:
-    """The sets that sum to the beauty, and why each of the others does not, by name.
+def _checked(
+    lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]
+) -> tuple[list[_Job], dict[str, str], list[str]]:
+    """The sets that sum to the beauty; why each of the others does not, by name; and warnings of layers of the LRHS.
 
     Sets with more layers come first, because layers of the others may be sums of theirs.
     """
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
+    warnings: list[str] = []
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        check, lrhs = in_parallel(partial(check_sum, hr, layers), partial(_same_layers, lr, layers))
+        check, (lrhs, problem) = in_parallel(partial(check_sum, hr, layers), partial(_lrhs_layers, lr, layers))
         if check.problem:
             refused[layers.name] = check.text
             continue
@@ -323,14 +338,21 @@ def _checked(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) ->
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
         keys = {layer: f"layer {len(jobs)}.{i}" for i, layer in enumerate(layers.layers)}
-        theirs = dict(zip(keys.values(), lrhs, strict=False))
-        jobs.append(_Job(layers, keys, theirs, check.remainder, known, check.noise_free))
+        theirs = {key: lrhs[layer] for layer, key in keys.items() if layer in lrhs}
+        job = _Job(layers, keys, theirs, check.remainder, known, check.noise_free)
+        jobs.append(job)
+        if problem:
+            warnings.append(
+                f"{layers.name}: the LRHS's layers do not sum to its beauty, so they are not read: {problem}"
+            )
+        elif theirs and job.hrls_alone:
+            warnings.append(f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there")
     taken = {channel for job in jobs for channel in job.channels}
     for job in jobs:
         for layer in job.layers.coarser:
             if taken.isdisjoint(layer.channels):
                 job.coarser.update(_sums_of(hr, [layer], job.layers))
-    return jobs, refused
+    return jobs, refused, warnings
 
 
 def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> _Sums:
@@ -352,14 +374,20 @@ def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveS
     return sums
 
 
-def _same_layers(lr: MappedRender, layers: AdditiveSet) -> list[AdditiveLayer]:
-    """The same layers of the LRHS, in the same order; none if it lacks one or they do not sum to its beauty."""
-    names = [layer.name for layer in layers.layers]
-    for found in lr.additive_sets:
-        by_name = {layer.name: layer for layer in found.layers}
-        if by_name.keys() == set(names) and not check_sum(lr, found).problem:
-            return [by_name[name] for name in names]
-    return []
+def _lrhs_layers(lr: MappedRender, layers: AdditiveSet) -> tuple[dict[AdditiveLayer, AdditiveLayer], str]:
+    """Those layers of a set that the LRHS has, too; and why these can't be used, if they do not sum to its beauty.
+
+    Some of its light may be missing from them.
+    """
+    by_name = {(layer.name, layer.factor is None): layer for layer in layers.layers}
+    best: dict[AdditiveLayer, AdditiveLayer] = {}
+    check: AdditiveSet | None = None
+    for candidate in lr.additive_sets:
+        same = {by_name[key]: each for each in candidate.layers if (key := (each.name, each.factor is None)) in by_name}
+        if len(same) > len(best):
+            best, check = same, candidate
+    problem = "" if check is None else check_sum(lr, check).problem
+    return ({}, problem) if problem else (best, "")
 
 
 class _Band:
@@ -571,16 +599,20 @@ class _Band:
         if job.lrhs:
             layers = self._dimmed(job, self._lrhs_layers)
             weight = self._likeness(layers)
-            total += weight * layers
-            total /= 1 + weight
-        known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
-        return np.delete(total, known, axis=0) if known else total
+            known = [key in job.lrhs for key in job.keys.values()]
+            for i, both in enumerate([*known, all(known)][: len(total)]):
+                if both:
+                    total[i] += weight * layers[i]
+                    total[i] /= 1 + weight
+        elsewhere = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
+        return np.delete(total, elsewhere, axis=0) if elsewhere else total
 
     def _dimmed(self, job: _Job, pixels: Mapping[str, Array]) -> Array:
-        """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. The remainder is the last
-        layer."""
-        layers = np.stack([planes_of(pixels[key]) for key in job.keys.values()])
-        if job.remainder:
+        """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Those that it lacks are
+        black. The rest of its beauty is the last layer, if a layer lacks or light is in none."""
+        black = np.zeros_like(self._low_beauty)
+        layers = np.stack([planes_of(pixels[key]) if key in pixels else black for key in job.keys.values()])
+        if job.remainder or not pixels.keys() >= set(job.keys.values()):
             rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
             layers = np.concatenate([layers, rest[None]])
         light = layers.sum(axis=(0, 1))

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.write_options import LOSSLESS
 from oiio_msspl.parallel import one_ahead
 
 #: Largest part of the beauty's light that may be wrong in a sum: what half floats round, and a few repaired pixels.
@@ -20,6 +21,8 @@ TOLERANCE = 2e-3
 #: What a sum is compared on: so many strips of rows, evenly spaced. A quarter of a 1080p frame. Files are mostly
 #: compressed in blocks of 16 rows, so each strip is one block.
 STRIPS, ROWS = 17, 16
+#: Largest residual that lossy compression explains.
+LOSSY = 0.05
 #: A layer has no noise if at least this share of its lit pixels equals a pixel beside it, within this share of their
 #: light. Layers with noise have few such pixels.
 NOISE_FREE, EQUAL = 2 / 3, 0.01
@@ -61,14 +64,12 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
     ]
     if other:
         return SumCheck(1.0, problem=f"{other[0]} has another data window")
-    layers = with_layers(render, additive_set)
-    names = [RGB, *layer_keys(additive_set)]
+    layers, names = with_layers(render, additive_set), [RGB, *layer_keys(additive_set)]
     light = wrong = missing = surplus = 0.0
     # Where a beauty of half floats is clipped, its layers have more light.
     brightest = HALF_MAX if render.beauty_channels[0].type == "half" else np.inf
     alike = np.zeros((len(additive_set.layers), 2), np.int64)
-    strips = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _strips(window))
-    for pixels in one_ahead(layers.read(strip, names) for strip in strips):
+    for pixels in _read_strips(layers, names):
         beauty = pixels[RGB].astype(np.float64)
         with np.errstate(invalid="ignore", over="ignore"):
             rest = beauty - sum(pixels[name] for name in names[1:])
@@ -90,10 +91,51 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
     if surplus / light <= TOLERANCE:
         return SumCheck(residual, remainder=True, noise_free=noise_free)
     if abs(missing - surplus) < wrong / 4:
-        return SumCheck(
-            residual, problem=f"they differ by {residual:.1%} both ways; is the beauty denoised, or stored lossily?"
-        )
-    return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; some layers overlap")
+        reason = "is the beauty denoised, or made with another pixel filter?"
+        lossy = _lossy_compression(render, additive_set)
+        if lossy and residual < LOSSY:
+            reason = f"the compression {lossy} is lossy, so store them with zip or piz"
+        return SumCheck(residual, problem=f"they differ by {residual:.1%} both ways; {reason}")
+    superfluous = _superfluous(layers, additive_set)
+    advice = f"without {' and '.join(superfluous)} they would sum to it" if superfluous else "some layers overlap"
+    return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; {advice}")
+
+
+def _superfluous(render: MappedRender, additive_set: AdditiveSet) -> list[str]:
+    """The names of what a set has too much of to sum to the beauty: one layer, or all that by their names are sums of
+    others. Empty if the rest would not sum to it either.
+
+    Args:
+        render: that of :func:`with_layers`.
+    """
+    keys = dict(zip(additive_set.layers, layer_keys(additive_set), strict=True))
+    choices = [(layer,) for layer in keys]
+    choices.append(tuple(layer for layer in keys if any(layer.words < other.words for other in keys)))
+    light, wrong = 0.0, np.zeros(len(choices))
+    for pixels in _read_strips(render, [RGB, *keys.values()]):
+        beauty = pixels[RGB].astype(np.float64)
+        with np.errstate(invalid="ignore", over="ignore"):
+            rest = beauty - sum(pixels[key] for key in keys.values())
+            rests = [rest + sum(pixels[keys[layer]] for layer in left_out) for left_out in choices]
+        usable = np.isfinite(rest)
+        light += np.abs(beauty[usable]).sum()
+        wrong += [np.abs(each[usable]).sum() for each in rests]
+    best = int(wrong.argmin())
+    return [layer.name for layer in choices[best]] if wrong[best] <= TOLERANCE * light else []
+
+
+def _lossy_compression(render: MappedRender, additive_set: AdditiveSet) -> str:
+    """The compression with which the beauty or a layer has lost precision; empty if none has."""
+    channels = [*render.beauty_channels, *(channel for layer in additive_set.layers for channel in layer.channels)]
+    used = {render.file.parts[channel.part].compression for channel in channels}
+    return min(used.difference(LOSSLESS), default="")
+
+
+def _read_strips(render: MappedRender, features: Sequence[str]) -> Iterator[dict[str, Array]]:
+    """Some features of a render, in strips of rows from top to bottom."""
+    window = render.data_window
+    strips = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _strips(window))
+    return one_ahead(render.read(strip, features) for strip in strips)
 
 
 def _equal_pixels(pixels: Array) -> tuple[int, int]:

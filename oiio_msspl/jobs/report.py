@@ -171,10 +171,13 @@ def name_of(view: str) -> str:
 
 
 def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:
-    """Sentences for the sets that the user has named and that could not be fused."""
-    refused = fused.passes.refused if fused.passes else {}
+    """Sentences for layers of the LRHS that lack, and for sets that the user has named and that could not be fused."""
+    if fused.passes is None:
+        return []
+    refused = fused.passes.refused
     named = [each.name for each in hr.additive_sets if each.by_user and each.name in refused]
-    return [f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are" for name in named]
+    passed_on = [f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are" for name in named]
+    return [*fused.passes.warnings, *passed_on]
 
 
 def _passes(fused: FusedFrame) -> dict[str, str]:
@@ -182,6 +185,7 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
     if fused.passes is None:
         return {}
     done = {each.name: f"fused: {each.layer_names}" for each in fused.passes.sets}
+    done |= {name: f"{done[name]} ({layers} from the HRLS alone)" for name, layers in fused.passes.hrls_alone.items()}
     return done | {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in done}
 
 

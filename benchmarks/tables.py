@@ -51,6 +51,7 @@ WHEN_IT_PAYS = {
     "ensemble-x2": ("`--quality best` (`ensemble-x2`)", "LRHS and HRLS"),
     "ensemble-x2, 7:1": ("the same, HRLS with 7/8 of the samples", "LRHS and HRLS"),
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
+    "OIDN fast on the HRLS": ("OIDN on the HRLS, its quality fast", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),

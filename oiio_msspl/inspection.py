@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,10 +17,12 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.motion import MotionSource, find_motion
+from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
-from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls
+from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -44,6 +47,8 @@ class Inspection:
     """What was found, one line each."""
     motion: MotionSource | None = None
     """How the movement to the next frame is known; None if there is no next frame beside this one."""
+    noise: str | None = None
+    """``independent`` or ``spread`` over neighbouring pixels; None unless :func:`inspect_noise` has looked."""
     passed_through: list[str] = field(default_factory=list)
     """Names of the layers and channels that no feature is read from."""
     problems: list[str] = field(default_factory=list)
@@ -96,6 +101,7 @@ class Inspection:
                 "notes": self.render.notes,
                 "passed_through": self.passed_through,
                 "motion_layers": {each.name: str(each.format) for each in self.render.motion.fields},
+                "noise": self.noise,
                 "motion": {"kind": self.motion.kind, "text": self.motion.text} if self.motion else None,
             }
         return result
@@ -141,6 +147,25 @@ def inspect_file(
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
     return result
+
+
+def inspect_noise(found: Sequence[Inspection], inputs: InputOptions) -> None:
+    """Tell of the two renders of a frame whether the pixel filter has spread their noise. The larger one gets the fact.
+
+    Files that are no such pair are left as they are.
+    """
+    renders = [each for each in found if each.render is not None]
+    if len(renders) != 2:
+        return
+    low, high = sorted(renders, key=lambda each: each.render.display_window.width if each.render else 0)
+    try:
+        lr, hr = map_pair(low.path, high.path, inputs)
+        spread = is_noise_spread(lr, hr, align(lr, hr))
+    except InputError:
+        return
+    high.noise = "spread" if spread else "independent"
+    text = "the pixel filter has spread it over neighbouring pixels" if spread else "independent in each pixel"
+    high.facts.append(f"noise, by {low.path.name}: {text}")
 
 
 def _set_facts(render: MappedRender) -> list[str]:

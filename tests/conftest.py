@@ -79,6 +79,16 @@ def noisy(clean, spp, seed=0):
     return (clean * rng.gamma(spp, 1 / spp, clean.shape)).astype(np.float32)
 
 
+def spread(image, sigma):
+    """An image whose pixels are Gaussian means of their neighbours, as a filter of ``sigma`` pixels makes them."""
+    taps = np.exp(-0.5 * (np.arange(-2, 3) / sigma) ** 2)
+    for axis in (0, 1):
+        padded = np.pad(image, [(2, 2) if a == axis else (0, 0) for a in range(3)], mode="edge")
+        shifted = [np.take(padded, np.arange(i, i + image.shape[axis]), axis) for i in range(5)]
+        image = np.tensordot(taps / taps.sum(), shifted, 1)
+    return image.astype(np.float32)
+
+
 def downsample(values, scale):
     """Box average over scale x scale pixels."""
     height, width = values.shape[0] // scale, values.shape[1] // scale

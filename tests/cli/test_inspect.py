@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.aovs.motion import MotionFormat
-from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
+from tests.conftest import SHARED, needs_shared, picture, rgb, spread, write_exr
 from tests.moving_plane import encode, frame, layer, truck_and_dolly, vectors
 from tests.programs import run
 
@@ -20,6 +20,18 @@ def test_inspect_tells_a_person_and_a_machine(files):
     data = json.loads(run("msspl", "inspect", files / "hr.exr", "--json").stdout)
     assert data["usable"]
     assert data["parts"][0]["channels"]["mask.X"] == "half"
+
+
+@pytest.mark.parametrize(("sigma", "noise"), [(0, "independent"), (0.5, "spread")])
+def test_inspect_tells_of_a_pair_whether_its_noise_is_spread(tmp_path, sigma, noise):
+    rng = np.random.default_rng(0)
+    for name, side, spp in (("lr", 64, 16), ("hr", 256, 1)):
+        image = rng.gamma(spp, 0.5 / spp, (side, side, 3)).astype(np.float32)
+        write_exr(tmp_path / f"{name}.exr", rgb(spread(image, sigma) if sigma else image))
+    done = run("msspl", "inspect", tmp_path / "hr.exr", tmp_path / "lr.exr")
+    assert f"  noise, by lr.exr: {'the pixel filter' if sigma else 'independent'}" in done.stdout
+    high, low = json.loads(run("msspl", "inspect", tmp_path / "hr.exr", tmp_path / "lr.exr", "--json").stdout)
+    assert (high["noise"], low["noise"]) == (noise, None)
 
 
 def test_inspect_says_what_the_model_does_not_read(files):

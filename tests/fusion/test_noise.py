@@ -8,17 +8,7 @@ from oiio_msspl import Render
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.noise import is_noise_spread
-from tests.conftest import noisy, picture
-
-
-def spread(image, sigma):
-    """An image whose pixels are Gaussian means of their neighbours, as a filter of ``sigma`` pixels makes them."""
-    taps = np.exp(-0.5 * (np.arange(-2, 3) / sigma) ** 2)
-    for axis in (0, 1):
-        padded = np.pad(image, [(2, 2) if a == axis else (0, 0) for a in range(3)], mode="edge")
-        shifted = [np.take(padded, np.arange(i, i + image.shape[axis]), axis) for i in range(5)]
-        image = np.tensordot(taps / taps.sum(), shifted, 1)
-    return image.astype(np.float32)
+from tests.conftest import noisy, picture, spread
 
 
 def asked(clean, scale, spp, sigma=None):

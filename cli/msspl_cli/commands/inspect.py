@@ -15,6 +15,8 @@ EXAMPLES = """[bold]Examples[/bold]
 
   msspl inspect hr.exr
 
+  msspl inspect lr.exr hr.exr
+
   msspl inspect hr.exr --map normal=N_bump --json
 """
 
@@ -32,14 +34,16 @@ def inspect(
 ) -> None:
     """Print what a render contains, and which of its layers a model would read.
 
-    If the next frame lies beside a file, the two verify its motion vectors.
+    If the next frame lies beside a file, the two verify its motion vectors. The two renders of a frame tell whether a
+    pixel filter has spread their noise.
 
     If a file can't be used, the reason is printed and the exit code is 2.
     """
-    from oiio_msspl.inspection import inspect_file
+    from oiio_msspl.inspection import inspect_file, inspect_noise
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
     found = [inspect_file(path, inputs, model, motion_format) for path in files]
+    inspect_noise(found, inputs)
     if as_json:
         data = [inspection.as_dict() for inspection in found]
         print(json.dumps(data if len(data) > 1 else data[0], indent=2))

@@ -2,9 +2,11 @@
 """Time of a shot whose frames are averaged with their neighbours, beside the same shot frame by frame.
 
     python -m benchmarks.runtime_temporal --table benchmarks/results/runtime_temporal.csv
+    python -m benchmarks.runtime_temporal --lamps 4 --table benchmarks/results/runtime_temporal_passes.csv
 
 A shot of real size is written to a temporary folder: a textured wall past which the camera moves, with noise of 1 spp,
-albedo, normal, depth and exact motion vectors, as half-float EXRs. All ways (`WAYS`) take turns for each quality, file
+albedo, normal, depth and exact motion vectors, as half-float EXRs. With ``--lamps`` both renders have light groups,
+whose passes are fused. All ways (`WAYS`) take turns for each quality, file
 to file, each in its own process; the median of all rounds counts. The ratio depends on the number of frames: the first
 and the last ones have fewer neighbours, and how motion is stored is found out once. Peak memory is that of the largest
 round.
@@ -32,6 +34,8 @@ from oiio_msspl.arrays import Array, box_downsample, enlarged
 STEP = 3
 #: Size of the wall's stains in pixels.
 STAIN = 8
+#: Size of the places where one lamp or another is brighter.
+LIT = 48
 #: Values of ``--temporal``: the first one is what the others are compared with.
 OFF = "off"
 WAYS = (OFF, "2", "auto")
@@ -43,18 +47,37 @@ def wall(height: int, width: int) -> Array:
     return (0.1 + 0.8 * enlarged(stains, STAIN)[:height, :width]).astype(np.float32)
 
 
-def write_shot(folder: Path, count: int, width: int, height: int, scale: int) -> None:
-    """Write the frames of both renders."""
-    whole = wall(height, width + STEP * count)
+def clean_frame(number: int, count: int, width: int, height: int, lamps: int) -> tuple[Array, list[Array]]:
+    """The wall's colour in a frame, (height, width, 3), and its light from each lamp; from all together without groups.
+
+    Args:
+        count: frames of the shot.
+    """
+    shares = np.ones((1, 1, 1, 1), np.float32)
+    if lamps:
+        stains = np.random.default_rng(1).random(
+            (lamps, -(-height // LIT), -(-(width + STEP * count) // LIT), 1), np.float32
+        )
+        shares = np.stack([enlarged(each, LIT) for each in stains / stains.sum(axis=0)])
+    colour, *parts = (
+        image[:height, STEP * number :][:, :width] for image in (wall(height, width + STEP * count), *shares)
+    )
+    return colour, [np.float32(0.5) * colour * part for part in parts]
+
+
+def write_shot(folder: Path, count: int, width: int, height: int, scale: int, lamps: int = 0) -> None:
+    """Write the frames of both renders, with the light of each lamp as a layer."""
     for name in ("lr", "hr"):
         (folder / name).mkdir()
     for number in range(1, count + 1):
-        colour = whole[:, STEP * number :][:, :width]
+        colour, clean = clean_frame(number, count, width, height, lamps)
         for name, factor, spp in (("lr", scale, scale**2), ("hr", 1, 1)):
             albedo = box_downsample(colour, factor)
             rng = np.random.default_rng([number, factor])
-            light = rng.gamma(spp, 0.5 / spp, (*albedo.shape[:2], 1)).astype(np.float32)
-            layers = {"": (albedo * light, "RGB"), "albedo": (albedo, "RGB")}
+            noise = rng.gamma(spp, 1 / spp, (len(clean), *albedo.shape[:2], 1)).astype(np.float32)
+            light = [box_downsample(each, factor) * part for each, part in zip(clean, noise, strict=True)]
+            layers = {"": (sum(light), "RGB"), "albedo": (albedo, "RGB")}
+            layers |= {f"light_{i}": (each, "RGB") for i, each in enumerate(light[:lamps])}
             layers["N"] = (np.full_like(albedo, (0, 0, 1)), "XYZ")
             if name == "hr":
                 back = np.full((height, width, 2), (STEP, 0), np.float32)
@@ -99,7 +122,9 @@ def layout(rows: list[Row]) -> str:
         for row in rows
     ]
     first = rows[0]
-    head = f"{first['frames']} frames, {first['size'].replace('x', ' x ')}, x{first['scale']}, {first['cores']} cores"
+    lamps = f", {first['lamps']} light groups" if first.get("lamps") else ""
+    head = f"{first['frames']} frames, {first['size'].replace('x', ' x ')}, x{first['scale']}{lamps}, "
+    head += f"{first['cores']} cores"
     return results.markdown([f"{head}, {first['machine']}", "seconds a frame", "ratio", "peak MB"], body)
 
 
@@ -108,6 +133,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--size", default="1920x1080")
     parser.add_argument("--scale", type=int, default=2)
+    parser.add_argument("--lamps", type=int, default=0, help="light groups of the shot")
     parser.add_argument("--qualities", nargs="+", default=["balanced", "best"])
     parser.add_argument("--rounds", type=int, default=1, help="times that all ways are measured, in turn")
     parser.add_argument("--measure", nargs=3, help=argparse.SUPPRESS)
@@ -122,11 +148,11 @@ def main() -> None:
     ways = [(quality, frames) for quality in args.qualities for frames in WAYS]
     measured: dict[tuple[str, str], list[dict[str, Any]]] = {way: [] for way in ways}
     with tempfile.TemporaryDirectory() as folder:
-        write_shot(Path(folder), args.frames, width, height, args.scale)
+        write_shot(Path(folder), args.frames, width, height, args.scale, args.lamps)
         for _ in range(args.rounds):
             for way in ways:
                 measured[way].append(in_process("benchmarks.runtime_temporal", "--measure", folder, *way))
-    shot = {name: getattr(args, name) for name in ("frames", "size", "scale")}
+    shot = {name: getattr(args, name) for name in ("frames", "size", "scale", "lamps")}
     machine = {"machine": processor(), "cores": os.cpu_count()}
     rows: list[Row] = [
         {

@@ -21,6 +21,7 @@ from benchmarks import confidence, quality, results, runtime_files, runtime_pass
 from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
+from benchmarks import temporal_passes as temporal_passes_benchmark
 from benchmarks.results import MEAN, Row
 from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
@@ -378,6 +379,11 @@ def temporal_time() -> str:
     return runtime_temporal.layout(results.read("runtime_temporal"))
 
 
+def temporal_passes() -> str:
+    """What neighbouring frames gain for passes."""
+    return temporal_passes_benchmark.layout(results.read("temporal_passes"))
+
+
 def temporal_counts() -> str:
     """What averaging gains over single frames with two frames on each side, and with `auto`."""
     tables = {"2": results.read("temporal_2"), "auto": results.read("temporal")}
@@ -413,7 +419,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         pair_checks,
     ),
     ROOT / "docs/design/passes.md": (passes, single_passes, passes_time),
-    ROOT / "docs/design/temporal.md": (temporal_time, temporal_counts),
+    ROOT / "docs/design/temporal.md": (temporal_passes, temporal_time, temporal_counts),
 }
 
 

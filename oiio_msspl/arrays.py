@@ -36,13 +36,26 @@ def quantile(values: NDArray[Any], share: float) -> float:
     return float(np.quantile(values[:: -(-values.size // LARGE_SAMPLE)], share))
 
 
-def blank(shape: tuple[int, ...], dtype: type[T] | np.dtype[T] = np.float32) -> NDArray[T]:  # type: ignore[assignment]
+def has_many_pixels(height: int, width: int) -> bool:
+    """Whether an image that waits for others does so in a temporary file."""
+    return height * width > MOST_PIXELS
+
+
+def blank(
+    shape: tuple[int, ...],
+    dtype: type[T] | np.dtype[T] = np.float32,  # type: ignore[assignment]
+    *,
+    on_disk: bool | None = None,
+) -> NDArray[T]:
     """A black image (h, w, ...) that is to be filled: in memory, or in a temporary file if it has many pixels.
+
+    Args:
+        on_disk: whether it is in a temporary file; None if its pixels decide.
 
     Raises:
         MssplError: the disk has no room.
     """
-    if shape[0] * shape[1] <= MOST_PIXELS:
+    if not (has_many_pixels(*shape[:2]) if on_disk is None else on_disk):
         return np.zeros(shape, dtype)
     with tempfile.TemporaryFile(prefix="msspl-") as file:
         reserve(file, math.prod(shape) * np.dtype(dtype).itemsize)
@@ -99,14 +112,18 @@ class ReusedMemory:
         self._free.append(image.base)
 
 
-def kept(values: NDArray[T]) -> NDArray[T]:
-    """An image that waits for others: itself, or a copy in a temporary file if it has many pixels and is in none."""
-    if values.shape[0] * values.shape[1] <= MOST_PIXELS or isinstance(values.base, mmap.mmap):
+def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
+    """An image that waits for others: itself, or a copy in a temporary file if it has many pixels and is in none.
+
+    Args:
+        on_disk: whether it is in a temporary file; None if its pixels decide.
+    """
+    if not (has_many_pixels(*values.shape[:2]) if on_disk is None else on_disk) or isinstance(values.base, mmap.mmap):
         return values
-    on_disk = blank(values.shape, values.dtype)
-    on_disk[:] = values
-    unload(on_disk)
-    return on_disk
+    copy = blank(values.shape, values.dtype, on_disk=True)
+    copy[:] = values
+    unload(copy)
+    return copy
 
 
 def unload(values: NDArray[Any]) -> None:

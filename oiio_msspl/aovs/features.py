@@ -29,6 +29,9 @@ LRHS_FEATURES: dict[str, int] = {RGB: 3}
 FEATURES = tuple(HRLS_FEATURES)
 #: Features that are radiance: they scale with the brightness of the scene.
 RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
+#: Beside these, a render may have the light of single passes, as features whose names begin so. Networks do not read
+#: them.
+LIGHT_OF = "light of "
 
 #: Features that a render may lack. The network then reads the value in ``DEFAULTS``.
 OPTIONAL_FEATURES = (ALBEDO, NORMAL, DIFFUSE, SPECULAR, VARIANCE)

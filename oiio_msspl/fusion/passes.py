@@ -26,7 +26,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
-from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload
@@ -105,6 +105,7 @@ def fuse_passes(
     pixels: ReplacedChannels | None = None,
     guides: Guides = NO_GUIDES,
     fuse_layers: LayerFuser | None = None,
+    averaged: tuple[Render, Render] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> FusedPasses:
     """Fuse the layers of additive sets of the HRLS.
@@ -119,6 +120,8 @@ def fuse_passes(
         guides: albedo and normal without noise, (height, width, 3) as the HRLS's own, as far as they are known. Albedos
             above 1 are taken from the HRLS.
         fuse_layers: the network that fuses single layers. Layers that it can't fuse are fitted, and all without one.
+        averaged: LRHS and HRLS with the features of :func:`pass_features`, averaged with those of other frames; None to
+            read the files.
         progress: called with (steps done, :func:`pass_steps`).
 
     Raises:
@@ -140,12 +143,16 @@ def fuse_passes(
     tell(done, steps)
     fused_light: dict[AdditiveLayer, Array] = {}
     colours = _colour_names(jobs)
-    high_file = _with_layers_of(hr, {key: layer for job in jobs for layer, key in job.keys.items()}, colours)
-    low_file = _with_layers_of(lr, {key: layer for job in jobs for key, layer in job.lrhs.items()})
-    low: ReadableRender = low_file
-    high: ReadableRender = high_file
+    low_layers = {key: each for job in jobs for key, each in job.lrhs.items()}
+    high_layers = {key: layer for job in jobs for layer, key in job.keys.items()}
+    low: MappedRender | Render = _with_layers_of(lr, low_layers)
+    high: MappedRender | Render = _with_layers_of(hr, high_layers, colours)
+    if averaged is not None:
+        # Light is divided by the colours of this frame, because those are written.
+        of_colours, _ = _decoded(_with_layers_of(replace(hr, features={}), {}, colours))
+        low, high = averaged[0], replace(averaged[1], layers=averaged[1].layers | of_colours.layers)
     if fuse_layers is not None and by_network:
-        (low, low_lit), (high, high_lit) = in_parallel(partial(_decoded, low_file), partial(_decoded, high_file))
+        (low, low_lit), (high, high_lit) = in_parallel(partial(_decoded, low), partial(_decoded, high))
         for job in jobs:
             for layer, light in _fused_layers(low, high, job, low_lit, high_lit, fuse_layers):
                 if light is not None:
@@ -190,6 +197,26 @@ def _bands(alignment: Alignment) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
 
 
+def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
+    """LRHS and HRLS whose features also are the light of the layers of additive sets. The LRHS may lack some."""
+    names = _layer_names(sets)
+    low = {layer: each for additive_set in sets for layer, each in _same_layers(lr, additive_set)[0].items()}
+    low_light = {names[layer]: each.formula for layer, each in low.items()}
+    high_light = {name: layer.formula for layer, name in names.items()}
+    return replace(lr, features=lr.features | low_light), replace(hr, features=hr.features | high_light)
+
+
+def _layer_names(sets: Sequence[AdditiveSet]) -> dict[AdditiveLayer, str]:
+    """Names, as features, of the light of all layers. Frames of a shot have the same names."""
+    names: dict[AdditiveLayer, str] = {}
+    for layer in dict.fromkeys(layer for each in sets for layer in each.layers):
+        name = f"{LIGHT_OF}{layer.name}{' x colour' if layer.factor else ''}"
+        while name in names.values():
+            name += " again"
+        names[layer] = name
+    return names
+
+
 def _colour_names(jobs: Iterable[_Job]) -> dict[Factor, str]:
     """Names, as features, of the colours by which layers that are fitted are multiplied."""
     factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
@@ -231,9 +258,11 @@ def _fused_layers(
             yield layer, np.zeros_like(high.layers[key]) if black else None
 
 
-def _decoded(render: MappedRender) -> tuple[Render, set[str]]:
+def _decoded(render: MappedRender | Render) -> tuple[Render, set[str]]:
     """The features of a render, which wait in temporary files if they have many pixels; and the names of those that
     are not black. A file is decoded once, because it has all layers together."""
+    if isinstance(render, Render):
+        return render, {name for name, values in render.layers.items() if values.any()}
     window = render.data_window
     pixels: dict[str, Array] = {}
     lit: set[str] = set()
@@ -325,6 +354,7 @@ def _checked(
     jobs: list[_Job] = []
     refused: dict[str, str] = {}
     warnings: list[str] = []
+    names = _layer_names(sets)
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
         check, (lrhs, problem) = in_parallel(partial(check_sum, hr, layers), partial(_lrhs_layers, lr, layers))
         if check.problem:
@@ -337,7 +367,7 @@ def _checked(
         if shared:
             refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        keys = {layer: f"layer {len(jobs)}.{i}" for i, layer in enumerate(layers.layers)}
+        keys = {layer: names[layer] for layer in layers.layers}
         theirs = {key: lrhs[layer] for layer, key in keys.items() if layer in lrhs}
         job = _Job(layers, keys, theirs, check.remainder, known, check.noise_free)
         jobs.append(job)
@@ -379,15 +409,24 @@ def _lrhs_layers(lr: MappedRender, layers: AdditiveSet) -> tuple[dict[AdditiveLa
 
     Some of its light may be missing from them.
     """
+    found, theirs = _same_layers(lr, layers)
+    problem = "" if theirs is None else check_sum(lr, theirs).problem
+    return ({}, problem) if problem else (found, "")
+
+
+def _same_layers(
+    render: MappedRender, layers: AdditiveSet
+) -> tuple[dict[AdditiveLayer, AdditiveLayer], AdditiveSet | None]:
+    """Layers of a set, each with the layer of the same name in another render; and the set in which that has most of
+    them."""
     by_name = {(layer.name, layer.factor is None): layer for layer in layers.layers}
     best: dict[AdditiveLayer, AdditiveLayer] = {}
-    check: AdditiveSet | None = None
-    for candidate in lr.additive_sets:
+    theirs: AdditiveSet | None = None
+    for candidate in render.additive_sets:
         same = {by_name[key]: each for each in candidate.layers if (key := (each.name, each.factor is None)) in by_name}
         if len(same) > len(best):
-            best, check = same, candidate
-    problem = "" if check is None else check_sum(lr, check).problem
-    return ({}, problem) if problem else (best, "")
+            best, theirs = same, candidate
+    return best, theirs
 
 
 class _Band:

@@ -20,7 +20,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB, VARIANCE
+from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE
 from oiio_msspl.arrays import Array, blank, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
@@ -35,6 +35,8 @@ from oiio_msspl.parallel import for_row_blocks
 COVERED = 0.9
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
+#: With more channels, as passes have, bands of rows are smaller.
+USUAL_CHANNELS = 16
 
 Features = dict[str, Array]
 
@@ -121,7 +123,7 @@ def average_renders(
             unload(image)
         pair.unload()
 
-    for_bands(alignment, average)
+    for_bands(alignment, average, _band_share(sum(image.shape[-1] for image in high.values())))
     return AveragedPair(_replaced(pair.lr, low), _replaced(pair.hr, high), frames)
 
 
@@ -152,7 +154,14 @@ def memory_to_average(window: Window, channels: int) -> int:
         window: the HRLS's data window.
         channels: of the HRLS's features.
     """
-    return rows_in_bands(window) * window.width * (BYTES_PER_PIXEL + 4 * channels)
+    rows = rows_in_bands(window, _band_share(channels))
+    return rows * window.width * (BYTES_PER_PIXEL + 4 * channels)
+
+
+def _band_share(channels: int) -> float:
+    """See :func:`oiio_msspl.fusion.light.for_bands`."""
+    usual, needed = (BYTES_PER_PIXEL + 4 * count for count in (USUAL_CHANNELS, channels))
+    return min(1.0, usual / needed)
 
 
 class _Band:
@@ -243,7 +252,8 @@ class _Band:
         def positions(rows: slice) -> tuple[Array, Array]:
             return x[rows], y[rows]
 
-        names = [name for name in (*RADIANCE_FEATURES, VARIANCE, "alpha") if name in stored]
+        light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
+        names = [name for name in stored if name in light or name.startswith(LIGHT_OF)]
         with np.errstate(invalid="ignore"):  # NaN is sorted out later
             smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape)
         return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable

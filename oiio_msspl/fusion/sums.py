@@ -109,7 +109,7 @@ def _superfluous(render: MappedRender, additive_set: AdditiveSet) -> list[str]:
         render: that of :func:`with_layers`.
     """
     keys = dict(zip(additive_set.layers, layer_keys(additive_set), strict=True))
-    choices = [(layer,) for layer in keys]
+    choices: list[tuple[AdditiveLayer, ...]] = [(layer,) for layer in keys]
     choices.append(tuple(layer for layer in keys if any(layer.words < other.words for other in keys)))
     light, wrong = 0.0, np.zeros(len(choices))
     for pixels in _read_strips(render, [RGB, *keys.values()]):

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, TypeVar
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, kept
 from oiio_msspl.errors import InputError, explain
+from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import FLOW, MotionFrame
 from oiio_msspl.fusion.render_average import RenderPair, shared_noise
@@ -46,6 +47,9 @@ class FusedAlone:
     fused: FusedFrame
     seconds: float
     """Wall time of fusing."""
+    averaged: tuple[Render, Render] | None = None
+    """Both renders with their passes, averaged with those of the neighbours; None if no pass is to be fused, or there
+    are no neighbours."""
 
 
 class FrameWindow:
@@ -243,10 +247,13 @@ def _check_alike(frame: tuple[LoadedFrame, Placed], neighbour: tuple[LoadedFrame
         raise InputError(f"its pair is x{its.alignment.scale}")
     if one.hr.display_window.size != other.hr.display_window.size:
         raise InputError(f"its size is {other.hr.display_window.size}")
-    for name in ("lr", "hr"):
-        lacking = _features(getattr(one, name)) - _features(getattr(other, name))
+    for name, ours, theirs in (
+        ("LRHS", one.averaged_lr, other.averaged_lr),
+        ("HRLS", one.averaged_hr, other.averaged_hr),
+    ):
+        lacking = _features(ours) - _features(theirs)
         if isinstance(its, RenderPair) and lacking:
-            raise InputError(f"its {'LRHS' if name == 'lr' else 'HRLS'} lacks {', '.join(sorted(lacking))}")
+            raise InputError(f"its {name} lacks {', '.join(sorted(lacking))}")
 
 
 def _features(render: MappedRender) -> set[str]:

@@ -11,17 +11,18 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, LIGHT_OF, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import MOST_PIXELS, Array, kept
+from oiio_msspl.arrays import Array, has_many_pixels, kept
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
+from oiio_msspl.fusion.passes import pass_features
 from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.fusion.warp import Mask
@@ -37,6 +38,7 @@ from oiio_msspl.jobs.views import (
     find_other_views,
     fuse_frame_passes,
     fuse_other_views,
+    sets_to_fuse,
     uses_clean_aovs,
 )
 from oiio_msspl.model.catalogue import load_model
@@ -53,10 +55,14 @@ class LoadedFrame:
     frame: Frame
     lr: MappedRender
     hr: MappedRender
+    averaged_lr: MappedRender
+    """``lr`` with the features of its passes, if renders are averaged with those of neighbours; otherwise ``lr``."""
+    averaged_hr: MappedRender
+    """``hr``, likewise."""
     lr_pixels: ReadableRender
-    """The LRHS in memory, or ``lr`` itself if the pair does not fit."""
+    """The LRHS in memory, or ``averaged_lr`` itself if the pair does not fit."""
     hr_pixels: ReadableRender
-    """The HRLS in memory, or ``hr`` itself if the pair does not fit."""
+    """The HRLS in memory, or ``averaged_hr`` itself if the pair does not fit."""
     seconds: float
     """Wall time of reading."""
     others: OtherViews
@@ -120,15 +126,23 @@ class Stages:
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
-        if not self._fits(lr, hr):
-            return LoadedFrame(frame, lr, hr, lr, hr, time.perf_counter() - start, others)
-        features, channels, motion = self._features(lr, hr), self._read_ahead(lr, hr), self.temporal.motion
-        on_disk = self._waits_on_disk(lr, hr)
-        pixels, stored = hr.load_with(channels, features, on_disk=on_disk)
+        low, high = self._with_passes(lr, hr)
+        if not self._fits(low, high):
+            return LoadedFrame(frame, lr, hr, low, high, low, high, time.perf_counter() - start, others)
+        features, channels, motion = self._features(low, high), self._read_ahead(low, high), self.temporal.motion
+        on_disk = self._waits_on_disk(low, high)
+        pixels, stored = high.load_with(channels, features, on_disk=on_disk)
         vectors = motion.vectors_of(hr, pixels, stored) if motion and channels else {}
         waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
-        low = lr.load(features, on_disk=on_disk)
-        return LoadedFrame(frame, lr, hr, low, pixels, time.perf_counter() - start, others, waiting)
+        low_pixels = low.load(features, on_disk=on_disk)
+        seconds = time.perf_counter() - start
+        return LoadedFrame(frame, lr, hr, low, high, low_pixels, pixels, seconds, others, waiting)
+
+    def _with_passes(self, lr: MappedRender, hr: MappedRender) -> tuple[MappedRender, MappedRender]:
+        """A pair with the features of the passes that are to be fused, if renders are averaged with those of
+        neighbours."""
+        sets = sets_to_fuse(hr, self.write_options) if self.temporal.renders else []
+        return pass_features(lr, hr, sets) if sets else (lr, hr)
 
     def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:
         """Whether there is room for the pixels of all frames that are held, beside a tile and two results."""
@@ -139,7 +153,7 @@ class Stages:
         features = self._features(lr, hr)
         result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
         other = FIXED_MEMORY + TILE_MEMORY + 2 * result + _pixel_bytes(lr, features)
-        other += self.temporal.memory(hr.data_window, _channels(hr, features))
+        other += self.temporal.memory(hr.data_window, _channels(hr, features)) + self._averaged_bytes(lr, hr)
         return self.max_memory - other - frames * sum(_pixel_bytes(render, features) for render in (lr, hr))
 
     @property
@@ -153,7 +167,7 @@ class Stages:
     def _waits_on_disk(self, lr: MappedRender, hr: MappedRender) -> bool:
         """Whether renders that wait for their neighbours lie in temporary files: those of large frames that do not fit
         into memory with their motion vectors."""
-        if not self.temporal.renders or hr.data_window.width * hr.data_window.height <= MOST_PIXELS:
+        if not self.temporal.renders or not _is_large(hr):
             return False
         return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
 
@@ -187,9 +201,9 @@ class Stages:
     def _features(self, lr: MappedRender, hr: MappedRender) -> list[str]:
         """The features of a pair that are read: a file may have many more, and to decode and keep these takes long."""
         try:
-            return _features_read(self._session(lr, hr))
+            return [*_features_read(self._session(lr, hr)), *_passes(hr)]
         except InputError:  # which `session` raises, too, when the frame's turn has come
-            return [*HRLS_FEATURES, "alpha"]
+            return [*HRLS_FEATURES, "alpha", *_passes(hr)]
 
     def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours) -> FusedAlone:
         """Fuse the beauty of a pair.
@@ -206,10 +220,13 @@ class Stages:
         start = time.perf_counter()
         held = self._held_bytes(loaded, session)
         check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, held)
-        pair, frames = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None
+        pair, frames, averaged = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None, None
         if any(neighbours):
-            averaged = average_renders(pair, *neighbours, _features_read(session))
-            pair, frames = RenderPair(averaged.lr, averaged.hr), averaged.frames
+            features = self._features(loaded.averaged_lr, loaded.averaged_hr)
+            means = average_renders(pair, *neighbours, features)
+            pair, frames = RenderPair(means.lr, means.hr), means.frames
+            if loaded.averaged_hr is not loaded.hr:
+                averaged = _kept(means.lr, on_disk=_is_large(loaded.hr)), _kept(means.hr, on_disk=_is_large(loaded.hr))
         fused = fuse(
             pair.lr,
             pair.hr,
@@ -221,8 +238,8 @@ class Stages:
         )
         fused.frames = frames
         # The pixels in memory are not needed any more. A neighbour may need the frame for a while.
-        alone = replace(loaded, lr_pixels=loaded.lr, hr_pixels=loaded.hr)
-        return FusedAlone(alone, session, fused, time.perf_counter() - start)
+        alone = replace(loaded, lr_pixels=loaded.averaged_lr, hr_pixels=loaded.averaged_hr)
+        return FusedAlone(alone, session, fused, time.perf_counter() - start, averaged)
 
     def complete(self, alone: FusedAlone, fused: FusedFrame) -> FrameReport:
         """Fuse what depends on the final beauty: the passes, and other views.
@@ -242,7 +259,8 @@ class Stages:
         fused.replaced, reports = fuse_other_views(
             loaded.others, session, self.write_options, self.max_memory, held=held
         )
-        fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, self.max_memory - held)
+        room = self.max_memory - held
+        fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, room, averaged=alone.averaged)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
         add_other_views(report, reports, loaded.others.passed_on)
@@ -252,14 +270,20 @@ class Stages:
 
     def _held_bytes(self, loaded: LoadedFrame, session: Session) -> int:
         """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
-        held = result_bytes(align(loaded.lr, loaded.hr), error=self.write_options.error_layer)
-        features = _features_read(session)
-        if self._fits(loaded.lr, loaded.hr):
-            held += self._frames_in_memory(loaded.lr, loaded.hr) * sum(
-                _pixel_bytes(render, features) for render in (loaded.lr, loaded.hr)
-            )
-            held += _vector_bytes(loaded.hr, self._read_ahead(loaded.lr, loaded.hr))
-        return held + self.temporal.memory(loaded.hr.data_window, _channels(loaded.hr, features))
+        lr, hr = loaded.averaged_lr, loaded.averaged_hr
+        held = result_bytes(align(lr, hr), error=self.write_options.error_layer)
+        features = self._features(lr, hr)
+        if self._fits(lr, hr):
+            held += self._frames_in_memory(lr, hr) * sum(_pixel_bytes(render, features) for render in (lr, hr))
+            held += _vector_bytes(hr, self._read_ahead(lr, hr))
+        return held + self._averaged_bytes(lr, hr) + self.temporal.memory(hr.data_window, _channels(hr, features))
+
+    def _averaged_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Memory of averaged renders that wait for their passes to be fused, but for those in temporary files."""
+        if not _passes(hr) or _is_large(hr):
+            return 0
+        waiting = 2 * self.temporal.results + 2
+        return waiting * sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_passes(each)]) for each in (lr, hr))
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
         """Write preview and EXR.
@@ -301,9 +325,26 @@ def _features_read(session: Session) -> list[str]:
     return list(dict.fromkeys([*session.contract.features, *session.lrhs_aovs, ALBEDO, NORMAL, "alpha"]))
 
 
+def _passes(render: MappedRender) -> list[str]:
+    """Features of a render that are the light of passes."""
+    return [name for name in render.features if name.startswith(LIGHT_OF)]
+
+
+def _is_large(hr: MappedRender) -> bool:
+    """Whether renders of a frame wait in temporary files for their neighbours."""
+    return has_many_pixels(hr.data_window.height, hr.data_window.width)
+
+
+def _kept(render: Render, *, on_disk: bool) -> Render:
+    """What passes are fused from of a render that waits for its neighbours."""
+    needed = [name for name in render.layers if name in (RGB, ALBEDO, NORMAL) or name.startswith(LIGHT_OF)]
+    return replace(render, layers={name: kept(render.layers[name], on_disk=on_disk) for name in needed})
+
+
 def _channels(render: MappedRender, features: Sequence[str]) -> int:
-    """Channels of the features that a render has of these."""
-    return sum(HRLS_FEATURES[name] for name in render.features if name in features) + (render.alpha is not None)
+    """Channels of the features that a render has of these. Light of passes has three."""
+    counts = [HRLS_FEATURES.get(name, 3) for name in render.features if name in features]
+    return sum(counts) + (render.alpha is not None)
 
 
 def _vector_bytes(render: MappedRender, channels: Sequence[Channel]) -> int:

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import MOST_PIXELS
+from oiio_msspl.arrays import has_many_pixels
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
@@ -119,7 +119,7 @@ class Temporal:
         if not self.count:
             return 0
         pixels = window.width * window.height
-        in_memory = pixels <= MOST_PIXELS
+        in_memory = not has_many_pixels(window.height, window.width)
         held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
         working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
         luminance = LUMINANCE_BYTES * (2 * self.count + 2)

@@ -18,6 +18,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels, widest_type
+from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
@@ -194,6 +195,7 @@ def fuse_frame_passes(
     write: WriteOptions,
     max_memory: int,
     progress: Callable[[int, int], None] | None = None,
+    averaged: tuple[Render, Render] | None = None,
 ) -> None:
     """Fuse the additive sets of :func:`sets_to_fuse` and add them to ``fused``.
 
@@ -204,6 +206,7 @@ def fuse_frame_passes(
         write: ``passes`` says which.
         max_memory: bytes that the process should stay below.
         progress: called with (steps done, steps in all) of this part of the work.
+        averaged: see :func:`oiio_msspl.fusion.passes.fuse_passes`.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -222,6 +225,7 @@ def fuse_frame_passes(
                 pixels=fused.replaced,
                 guides=fused.clean_aovs,
                 fuse_layers=layer_fuser(session, fused),
+                averaged=averaged,
                 progress=progress,
             )
         fused.replaced = fused.passes.pixels

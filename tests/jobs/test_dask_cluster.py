@@ -16,6 +16,8 @@ from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs.dask_cluster import _sessions
 from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.temporal import TemporalOptions
+from tests.jobs.test_temporal import make_shot_with_passes
 from tests.programs import fuse
 from tests.shots import contents, make_shot
 
@@ -96,6 +98,18 @@ def test_a_worker_killed_in_the_middle_of_a_frame_loses_nothing(tmp_path, biline
     saved = json.loads(report_path.read_text())
     assert saved["finished"] and saved["counts"]["fused"] == 10
     assert [entry["frame"] for entry in saved["frames"]] == list(range(1001, 1011))
+
+
+def test_passes_and_neighbours_on_a_cluster_are_those_of_a_local_run(tmp_path, bilinear_models, client):
+    """A task of eight frames needs the files of frames of the other one."""
+    shot = make_shot_with_passes(tmp_path, count=12)
+    for out, more in (("local", {}), ("out", {"client": client})):
+        report = fuse_shot(
+            shot / "lr", shot / "hr", shot / out, model=str(bilinear_models[4]), temporal=TemporalOptions("4"), **more
+        )
+        assert report.exit_code == 0 and "with 4 frames" in report.temporal
+    assert len(contents(shot / "out")) == 12
+    assert contents(shot / "out") == contents(shot / "local")
 
 
 def test_the_program_says_of_a_cluster_what_it_says_of_a_local_run(tmp_path, bilinear_models, two_workers, client):

@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from tests.conftest import write_exr
-from tests.jobs.test_temporal import make_moving_shot
+from tests.jobs.test_temporal import make_shot_with_passes
 from tests.programs import fuse, run
 from tests.shots import contents, layers, make_shot, pixels
 
@@ -96,8 +96,8 @@ def test_openjd_runs_it_and_names_survive(tmp_path, bilinear_models):
 
 @pytest.fixture(scope="module")
 def averaged(tmp_path_factory, bilinear_models):
-    """A shot that is averaged with its neighbours in one run: local/."""
-    folder = make_moving_shot(tmp_path_factory.mktemp("averaged"), count=8)
+    """A shot with passes that is averaged with its neighbours in one run: local/."""
+    folder = make_shot_with_passes(tmp_path_factory.mktemp("averaged"), count=8)
     options = ("--model", bilinear_models[4], "--no-preview")
     done = fuse(folder / "lr", folder / "hr", "-o", folder / "local", *options)
     assert done.returncode == 0, done.stderr

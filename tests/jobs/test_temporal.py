@@ -57,11 +57,10 @@ def whole(shot, bilinear_models):
     return run(shot, bilinear_models[4], "whole")
 
 
-@pytest.fixture(scope="module")
-def shot_with_passes(tmp_path_factory):
-    """The shot, lit by two lamps that are passes, each with noise of its own."""
-    shot = make_moving_shot(tmp_path_factory.mktemp("passes"))
-    for t in range(COUNT):
+def make_shot_with_passes(folder, count=COUNT):
+    """A moving shot, lit by two lamps that are passes, each with noise of its own."""
+    shot = make_moving_shot(folder, count=count, seeds=range(count))
+    for t in range(count):
         for name, spp in (("lr", 16), ("hr", 1)):
             path = shot / f"{name}/{name}.{FIRST + t}.exr"
             channels = read_bits(path)[0][1]
@@ -74,6 +73,11 @@ def shot_with_passes(tmp_path_factory):
                 channels |= rgb(light, f"{lamp}.")
             write_exr(path, channels | rgb(sum(lamps.values())))
     return shot
+
+
+@pytest.fixture(scope="module")
+def shot_with_passes(tmp_path_factory):
+    return make_shot_with_passes(tmp_path_factory.mktemp("passes"))
 
 
 def light_of(lamp, t):

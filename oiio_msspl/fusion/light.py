@@ -42,16 +42,16 @@ BAND_PIXELS, BAND_ROWS = 1 << 22, 128
 ROW_MULTIPLE = max(SCALES)
 
 
-def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], share: float = 1.0) -> list[T]:
+def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], weight: float = 1.0) -> list[T]:
     """The results of ``work(core, area)`` for each band, from top to bottom; two are computed at the same time.
 
     ``core`` has the rows of the data window that are to be computed, ``area`` also those around that decide on them.
 
     Args:
-        share: of the usual number of pixels that a band has, where each takes more memory.
+        weight: how many times as much memory as usual a pixel takes. Bands have fewer rows then.
     """
     window, scale = alignment.hr_data_window, alignment.scale
-    halo, rows = -(-max(RADII) // scale) * scale + 2 * scale, _band_rows(window, share)
+    halo, rows = -(-max(RADII) // scale) * scale + 2 * scale, _band_rows(window, weight)
     bands = []
     for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, rows):
         core = Window(window.x0, max(top, window.y0), window.x1, min(top + rows, window.y1))
@@ -60,16 +60,18 @@ def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], share: 
     return two_at_a_time(lambda band: work(*band), bands)
 
 
-def _band_rows(window: Window, share: float) -> int:
-    pairs = -(-window.width * window.height // int(BAND_PIXELS * share))
-    rows = max(-(-window.height // max(2 * pairs, 1)), BAND_ROWS)
-    return -(-rows // ROW_MULTIPLE) * ROW_MULTIPLE
+def _band_rows(window: Window, weight: float) -> int:
+    pairs = -(-window.width * window.height // BAND_PIXELS)
+    rows = -(-window.height // max(2 * pairs, 1))
+    if weight > 1:
+        rows = int((rows + 2 * max(RADII)) / weight) - 2 * max(RADII)
+    return -(-max(rows, BAND_ROWS) // ROW_MULTIPLE) * ROW_MULTIPLE
 
 
-def rows_in_bands(window: Window, share: float = 1.0) -> int:
+def rows_in_bands(window: Window, weight: float = 1.0) -> int:
     """The most rows of the areas of :func:`for_bands` that are worked on at the same time, in this data window."""
     halos = 4 * max(RADII)
-    return min(window.height + halos, 2 * (_band_rows(window, share) + halos))
+    return min(window.height + halos, 2 * (_band_rows(window, weight) + halos))
 
 
 def grid_rows(alignment: Alignment, area: Window) -> slice:

@@ -35,8 +35,8 @@ from oiio_msspl.parallel import for_row_blocks
 COVERED = 0.9
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
-#: With more channels, as passes have, bands of rows are smaller.
-USUAL_CHANNELS = 16
+#: With more channels, as passes have, bands have fewer rows.
+USUAL_CHANNELS = 10
 
 Features = dict[str, Array]
 
@@ -123,7 +123,7 @@ def average_renders(
             unload(image)
         pair.unload()
 
-    for_bands(alignment, average, _band_share(sum(image.shape[-1] for image in high.values())))
+    for_bands(alignment, average, _weight(sum(image.shape[-1] for image in high.values())))
     return AveragedPair(_replaced(pair.lr, low), _replaced(pair.hr, high), frames)
 
 
@@ -154,14 +154,14 @@ def memory_to_average(window: Window, channels: int) -> int:
         window: the HRLS's data window.
         channels: of the HRLS's features.
     """
-    rows = rows_in_bands(window, _band_share(channels))
+    rows = rows_in_bands(window, _weight(channels))
     return rows * window.width * (BYTES_PER_PIXEL + 4 * channels)
 
 
-def _band_share(channels: int) -> float:
+def _weight(channels: int) -> float:
     """See :func:`oiio_msspl.fusion.light.for_bands`."""
     usual, needed = (BYTES_PER_PIXEL + 4 * count for count in (USUAL_CHANNELS, channels))
-    return min(1.0, usual / needed)
+    return max(1.0, needed / usual)
 
 
 class _Band:

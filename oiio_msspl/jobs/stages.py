@@ -153,7 +153,7 @@ class Stages:
         features = self._features(lr, hr)
         result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
         other = FIXED_MEMORY + TILE_MEMORY + 2 * result + _pixel_bytes(lr, features)
-        other += self.temporal.memory(hr.data_window, _channels(hr, features)) + self._averaged_bytes(lr, hr)
+        other += self._temporal_bytes(lr, hr)
         return self.max_memory - other - frames * sum(_pixel_bytes(render, features) for render in (lr, hr))
 
     @property
@@ -276,14 +276,17 @@ class Stages:
         if self._fits(lr, hr):
             held += self._frames_in_memory(lr, hr) * sum(_pixel_bytes(render, features) for render in (lr, hr))
             held += _vector_bytes(hr, self._read_ahead(lr, hr))
-        return held + self._averaged_bytes(lr, hr) + self.temporal.memory(hr.data_window, _channels(hr, features))
+        return held + self._temporal_bytes(lr, hr)
 
-    def _averaged_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Memory of averaged renders that wait for their passes to be fused, but for those in temporary files."""
-        if not _passes(hr) or _is_large(hr):
-            return 0
+    def _temporal_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Memory of averaging, and of averaged renders that wait for their passes to be fused."""
+        channels = _channels(hr, self._features(lr, hr))
+        averaging = self.temporal.memory(hr.data_window, channels, align(lr, hr).scale)
+        if not _passes(hr) or _is_large(hr):  # large ones wait in temporary files
+            return averaging
         waiting = 2 * self.temporal.results + 2
-        return waiting * sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_passes(each)]) for each in (lr, hr))
+        bytes_of_pair = sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_passes(each)]) for each in (lr, hr))
+        return averaging + waiting * bytes_of_pair
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
         """Write preview and EXR.

@@ -36,9 +36,8 @@ MOST_RESULTS = 2
 MOST = 8
 #: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
-#: Bytes of an HRLS pixel that the luminance of both renders takes for each frame that is held. It is stored at the
-#: LRHS's resolution, and this is for x2.
-LUMINANCE_BYTES = 2
+#: Bytes of an LRHS pixel that the luminance of both renders takes for each frame that is held.
+LUMINANCE_BYTES = 8
 
 
 @dataclass(frozen=True)
@@ -109,12 +108,13 @@ class Temporal:
         beside = [] if number is None else [self.frames[n] for n in self.neighbours(number)]
         return [path for frame in beside for path in (frame.lr, frame.hr) if path is not None]
 
-    def memory(self, window: Window, channels: int) -> int:
+    def memory(self, window: Window, channels: int, scale: int) -> int:
         """Bytes that averaging takes, and what waits for it, without the pixels of renders that are in memory.
 
         Args:
             window: the HRLS's data window.
             channels: of its features.
+            scale: of the pair.
         """
         if not self.count:
             return 0
@@ -122,8 +122,8 @@ class Temporal:
         in_memory = not has_many_pixels(window.height, window.width)
         held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
         working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
-        luminance = LUMINANCE_BYTES * (2 * self.count + 2)
-        return (held * in_memory + luminance + RESULT_BYTES) * pixels + working
+        luminance = LUMINANCE_BYTES * (2 * self.count + 2) * pixels // scale**2
+        return (held * in_memory + RESULT_BYTES) * pixels + luminance + working
 
     def missing(self, number: int) -> list[int]:
         """The numbers next to a frame that lie within the shot, and of which a render is missing."""

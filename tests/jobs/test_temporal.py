@@ -358,9 +358,9 @@ def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monk
     window = Window(0, 0, 4096, 2160)
     monkeypatch.undo()
     temporal = Temporal(2, 2)
-    assert temporal.memory(window, 12) < 1 << 30
-    assert temporal.memory(Window(0, 0, 1920, 1080), 12) < 1 << 29
-    assert Temporal().memory(window, 12) == 0
+    assert temporal.memory(window, 12, 2) < 1 << 30
+    assert temporal.memory(Window(0, 0, 1920, 1080), 12, 2) < 1 << 29
+    assert Temporal().memory(window, 12, 2) == 0
 
 
 def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):

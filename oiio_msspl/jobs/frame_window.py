@@ -152,6 +152,8 @@ class FrameWindow:
             fused = outcome.fused
             fused.rgb = kept(fused.rgb)
             fused.alpha, fused.error = (None if image is None else kept(image) for image in (fused.alpha, fused.error))
+        if isinstance(outcome, FusedAlone) and number not in self._wanted:
+            return replace(outcome, averaged=None)  # its passes are not written
         return outcome
 
     def _pair(self, loaded: LoadedFrame) -> tuple[LoadedFrame, RenderPair]:

@@ -2,7 +2,7 @@
 """Time of a shot whose frames are averaged with their neighbours, beside the same shot frame by frame.
 
     python -m benchmarks.runtime_temporal --table benchmarks/results/runtime_temporal.csv
-    python -m benchmarks.runtime_temporal --lamps 4 --table benchmarks/results/runtime_temporal_passes.csv
+    python -m benchmarks.runtime_temporal --lamps 4
 
 A shot of real size is written to a temporary folder: a textured wall past which the camera moves, with noise of 1 spp,
 albedo, normal, depth and exact motion vectors, as half-float EXRs. With ``--lamps`` both renders have light groups,

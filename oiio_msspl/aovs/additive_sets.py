@@ -104,7 +104,10 @@ def find_additive_sets(
         found = tuple(each for each in found if not any(fnmatchcase(each.name.lower(), p) for p in unwanted))
         coarser = tuple(each for each in found if entry.get("finest") and any(each.words < o.words for o in found))
         finest = tuple(each for each in found if each not in coarser)
-        if len(finest) > 1 and all(set(finest) != set(other.layers) for other in sets):
+        # A part of another set of the table says nothing new, such as raw components of a file without raw layers.
+        same = (set(finest) == set(other.layers) for other in sets)
+        part = (set(finest) <= set(other.layers) for other in sets if not other.by_user)
+        if len(finest) > 1 and not any(same) and not any(part):
             sets.append(AdditiveSet(entry["name"], finest, coarser))
     return sets
 

@@ -170,7 +170,7 @@ class MappedRender:
 
         Args:
             features: as for :meth:`read`.
-            on_disk: in temporary files instead, if it has many pixels.
+            on_disk: in temporary files instead.
 
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
@@ -200,7 +200,7 @@ class MappedRender:
             for name, rows in strips.items():
                 if name not in layers:
                     shape = (whole.height, whole.width, rows.shape[-1])
-                    layers[name] = blank(shape) if on_disk else np.empty(shape, np.float32)
+                    layers[name] = blank(shape, on_disk=True) if on_disk else np.empty(shape, np.float32)
                 layers[name][window.slices(whole)] = rows
                 unload(layers[name])
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored

@@ -148,9 +148,13 @@ def fuse_passes(
     low: MappedRender | Render = _with_layers_of(lr, low_layers)
     high: MappedRender | Render = _with_layers_of(hr, high_layers, colours)
     if averaged is not None:
-        # Light is divided by the colours of this frame, because those are written.
-        of_colours, _ = _decoded(_with_layers_of(replace(hr, features={}), {}, colours))
-        low, high = averaged[0], replace(averaged[1], layers=averaged[1].layers | of_colours.layers)
+        usable = {RGB, ALBEDO, NORMAL, *low_layers}
+        low = replace(averaged[0], layers={name: v for name, v in averaged[0].layers.items() if name in usable})
+        high = averaged[1]
+        if colours:
+            # Light is divided by the colours of this frame, because those are written.
+            of_colours, _ = _decoded(_with_layers_of(replace(hr, features={}), {}, colours))
+            high = replace(high, layers=high.layers | of_colours.layers)
     if fuse_layers is not None and by_network:
         (low, low_lit), (high, high_lit) = in_parallel(partial(_decoded, low), partial(_decoded, high))
         for job in jobs:
@@ -262,10 +266,15 @@ def _decoded(render: MappedRender | Render) -> tuple[Render, set[str]]:
     """The features of a render, which wait in temporary files if they have many pixels; and the names of those that
     are not black. A file is decoded once, because it has all layers together."""
     if isinstance(render, Render):
-        return render, {name for name, values in render.layers.items() if values.any()}
+        lit = set()
+        for name, values in render.layers.items():
+            if any(values[y : y + BAND_ROWS].any() for y in range(0, len(values), BAND_ROWS)):
+                lit.add(name)
+            unload(values)
+        return render, lit
     window = render.data_window
     pixels: dict[str, Array] = {}
-    lit: set[str] = set()
+    lit = set()
     tops = range(window.y0, window.y1, BAND_ROWS)
     parts = [Window(window.x0, y, window.x1, min(y + BAND_ROWS, window.y1)) for y in tops]
     for part, features in zip(parts, one_ahead(render.read(part, render.features) for part in parts), strict=True):

@@ -77,6 +77,12 @@ def test_raw_light_is_multiplied_by_its_filter(tmp_path, attributes, layers, raw
     assert check_sum(found, components).text == "sums to the beauty but for 0 of it"
 
 
+def test_a_set_without_its_raw_layers_is_none(tmp_path):
+    layers = {name: 1 for name in ("lighting", "GI", "specular", "SSS")}
+    found = render(tmp_path, layers, **{"vrayInfo/vraycore": "6"})
+    assert names(found) == {"components": list(layers)}
+
+
 def test_a_single_layer_and_integers_are_no_set(tmp_path):
     assert names(render(tmp_path, {"light_key": 1, "other": 2})) == {}
     ids = rgb(np.ones((*SIZE, 3), np.uint32), "light_id.")

@@ -6,10 +6,9 @@
 
 A shot of real size is written to a temporary folder: a textured wall past which the camera moves, with noise of 1 spp,
 albedo, normal, depth and exact motion vectors, as half-float EXRs. With ``--lamps`` both renders have light groups,
-whose passes are fused. All ways (`WAYS`) take turns for each quality, file
-to file, each in its own process; the median of all rounds counts. The ratio depends on the number of frames: the first
-and the last ones have fewer neighbours, and how motion is stored is found out once. Peak memory is that of the largest
-round.
+whose passes are fused. All ways (`WAYS`) take turns for each quality, file to file, each in its own process; the median
+of all rounds counts. The ratio depends on the number of frames: the first and the last ones have fewer neighbours, and
+how motion is stored is found out once. Peak memory is that of the largest round.
 """
 
 from __future__ import annotations

@@ -4,7 +4,7 @@
     python -m benchmarks.temporal_passes --table benchmarks/results/temporal_passes.csv
 
 The shot is that of :mod:`benchmarks.runtime_temporal`: a wall past which the camera moves, lit by lamps. Its clean
-light is known. Flicker is the mean difference of the error from one frame to the next, along the motion.
+light is known. Flicker is the mean absolute difference of the error from one frame to the next, along the motion.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from oiio_msspl.jobs.temporal import TemporalOptions
 
 SIZE, LAMPS = (320, 180), 4
 #: Frames at either end of the shot have fewer neighbours and are not scored.
-ENDS = 4
+ENDS = 6
 
 
 def images_of(path: Path) -> list[Array]:
@@ -79,7 +79,7 @@ def layout(rows: list[Row]) -> str:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--frames", type=int, default=14)
+    parser.add_argument("--frames", type=int, default=18)
     results.add_option(parser)
     args = parser.parse_args()
     rows: list[Row] = []

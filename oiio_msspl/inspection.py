@@ -22,7 +22,7 @@ from oiio_msspl.fusion.motion import MotionSource, find_motion
 from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
-from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -149,17 +149,16 @@ def inspect_file(
     return result
 
 
-def inspect_noise(found: Sequence[Inspection], inputs: InputOptions) -> None:
+def inspect_noise(found: Sequence[Inspection]) -> None:
     """Tell of the two renders of a frame whether the pixel filter has spread their noise. The larger one gets the fact.
 
     Files that are no such pair are left as they are.
     """
-    renders = [each for each in found if each.render is not None]
+    renders = [(each.render, each) for each in found if each.render is not None]
     if len(renders) != 2:
         return
-    low, high = sorted(renders, key=lambda each: each.render.display_window.width if each.render else 0)
+    (lr, low), (hr, high) = sorted(renders, key=lambda each: each[0].display_window.width)
     try:
-        lr, hr = map_pair(low.path, high.path, inputs)
         spread = is_noise_spread(lr, hr, align(lr, hr))
     except InputError:
         return

@@ -33,6 +33,12 @@ RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
 #: them.
 LIGHT_OF = "light of "
 
+
+def is_light_of_pass(feature: str) -> bool:
+    """Whether a feature is the light of a pass."""
+    return feature.startswith(LIGHT_OF)
+
+
 #: Features that a render may lack. The network then reads the value in ``DEFAULTS``.
 OPTIONAL_FEATURES = (ALBEDO, NORMAL, DIFFUSE, SPECULAR, VARIANCE)
 

@@ -202,9 +202,9 @@ def _bands(alignment: Alignment) -> list[Window]:
 
 
 def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
-    """LRHS and HRLS whose features also are the light of the layers of additive sets. The LRHS may lack some."""
+    """LRHS and HRLS, with the light of layers of additive sets as further features. The LRHS may lack some of them."""
     names = _layer_names(sets)
-    low = {layer: each for additive_set in sets for layer, each in _same_layers(lr, additive_set)[0].items()}
+    low = {layer: each for additive_set in sets for layer, each in _same_layers(lr, additive_set).items()}
     low_light = {names[layer]: each.formula for layer, each in low.items()}
     high_light = {name: layer.formula for layer, name in names.items()}
     return replace(lr, features=lr.features | low_light), replace(hr, features=hr.features | high_light)
@@ -343,7 +343,7 @@ class _Job:
 
     @property
     def hrls_alone(self) -> str:
-        """Fitted layers that the LRHS lacks: their names, or that it is all; empty if it lacks none."""
+        """Names of fitted layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
         missing = [layer.name for layer in self.fitted if self.keys[layer] not in self.lrhs]
         return "all layers" if missing and not self.lrhs else ", ".join(missing)
 
@@ -365,7 +365,7 @@ def _checked(
     warnings: list[str] = []
     names = _layer_names(sets)
     for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        check, (lrhs, problem) = in_parallel(partial(check_sum, hr, layers), partial(_lrhs_layers, lr, layers))
+        check, (lrhs, problem) = in_parallel(partial(check_sum, hr, layers), partial(_usable_layers, lr, layers))
         if check.problem:
             refused[layers.name] = check.text
             continue
@@ -413,29 +413,24 @@ def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveS
     return sums
 
 
-def _lrhs_layers(lr: MappedRender, layers: AdditiveSet) -> tuple[dict[AdditiveLayer, AdditiveLayer], str]:
-    """Those layers of a set that the LRHS has, too; and why these can't be used, if they do not sum to its beauty.
+def _usable_layers(lr: MappedRender, layers: AdditiveSet) -> tuple[dict[AdditiveLayer, AdditiveLayer], str]:
+    """The layers of :func:`_same_layers`; and why they can't be used, if they do not sum to the LRHS's beauty.
 
-    Some of its light may be missing from them.
+    They may lack some of its light.
     """
-    found, theirs = _same_layers(lr, layers)
-    problem = "" if theirs is None else check_sum(lr, theirs).problem
+    found = _same_layers(lr, layers)
+    problem = check_sum(lr, AdditiveSet(layers.name, tuple(found.values()))).problem if found else ""
     return ({}, problem) if problem else (found, "")
 
 
-def _same_layers(
-    render: MappedRender, layers: AdditiveSet
-) -> tuple[dict[AdditiveLayer, AdditiveLayer], AdditiveSet | None]:
-    """Layers of a set, each with the layer of the same name in another render; and the set in which that has most of
-    them."""
+def _same_layers(render: MappedRender, layers: AdditiveSet) -> dict[AdditiveLayer, AdditiveLayer]:
+    """Layers of a set, each with the layer of the same name in another render: in the set that has most of them."""
     by_name = {(layer.name, layer.factor is None): layer for layer in layers.layers}
-    best: dict[AdditiveLayer, AdditiveLayer] = {}
-    theirs: AdditiveSet | None = None
-    for candidate in render.additive_sets:
-        same = {by_name[key]: each for each in candidate.layers if (key := (each.name, each.factor is None)) in by_name}
-        if len(same) > len(best):
-            best, theirs = same, candidate
-    return best, theirs
+    found = (
+        {by_name[key]: each for each in candidate.layers if (key := (each.name, each.factor is None)) in by_name}
+        for candidate in render.additive_sets
+    )
+    return max(found, key=len, default={})
 
 
 class _Band:
@@ -656,8 +651,8 @@ class _Band:
         return np.delete(total, elsewhere, axis=0) if elsewhere else total
 
     def _dimmed(self, job: _Job, pixels: Mapping[str, Array]) -> Array:
-        """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Those that it lacks are
-        black. The rest of its beauty is the last layer, if a layer lacks or light is in none."""
+        """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Layers that it lacks are
+        black. The rest of its beauty is the last layer, if layers are missing or light is in none."""
         black = np.zeros_like(self._low_beauty)
         layers = np.stack([planes_of(pixels[key]) if key in pixels else black for key in job.keys.values()])
         if job.remainder or not pixels.keys() >= set(job.keys.values()):

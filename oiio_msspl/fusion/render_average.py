@@ -20,7 +20,8 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE
+from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, blank, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
@@ -147,6 +148,20 @@ def shared_noise(frame: RenderPair, other: RenderPair) -> float:
     return float(np.dot(*noise) / lengths) if lengths > 0 else 0.0
 
 
+def lacking_passes(frame: RenderPair, other: RenderPair) -> list[str]:
+    """Names of the passes of a frame's renders that those of another frame lack."""
+    both = ((frame.lr, other.lr), (frame.hr, other.hr))
+    lacking = {name for own, its in both for name in _names(own) - _names(its) if is_light_of_pass(name)}
+    return sorted(name.removeprefix(LIGHT_OF) for name in lacking)
+
+
+def _names(render: ReadableRender) -> set[str]:
+    """The features of a render in memory, or of a file whose layers are mapped."""
+    if isinstance(render, Render):
+        return set(render.layers)
+    return set(render.features) if isinstance(render, MappedRender) else set()
+
+
 def memory_to_average(window: Window, channels: int) -> int:
     """Bytes that :func:`average_renders` needs beside its arguments and its result.
 
@@ -243,7 +258,7 @@ class _Band:
         x, y = np.clip(x, data.x0, data.x1 - 1), np.clip(y, data.y0, data.y1 - 1)
         top, bottom = max(int(y.min()) - 1, data.y0), min(int(y.max()) + 3, data.y1)
         place = Window(data.x0, top, data.x1, bottom)
-        stored = _read(frame.lr, place, self._low_features)
+        stored = _with_finite_passes(_read(frame.lr, place, self._low_features))
         x, y = x - place.x0, y - place.y0
         if path.x is None:
             rows, columns = y[:, 0].astype(int), x[0].astype(int)
@@ -253,7 +268,7 @@ class _Band:
             return x[rows], y[rows]
 
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
-        names = [name for name in stored if name in light or name.startswith(LIGHT_OF)]
+        names = [name for name in stored if name in light or is_light_of_pass(name)]
         with np.errstate(invalid="ignore"):  # NaN is sorted out later
             smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape)
         return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable
@@ -284,10 +299,10 @@ class _Nearest:
         window = frame.alignment.hr_data_window
         place = path.place_in(window)
         self._size = path.valid.shape
-        self._flat = {
-            name: np.ascontiguousarray(values).reshape(-1, values.shape[-1])
-            for name, values in _read(frame.hr, place, features).items()
-        }
+        pixels = _read(frame.hr, place, features)
+        if not frame.hr_is_finite:
+            pixels = _with_finite_passes(pixels)
+        self._flat = {name: np.ascontiguousarray(v).reshape(-1, v.shape[-1]) for name, v in pixels.items()}
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
         self._finite = None if frame.hr_is_finite else _finite_pixels(self._flat)
@@ -346,6 +361,12 @@ def _nearest_pixels(
 
     for_row_blocks(work, height if flat else 0, width * sum(v.shape[-1] for v in flat.values()))
     return result
+
+
+def _with_finite_passes(features: Features) -> Features:
+    """Features of a neighbour whose passes are repaired, so that a broken pixel of a pass does not count against the
+    beauty."""
+    return {name: repair(v, signed=True)[0] if is_light_of_pass(name) else v for name, v in features.items()}
 
 
 def _make_finite(features: Features) -> Mask:

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import RGB
@@ -52,8 +53,11 @@ class SumCheck:
         return f"sums to the beauty but for {share}" + (" that is in no layer" if self.remainder else "")
 
 
-def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
+def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool = True) -> SumCheck:
     """Compare the sum of a set's layers with the beauty of the same file, on some strips of rows.
+
+    Args:
+        advise: if the layers have more light, read them again to find out which are too many.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -64,20 +68,13 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
     ]
     if other:
         return SumCheck(1.0, problem=f"{other[0]} has another data window")
-    layers, names = with_layers(render, additive_set), [RGB, *layer_keys(additive_set)]
     light = wrong = missing = surplus = 0.0
-    # Where a beauty of half floats is clipped, its layers have more light.
-    brightest = HALF_MAX if render.beauty_channels[0].type == "half" else np.inf
     alike = np.zeros((len(additive_set.layers), 2), np.int64)
-    for pixels in _read_strips(layers, names):
-        beauty = pixels[RGB].astype(np.float64)
-        with np.errstate(invalid="ignore", over="ignore"):
-            rest = beauty - sum(pixels[name] for name in names[1:])
-        usable = np.isfinite(rest) & (beauty < brightest)
-        rest, beauty = rest[usable], beauty[usable]
-        light, wrong = light + np.abs(beauty).sum(), wrong + np.abs(rest).sum()
-        missing, surplus = missing + np.maximum(rest, 0).sum(), surplus + np.maximum(-rest, 0).sum()
-        alike += [_equal_pixels(pixels[name]) for name in names[1:]]
+    for layers, beauty, rest, usable in _strips_of(render, additive_set):
+        light, wrong = light + np.abs(beauty[usable]).sum(), wrong + np.abs(rest[usable]).sum()
+        missing += np.maximum(rest[usable], 0).sum()
+        surplus += np.maximum(-rest[usable], 0).sum()
+        alike += [_equal_pixels(pixels) for pixels in layers]
     if light == 0:
         return SumCheck(0.0, problem="the beauty is black")
     residual = float(wrong / light)
@@ -96,7 +93,7 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
         if lossy and residual < LOSSY:
             reason = f"the compression {lossy} is lossy, so store them with zip or piz"
         return SumCheck(residual, problem=f"they differ by {residual:.1%} both ways; {reason}")
-    superfluous = _superfluous(layers, additive_set)
+    superfluous = _superfluous(render, additive_set) if advise else []
     advice = f"without {' and '.join(superfluous)} they would sum to it" if superfluous else "some layers overlap"
     return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; {advice}")
 
@@ -104,38 +101,40 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
 def _superfluous(render: MappedRender, additive_set: AdditiveSet) -> list[str]:
     """The names of what a set has too much of to sum to the beauty: one layer, or all that by their names are sums of
     others. Empty if the rest would not sum to it either.
-
-    Args:
-        render: that of :func:`with_layers`.
     """
-    keys = dict(zip(additive_set.layers, layer_keys(additive_set), strict=True))
-    choices: list[tuple[AdditiveLayer, ...]] = [(layer,) for layer in keys]
-    choices.append(tuple(layer for layer in keys if any(layer.words < other.words for other in keys)))
+    all_layers = additive_set.layers
+    choices = [[i] for i in range(len(all_layers))]
+    choices.append([i for i, each in enumerate(all_layers) if any(each.words < other.words for other in all_layers)])
     light, wrong = 0.0, np.zeros(len(choices))
-    for pixels in _read_strips(render, [RGB, *keys.values()]):
-        beauty = pixels[RGB].astype(np.float64)
-        with np.errstate(invalid="ignore", over="ignore"):
-            rest = beauty - sum(pixels[key] for key in keys.values())
-            rests = [rest + sum(pixels[keys[layer]] for layer in left_out) for left_out in choices]
-        usable = np.isfinite(rest)
+    for layers, beauty, rest, usable in _strips_of(render, additive_set):
         light += np.abs(beauty[usable]).sum()
-        wrong += [np.abs(each[usable]).sum() for each in rests]
+        wrong += [np.abs(rest[usable] + sum(layers[i][usable] for i in left_out)).sum() for left_out in choices]
     best = int(wrong.argmin())
-    return [layer.name for layer in choices[best]] if wrong[best] <= TOLERANCE * light else []
+    return [all_layers[i].name for i in choices[best]] if wrong[best] <= TOLERANCE * light else []
 
 
 def _lossy_compression(render: MappedRender, additive_set: AdditiveSet) -> str:
     """The compression with which the beauty or a layer has lost precision; empty if none has."""
     channels = [*render.beauty_channels, *(channel for layer in additive_set.layers for channel in layer.channels)]
-    used = {render.file.parts[channel.part].compression for channel in channels}
-    return min(used.difference(LOSSLESS), default="")
+    used = ((render.file.parts[channel.part].compression, channel.type) for channel in channels)
+    # PXR24 keeps all bits of half floats.
+    return min((name for name, kind in used if name not in LOSSLESS and (name, kind) != ("pxr24", "half")), default="")
 
 
-def _read_strips(render: MappedRender, features: Sequence[str]) -> Iterator[dict[str, Array]]:
-    """Some features of a render, in strips of rows from top to bottom."""
-    window = render.data_window
+def _strips_of(
+    render: MappedRender, additive_set: AdditiveSet
+) -> Iterator[tuple[list[Array], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
+    """For strips of rows from top to bottom: the layers, the beauty, what the layers lack of it, and which of its
+    values can be compared, (h, w, 3) each."""
+    window, layers, keys = render.data_window, with_layers(render, additive_set), layer_keys(additive_set)
+    # Where a beauty of half floats is clipped, its layers have more light.
+    brightest = HALF_MAX if render.beauty_channels[0].type == "half" else np.inf
     strips = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _strips(window))
-    return one_ahead(render.read(strip, features) for strip in strips)
+    for features in one_ahead(layers.read(strip, [RGB, *keys]) for strip in strips):
+        beauty, pixels = features[RGB].astype(np.float64), [features[key] for key in keys]
+        with np.errstate(invalid="ignore", over="ignore"):
+            rest = beauty - sum(pixels)
+        yield pixels, beauty, rest, np.isfinite(rest) & (beauty < brightest)
 
 
 def _equal_pixels(pixels: Array) -> tuple[int, int]:
@@ -160,7 +159,7 @@ def is_sum_of(render: MappedRender, layer: AdditiveLayer, parts: Sequence[Additi
         InputError: pixels can't be decoded.
     """
     whole = replace(render, features={RGB: layer.formula}, alpha=None)
-    check = check_sum(whole, AdditiveSet(layer.name, tuple(parts)))
+    check = check_sum(whole, AdditiveSet(layer.name, tuple(parts)), advise=False)
     return not check.problem and not check.remainder
 
 

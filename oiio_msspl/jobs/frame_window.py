@@ -14,7 +14,7 @@ from oiio_msspl.errors import InputError, explain
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import FLOW, MotionFrame
-from oiio_msspl.fusion.render_average import RenderPair, shared_noise
+from oiio_msspl.fusion.render_average import RenderPair, lacking_passes, shared_noise
 from oiio_msspl.fusion.temporal import accumulate
 from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Mask, Placed, Step
 from oiio_msspl.jobs.sequence import Frame
@@ -126,6 +126,9 @@ class FrameWindow:
         results = self._temporal.results
         needed = {each for n in self._wanted for each in (n, *self._temporal.neighbours(n, results))}
         self._fused = {n: outcome for n, outcome in self._fused.items() if n in needed}
+        for n, outcome in self._fused.items():
+            if isinstance(outcome, FusedAlone) and n not in self._wanted:
+                self._fused[n] = replace(outcome, averaged=None)  # its passes are fused, or are not asked for
         self._release_renders()
         known = self._loaded.keys() | self._fused.keys()
         self._vectors = {(a, b): found for (a, b), found in self._vectors.items() if a in known and b in known}
@@ -152,8 +155,6 @@ class FrameWindow:
             fused = outcome.fused
             fused.rgb = kept(fused.rgb)
             fused.alpha, fused.error = (None if image is None else kept(image) for image in (fused.alpha, fused.error))
-        if isinstance(outcome, FusedAlone) and number not in self._wanted:
-            return replace(outcome, averaged=None)  # its passes are not written
         return outcome
 
     def _pair(self, loaded: LoadedFrame) -> tuple[LoadedFrame, RenderPair]:
@@ -193,6 +194,9 @@ class FrameWindow:
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {number} and {n} {SAME_SEED}")
+                    if lacking := lacking_passes(here[1], there[1]):
+                        names = " and ".join(lacking)
+                        warnings.append(f"frame {n} has no set of passes with {names}, so passes are not averaged")
                 (vectors, valid), (back, back_valid) = self._read_both_ways(n - step, n)
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
@@ -249,13 +253,10 @@ def _check_alike(frame: tuple[LoadedFrame, Placed], neighbour: tuple[LoadedFrame
         raise InputError(f"its pair is x{its.alignment.scale}")
     if one.hr.display_window.size != other.hr.display_window.size:
         raise InputError(f"its size is {other.hr.display_window.size}")
-    for name, ours, theirs in (
-        ("LRHS", one.averaged_lr, other.averaged_lr),
-        ("HRLS", one.averaged_hr, other.averaged_hr),
-    ):
-        lacking = _features(ours) - _features(theirs)
+    for name in ("lr", "hr"):
+        lacking = _features(getattr(one, name)) - _features(getattr(other, name))
         if isinstance(its, RenderPair) and lacking:
-            raise InputError(f"its {name} lacks {', '.join(sorted(lacking))}")
+            raise InputError(f"its {'LRHS' if name == 'lr' else 'HRLS'} lacks {', '.join(sorted(lacking))}")
 
 
 def _features(render: MappedRender) -> set[str]:

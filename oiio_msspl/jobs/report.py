@@ -171,7 +171,7 @@ def name_of(view: str) -> str:
 
 
 def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:
-    """Sentences for layers of the LRHS that lack, and for sets that the user has named and that could not be fused."""
+    """Sentences for layers that the LRHS lacks, and for sets that the user has named and that could not be fused."""
     if fused.passes is None:
         return []
     refused = fused.passes.refused

@@ -11,7 +11,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, LIGHT_OF, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, has_many_pixels, kept
 from oiio_msspl.errors import InputError
@@ -23,7 +23,7 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
 from oiio_msspl.fusion.passes import pass_features
-from oiio_msspl.fusion.render_average import RenderPair, average_renders
+from oiio_msspl.fusion.render_average import RenderPair, average_renders, lacking_passes
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.fusion.warp import Mask
 from oiio_msspl.jobs.frame import check_frame_memory, require_outputs, write_frame, write_frame_preview
@@ -201,9 +201,9 @@ class Stages:
     def _features(self, lr: MappedRender, hr: MappedRender) -> list[str]:
         """The features of a pair that are read: a file may have many more, and to decode and keep these takes long."""
         try:
-            return [*_features_read(self._session(lr, hr)), *_passes(hr)]
+            return [*_features_read(self._session(lr, hr)), *_light_features(hr)]
         except InputError:  # which `session` raises, too, when the frame's turn has come
-            return [*HRLS_FEATURES, "alpha", *_passes(hr)]
+            return [*HRLS_FEATURES, "alpha", *_light_features(hr)]
 
     def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours) -> FusedAlone:
         """Fuse the beauty of a pair.
@@ -222,11 +222,14 @@ class Stages:
         check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, held)
         pair, frames, averaged = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None, None
         if any(neighbours):
-            features = self._features(loaded.averaged_lr, loaded.averaged_hr)
-            means = average_renders(pair, *neighbours, features)
+            passes = _light_features(loaded.averaged_hr)
+            if any(lacking_passes(pair, step.frame) for steps in neighbours for step in steps):
+                passes = []
+            means = average_renders(pair, *neighbours, [*_features_read(session), *passes])
             pair, frames = RenderPair(means.lr, means.hr), means.frames
-            if loaded.averaged_hr is not loaded.hr:
-                averaged = _kept(means.lr, on_disk=_is_large(loaded.hr)), _kept(means.hr, on_disk=_is_large(loaded.hr))
+            if passes:
+                on_disk = _is_large(loaded.hr)
+                averaged = _kept(means.lr, on_disk=on_disk), _kept(means.hr, on_disk=on_disk)
         fused = fuse(
             pair.lr,
             pair.hr,
@@ -282,10 +285,10 @@ class Stages:
         """Memory of averaging, and of averaged renders that wait for their passes to be fused."""
         channels = _channels(hr, self._features(lr, hr))
         averaging = self.temporal.memory(hr.data_window, channels, align(lr, hr).scale)
-        if not _passes(hr) or _is_large(hr):  # large ones wait in temporary files
+        if not _light_features(hr) or _is_large(hr):  # large ones wait in temporary files
             return averaging
-        waiting = 2 * self.temporal.results + 2
-        bytes_of_pair = sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_passes(each)]) for each in (lr, hr))
+        waiting = self.temporal.results + 2
+        bytes_of_pair = sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_light_features(each)]) for each in (lr, hr))
         return averaging + waiting * bytes_of_pair
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
@@ -328,9 +331,9 @@ def _features_read(session: Session) -> list[str]:
     return list(dict.fromkeys([*session.contract.features, *session.lrhs_aovs, ALBEDO, NORMAL, "alpha"]))
 
 
-def _passes(render: MappedRender) -> list[str]:
+def _light_features(render: MappedRender) -> list[str]:
     """Features of a render that are the light of passes."""
-    return [name for name in render.features if name.startswith(LIGHT_OF)]
+    return [name for name in render.features if is_light_of_pass(name)]
 
 
 def _is_large(hr: MappedRender) -> bool:
@@ -340,7 +343,7 @@ def _is_large(hr: MappedRender) -> bool:
 
 def _kept(render: Render, *, on_disk: bool) -> Render:
     """What passes are fused from of a render that waits for its neighbours."""
-    needed = [name for name in render.layers if name in (RGB, ALBEDO, NORMAL) or name.startswith(LIGHT_OF)]
+    needed = [name for name in render.layers if name in (RGB, ALBEDO, NORMAL) or is_light_of_pass(name)]
     return replace(render, layers={name: kept(render.layers[name], on_disk=on_disk) for name in needed})
 
 

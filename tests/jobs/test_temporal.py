@@ -11,7 +11,7 @@ import time
 import numpy as np
 import pytest
 
-from oiio_msspl import InputError, fuse_shot, map_render, open_exr, parallel
+from oiio_msspl import InputError, InputOptions, fuse_shot, map_render, open_exr, parallel
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
@@ -294,6 +294,44 @@ def test_passes_are_averaged_with_the_weights_of_the_beauty(shot_with_passes, bi
         gains.append(10 * np.log10(errors[0] / errors[1]))
     # If only the beauty were averaged, the passes would gain 4.3 and 1.3 dB.
     assert np.mean(gains) > {"fit": 4.8, "best": 2.0}[quality]
+
+
+def test_broken_and_missing_passes_do_not_change_the_beauty(tmp_path, bilinear_models):
+    """A pass of one frame has pixels that are NaN, another frame lacks a pass."""
+    shot = make_shot_with_passes(tmp_path, count=7)
+    broken, lacking = (shot / f"hr/hr.{n}.exr" for n in (1003, 1007))
+    channels = read_bits(broken)[0][1]
+    channels["light_key.R"] = channels["light_key.R"].copy()
+    channels["light_key.R"][10:20, 30:50] = np.nan
+    write_exr(broken, channels)
+    write_exr(lacking, {name: v for name, v in read_bits(lacking)[0][1].items() if not name.startswith("light_key.")})
+    report = run(shot, bilinear_models[4], "auto", "4")
+    run(shot, bilinear_models[4], "none", "4", write=WriteOptions(passes=("none",)))
+    for n in range(FIRST, FIRST + 7):
+        fused, plain = (layer(shot / name / f"hr.{n}.exr", "") for name in ("auto", "none"))
+        np.testing.assert_array_equal(fused, plain)
+    total = sum(layer(shot / "auto/hr.1004.exr", f"{lamp}.") for lamp in LAMPS)
+    np.testing.assert_allclose(total, layer(shot / "auto/hr.1004.exr", ""), rtol=2e-6, atol=1e-6)
+    warnings = {n: [text for text in report.results[n].warnings if "light_key" in text] for n in (1004, 1006)}
+    said = "frame 1007 has no set of passes with light_fill and light_key, so passes are not averaged"
+    assert warnings == {1004: [], 1006: [said]}
+
+
+def test_products_of_light_and_colour_are_averaged_as_products(tmp_path, bilinear_models):
+    shot = make_shot_with_passes(tmp_path, count=5)
+    for path in sorted(shot.glob("?r/*.exr")):
+        channels = read_bits(path)[0][1]
+        height, width = channels["R"].shape
+        tint = np.full((height, width, 3), (0.5, 0.25, 0.8), np.float32)
+        tint[: height // 2] = 0
+        key, fill = (np.stack([channels[f"{lamp}.{c}"] for c in "RGB"], axis=-1) for lamp in LAMPS)
+        write_exr(path, channels | rgb(tint, "tint.") | rgb(key * tint + fill))
+    inputs = InputOptions(sums=("parts=light_key*tint+light_fill",))
+    run(shot, bilinear_models[4], "out", "4", inputs=inputs)
+    path = shot / "out/hr.1003.exr"
+    total = layer(path, "light_key.") * layer(path, "tint.") + layer(path, "light_fill.")
+    np.testing.assert_allclose(total, layer(path, ""), rtol=3e-6, atol=1e-6)
+    assert not layer(path, "light_key.")[:40].any()  # where the colour is black
 
 
 def test_passes_of_chunks_are_those_of_one_run_bit_for_bit(shot_with_passes, bilinear_models, monkeypatch):

@@ -43,7 +43,7 @@ def inspect(
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
     found = [inspect_file(path, inputs, model, motion_format) for path in files]
-    inspect_noise(found, inputs)
+    inspect_noise(found)
     if as_json:
         data = [inspection.as_dict() for inspection in found]
         print(json.dumps(data if len(data) > 1 else data[0], indent=2))

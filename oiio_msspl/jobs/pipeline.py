@@ -13,10 +13,11 @@ from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
+from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
+from oiio_msspl.jobs.view_windows import ViewWindows
 from oiio_msspl.parallel import limit_threads, submit
 
 
@@ -63,7 +64,7 @@ def run_pipeline(
     def fuse(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone | Exception:
         session = stages.session(loaded)
         try:
-            return stages.fuse(loaded, session, neighbours)
+            return loaded.stages.fuse(loaded, session, neighbours)
         except Exception as error:
             return error
 
@@ -76,7 +77,7 @@ def run_pipeline(
         if isinstance(outcome, FusedAlone) and error is None:
             try:
                 fused = window.accumulate(frame.number)
-                report = stages.complete(outcome, fused)
+                report = outcome.loaded.stages.complete(outcome, fused, window.others(frame.number))
             except Exception as caught:
                 error = caught
         # The previous frame is written before this one is handed over, so one is written at a time.
@@ -89,7 +90,7 @@ def run_pipeline(
         writing = frame, report, written
         submit(writer, _write, stages, report, fused, written)
 
-    window = FrameWindow(stages.temporal, frames, fuse)
+    window = ViewWindows(stages.temporal, frames, fuse)
     order = window.order()
     with (
         limit_threads(stages.threads),

@@ -7,7 +7,7 @@ A shot, and each chunk of frames on a Dask worker, runs them in a pipeline (:mod
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,6 +19,7 @@ from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render
+from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
@@ -34,11 +35,13 @@ from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.jobs.views import (
     OtherViews,
+    View,
     check_passes,
     find_other_views,
     fuse_frame_passes,
     fuse_other_views,
     sets_to_fuse,
+    store_view,
     uses_clean_aovs,
 )
 from oiio_msspl.model.catalogue import load_model
@@ -65,10 +68,14 @@ class LoadedFrame:
     """The HRLS in memory, or ``averaged_hr`` itself if the pair does not fit."""
     seconds: float
     """Wall time of reading."""
-    others: OtherViews
-    """Views beside the first one. Their pixels are read when they are fused."""
+    stages: Stages
+    """The stages with what belongs to this view: its neighbours, and the memory that other views take."""
     vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
     """Motion vectors that are read with the pixels, see :class:`oiio_msspl.fusion.motion.MotionFrame`."""
+    others: OtherViews = field(default_factory=OtherViews)
+    """Views beside the first one that are fused by themselves. Their pixels are read then."""
+    views: Mapping[str, LoadedFrame] = field(default_factory=dict)
+    """Views beside the first one that are averaged with their neighbours."""
 
 
 @dataclass(frozen=True)
@@ -91,6 +98,9 @@ class Stages:
     update: bool = False
     temporal: Temporal = field(default_factory=Temporal)
     """Which neighbours each frame is fused with."""
+    elsewhere: int = 0
+    """Memory that waiting frames of other views take. If there are other views, large renders wait in temporary files.
+    """
     sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
     """Models that are loaded, by scale and ``model``."""
 
@@ -126,9 +136,33 @@ class Stages:
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
+        over_time = [view for view in others.views if view.hr.view in self.temporal.views]
+        alone = tuple(view for view in others.views if view not in over_time)
+        first, *rest = self._of_views([View(lr, hr), *over_time])
+        loaded = first._load(frame, lr, hr)
+        views = {
+            view.hr.view: stages._load(frame, view.lr, view.hr) for stages, view in zip(rest, over_time, strict=True)
+        }
+        seconds = time.perf_counter() - start
+        return replace(loaded, seconds=seconds, others=replace(others, views=alone), views=views)
+
+    def _of_views(self, views: Sequence[View]) -> list[Stages]:
+        """The stages for each view of a frame that is averaged with its neighbours."""
+        if len(views) == 1:
+            return [self]
+        # Layers about the fused picture are those of the first view.
+        options = replace(self.write_options, error_layer=False, data_passes=False)
+        plans = [self.temporal.views[view.hr.view] for view in views[1:]]
+        stages = [self, *(replace(self, temporal=plan, write_options=options) for plan in plans)]
+        waiting = [each._waiting_bytes(view.lr, view.hr) for each, view in zip(stages, views, strict=True)]
+        return [replace(each, elsewhere=sum(waiting) - own) for each, own in zip(stages, waiting, strict=True)]
+
+    def _load(self, frame: Frame, lr: MappedRender, hr: MappedRender) -> LoadedFrame:
+        """Read the pixels of a pair if two frames fit into memory beside a tile."""
+        start = time.perf_counter()
         low, high = self._with_passes(lr, hr)
         if not self._fits(low, high):
-            return LoadedFrame(frame, lr, hr, low, high, low, high, time.perf_counter() - start, others)
+            return LoadedFrame(frame, lr, hr, low, high, low, high, time.perf_counter() - start, self)
         features, channels, motion = self._features(low, high), self._read_ahead(low, high), self.temporal.motion
         on_disk = self._waits_on_disk(low, high)
         pixels, stored = high.load_with(channels, features, on_disk=on_disk)
@@ -136,7 +170,7 @@ class Stages:
         waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
         low_pixels = low.load(features, on_disk=on_disk)
         seconds = time.perf_counter() - start
-        return LoadedFrame(frame, lr, hr, low, high, low_pixels, pixels, seconds, others, waiting)
+        return LoadedFrame(frame, lr, hr, low, high, low_pixels, pixels, seconds, self, waiting)
 
     def _with_passes(self, lr: MappedRender, hr: MappedRender) -> tuple[MappedRender, MappedRender]:
         """A pair with the features of the passes that are to be fused, if renders are averaged with those of
@@ -153,7 +187,7 @@ class Stages:
         features = self._features(lr, hr)
         result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
         other = FIXED_MEMORY + TILE_MEMORY + 2 * result + _pixel_bytes(lr, features)
-        other += self._temporal_bytes(lr, hr)
+        other += self._temporal_bytes(lr, hr) + self.elsewhere
         return self.max_memory - other - frames * sum(_pixel_bytes(render, features) for render in (lr, hr))
 
     @property
@@ -169,6 +203,8 @@ class Stages:
         into memory with their motion vectors."""
         if not self.temporal.renders or not _is_large(hr):
             return False
+        if self.elsewhere:
+            return True
         return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
 
     def _motion_channels(self, hr: MappedRender) -> list[Channel]:
@@ -244,12 +280,15 @@ class Stages:
         alone = replace(loaded, lr_pixels=loaded.averaged_lr, hr_pixels=loaded.averaged_hr)
         return FusedAlone(alone, session, fused, time.perf_counter() - start, averaged)
 
-    def complete(self, alone: FusedAlone, fused: FusedFrame) -> FrameReport:
+    def complete(
+        self, alone: FusedAlone, fused: FusedFrame, views: Iterable[tuple[FusedAlone, FusedFrame]] = ()
+    ) -> FrameReport:
         """Fuse what depends on the final beauty: the passes, and other views.
 
         Args:
             alone: the frame.
             fused: its final beauty; gets the passes.
+            views: the same for each view beside the first one that is averaged with its neighbours.
 
         Returns:
             The report, complete but for the time and the warnings of writing.
@@ -262,14 +301,25 @@ class Stages:
         fused.replaced, reports = fuse_other_views(
             loaded.others, session, self.write_options, self.max_memory, held=held
         )
-        room = self.max_memory - held
-        fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, room, averaged=alone.averaged)
+        for view, final in views:
+            final.replaced = fused.replaced or ReplacedChannels()
+            view.loaded.stages._fuse_passes(view, final)
+            reports.append(store_view(View(view.loaded.lr, view.loaded.hr), final, session))
+            fused.replaced = final.replaced
+        reports.sort(key=lambda each: loaded.hr.other_views.index(each.hr.view))
+        self._fuse_passes(alone, fused)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
         add_other_views(report, reports, loaded.others.passed_on)
         seconds = alone.seconds + time.perf_counter() - start
         report.seconds = {"read": loaded.seconds, "fuse": seconds, "network": report.network_seconds}
         return report
+
+    def _fuse_passes(self, alone: FusedAlone, fused: FusedFrame) -> None:
+        """Fuse the passes of a view, given its final beauty."""
+        loaded, session = alone.loaded, alone.session
+        room = self.max_memory - self._held_bytes(loaded, session)
+        fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, room, averaged=alone.averaged)
 
     def _held_bytes(self, loaded: LoadedFrame, session: Session) -> int:
         """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
@@ -279,17 +329,30 @@ class Stages:
         if self._fits(lr, hr):
             held += self._frames_in_memory(lr, hr) * sum(_pixel_bytes(render, features) for render in (lr, hr))
             held += _vector_bytes(hr, self._read_ahead(lr, hr))
-        return held + self._temporal_bytes(lr, hr)
+        return held + self._temporal_bytes(lr, hr) + self.elsewhere
 
     def _temporal_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
         """Memory of averaging, and of averaged renders that wait for their passes to be fused."""
         channels = _channels(hr, self._features(lr, hr))
         averaging = self.temporal.memory(hr.data_window, channels, align(lr, hr).scale)
+        return averaging + self._averaged_bytes(lr, hr)
+
+    def _averaged_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Memory of averaged renders that wait for their passes to be fused."""
         if not _light_features(hr) or _is_large(hr):  # large ones wait in temporary files
-            return averaging
+            return 0
         waiting = self.temporal.results + 2
-        bytes_of_pair = sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_light_features(each)]) for each in (lr, hr))
-        return averaging + waiting * bytes_of_pair
+        return waiting * sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_light_features(each)]) for each in (lr, hr))
+
+    def _waiting_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
+        """Most memory that the frames of a view take while another view is fused."""
+        low, high = self._with_passes(lr, hr)
+        features = self._features(low, high)
+        waiting = self.temporal.waiting(hr.data_window, _channels(high, features), align(lr, hr).scale)
+        waiting += self._averaged_bytes(low, high)
+        if _is_large(hr):
+            return waiting
+        return waiting + self._frames_held * sum(_pixel_bytes(render, features) for render in (low, high))
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
         """Write preview and EXR.

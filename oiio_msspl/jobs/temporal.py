@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -19,8 +20,9 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
 from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
-from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
 from oiio_msspl.jobs.sequence import Frame, Shot
+from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of
 
 log = logging.getLogger(__name__)
@@ -81,6 +83,8 @@ class Temporal:
     """Every frame of the shot that has both renders, whether it is to be fused or not."""
     text: str = ""
     """One sentence for the user; empty if the user has switched it off."""
+    views: Mapping[str, Temporal] = field(default_factory=dict)
+    """The same for those views beside the first one that are averaged, too. All have the same ``count``."""
 
     @property
     def count(self) -> int:
@@ -100,7 +104,8 @@ class Temporal:
 
     def absolute(self) -> Temporal:
         """The same with absolute paths, for workers with other working directories."""
-        return replace(self, frames={n: frame.absolute() for n, frame in self.frames.items()})
+        views = {view: each.absolute() for view, each in self.views.items()}
+        return replace(self, frames={n: frame.absolute() for n, frame in self.frames.items()}, views=views)
 
     def files_beside(self, hr: Path) -> list[Path]:
         """The files of the neighbours of the frame whose HRLS this is."""
@@ -118,12 +123,16 @@ class Temporal:
         """
         if not self.count:
             return 0
+        working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
+        return self.waiting(window, channels, scale) + RESULT_BYTES * window.width * window.height + working
+
+    def waiting(self, window: Window, channels: int, scale: int) -> int:
+        """The part of :meth:`memory` that is held from one frame to the next."""
         pixels = window.width * window.height
         in_memory = not has_many_pixels(window.height, window.width)
         held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
-        working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
         luminance = LUMINANCE_BYTES * (2 * self.count + 2) * pixels // scale**2
-        return (held * in_memory + RESULT_BYTES) * pixels + luminance + working
+        return held * in_memory * pixels + luminance
 
     def missing(self, number: int) -> list[int]:
         """The numbers next to a frame that lie within the shot, and of which a render is missing."""
@@ -142,6 +151,8 @@ def _is_slow(model: str | None) -> bool:
 def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None = None) -> Temporal:
     """Decide how a shot is fused over time. The decision depends on all files of the shot, not on the frames chosen.
 
+    Each view and view layer has its own motion. If that of the first view is not known, all are fused frame by frame.
+
     Args:
         model: see :meth:`TemporalOptions.count`.
 
@@ -158,7 +169,23 @@ def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions, mo
         if asked:
             raise InputError(f"--temporal {count}: {shot.hr.pattern} has no two frames that follow each other")
         return Temporal(text="frame by frame: no two frames follow each other")
-    source = _motion_of(frames, pairs, inputs, options, required=asked)
+    looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1])))
+    first = _plan(_motion_of(frames, looked_at, inputs, options, required=asked), count, frames, asked=asked)
+    if not first.count:
+        return first
+    views, text = {}, first.text
+    for label in _other_views(frames, looked_at, inputs):
+        source = _motion_of(frames, looked_at, inputs, options, label, required=False)
+        plan = _plan(source, count, frames, asked=asked)
+        if plan.count:
+            views[label] = plan
+        else:
+            text += f"; {label or '(unnamed)'} {plan.text}"
+    return replace(first, views=views, text=text)
+
+
+def _plan(source: MotionSource, count: int, frames: Mapping[int, Frame], *, asked: bool) -> Temporal:
+    """How one view is fused over time."""
     if source.kind == NONE or (source.kind == FLOW and not asked):
         hint = "; --temporal 2 uses it all the same" if source.kind == FLOW else ""
         return Temporal(text=f"frame by frame: {source.text}{hint}")
@@ -166,6 +193,16 @@ def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions, mo
     frame_count = "one frame" if count == 1 else f"{count} frames"
     text = f"with {frame_count} before and after each: {source.text}"
     return Temporal(renders, results, source, frames, text)
+
+
+def _other_views(frames: Mapping[int, Frame], numbers: Sequence[int], inputs: InputOptions) -> list[str]:
+    """The views beside the first one that are fused in some of these frames."""
+    views: dict[str, None] = {}
+    for number in numbers:
+        with suppress(InputError):  # the run says so when the turn of this frame has come
+            others = find_other_views(*_map_frame(frames[number], inputs), inputs)
+            views |= dict.fromkeys(view.hr.view for view in others.views)
+    return list(views)
 
 
 def shares(count: int, kind: str) -> tuple[int, int]:
@@ -182,22 +219,26 @@ def shares(count: int, kind: str) -> tuple[int, int]:
 
 def _motion_of(
     frames: Mapping[int, Frame],
-    pairs: Sequence[int],
+    numbers: Sequence[int],
     inputs: InputOptions,
     options: TemporalOptions,
+    view: str | None = None,
     *,
     required: bool,
 ) -> MotionSource:
-    """How the motion of a shot is known, by the first pair of frames, the middle one and the last one.
+    """How the motion of a shot is known, by some of its frames and the frames after these.
 
-    The camera may stand still at one end. A pair that can't be read is passed over, because the run says so when its
-    turn comes.
+    The camera may stand still at one end, so several frames are looked at. One that can't be read is passed over,
+    because the run says so when its turn comes.
+
+    Args:
+        view: the view or view layer; None for each file's first one.
     """
     found: list[MotionSource] = []
     problem: InputError | None = None
-    for number in dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1])):
+    for number in numbers:
         try:
-            first, second = (_map_hrls(frames[n], inputs) for n in (number, number + 1))
+            first, second = (_map_hrls(frames[n], inputs, view) for n in (number, number + 1))
             found.append(find_motion(first, second, options.motion_format, required=required))
         except InputError as error:
             problem = problem or error
@@ -212,11 +253,16 @@ def _motion_of(
     if found:
         return found[0]
     assert problem is not None
-    if required or options.motion_format is not None:
+    if required or (options.motion_format is not None and view is None):
         raise problem
     return MotionSource(NONE, str(problem))
 
 
-def _map_hrls(frame: Frame, inputs: InputOptions) -> MappedRender:
+def _map_hrls(frame: Frame, inputs: InputOptions, view: str | None) -> MappedRender:
+    hr = _map_frame(frame, inputs)[1]
+    return hr if view is None else map_other_hrls(hr, view, inputs)
+
+
+def _map_frame(frame: Frame, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
     assert frame.lr is not None and frame.hr is not None
-    return map_pair(frame.lr, frame.hr, inputs)[1]
+    return map_pair(frame.lr, frame.hr, inputs)

@@ -2,7 +2,8 @@
 """The views and view layers of a pair, and their passes.
 
 The first view goes the way of a file that has only one. The others are fused before it, one after the other, into a
-temporary file, so memory holds one view at a time.
+temporary file, so memory holds one view at a time. In a shot, they are averaged with their neighbours as the first one
+is (:mod:`oiio_msspl.jobs.view_windows`).
 """
 
 from __future__ import annotations
@@ -135,10 +136,15 @@ def fuse_other_views(
         fused = fuse(view.lr, view.hr, session, clean_aovs=clean, max_memory=max_memory, held=held, progress=progress)
         fused.replaced = replaced
         fuse_frame_passes(view.lr, view.hr, fused, session, write, max_memory - held, progress)
-        assert fused.replaced is not None
-        _store(fused.replaced, view.hr, fused)
-        reports.append(report_on(view.lr, view.hr, session, fused, view.hr.file.path, None))
+        reports.append(store_view(view, fused, session))
     return replaced, reports
+
+
+def store_view(view: View, fused: FusedFrame, session: Session) -> FrameReport:
+    """Put a fused view beside the first one where its passes are, in ``fused.replaced``, and report on it."""
+    assert fused.replaced is not None
+    _store(fused.replaced, view.hr, fused)
+    return report_on(view.lr, view.hr, session, fused, view.hr.file.path, None)
 
 
 def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> None:

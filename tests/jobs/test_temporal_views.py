@@ -1,0 +1,165 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Each view and view layer of a shot is averaged with its own neighbours."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl import InputOptions, WriteOptions, fuse_shot
+from oiio_msspl.jobs import stages
+from oiio_msspl.jobs.temporal import TemporalOptions
+from tests.conftest import downsample, noisy, read_bits, rgb, same_bits, write_exr
+from tests.moving_plane import positions, texture, truck, vectors
+
+FIRST, COUNT = 1001, 7
+
+
+def backwards(t):
+    """A camera that moves to the left."""
+    return truck(t) * (-1, 1, 1)
+
+
+CAMERAS = {"fg": truck, "bg": backwards}
+
+
+def channels_of(view, t, scale, spp, *, motion=True):
+    """A view layer's channels: beauty, albedo, two light groups and, in the HRLS, motion vectors."""
+    camera, seed = CAMERAS[view], 10 * t + len(view) + (50 if view == "bg" else 0)
+    places = positions(camera, t)
+    clean = texture(places[..., 0], places[..., 1])
+    share = np.linspace(0.2, 0.8, clean.shape[1], dtype=np.float32)[:, None]
+    lamps = {"Combined_key": clean * share, "Combined_fill": clean * (1 - share)}
+    lamps = {
+        name: noisy(downsample(light, scale), spp, 1000 * scale + 2 * seed + i).astype(np.float32)
+        for i, (name, light) in enumerate(lamps.items())
+    }
+    channels = rgb(sum(lamps.values()), f"{view}.Combined.")
+    for name, light in lamps.items():
+        channels |= rgb(light, f"{view}.{name}.")
+    if scale > 1:
+        return channels
+    channels |= rgb(clean, f"{view}.Denoising Albedo.")
+    if motion:
+        back, ahead = vectors(camera, t, -1), vectors(camera, t, 1)
+        # Cycles: where the surface was, and where it will be; y points up, and the second pair is reversed.
+        parts = (back[..., 0], -back[..., 1], -ahead[..., 0], ahead[..., 1])
+        channels |= {f"{view}.Vector.{c}": values for c, values in zip("XYZW", parts, strict=True)}
+    return channels
+
+
+def make_shot(folder, views=("fg", "bg"), still=(), lacking=()):
+    """Pairs at x4 with view layers, whose cameras move in opposite directions.
+
+    Args:
+        views: the view layers.
+        still: those without motion vectors.
+        lacking: frames without the last view layer.
+    """
+    for name in ("lr", "hr"):
+        (folder / name).mkdir(parents=True)
+    header = {"cycles.fg.samples": "1", "cycles.bg.samples": "1"}
+    for t in range(COUNT):
+        there = views[:-1] if t in lacking else views
+        low = [(view, channels_of(view, t, 4, 16), (0, 0)) for view in there]
+        high = [(view, channels_of(view, t, 1, 1, motion=view not in still), (0, 0)) for view in there]
+        write_exr(folder / f"lr/lr.{FIRST + t}.exr", low, **header)
+        write_exr(folder / f"hr/hr.{FIRST + t}.exr", high, **header)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def shot(tmp_path_factory):
+    return make_shot(tmp_path_factory.mktemp("views"))
+
+
+@pytest.fixture(scope="module")
+def whole(shot, bilinear_models):
+    return run(shot, bilinear_models[4], "whole")
+
+
+def run(shot, model, name, frames=None, temporal="auto", view=None, **more):
+    out = shot / name
+    out.mkdir(exist_ok=True)
+    inputs, options = InputOptions(view=view), TemporalOptions(temporal)
+    report = fuse_shot(
+        shot / "lr", shot / "hr", out, frames=frames, model=str(model), temporal=options, inputs=inputs, **more
+    )
+    assert report.exit_code == 0, report.results
+    return report
+
+
+def pixels_of(shot, name, t, view=""):
+    """{channel: pixels} of a view layer of a fused frame."""
+    parts = read_bits(shot / name / f"hr.{FIRST + t}.exr")
+    return {channel: pixels for _, part in parts for channel, pixels in part.items() if channel.startswith(view)}
+
+
+def light(shot, name, layer):
+    """A layer of the fourth frame, (h, w, 3)."""
+    channels = pixels_of(shot, name, 3)
+    return np.stack([channels[f"{layer}.{c}"] for c in "RGB"], axis=-1)
+
+
+@pytest.mark.parametrize("view", CAMERAS)
+def test_each_view_is_what_it_is_when_its_shot_is_fused_alone(shot, whole, bilinear_models, view):
+    assert whole.temporal.startswith("with 4 frames before and after each: motion vectors of ")
+    run(shot, bilinear_models[4], f"{view} alone", view=view)
+    for t in range(COUNT):
+        alone, both = (pixels_of(shot, name, t, f"{view}.") for name in (f"{view} alone", "whole"))
+        assert alone.keys() == both.keys() and all(same_bits(both[name], alone[name]) for name in alone)
+
+
+def test_views_gain_as_much_as_the_first_one(shot, whole, bilinear_models):
+    run(shot, bilinear_models[4], "off", temporal="off")
+    for view, camera in CAMERAS.items():
+        places = positions(camera, 3)
+        clean = texture(places[..., 0], places[..., 1])
+        share = np.linspace(0.2, 0.8, clean.shape[1], dtype=np.float32)[:, None]
+        for layer, truth in (("Combined", clean), ("Combined_key", clean * share)):
+            before, after = (np.mean((light(shot, name, f"{view}.{layer}") - truth) ** 2) for name in ("off", "whole"))
+            assert after < before / 1.3
+
+
+def test_chunks_of_several_views_are_one_run_bit_for_bit(shot, whole, bilinear_models):
+    for frames in ("1001-1003", "1004-1007"):
+        run(shot, bilinear_models[4], "chunks", frames)
+    for t in range(COUNT):
+        once, chunks = (pixels_of(shot, name, t) for name in ("whole", "chunks"))
+        assert all(same_bits(once[name], chunks[name]) for name in once)
+
+
+def test_large_renders_of_several_views_wait_in_files(shot, whole, bilinear_models, monkeypatch):
+    monkeypatch.setattr(stages, "has_many_pixels", lambda height, width: True)
+    run(shot, bilinear_models[4], "on disk")
+    once, again = (pixels_of(shot, name, 3) for name in ("whole", "on disk"))
+    assert all(same_bits(once[name], again[name]) for name in once)
+
+
+def test_frames_of_other_views_are_counted_as_memory(shot, whole):
+    frame = whole.shot.frames[0]
+    both = stages.Stages(temporal=stages.Temporal(2, 2, views={"bg": stages.Temporal(2, 2)})).read(frame)
+    alone = stages.Stages(temporal=stages.Temporal(2, 2)).read(frame)
+    assert both.stages.elsewhere >= 6 * both.views["bg"].hr_pixels.layers["rgb"].nbytes
+    assert alone.stages.elsewhere == 0 and not alone.views
+
+
+def test_a_view_without_motion_stays_alone(tmp_path, bilinear_models):
+    shot = make_shot(tmp_path, still=("bg",))
+    report = run(shot, bilinear_models[4], "whole")
+    assert report.temporal.startswith("with 4 frames before and after each: motion vectors of ")
+    assert "; bg frame by frame: no motion vectors" in report.temporal
+    run(shot, bilinear_models[4], "off", temporal="off")
+    off, whole = (pixels_of(shot, name, 3) for name in ("off", "whole"))
+    assert all(same_bits(off[name], whole[name]) for name in off if name.startswith("bg."))
+    assert not same_bits(off["fg.Combined.R"], whole["fg.Combined.R"])
+
+
+def test_a_frame_may_lack_a_view(tmp_path, bilinear_models):
+    shot = make_shot(tmp_path, lacking=(3,))
+    report = run(shot, bilinear_models[4], "whole", write=WriteOptions(passes=("none",)))
+    assert not any(name.startswith("bg.") for name in pixels_of(shot, "whole", 3))
+    warnings = report.results[FIRST + 2].warnings
+    assert "bg: frame 1004 is not averaged: it has no pair for bg" in warnings
+    run(shot, bilinear_models[4], "fg alone", view="fg", write=WriteOptions(passes=("none",)))
+    for t in (2, 3):
+        whole, alone = (pixels_of(shot, name, t, "fg.") for name in ("whole", "fg alone"))
+        assert all(same_bits(whole[name], alone[name]) for name in alone)

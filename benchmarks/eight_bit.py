@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy of the `joint` models' files for CPUs (8 bits) and for GPUs (half floats) beside PyTorch in 32 bits.
+"""Accuracy of the files for CPUs (8 bits) and for GPUs (half floats) beside PyTorch in 32 bits, but for `paper`, which
+has one file.
 
     python -m benchmarks.eight_bit RENDERS
     python -m benchmarks.eight_bit VIEWS
@@ -37,6 +38,7 @@ from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
 from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
 from training.checkpoints import load as load_checkpoint
 from training.data import to_tensor
+from training.ensemble import EnsembleFusion, load_weights
 from training.joint import JointFusion
 
 SPP = (1, 2, 4)
@@ -45,7 +47,11 @@ WAYS = ("32bit", "8bit", "half")
 SIZE, REPEATS = 1024, 5
 _FOLDER = Path(__file__).parents[1] / "training/checkpoints"
 #: By family of models.
-CHECKPOINTS = {"joint": _FOLDER / "joint.pt", "joint-small": _FOLDER / "joint_small.pt"}
+CHECKPOINTS = {
+    "joint": _FOLDER / "joint.pt",
+    "joint-small": _FOLDER / "joint_small.pt",
+    "ensemble": _FOLDER / "ensemble.pt",
+}
 
 
 def medians(ways: list[Callable[[], object]]) -> list[float]:
@@ -71,16 +77,20 @@ def accuracy(views: list[scenes.Scene], scale: int, sessions: Sequence[Session])
 
 
 class InTorch(Session):
-    """A joint model computed by PyTorch in 32 bits, from its checkpoint."""
+    """A model computed by PyTorch in 32 bits, from its checkpoint."""
 
-    def __init__(self, path: Path, checkpoint: Path) -> None:
+    def __init__(self, path: Path, family: str) -> None:
         super().__init__(path)
-        network, other = (load_checkpoint(path)[0] for path in (checkpoint, CHECKPOINTS["joint"]))
-        assert isinstance(network, JointFusion) and isinstance(other, JointFusion)
-        self._network = network
+        network, usual = (
+            load_checkpoint(CHECKPOINTS[name])[0] for name in (family.replace("ensemble", "joint"), "joint")
+        )
+        assert isinstance(network, JointFusion) and isinstance(usual, JointFusion)
+        self._fuse: Callable[..., Sequence[torch.Tensor]] = network.fuse
+        if family == "ensemble":
+            self._fuse = EnsembleFusion(network, load_weights(CHECKPOINTS[family])[0]).eval()
         # The small network has the large denoiser at x4 and x8
         large = self.contract.denoiser == MEAN_DENOISER
-        self._mean_denoiser = other.mean_denoiser if large else network.mean_denoiser
+        self._mean_denoiser = usual.mean_denoiser if large else network.mean_denoiser
 
     def run(
         self,
@@ -96,7 +106,7 @@ class InTorch(Session):
         layers = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs, mean)
         images = np.concatenate([light, self._mean_denoiser.denoise(layers)], axis=-1), hrls
         with torch.inference_mode():
-            fused, _ = self._network.fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))
+            fused = self._fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))[0]
         return {"fused": fused[0].permute(1, 2, 0).numpy()}
 
 
@@ -114,7 +124,7 @@ def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Ite
     hr = Render.from_arrays("hr", **layers)
     for name in models:
         path = find_model(0, name)
-        sessions = [InTorch(path, CHECKPOINTS[name.rpartition("-x")[0]]), Session(path), ForGpus(path)]
+        sessions = [InTorch(path, name.rpartition("-x")[0]), Session(path), ForGpus(path)]
         scale = sessions[0].contract.scale
         lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
         seconds: Row = {}

@@ -163,3 +163,31 @@ def test_a_frame_may_lack_a_view(tmp_path, bilinear_models):
     for t in (2, 3):
         whole, alone = (pixels_of(shot, name, t, "fg.") for name in ("whole", "fg alone"))
         assert all(same_bits(whole[name], alone[name]) for name in alone)
+
+
+def test_both_eyes_are_averaged(tmp_path, bilinear_models):
+    """Layers of the second eye have its name before the channel's, as OpenEXR stores them."""
+    for name, scale, spp in (("lr", 4, 16), ("hr", 1, 1)):
+        (tmp_path / name).mkdir()
+        for t in range(COUNT):
+            channels = {}
+            for view, eye in (("fg", ""), ("bg", "right.")):
+                for stored, values in channels_of(view, t, scale, spp, motion=False).items():
+                    layer, _, letter = stored.removeprefix(f"{view}.").rpartition(".")
+                    if layer != "Denoising Albedo":
+                        channels[{"Combined": ""}.get(layer, f"{layer}.") + eye + letter] = values
+                if scale == 1:
+                    ahead = vectors(CAMERAS[view], t, 1)
+                    channels |= {f"motionFore.{eye}{c}": ahead[..., i] for i, c in enumerate("XY")}
+                    places = positions(CAMERAS[view], t)
+                    channels |= rgb(texture(places[..., 0], places[..., 1]), f"albedo.{eye}")
+            write_exr(tmp_path / name / f"{name}.{FIRST + t}.exr", channels, multiView=["left", "right"])
+    run(tmp_path, bilinear_models[4], "whole")
+    run(tmp_path, bilinear_models[4], "off", temporal="off")
+    places = positions(backwards, 3)
+    clean = texture(places[..., 0], places[..., 1])
+    before, after = (
+        np.mean((np.stack([pixels_of(tmp_path, name, 3)[f"right.{c}"] for c in "RGB"], -1) - clean) ** 2)
+        for name in ("off", "whole")
+    )
+    assert after < before / 1.5

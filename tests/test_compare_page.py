@@ -186,6 +186,62 @@ def test_the_browser_shows_the_pixels_of_the_files(page, layer, exposure, wipe, 
     assert texts["caption-left"].startswith("out.exr\nPSNR ") and texts["caption-right"] == "ref.exr"
 
 
+def act(page, script, tmp_path, **wanted):
+    """What the screen shows around the place (10, 40) after a script has sent events, as sRGB codes (21, 21, 3).
+
+    The script may use ``at(x, y)``: where a point of the picture lies on the screen, as the coordinates of an event.
+    """
+    helpers = """
+      const at = (x, y) => {
+        const box = stage.getBoundingClientRect(), ratio = window.devicePixelRatio || 1;
+        const [left, top] = [camera.x + x * camera.scale * page.pixelAspect, camera.y + y * camera.scale];
+        return { clientX: box.left + left / ratio, clientY: box.top + top / ratio, bubbles: true, cancelable: true };
+      };
+      const press = (key) => document.dispatchEvent(new KeyboardEvent("keydown", { key, bubbles: true }));
+    """
+    look = """
+      const [x, y] = [camera.x + 10.5 * camera.scale * page.pixelAspect, camera.y + 40.5 * camera.scale];
+      const around = context.getImageData(Math.floor(x) - 10, Math.floor(y) - 10, 21, 21).data;
+      document.body.dataset.around = Array.from(around).join(" ");
+    """
+    copy = tmp_path / "acted.html"
+    # The page decodes and paints in the background.
+    code = f"{helpers} setTimeout(() => {{ {script} setTimeout(() => {{ {look} }}, 1000); }}, 1000);"
+    html = page.read_text(encoding="utf-8").replace("</body>", f"<script>{code}</script></body>")
+    copy.write_text(html, encoding="utf-8")
+    found = dump_dom(f"{copy.as_uri()}#{urlencode(wanted)}")
+    codes = re.search(r'data-around="([\d ]+)"', found)[1].split()
+    return np.array(codes, int).reshape(21, 21, 4)[..., :3]
+
+
+@needs_browser
+def test_the_wheel_zooms_around_the_cursor(page, tmp_path):
+    """Enlarged pixels keep their edges: after zooming, one pixel fills what several did."""
+    light = (1.1 * LIGHT_1 + LIGHT_2)[40, 10]
+    before, after = (
+        act(page, script, tmp_path, layer="beauty", left=1, wipe=1)
+        for script in ("", 'stage.dispatchEvent(new WheelEvent("wheel", { ...at(10.5, 40.5), deltaY: -600 }));')
+    )
+    assert (before[10, 10] == after[10, 10]).all() and np.ptp(before, axis=(0, 1)).any()
+    assert not np.ptp(after, axis=(0, 1)).any()
+    assert_shows(after[10, 10], light)
+
+
+@needs_browser
+def test_dragging_the_line_wipes_and_keys_change_the_exposure(page, tmp_path):
+    drag = """
+      const line = (share) => at((share * screen.width - camera.x) / (camera.scale * page.pixelAspect), 5);
+      const send = (type, share) => stage.dispatchEvent(new PointerEvent(type, { ...line(share), pointerId: 1 }));
+      send("pointerdown", 1);
+      send("pointermove", 0.01);
+      send("pointerup", 0.01);
+      press("+");
+      press("+");
+    """
+    shown = act(page, drag, tmp_path, layer="light_1", left=1, right=REF + 1, wipe=1)
+    assert_shows(shown[10, 10], LIGHT_1[40, 10], 1)
+
+
 @needs_browser
 def test_the_browser_shows_the_lrhs_with_its_own_pixels(page):
     screen, *_ = look(page, layer="light_1", left=LR + 1, wipe=1, at="11,23")

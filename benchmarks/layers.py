@@ -25,6 +25,7 @@ from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, NORMAL, SPECULAR
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.compare import scores
 from oiio_msspl.exr.render import ReadableRender, Render
+from oiio_msspl.fusion.render_average import feature_names
 from oiio_msspl.model.catalogue import load_model
 
 MODELS = ("joint-small-x2", "joint-x2", "ensemble-x2", "joint-x4", "ensemble-x4", "paper-x4")
@@ -42,11 +43,6 @@ WITHOUT = {
 KEYS = ("model", "spp", "without")
 
 
-def names_of(render: ReadableRender) -> set[str]:
-    """The features of a render."""
-    return set(render.features if isinstance(render, MappedRender) else render.layers)  # type: ignore[attr-defined]
-
-
 def less(render: ReadableRender, features: Sequence[str]) -> ReadableRender:
     """A render without some of its features."""
     if isinstance(render, MappedRender):
@@ -62,8 +58,8 @@ def measure(renders: str, scene: scenes.Scene) -> list[Row]:
         session = load_model(0, name)
         for spp in AVERAGES:
             lr, hr = scene.lrhs(session.contract.scale, spp // 2), scene.hrls(spp // 2)
-            high = names_of(hr) & set(session.contract.features)
-            low = names_of(lr) & set(session.lrhs_aovs)
+            high = feature_names(hr) & set(session.contract.features)
+            low = feature_names(lr) & set(session.lrhs_aovs)
             for title, (of_hrls, of_lrhs) in WITHOUT.items():
                 if (of_hrls and not high.issuperset(of_hrls)) or (not of_hrls and of_lrhs and not low):
                     continue

@@ -50,7 +50,7 @@ def measure_stages(folder: Path, device: str, threads: int) -> dict[str, Any]:
         moments = [time.perf_counter()]
         ready = stages.read(frame)
         moments.append(time.perf_counter())
-        alone = stages.fuse(ready, stages.session(ready))
+        alone = stages.fuse(ready, stages.session(ready), ((), ()))
         report = stages.complete(alone, alone.fused)
         moments.append(time.perf_counter())
         stages.write(report, alone.fused)

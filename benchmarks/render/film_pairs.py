@@ -28,7 +28,7 @@ from oiio_msspl.model.contract import SCALES
 CROP = np.array((376, 232))
 FILTERS = ("box", "gaussian")
 #: Name, scale and spp of each render.
-RENDERS = [("ref", 1, 512), *((f"hr_{n}spp", 1, n) for n in (1, 2, 4, 8))]
+RENDERS = [("ref", 1, 256), *((f"hr_{n}spp", 1, n) for n in (1, 2, 4, 8))]
 RENDERS += [(f"lr_x{scale}_{scale**2 * n}spp", scale, scale**2 * n) for scale in SCALES for n in (1, 2, 4)]
 #: Samples that are rendered at once; more need more memory.
 LAUNCH = 1_500_000
@@ -38,7 +38,7 @@ CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "
 
 def render(mi: Any, file: Path, out: Path, pixel_filter: str) -> None:
     """Render the files of one scene with one filter that do not exist yet."""
-    mi.file_resolver().append(str(file.parent))
+    mi.file_resolver().prepend(str(file.parent))  # before the folders of other scenes
     scene = mi.load_string(re.sub(r'<rfilter type="\w+"', f'<rfilter type="{pixel_filter}"', file.read_text()))
     sensor = scene.sensors()[0]
     if pixel_filter not in str(sensor.film().rfilter()).lower():

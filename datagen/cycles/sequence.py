@@ -21,7 +21,7 @@ import OpenImageIO as oiio
 
 #: Width and height; multiples of every scale.
 SIZE = (320, 180)
-FRAMES, SCALES, REFERENCE_HALF = 6, (2, 4), 64
+FRAMES, SCALES, REFERENCE_HALF = 10, (2, 4), 64
 #: Metres that the camera and the cube move in a frame, along x, and radians that the cube turns.
 TRUCK, SLIDE, TURN = 0.035, -0.05, 0.05
 

@@ -151,11 +151,11 @@ def shared_noise(frame: RenderPair, other: RenderPair) -> float:
 def lacking_passes(frame: RenderPair, other: RenderPair) -> list[str]:
     """Names of the passes of a frame's renders that those of another frame lack."""
     both = ((frame.lr, other.lr), (frame.hr, other.hr))
-    lacking = {name for own, its in both for name in _names(own) - _names(its) if is_light_of_pass(name)}
+    lacking = {name for own, its in both for name in feature_names(own) - feature_names(its) if is_light_of_pass(name)}
     return sorted(name.removeprefix(LIGHT_OF) for name in lacking)
 
 
-def _names(render: ReadableRender) -> set[str]:
+def feature_names(render: ReadableRender) -> set[str]:
     """The features of a render in memory, or of a file whose layers are mapped."""
     if isinstance(render, Render):
         return set(render.layers)

@@ -194,14 +194,15 @@ class FrameWindow:
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {number} and {n} {SAME_SEED}")
-                    if lacking := lacking_passes(here[1], there[1]):
-                        names = " and ".join(lacking)
-                        warnings.append(f"frame {n} has no set of passes with {names}, so passes are not averaged")
                 (vectors, valid), (back, back_valid) = self._read_both_ways(n - step, n)
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
                 break
             steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance))
+            if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
+                names = " and ".join(lacking_passes(here[1], there[1]))
+                if names:
+                    warnings.append(f"frame {n} has no set of passes with {names}, so passes are not averaged")
         return steps
 
     def _placed(self, outcome: T | Exception, placed: Callable[[T], tuple[LoadedFrame, F]]) -> tuple[LoadedFrame, F]:
@@ -253,10 +254,10 @@ def _check_alike(frame: tuple[LoadedFrame, Placed], neighbour: tuple[LoadedFrame
         raise InputError(f"its pair is x{its.alignment.scale}")
     if one.hr.display_window.size != other.hr.display_window.size:
         raise InputError(f"its size is {other.hr.display_window.size}")
-    for name in ("lr", "hr"):
-        lacking = _features(getattr(one, name)) - _features(getattr(other, name))
+    for name, ours, theirs in (("LRHS", one.lr, other.lr), ("HRLS", one.hr, other.hr)):
+        lacking = _features(ours) - _features(theirs)
         if isinstance(its, RenderPair) and lacking:
-            raise InputError(f"its {'LRHS' if name == 'lr' else 'HRLS'} lacks {', '.join(sorted(lacking))}")
+            raise InputError(f"its {name} lacks {', '.join(sorted(lacking))}")
 
 
 def _features(render: MappedRender) -> set[str]:

@@ -97,11 +97,11 @@ def run_pipeline(
         ThreadPoolExecutor(1, "read") as reader,
         ThreadPoolExecutor(1, "write") as writer,
     ):
-        reads = [submit(reader, stages.read, frame) for frame in order[:1]]
+        reads = [submit(reader, stages.read_views, frame) for frame in order[:1]]
         try:
             for index, frame in enumerate(order):
                 reading = reads.pop()
-                reads += [submit(reader, stages.read, following) for following in order[index + 1 : index + 2]]
+                reads += [submit(reader, stages.read_views, following) for following in order[index + 1 : index + 2]]
                 problem = reading.exception()
                 if problem is None and not stages.temporal.count and stages.skips(frame):
                     problem = InputError("another run has fused it")  # is recorded as skipped

@@ -96,7 +96,7 @@ def fuse_shot(
     pngs = [frame.output.with_suffix(".png") for frame in shot.frames] if previews else []
     prepare_output(shot, inputs, model, [*pngs, *([report_path] if report_path else [])])
     with limit_threads(threads):
-        over_time = plan_temporal(shot, inputs, temporal, model)
+        over_time = plan_temporal(shot, inputs, temporal, model, write)
     report = ShotReport(shot, temporal=over_time.text)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
 

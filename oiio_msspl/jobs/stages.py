@@ -7,7 +7,7 @@ A shot, and each chunk of frames on a Dask worker, runs them in a pipeline (:mod
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
@@ -49,6 +49,8 @@ from oiio_msspl.model.session import Session
 
 #: Bytes of a pixel for each channel of motion vectors that is read: as stored, decoded, and compared with zero.
 READ_VECTOR_BYTES = 12
+#: Bytes of a pixel of the error layer.
+ERROR_BYTES = 4
 
 
 @dataclass(frozen=True)
@@ -69,13 +71,12 @@ class LoadedFrame:
     seconds: float
     """Wall time of reading."""
     stages: Stages
-    """The stages with what belongs to this view: its neighbours, and the memory that other views take."""
+    """The stages with what belongs to this view: its neighbours, the layers that are written of it, and the memory that
+    other views take."""
     vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
     """Motion vectors that are read with the pixels, see :class:`oiio_msspl.fusion.motion.MotionFrame`."""
     others: OtherViews = field(default_factory=OtherViews)
     """Views beside the first one that are fused by themselves. Their pixels are read then."""
-    views: Mapping[str, LoadedFrame] = field(default_factory=dict)
-    """Views beside the first one that are averaged with their neighbours."""
 
 
 @dataclass(frozen=True)
@@ -98,9 +99,8 @@ class Stages:
     update: bool = False
     temporal: Temporal = field(default_factory=Temporal)
     """Which neighbours each frame is fused with."""
-    elsewhere: int = 0
-    """Memory that waiting frames of other views take. If there are other views, large renders wait in temporary files.
-    """
+    held_by_other_views: int = 0
+    """Memory that frames of other views take while they wait. It is 0 if only one view is averaged."""
     sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
     """Models that are loaded, by scale and ``model``."""
 
@@ -123,7 +123,22 @@ class Stages:
         return [path for path in files if path.is_file() and path.stat().st_mtime > written]
 
     def read(self, frame: Frame) -> LoadedFrame:
-        """Open and map a pair, and read its pixels if two frames fit into memory beside a tile.
+        """The first view of :meth:`read_views`.
+
+        Raises:
+            InputError: a file can't be used, or the two renders don't fit together.
+        """
+        loaded = self.read_views(frame)[None]
+        if isinstance(loaded, Exception):
+            raise loaded
+        return loaded
+
+    def read_views(self, frame: Frame) -> dict[str | None, LoadedFrame | Exception]:
+        """Open and map a pair, and read its pixels if the frames that are held fit into memory beside a tile.
+
+        Returns:
+            The first view under None, and those beside it that are averaged with their neighbours; or why pixels of a
+            view can't be decoded.
 
         Raises:
             InputError: a file can't be used, or the two renders don't fit together.
@@ -137,28 +152,36 @@ class Stages:
         align(lr, hr)  # refuses the pair before its pixels are read
         check_passes(hr, others, self.write_options)
         over_time = [view for view in others.views if view.hr.view in self.temporal.views]
-        alone = tuple(view for view in others.views if view not in over_time)
-        first, *rest = self._of_views([View(lr, hr), *over_time])
-        loaded = first._load(frame, lr, hr)
-        views = {
-            view.hr.view: stages._load(frame, view.lr, view.hr) for stages, view in zip(rest, over_time, strict=True)
-        }
-        seconds = time.perf_counter() - start
-        return replace(loaded, seconds=seconds, others=replace(others, views=alone), views=views)
+        alone = replace(others, views=tuple(view for view in others.views if view not in over_time))
+        found: dict[str | None, LoadedFrame | Exception] = {}
+        for view, stages in self._stages_of_views([View(lr, hr), *over_time]):
+            label = None if view.hr is hr else view.hr.view
+            try:
+                found[label] = stages._load(frame, view.lr, view.hr)
+            except Exception as error:
+                found[label] = error
+        first = found[None]
+        if isinstance(first, LoadedFrame):
+            found[None] = replace(first, others=alone, seconds=time.perf_counter() - start)
+        return found
 
-    def _of_views(self, views: Sequence[View]) -> list[Stages]:
-        """The stages for each view of a frame that is averaged with its neighbours."""
-        if len(views) == 1:
-            return [self]
+    def _stages_of_views(self, views: Sequence[View]) -> Iterator[tuple[View, Stages]]:
+        """The stages for the first view of a frame, and for those beside it that are averaged with their neighbours."""
+        plans = self.temporal.views
         # Layers about the fused picture are those of the first view.
         options = replace(self.write_options, error_layer=False, data_passes=False)
-        plans = [self.temporal.views[view.hr.view] for view in views[1:]]
-        stages = [self, *(replace(self, temporal=plan, write_options=options) for plan in plans)]
-        waiting = [each._waiting_bytes(view.lr, view.hr) for each, view in zip(stages, views, strict=True)]
-        return [replace(each, elsewhere=sum(waiting) - own) for each, own in zip(stages, waiting, strict=True)]
+        others = [replace(self, temporal=plans[view.hr.view], write_options=options) for view in views[1:]]
+        stages = [self, *others]
+        if not plans:
+            waiting = [0]
+        else:
+            waiting = [each._waiting_bytes(view.lr, view.hr) for each, view in zip(stages, views, strict=True)]
+            waiting += waiting[:1] * (len(plans) - len(others))  # a frame may lack a view of which others wait
+        for view, each, own in zip(views, stages, waiting, strict=False):
+            yield view, replace(each, held_by_other_views=sum(waiting) - own)
 
     def _load(self, frame: Frame, lr: MappedRender, hr: MappedRender) -> LoadedFrame:
-        """Read the pixels of a pair if two frames fit into memory beside a tile."""
+        """Read the pixels of a view if the frames that are held fit into memory beside a tile."""
         start = time.perf_counter()
         low, high = self._with_passes(lr, hr)
         if not self._fits(low, high):
@@ -187,7 +210,7 @@ class Stages:
         features = self._features(lr, hr)
         result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
         other = FIXED_MEMORY + TILE_MEMORY + 2 * result + _pixel_bytes(lr, features)
-        other += self._temporal_bytes(lr, hr) + self.elsewhere
+        other += self._temporal_bytes(lr, hr) + self.held_by_other_views
         return self.max_memory - other - frames * sum(_pixel_bytes(render, features) for render in (lr, hr))
 
     @property
@@ -199,11 +222,11 @@ class Stages:
         return 0 if self._waits_on_disk(lr, hr) else self._frames_held
 
     def _waits_on_disk(self, lr: MappedRender, hr: MappedRender) -> bool:
-        """Whether renders that wait for their neighbours lie in temporary files: those of large frames that do not fit
-        into memory with their motion vectors."""
+        """Whether renders that wait for their neighbours lie in temporary files: those of large frames, if they do not
+        fit into memory with their motion vectors, or if other views are averaged, too."""
         if not self.temporal.renders or not _is_large(hr):
             return False
-        if self.elsewhere:
+        if self.held_by_other_views:
             return True
         return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
 
@@ -296,24 +319,36 @@ class Stages:
         Raises:
             InputError, MssplError: see :meth:`fuse`.
         """
-        start = time.perf_counter()
+        start, busy = time.perf_counter(), alone.seconds
         loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded, alone.session)
         fused.replaced, reports = fuse_other_views(
             loaded.others, session, self.write_options, self.max_memory, held=held
         )
-        for view, final in views:
-            final.replaced = fused.replaced or ReplacedChannels()
-            view.loaded.stages._fuse_passes(view, final)
-            reports.append(store_view(View(view.loaded.lr, view.loaded.hr), final, session))
-            fused.replaced = final.replaced
+        for report, seconds in self._complete_views(fused, views):
+            reports.append(report)
+            busy += seconds
         reports.sort(key=lambda each: loaded.hr.other_views.index(each.hr.view))
         self._fuse_passes(alone, fused)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
         add_other_views(report, reports, loaded.others.passed_on)
-        seconds = alone.seconds + time.perf_counter() - start
-        report.seconds = {"read": loaded.seconds, "fuse": seconds, "network": report.network_seconds}
+        busy += time.perf_counter() - start
+        report.seconds = {"read": loaded.seconds, "fuse": busy, "network": report.network_seconds}
         return report
+
+    def _complete_views(
+        self, fused: FusedFrame, views: Iterable[tuple[FusedAlone, FusedFrame]]
+    ) -> Iterator[tuple[FrameReport, float]]:
+        """Fuse the passes of other views and put all that is fused of them into ``fused``, the frame of the first view.
+
+        Yields:
+            The report on each, and the seconds for which it was fused before it was averaged.
+        """
+        for alone, final in views:
+            final.replaced = fused.replaced or ReplacedChannels()
+            alone.loaded.stages._fuse_passes(alone, final)
+            fused.replaced = final.replaced
+            yield store_view(View(alone.loaded.lr, alone.loaded.hr), final, alone.session), alone.seconds
 
     def _fuse_passes(self, alone: FusedAlone, fused: FusedFrame) -> None:
         """Fuse the passes of a view, given its final beauty."""
@@ -329,7 +364,7 @@ class Stages:
         if self._fits(lr, hr):
             held += self._frames_in_memory(lr, hr) * sum(_pixel_bytes(render, features) for render in (lr, hr))
             held += _vector_bytes(hr, self._read_ahead(lr, hr))
-        return held + self._temporal_bytes(lr, hr) + self.elsewhere
+        return held + self._temporal_bytes(lr, hr) + self.held_by_other_views
 
     def _temporal_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
         """Memory of averaging, and of averaged renders that wait for their passes to be fused."""
@@ -350,7 +385,8 @@ class Stages:
         features = self._features(low, high)
         waiting = self.temporal.waiting(hr.data_window, _channels(high, features), align(lr, hr).scale)
         waiting += self._averaged_bytes(low, high)
-        if _is_large(hr):
+        waiting += ERROR_BYTES * self.write_options.error_layer * hr.data_window.width * hr.data_window.height
+        if _is_large(hr) and self.temporal.renders:  # they wait in temporary files
             return waiting
         return waiting + self._frames_held * sum(_pixel_bytes(render, features) for render in (low, high))
 
@@ -400,7 +436,7 @@ def _light_features(render: MappedRender) -> list[str]:
 
 
 def _is_large(hr: MappedRender) -> bool:
-    """Whether renders of a frame wait in temporary files for their neighbours."""
+    """Whether a frame has so many pixels that what waits of it may lie in temporary files."""
     return has_many_pixels(hr.data_window.height, hr.data_window.width)
 
 

@@ -7,8 +7,9 @@ chunks, or resumed, has the same pixels as one run: the neighbours of a chunk ar
 
 from __future__ import annotations
 
+import functools
 import logging
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import has_many_pixels
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
 from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
@@ -26,6 +28,9 @@ from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of
 
 log = logging.getLogger(__name__)
+
+#: LRHS and HRLS.
+Pair = tuple[MappedRender, MappedRender]
 
 #: What ``--temporal`` takes beside a number.
 AUTO, OFF = "auto", "off"
@@ -124,15 +129,15 @@ class Temporal:
         if not self.count:
             return 0
         working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
-        return self.waiting(window, channels, scale) + RESULT_BYTES * window.width * window.height + working
+        return self.waiting(window, channels, scale) + working
 
     def waiting(self, window: Window, channels: int, scale: int) -> int:
-        """The part of :meth:`memory` that is held from one frame to the next."""
+        """The part of :meth:`memory` that is held while other views are averaged."""
         pixels = window.width * window.height
         in_memory = not has_many_pixels(window.height, window.width)
         held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
         luminance = LUMINANCE_BYTES * (2 * self.count + 2) * pixels // scale**2
-        return held * in_memory * pixels + luminance
+        return (held * in_memory + RESULT_BYTES) * pixels + luminance
 
     def missing(self, number: int) -> list[int]:
         """The numbers next to a frame that lie within the shot, and of which a render is missing."""
@@ -148,13 +153,20 @@ def _is_slow(model: str | None) -> bool:
     return (family_of(model) or model or "").startswith(QUALITIES["best"])
 
 
-def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None = None) -> Temporal:
+def plan_temporal(
+    shot: Shot,
+    inputs: InputOptions,
+    options: TemporalOptions,
+    model: str | None = None,
+    write: WriteOptions = WriteOptions(),
+) -> Temporal:
     """Decide how a shot is fused over time. The decision depends on all files of the shot, not on the frames chosen.
 
     Each view and view layer has its own motion. If that of the first view is not known, all are fused frame by frame.
 
     Args:
         model: see :meth:`TemporalOptions.count`.
+        write: views of which nothing is written are not planned.
 
     Raises:
         InputError: the user asks for neighbours, and nothing is known of the motion.
@@ -170,12 +182,13 @@ def plan_temporal(shot: Shot, inputs: InputOptions, options: TemporalOptions, mo
             raise InputError(f"--temporal {count}: {shot.hr.pattern} has no two frames that follow each other")
         return Temporal(text="frame by frame: no two frames follow each other")
     looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1])))
-    first = _plan(_motion_of(frames, looked_at, inputs, options, required=asked), count, frames, asked=asked)
+    mapped = functools.cache(lambda number: _map_frame(frames[number], inputs))
+    first = _plan(_motion_of(mapped, looked_at, inputs, options, required=asked), count, frames, asked=asked)
     if not first.count:
         return first
     views, text = {}, first.text
-    for label in _other_views(frames, looked_at, inputs):
-        source = _motion_of(frames, looked_at, inputs, options, label, required=False)
+    for label in _other_views(mapped, looked_at, inputs, write):
+        source = _motion_of(mapped, looked_at, inputs, options, label, required=False)
         plan = _plan(source, count, frames, asked=asked)
         if plan.count:
             views[label] = plan
@@ -195,12 +208,14 @@ def _plan(source: MotionSource, count: int, frames: Mapping[int, Frame], *, aske
     return Temporal(renders, results, source, frames, text)
 
 
-def _other_views(frames: Mapping[int, Frame], numbers: Sequence[int], inputs: InputOptions) -> list[str]:
+def _other_views(
+    mapped: Callable[[int], Pair], numbers: Sequence[int], inputs: InputOptions, write: WriteOptions
+) -> list[str]:
     """The views beside the first one that are fused in some of these frames."""
     views: dict[str, None] = {}
     for number in numbers:
         with suppress(InputError):  # the run says so when the turn of this frame has come
-            others = find_other_views(*_map_frame(frames[number], inputs), inputs)
+            others = find_other_views(*mapped(number), inputs, write)
             views |= dict.fromkeys(view.hr.view for view in others.views)
     return list(views)
 
@@ -218,7 +233,7 @@ def shares(count: int, kind: str) -> tuple[int, int]:
 
 
 def _motion_of(
-    frames: Mapping[int, Frame],
+    mapped: Callable[[int], Pair],
     numbers: Sequence[int],
     inputs: InputOptions,
     options: TemporalOptions,
@@ -232,13 +247,15 @@ def _motion_of(
     because the run says so when its turn comes.
 
     Args:
+        mapped: opens and maps a frame.
         view: the view or view layer; None for each file's first one.
     """
     found: list[MotionSource] = []
     problem: InputError | None = None
     for number in numbers:
         try:
-            first, second = (_map_hrls(frames[n], inputs, view) for n in (number, number + 1))
+            hrls = [mapped(n)[1] for n in (number, number + 1)]
+            first, second = (hr if view is None else map_other_hrls(hr, view, inputs) for hr in hrls)
             found.append(find_motion(first, second, options.motion_format, required=required))
         except InputError as error:
             problem = problem or error
@@ -258,11 +275,6 @@ def _motion_of(
     return MotionSource(NONE, str(problem))
 
 
-def _map_hrls(frame: Frame, inputs: InputOptions, view: str | None) -> MappedRender:
-    hr = _map_frame(frame, inputs)[1]
-    return hr if view is None else map_other_hrls(hr, view, inputs)
-
-
-def _map_frame(frame: Frame, inputs: InputOptions) -> tuple[MappedRender, MappedRender]:
+def _map_frame(frame: Frame, inputs: InputOptions) -> Pair:
     assert frame.lr is not None and frame.hr is not None
     return map_pair(frame.lr, frame.hr, inputs)

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
 from oiio_msspl.errors import InputError
@@ -17,8 +17,14 @@ if TYPE_CHECKING:
     from oiio_msspl.jobs.stages import LoadedFrame
 
 
+class NoSuchView(InputError):
+    """A frame lacks a view that other frames of the shot have."""
+
+
 class ViewWindows:
     """The windows of all views of a shot, with the methods of :class:`FrameWindow`.
+
+    Frames become ready at the same time in all of them, because all have the same ``count`` and the same frames.
 
     Args:
         temporal, frames, fuse: see :class:`FrameWindow`.
@@ -30,50 +36,50 @@ class ViewWindows:
         frames: Sequence[Frame],
         fuse: Callable[[LoadedFrame, Neighbours], FusedAlone | Exception],
     ) -> None:
-        self._first = FrameWindow(temporal, frames, fuse)
-        self._others = {view: FrameWindow(each, frames, fuse) for view, each in temporal.views.items()}
-        #: What became of views beside the first one, by view and frame, of the frames that can be written now. That is
-        #: the same for all views, because all need the same number of neighbours.
-        self._outcomes: dict[tuple[str, int], FusedAlone | Exception] = {}
+        self._windows: dict[str | None, FrameWindow] = {None: FrameWindow(temporal, frames, fuse)}
+        self._windows |= {view: FrameWindow(each, frames, fuse) for view, each in temporal.views.items()}
+        #: What became of each view, by the numbers of the frames that can be written now. The first view is None.
+        self._ready: dict[int, dict[str | None, FusedAlone | Exception]] = {}
 
     def order(self) -> list[Frame]:
-        """See :meth:`FrameWindow.order`. It is the same for all views."""
-        return self._first.order()
+        """See :meth:`FrameWindow.order`."""
+        return self._windows[None].order()
 
-    def add(self, number: int, outcome: LoadedFrame | Exception) -> list[tuple[Frame, FusedAlone | Exception]]:
-        """See :meth:`FrameWindow.add`.
+    def add(
+        self, number: int, outcome: Mapping[str | None, LoadedFrame | Exception] | Exception
+    ) -> list[tuple[Frame, FusedAlone | Exception]]:
+        """See :meth:`FrameWindow.add`. Takes all views, see :meth:`oiio_msspl.jobs.stages.Stages.read_views`.
 
         Returns:
             Frames, with what became of their first view. It is an error if that of another view is one.
         """
-        for view, window in self._others.items():
-            lacking = InputError(f"it has no pair for {name_of(view)}")
-            loaded = outcome if isinstance(outcome, Exception) else outcome.views.get(view, lacking)
-            self._outcomes |= {(view, frame.number): result for frame, result in window.add(number, loaded)}
-        ready = self._first.add(number, outcome)
-        return [(frame, self._error(frame.number, result) or result) for frame, result in ready]
+        frames: dict[int, Frame] = {}
+        for view, window in self._windows.items():
+            lacking = NoSuchView(f"it has no pair for {name_of(view or '')}")
+            loaded = outcome if isinstance(outcome, Exception) else outcome.get(view, lacking)
+            for frame, result in window.add(number, loaded):
+                frames[frame.number] = frame
+                self._ready.setdefault(frame.number, {})[view] = result
+        return [(frame, self._result(n)) for n, frame in frames.items()]
 
-    def _error(self, number: int, first: FusedAlone | Exception) -> Exception | None:
-        """Why a frame can't be written whose first view is fused, if that is so."""
-        if isinstance(first, Exception):
-            return None
-        outcomes = (self._outcomes[view, number] for view in first.loaded.views)
-        return next((each for each in outcomes if isinstance(each, Exception)), None)
+    def _result(self, number: int) -> FusedAlone | Exception:
+        """What became of the first view, or why another view could not be fused."""
+        views = self._ready[number]
+        errors = (each for each in views.values() if isinstance(each, Exception) and not isinstance(each, NoSuchView))
+        return next(errors, views[None])
 
     def accumulate(self, number: int) -> FusedFrame:
         """See :meth:`FrameWindow.accumulate`: the first view."""
-        return self._first.accumulate(number)
+        return self._windows[None].accumulate(number)
 
     def others(self, number: int) -> Iterator[tuple[FusedAlone, FusedFrame]]:
         """The views beside the first one that are averaged: each as fused alone, and averaged with its neighbours."""
-        for view, window in self._others.items():
-            outcome = self._outcomes[view, number]
-            if isinstance(outcome, FusedAlone):
-                yield outcome, window.accumulate(number)
+        for view, alone in self._ready[number].items():
+            if view is not None and isinstance(alone, FusedAlone):
+                yield alone, self._windows[view].accumulate(number)
 
     def release(self) -> None:
         """See :meth:`FrameWindow.release`. The frames that could be written are."""
-        self._outcomes.clear()
-        self._first.release()
-        for window in self._others.values():
+        self._ready.clear()
+        for window in self._windows.values():
             window.release()

@@ -2,6 +2,7 @@
 """Which layers may sum to the beauty, by name, and whether they do."""
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl.aovs.matching import map_render
@@ -135,6 +136,18 @@ def test_broken_pixels_do_not_decide(tmp_path):
     )
     found = map_render(open_exr(write_exr(tmp_path / "in.exr", channels)))
     assert not check_sum(found, found.additive_sets[0]).problem
+
+
+@pytest.mark.parametrize(("dtype", "lossy"), [(np.float32, True), (np.float16, False)])
+def test_pxr24_loses_bits_of_floats_alone(tmp_path, dtype, lossy):
+    """A set that does not sum is told apart from one that lossy compression has damaged."""
+    light = np.random.default_rng(2).uniform(0.2, 0.8, (32, 48, 3)).astype(dtype)
+    unlike = light * np.where(np.arange(48)[:, None] % 2, dtype(1.02), dtype(0.98))
+    channels = rgb(light + light) | rgb(light, "light_a.") | rgb(unlike.astype(dtype), "light_b.")
+    path = write_exr(tmp_path / "in.exr", channels, compression=OpenEXR.PXR24_COMPRESSION)
+    found = map_render(open_exr(path))
+    text = check_sum(found, found.additive_sets[0]).text
+    assert "both ways" in text and ("compression pxr24 is lossy" in text) == lossy
 
 
 @needs_shared("exr")

@@ -13,7 +13,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import _Pair, fuse, layer_fuser
-from oiio_msspl.fusion.passes import fuse_passes, pass_steps
+from oiio_msspl.fusion.passes import _make_sum, fuse_passes, pass_steps
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.jobs import frame
 from oiio_msspl.model.catalogue import load_model
@@ -283,6 +283,46 @@ def test_a_firefly_in_one_layer_leaves_no_speck_in_any(tmp_path, model, file, pi
     for name, brightest in (("", 1.5), ("light_key", 1.75), ("light_spot", 1.75)):
         ratio = layer(out, name)[around] / layer(without, name)[around]
         assert ratio.min() > 0.7 and ratio.max() < brightest
+
+
+@pytest.mark.parametrize(
+    ("beauty", "doubts", "expected"),
+    [
+        (1.25, (1, 0.25), (0.7, 0.55)),  # a quarter more, in the ratio 4 : 1
+        (0.75, (1, 0.25), (0.3, 0.45)),
+        (1.25, None, (0.625, 0.625)),
+        (1e-3, (1, 0.25), (1e-3 * 0.05 / 0.37, 1e-3 * 0.32 / 0.37)),  # the first loses nine tenths, and then both
+        (0.0, (1, 1), (0, 0)),
+    ],
+)
+def test_what_layers_lack_is_spread_by_light_and_doubt(beauty, doubts, expected):
+    layers = np.full((2, 3, 1, 1), 0.5, np.float32)
+    _make_sum(
+        layers, np.full((3, 1, 1), beauty, np.float32), None if doubts is None else np.float32(doubts)[:, None, None]
+    )
+    np.testing.assert_allclose(layers[:, 0, 0, 0], expected, rtol=2e-6)
+
+
+def test_no_layer_becomes_black_however_far_the_sum_is_off():
+    rng = np.random.default_rng(3)
+    layers = (10 ** rng.uniform(-30, 29, (4, 3, 8, 50))).astype(np.float32)
+    beauty = (10 ** rng.uniform(-30, 29, (3, 8, 50))).astype(np.float32)
+    before = layers.copy()
+    _make_sum(layers, beauty, rng.uniform(0.25, 1, (4, 8, 50)).astype(np.float32))
+    np.testing.assert_allclose(layers.sum(axis=0, dtype=np.float64), beauty, rtol=3e-6)
+    share = layers / beauty.astype(np.float64) / (before / before.sum(axis=0, dtype=np.float64))
+    assert share[layers > 1e-36].min() > 0.05
+
+
+@pytest.mark.parametrize("model", ["balanced", "best"])
+def test_a_layer_without_noise_gets_little_of_the_error_of_the_beauty(tmp_path, model):
+    """It has as much light as a noisy layer beside it."""
+    light = np.full((HEIGHT, WIDTH, 3), 0.4, np.float32)
+    pair = write_pair(tmp_path, {"light_key": light, "light_sky": light}, noise_free=["light_sky"])
+    _, out = fused(pair, tmp_path / "out.exr", model)
+    off = np.abs(layer(out) - 0.8).mean()
+    assert off > 1e-3
+    assert np.abs(layer(out, "light_sky") - 0.4).mean() < 0.3 * off
 
 
 def test_light_of_a_layer_without_noise_does_not_leak_over_its_edge(tmp_path, model):

@@ -137,7 +137,7 @@ def test_a_frame_that_kills_its_workers_is_given_up(tmp_path, bilinear_models, t
     def die(self, frame):
         os._exit(1)
 
-    client.run(partial(setattr, Stages, "read"), die)
+    client.run(partial(setattr, Stages, "read_views"), die)
     try:
         report = fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", client=client)
     finally:

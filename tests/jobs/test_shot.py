@@ -80,7 +80,7 @@ def test_layers_that_the_model_does_not_read_are_not_loaded(tmp_path, monkeypatc
 
 def test_the_three_stages_overlap_and_hold_one_frame_each(tmp_path, bilinear_models, monkeypatch):
     """Each frame waits in its stage until the neighbours are in theirs: a pipeline that did not overlap would hang."""
-    inside = {"read": 0, "fuse": 0, "write": 0}
+    inside = {"read_views": 0, "fuse": 0, "write": 0}
     most = dict(inside)
     began = {(stage, n): threading.Event() for stage in inside for n in range(1, 7)}
 
@@ -101,12 +101,12 @@ def test_the_three_stages_overlap_and_hold_one_frame_each(tmp_path, bilinear_mod
 
         monkeypatch.setattr(Stages, stage, call)
 
-    watched("read", lambda frame: frame.number, [])
-    watched("fuse", lambda ready: ready.frame.number, [("read", 1), ("write", -1)])
+    watched("read_views", lambda frame: frame.number, [])
+    watched("fuse", lambda ready: ready.frame.number, [("read_views", 1), ("write", -1)])
     watched("write", lambda report: int(report.output.stem.split(".")[1]), [("fuse", 1)])
     folder = make_shot(tmp_path, 6, first=1)
     assert run(folder, bilinear_models[4]).exit_code == 0
-    assert most == {"read": 1, "fuse": 1, "write": 1}
+    assert most == {"read_views": 1, "fuse": 1, "write": 1}
 
 
 def test_a_long_shot_loads_the_model_once_and_keeps_no_file_open(tmp_path, bilinear_models, monkeypatch):

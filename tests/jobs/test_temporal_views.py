@@ -1,6 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each view and view layer of a shot is averaged with its own neighbours."""
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -99,6 +102,15 @@ def light(shot, name, layer):
     return np.stack([channels[f"{layer}.{c}"] for c in "RGB"], axis=-1)
 
 
+def cut_part(path, view):
+    """Damage the pixels of a view layer: overwrite the last bytes of its part, which is stored in file order."""
+    data = bytearray(path.read_bytes())
+    half = len(data) // 2
+    where = half - 2000 if view == "fg" else len(data) - 2000
+    data[where : where + 1500] = bytes(1500)
+    path.write_bytes(bytes(data))
+
+
 @pytest.mark.parametrize("view", CAMERAS)
 def test_each_view_is_what_it_is_when_its_shot_is_fused_alone(shot, whole, bilinear_models, view):
     assert whole.temporal.startswith("with 4 frames before and after each: motion vectors of ")
@@ -135,11 +147,14 @@ def test_large_renders_of_several_views_wait_in_files(shot, whole, bilinear_mode
 
 
 def test_frames_of_other_views_are_counted_as_memory(shot, whole):
+    """Also by a frame that lacks the view."""
     frame = whole.shot.frames[0]
-    both = stages.Stages(temporal=stages.Temporal(2, 2, views={"bg": stages.Temporal(2, 2)})).read(frame)
-    alone = stages.Stages(temporal=stages.Temporal(2, 2)).read(frame)
-    assert both.stages.elsewhere >= 6 * both.views["bg"].hr_pixels.layers["rgb"].nbytes
-    assert alone.stages.elsewhere == 0 and not alone.views
+    planned = stages.Temporal(2, 2, views={"bg": stages.Temporal(2, 2), "gone": stages.Temporal(2, 2)})
+    views = stages.Stages(temporal=planned).read_views(frame)
+    counted = {view: loaded.stages.held_by_other_views for view, loaded in views.items()}
+    assert counted.keys() == {None, "bg"}
+    assert min(counted.values()) >= 2 * 6 * views["bg"].hr_pixels.layers["rgb"].nbytes
+    assert stages.Stages(temporal=stages.Temporal(2, 2)).read(frame).stages.held_by_other_views == 0
 
 
 def test_a_view_without_motion_stays_alone(tmp_path, bilinear_models):
@@ -191,3 +206,49 @@ def test_both_eyes_are_averaged(tmp_path, bilinear_models):
         for name in ("off", "whole")
     )
     assert after < before / 1.5
+
+
+@pytest.mark.parametrize("view", CAMERAS)
+def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_models, monkeypatch, view):
+    """Frames beside it lose that view of it as a neighbour, and no other one."""
+    shot = make_shot(tmp_path)
+    path = shot / f"hr/hr.{FIRST + 3}.exr"
+    cut_part(path, view)
+    results = []
+    for name, fits in (("in memory", True), ("in files", False)):
+        monkeypatch.setattr(stages.Stages, "_fits", lambda *_, fits=fits: fits)
+        out = shot / name
+        out.mkdir()
+        options = TemporalOptions("auto")
+        report = fuse_shot(shot / "lr", shot / "hr", out, model=str(bilinear_models[4]), temporal=options)
+        assert [n for n, result in report.results.items() if result.status == "failed"] == [FIRST + 3]
+        results.append(pixels_of(shot, name, 2))
+        other = "bg" if view == "fg" else "fg"
+        warnings = [text for text in report.results[FIRST + 2].warnings if "1004" in text]
+        assert len(warnings) == 1 and warnings[0].startswith(f"{view}: ") and other not in warnings[0]
+    assert all(same_bits(results[0][name], results[1][name]) for name in results[0])
+
+
+def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeypatch):
+    held, most = [], []
+    real = stages.Stages._load
+
+    def load(self, *arguments):
+        loaded = real(self, *arguments)
+        if loaded.hr.view == "bg":
+            held.append(weakref.ref(loaded.hr_pixels.layers["rgb"]))
+            gc.collect()
+            most.append((sum(pixels() is not None for pixels in held), self._frames_held))
+        return loaded
+
+    monkeypatch.setattr(stages.Stages, "_load", load)
+    for count in ("auto", "1"):
+        most.clear()
+        run(shot, bilinear_models[4], f"held {count}", temporal=count)
+        assert max(number for number, _ in most) <= most[0][1]
+
+
+def test_a_view_of_which_nothing_is_written_is_not_planned(tmp_path, bilinear_models):
+    shot = make_shot(tmp_path, still=("bg",))
+    report = run(shot, bilinear_models[4], "whole", "1001", write=WriteOptions(layers=("fg.*",)))
+    assert "bg" not in report.temporal

@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import confidence, quality, results, runtime_files, runtime_passes, runtime_temporal, versus
+from benchmarks import confidence, layers, quality, results, runtime_files, runtime_passes, runtime_temporal, versus
 from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
@@ -83,6 +83,17 @@ MACHINES = {
     "VNNI": ("runtime_vnni", "render_time_vnni"),
     "neither": ("runtime", "render_time"),
 }
+
+#: Methods that are compared on the same views with two pixel filters.
+SAME_VIEWS = (
+    "joint-small-x2",
+    "joint-x2",
+    "ensemble-x2",
+    "OIDN on the HRLS",
+    "OIDN prefiltered on the HRLS",
+    "OIDN, same samples",
+    "OIDN prefiltered, same samples",
+)
 
 Found = Mapping[Hashable, Row]
 #: Methods of README's table of spread noise, and their titles.
@@ -170,6 +181,26 @@ def spread_noise() -> str:
         body.append([name, *cells, f"{best} of {len(clean)}"])
     head = ["method", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "best at 2 spp (PSNR)"]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
+
+
+def same_views() -> str:
+    """The same views with a box filter, and with a Gaussian that spreads samples, for which other models are made."""
+    films = {name: means_of(results.read(f"quality_film_{name}")) for name in ("box", "gaussian")}
+    body = []
+    for method in SAME_VIEWS:
+        spread = f"{method}-spread" if method.startswith(FAMILIES) else method
+        found = {"box": method, "gaussian": spread}
+        cells = [quality.cell(films[n].get((spp, found[n])), "psnr", "relmse") for spp in (2, 8) for n in films]
+        body.append([title(method), *cells])
+    head = [f"{spp} spp, {name}" for spp in (2, 8) for name in ("box", "Gaussian")]
+    return (
+        f"{results.markdown(['PSNR / RelMSE', *head], body)}\n{quality.mean_note(results.read('quality_film_box'))}\n"
+    )
+
+
+def layer_worth() -> str:
+    """What each layer is worth at 2 spp."""
+    return layers.layout([row for row in results.read("layers") if row["spp"] == 2])
 
 
 def scenes() -> str:
@@ -410,6 +441,8 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         runtime,
         total,
         filters,
+        same_views,
+        layer_worth,
         cycles,
         luxcore,
         division,

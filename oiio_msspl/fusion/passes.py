@@ -67,8 +67,8 @@ OTHER_LIGHT = 1.0
 #: The least doubt of a layer, relative to the largest. Without it, a layer gains up to 0.01 dB more, but one that has
 #: hardly any noise by chance would push a large error into others.
 LEAST_DOUBT = np.float32(0.25)
-#: Most that is added to the sum of the layers by their doubt, relative to the sum, and most of its light that a layer
-#: loses by it. So no layer becomes black where the sum is far off. The rest goes by their light.
+#: What is spread by doubt adds at most this share to the sum of the layers, and takes at most this share of a layer's
+#: light, so none becomes black where the sum is far off. The rest is spread by light alone.
 MOST_SPREAD = np.float32(0.9)
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
@@ -911,7 +911,8 @@ def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer
 
 
 def _make_sum(layers: Array, beauty: Array, doubts: Array | None) -> None:
-    """Change layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w).
+    """Change layers (n, 3, h, w), none of them negative, so that they sum to the beauty (3, h, w). Where all are
+    black, they stay black.
 
     Args:
         doubts: how uncertain each layer is (n, h, w). What is lacking is spread in proportion to light times doubt; in

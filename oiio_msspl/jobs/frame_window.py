@@ -17,6 +17,7 @@ from oiio_msspl.fusion.motion import FLOW, MotionFrame
 from oiio_msspl.fusion.render_average import RenderPair, lacking_passes, shared_noise
 from oiio_msspl.fusion.temporal import accumulate
 from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Mask, Placed, Step
+from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session
@@ -128,7 +129,9 @@ class FrameWindow:
         self._fused = {n: outcome for n, outcome in self._fused.items() if n in needed}
         for n, outcome in self._fused.items():
             if isinstance(outcome, FusedAlone) and n not in self._wanted:
-                self._fused[n] = replace(outcome, averaged=None)  # its passes are fused, or are not asked for
+                # Its passes are fused, or are not asked for. Neighbours need the picture alone.
+                fused = replace(outcome.fused, clean_aovs={}, error=None, frames=None)
+                self._fused[n] = replace(outcome, averaged=None, fused=fused)
         self._release_renders()
         known = self._loaded.keys() | self._fused.keys()
         self._vectors = {(a, b): found for (a, b), found in self._vectors.items() if a in known and b in known}
@@ -252,6 +255,8 @@ def _check_alike(frame: tuple[LoadedFrame, Placed], neighbour: tuple[LoadedFrame
     (one, own), (other, its) = frame, neighbour
     if own.alignment.scale != its.alignment.scale:
         raise InputError(f"its pair is x{its.alignment.scale}")
+    if one.hr.view != other.hr.view:
+        raise InputError(f"its first view is {name_of(other.hr.view)}")
     if one.hr.display_window.size != other.hr.display_window.size:
         raise InputError(f"its size is {other.hr.display_window.size}")
     for name, ours, theirs in (("LRHS", one.lr, other.lr), ("HRLS", one.hr, other.hr)):

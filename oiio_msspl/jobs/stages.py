@@ -7,6 +7,7 @@ A shot, and each chunk of frames on a Dask worker, runs them in a pipeline (:mod
 from __future__ import annotations
 
 import time
+import traceback
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -49,8 +50,6 @@ from oiio_msspl.model.session import Session
 
 #: Bytes of a pixel for each channel of motion vectors that is read: as stored, decoded, and compared with zero.
 READ_VECTOR_BYTES = 12
-#: Bytes of a pixel of the error layer.
-ERROR_BYTES = 4
 
 
 @dataclass(frozen=True)
@@ -137,8 +136,8 @@ class Stages:
         """Open and map a pair, and read its pixels if the frames that are held fit into memory beside a tile.
 
         Returns:
-            The first view under None, and those beside it that are averaged with their neighbours; or why pixels of a
-            view can't be decoded.
+            Under None the first view, and by name those beside it that are averaged with their neighbours. In place of
+            one whose pixels can't be read: the reason.
 
         Raises:
             InputError: a file can't be used, or the two renders don't fit together.
@@ -155,18 +154,14 @@ class Stages:
         alone = replace(others, views=tuple(view for view in others.views if view not in over_time))
         found: dict[str | None, LoadedFrame | Exception] = {}
         for view, stages in self._stages_of_views([View(lr, hr), *over_time]):
-            label = None if view.hr is hr else view.hr.view
-            try:
-                found[label] = stages._load(frame, view.lr, view.hr)
-            except Exception as error:
-                found[label] = error
+            found[None if view.hr is hr else view.hr.view] = stages._loaded(frame, view.lr, view.hr)
         first = found[None]
         if isinstance(first, LoadedFrame):
             found[None] = replace(first, others=alone, seconds=time.perf_counter() - start)
         return found
 
     def _stages_of_views(self, views: Sequence[View]) -> Iterator[tuple[View, Stages]]:
-        """The stages for the first view of a frame, and for those beside it that are averaged with their neighbours."""
+        """Views of a frame with their stages: the first one, and those that are averaged with their neighbours."""
         plans = self.temporal.views
         # Layers about the fused picture are those of the first view.
         options = replace(self.write_options, error_layer=False, data_passes=False)
@@ -176,9 +171,17 @@ class Stages:
             waiting = [0]
         else:
             waiting = [each._waiting_bytes(view.lr, view.hr) for each, view in zip(stages, views, strict=True)]
-            waiting += waiting[:1] * (len(plans) - len(others))  # a frame may lack a view of which others wait
+            waiting += [max(waiting)] * (len(plans) - len(others))  # a frame may lack a view of which others wait
         for view, each, own in zip(views, stages, waiting, strict=False):
             yield view, replace(each, held_by_other_views=sum(waiting) - own)
+
+    def _loaded(self, frame: Frame, lr: MappedRender, hr: MappedRender) -> LoadedFrame | Exception:
+        """The view of :meth:`_load`, or why its pixels can't be read."""
+        try:
+            return self._load(frame, lr, hr)
+        except Exception as error:
+            traceback.clear_frames(error.__traceback__)  # or they would keep the pixels that were read
+            return error
 
     def _load(self, frame: Frame, lr: MappedRender, hr: MappedRender) -> LoadedFrame:
         """Read the pixels of a view if the frames that are held fit into memory beside a tile."""
@@ -222,13 +225,13 @@ class Stages:
         return 0 if self._waits_on_disk(lr, hr) else self._frames_held
 
     def _waits_on_disk(self, lr: MappedRender, hr: MappedRender) -> bool:
-        """Whether renders that wait for their neighbours lie in temporary files: those of large frames, if they do not
-        fit into memory with their motion vectors, or if other views are averaged, too."""
-        if not self.temporal.renders or not _is_large(hr):
+        """Whether renders that wait for their neighbours lie in temporary files: those of large frames that do not fit
+        into memory with their motion vectors, and all if other views are averaged, too."""
+        if not self.temporal.renders:
             return False
         if self.held_by_other_views:
             return True
-        return self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
+        return _is_large(hr) and self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
 
     def _motion_channels(self, hr: MappedRender) -> list[Channel]:
         """The channels of the motion vectors; none if the motion is known otherwise."""
@@ -385,8 +388,7 @@ class Stages:
         features = self._features(low, high)
         waiting = self.temporal.waiting(hr.data_window, _channels(high, features), align(lr, hr).scale)
         waiting += self._averaged_bytes(low, high)
-        waiting += ERROR_BYTES * self.write_options.error_layer * hr.data_window.width * hr.data_window.height
-        if _is_large(hr) and self.temporal.renders:  # they wait in temporary files
+        if self.temporal.renders:  # they wait in temporary files
             return waiting
         return waiting + self._frames_held * sum(_pixel_bytes(render, features) for render in (low, high))
 

@@ -41,8 +41,9 @@ AUTO_COUNT, AUTO_COUNT_SLOW = 4, 6
 MOST_RESULTS = 2
 #: The most that can be asked for.
 MOST = 8
-#: Bytes of a pixel: a fused frame with alpha, a vector and whether it is believed, and the averaged frame.
-FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 16, 9, 20
+#: Bytes of a pixel: a fused frame with alpha and the expected error, a vector and whether it is believed, and the
+#: averaged frame.
+FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 9, 20
 #: Bytes of an LRHS pixel that the luminance of both renders takes for each frame that is held.
 LUMINANCE_BYTES = 8
 
@@ -166,7 +167,7 @@ def plan_temporal(
 
     Args:
         model: see :meth:`TemporalOptions.count`.
-        write: views of which nothing is written are not planned.
+        write: views whose beauty is not written are not planned.
 
     Raises:
         InputError: the user asks for neighbours, and nothing is known of the motion.

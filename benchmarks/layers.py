@@ -33,7 +33,7 @@ MODELS = ("joint-small-x2", "joint-x2", "ensemble-x2", "joint-x4", "ensemble-x4"
 AVERAGES = (2, 4)
 #: What is left out -> of the HRLS, and of the LRHS.
 WITHOUT = {
-    "": ((), ()),
+    "nothing": ((), ()),
     "albedo": ((ALBEDO,), (ALBEDO,)),
     "normal": ((NORMAL,), (NORMAL,)),
     "albedo and normal": ((ALBEDO, NORMAL), (ALBEDO, NORMAL)),
@@ -65,13 +65,7 @@ def measure(renders: str, scene: scenes.Scene) -> list[Row]:
                     continue
                 image = fuse(less(lr, of_lrhs), less(hr, of_hrls), session).rgb
                 found = scores(image, scene.reference)
-                key = {
-                    "renders": renders,
-                    "scene": scene.name,
-                    "model": name,
-                    "spp": spp,
-                    "without": title or "nothing",
-                }
+                key = {"renders": renders, "scene": scene.name, "model": name, "spp": spp, "without": title}
                 rows.append(key | {measure: found[measure] for measure in ("psnr", "relmse")})
     return rows
 

@@ -185,17 +185,20 @@ def spread_noise() -> str:
 
 def same_views() -> str:
     """The same views with a box filter, and with a Gaussian that spreads samples, for which other models are made."""
-    films = {name: means_of(results.read(f"quality_film_{name}")) for name in ("box", "gaussian")}
+    films = {name: results.read(f"quality_film_{name}") for name in ("box", "gaussian")}
+    found = {name: results.index(rows, *quality.KEYS) for name, rows in films.items()}
+    clean = versus.clean_scenes(films["box"])
     body = []
     for method in SAME_VIEWS:
-        spread = f"{method}-spread" if method.startswith(FAMILIES) else method
-        found = {"box": method, "gaussian": spread}
-        cells = [quality.cell(films[n].get((spp, found[n])), "psnr", "relmse") for spp in (2, 8) for n in films]
-        body.append([title(method), *cells])
-    head = [f"{spp} spp, {name}" for spp in (2, 8) for name in ("box", "Gaussian")]
-    return (
-        f"{results.markdown(['PSNR / RelMSE', *head], body)}\n{quality.mean_note(results.read('quality_film_box'))}\n"
-    )
+        names = {"box": method, "gaussian": f"{method}-spread" if method.startswith(FAMILIES) else method}
+        line = [title(method)]
+        for spp in (2, 8):
+            line += [quality.cell(found[film][MEAN, spp, name], "psnr", "relmse") for film, name in names.items()]
+            box, spread = ([found[film][n, spp, name]["psnr"] for n in clean] for film, name in names.items())
+            line.append(versus.cell(versus.with_interval(np.subtract(spread, box)), "+.2f"))
+        body.append(line)
+    head = [f"{spp} spp, {name}" for spp in (2, 8) for name in ("box", "Gaussian", "difference, dB")]
+    return f"{results.markdown(['PSNR / RelMSE', *head], body)}\n{quality.mean_note(films['box'])}\n"
 
 
 def layer_worth() -> str:

@@ -350,11 +350,6 @@ class _Job:
         return [layer for layer in self.layers.layers if layer not in self.known]
 
     @property
-    def in_both(self) -> bool:
-        """Both renders have all layers."""
-        return self.lrhs.keys() == set(self.keys.values())
-
-    @property
     def hrls_alone(self) -> str:
         """Names of fitted layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
         missing = [layer.name for layer in self.fitted if self.keys[layer] not in self.lrhs]
@@ -704,8 +699,10 @@ class _Band:
 
 
 def _in_both(job: _Job, count: int) -> NDArray[np.bool_]:
-    """Which of the first ``count`` layers of a set both renders have. The remainder is the last one."""
-    return np.array([*(key in job.lrhs for key in job.keys.values()), job.in_both])[:count]
+    """Which of the first ``count`` layers of a set both renders have. The remainder comes behind them: both have it if
+    they have all layers."""
+    both = [key in job.lrhs for key in job.keys.values()]
+    return np.array([*both, all(both)])[:count]
 
 
 def _to_be_fitted(job: _Job, layers: NDArray[T]) -> NDArray[T]:

@@ -23,6 +23,7 @@ from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, Motion
 from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
 from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
+from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of
@@ -194,7 +195,7 @@ def plan_temporal(
         if plan.count:
             views[label] = plan
         else:
-            text += f"; {label or '(unnamed)'} {plan.text}"
+            text += f"; {name_of(label)} {plan.text}"
     return replace(first, views=views, text=text)
 
 

@@ -2,8 +2,8 @@
 """The views and view layers of a pair, and their passes.
 
 The first view goes the way of a file that has only one. The others are fused before it, one after the other, into a
-temporary file, so memory holds one view at a time. In a shot, each view whose motion is known is averaged with
-its own neighbours instead (:mod:`oiio_msspl.jobs.view_windows`), and memory holds frames of all these views.
+temporary file, so memory holds one view at a time. In a shot, each view whose motion is known is averaged with its own
+neighbours instead (:mod:`oiio_msspl.jobs.view_windows`), and memory holds frames of all these views.
 """
 
 from __future__ import annotations

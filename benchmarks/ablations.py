@@ -29,10 +29,10 @@ from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.metrics import psnr, relmse
-from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from training import losses
 from training.data import to_tensor
-from training.encoding import log_decode
+from training.encoding import log_decode, packed
 from training.paper import HRLS_CHANNELS, MultiResolutionFusion
 
 REDUCED = {"channels": 32, "growth": 16, "groups": 2, "blocks": 3}
@@ -101,14 +101,12 @@ def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int
     exposure = find_exposure(colour)
     low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
 
-    def packed(passes: np.ndarray) -> np.ndarray:
-        return encode_features(split_features(passes), HRLS_FEATURES, exposure)
-
     others = [p for p in range(len(view.hr)) if p != chosen]
     low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
     low[..., :3] = colour[low_rows, low_columns]
     high = read_hrls(view, [chosen], rows, columns)[0]
-    return Pair(packed(low), packed(high), as_float32(view.ref[rows, columns]), exposure)
+    encoded = (packed(split_features(passes), exposure) for passes in (low, high))
+    return Pair(*encoded, as_float32(view.ref[rows, columns]), exposure)
 
 
 def channels_of(name: str) -> Tensor:

@@ -20,7 +20,6 @@ from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from benchmarks import results, scenes
@@ -29,17 +28,16 @@ from benchmarks.runtime import frame
 from datagen.views import Folder
 from oiio_msspl import Render, Session, find_model, fuse
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import psnr
-from oiio_msspl.model.contract import MEAN_DENOISER, SCALES
+from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.devices import gpu_file
-from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
-from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, denoiser_images, mean_of_renders
+from oiio_msspl.model.render_mean import Images, Shares
 from training.checkpoints import load as load_checkpoint
-from training.data import to_tensor
 from training.ensemble import EnsembleFusion, load_weights
+from training.export import denoiser_for
 from training.joint import JointFusion
+from training.whole_model import InTorch
 
 SPP = (1, 2, 4)
 #: Columns: how the network computes.
@@ -76,46 +74,22 @@ def accuracy(views: list[scenes.Scene], scale: int, sessions: Sequence[Session])
         yield spp, [statistics.fmean(psnr(fuse(lr, hr, s).rgb, ref) for lr, hr, ref in pairs) for s in sessions]
 
 
-class InTorch(Session):
+class InPyTorch(Session):
     """A model computed by PyTorch in 32 bits, from its checkpoint."""
 
     def __init__(self, path: Path, family: str) -> None:
         super().__init__(path)
-        network, usual = (
-            load_checkpoint(CHECKPOINTS[name])[0] for name in (family.replace("ensemble", "joint"), "joint")
-        )
-        assert isinstance(network, JointFusion) and isinstance(usual, JointFusion)
-        self._fuse: Callable[..., Sequence[torch.Tensor]] = network.fuse
+        network, _ = load_checkpoint(CHECKPOINTS[family.replace("ensemble", "joint")])
+        assert isinstance(network, JointFusion)
+        fuse: Callable[..., Sequence[torch.Tensor]] = network.fuse
         if family == "ensemble":
-            self._fuse = EnsembleFusion(network, load_weights(CHECKPOINTS[family])[0]).eval()
-        # The small network has the large denoiser at x4 and x8
-        large = self.contract.denoiser == MEAN_DENOISER
-        self._mean_denoiser = usual.mean_denoiser if large else network.mean_denoiser
+            fuse = EnsembleFusion(network, load_weights(CHECKPOINTS[family])[0]).eval()
+        self._model = InTorch(self.contract, fuse, denoiser_for(network, self.contract.denoiser))
 
-    def run(
-        self,
-        lrhs: Array,
-        hrls: Array,
-        *,
-        lrhs_aovs: Images = NO_IMAGES,
-        mean: MeanSettings | None = None,
-        error: bool = False,
-        aovs: Sequence[str] = (),
-    ) -> Images:
-        light = lrhs[..., :3]
-        layers = mean_of_renders(light, denoiser_images(hrls), lrhs_aovs, mean)
-        images = np.concatenate([light, self._mean_denoiser.denoise(layers)], axis=-1), hrls
-        with torch.inference_mode():
-            fused = self._fuse(*(to_tensor(image[None], torch.device("cpu")) for image in images))[0]
-        return {"fused": fused[0].permute(1, 2, 0).numpy()}
-
-
-class ForGpus(Session):
-    """The files for GPUs, on the CPU."""
-
-    def __init__(self, path: Path) -> None:
-        super().__init__(gpu_file(path) or path)
-        self._denoiser = MeanDenoiser(path=gpu_file(WEIGHTS[self.contract.denoiser]) or path)
+    @torch.inference_mode()
+    def run(self, lrhs: Images, hrls: Images, exposure: float, shares: Shares, **_: object) -> Images:
+        feed = {name: torch.from_numpy(values) for name, values in self._feed(lrhs, hrls, exposure, shares).items()}
+        return {"fused": self._model(feed)[0].permute(1, 2, 0).numpy()}
 
 
 def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Iterator[Row]:
@@ -124,7 +98,7 @@ def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Ite
     hr = Render.from_arrays("hr", **layers)
     for name in models:
         path = find_model(0, name)
-        sessions = [InTorch(path, name.rpartition("-x")[0]), Session(path), ForGpus(path)]
+        sessions = [InPyTorch(path, name.rpartition("-x")[0]), Session(path), Session(gpu_file(path) or path)]
         scale = sessions[0].contract.scale
         lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
         seconds: Row = {}

@@ -58,8 +58,8 @@ def measure(renders: str, scene: scenes.Scene) -> list[Row]:
         session = load_model(0, name)
         for spp in AVERAGES:
             lr, hr = scene.lrhs(session.contract.scale, spp // 2), scene.hrls(spp // 2)
-            high = feature_names(hr) & set(session.contract.features)
-            low = feature_names(lr) & set(session.lrhs_aovs)
+            high = feature_names(hr) & set(session.contract.hrls)
+            low = feature_names(lr) & set(session.contract.lrhs[1:])
             for title, (of_hrls, of_lrhs) in WITHOUT.items():
                 if (of_hrls and not high.issuperset(of_hrls)) or (not of_hrls and of_lrhs and not low):
                     continue

@@ -6,15 +6,14 @@ from __future__ import annotations
 import numpy as np
 
 from benchmarks.oidn import denoise, denoise_prefiltered, run_filter
-from benchmarks.scenes import beauty
-from oiio_msspl.aovs.features import HRLS_FEATURES
-from oiio_msspl.arrays import Array, box_downsample, repair
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.arrays import Array, box_downsample, clip, repair
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.spread import STRIDE, join, without_grid
 from oiio_msspl.fusion.tile_features import read_features
-from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
-from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders, useful_lrhs_aovs
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
+from oiio_msspl.model.render_mean import find_shares
 
 
 def oidn(source: ReadableRender, quality: str = "high") -> Array:
@@ -53,22 +52,21 @@ def oidn_on_average(lrhs: ReadableRender, hrls: ReadableRender) -> Array:
     """OIDN on the weighted mean of both renders at the LRHS's resolution; linear (h / s, w / s, 3).
 
     Albedo and normal are means of many pixels and have hardly any noise, so ``cleanAux`` is set. At x2 they are means
-    of four, so the albedo is prefiltered.
+    of four, so those of the LRHS are averaged in, and the albedo is prefiltered.
     """
-    low = beauty(lrhs)
-    exposure = find_exposure(low)
-    layers = read_features(hrls, hrls.data_window, hrls.data_window)
-    packed = encode_features(layers, HRLS_FEATURES, exposure)
-    scale = packed.shape[0] // low.shape[0]
-    names = useful_lrhs_aovs(scale)
-    lrhs_aovs = read_features(lrhs, lrhs.data_window, lrhs.data_window, features=names) if names else {}
-    mean = mean_of_renders(encode_radiance(low, exposure), denoiser_images(packed), lrhs_aovs)
-    auxiliary = {name: mean[name] for name in ("albedo", "normal") if name in layers and "albedo" in layers}
-    if scale == 2 and auxiliary:
-        auxiliary["albedo"] = run_filter({"albedo": auxiliary["albedo"]})
-    return run_filter(
-        {"color": decode_radiance(mean["colour"], exposure), **auxiliary}, hdr=True, cleanAux=bool(auxiliary)
+    low, high = (
+        read_features(render, render.data_window, render.data_window, features=(RGB, ALBEDO, NORMAL))
+        for render in (lrhs, hrls)
     )
+    high |= {name: clip(high[name], -1.0, 1.0) for name in (ALBEDO, NORMAL) if name in high}
+    scale = len(high[RGB]) // len(low[RGB])
+    shares = find_shares([(low if scale == 2 else {RGB: low[RGB]}, high)], find_exposure(low[RGB]))
+    means = {name: box_downsample(image, scale) for name, image in high.items()}
+    means |= {name: means[name] + np.float32(share) * (low[name] - means[name]) for name, share in shares.items()}
+    auxiliary = {name: means[name] for name in (ALBEDO, NORMAL) if name in high and ALBEDO in high}
+    if scale == 2 and auxiliary:
+        auxiliary[ALBEDO] = run_filter({ALBEDO: auxiliary[ALBEDO]})
+    return run_filter({"color": means[RGB], **auxiliary}, hdr=True, cleanAux=bool(auxiliary))
 
 
 def match_local_means(image: Array, low: Array) -> Array:

@@ -89,29 +89,6 @@ def planes(like: Array, channels: int) -> Array:
     return np.empty((channels, *like.shape[:2]), np.float32).transpose(1, 2, 0)
 
 
-class ReusedMemory:
-    """Memory for images of which a few exist at a time. It is used again, because the system clears new memory, which
-    takes longer than to fill it."""
-
-    def __init__(self) -> None:
-        self._free: list[Array] = []
-
-    def planes(self, like: Array, channels: int) -> Array:
-        """An image as :func:`planes` makes it."""
-        height, width = like.shape[:2]
-        count = height * width * channels
-        memory = self._free.pop() if self._free else np.empty(0, np.float32)
-        if memory.size < count:
-            # Tiles at the border of a frame come first and are smaller. What is never filled takes no memory.
-            memory = np.empty(count + count // 2, np.float32)
-        return memory[:count].reshape(channels, height, width).transpose(1, 2, 0)
-
-    def release(self, image: Array) -> None:
-        """Take back the memory of an image of this object, which nobody uses any more."""
-        assert isinstance(image.base, np.ndarray)
-        self._free.append(image.base)
-
-
 def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
     """An image that waits for others: itself, or a copy in a temporary file if it has many pixels and is in none.
 
@@ -185,22 +162,17 @@ def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bo
     return (fixed if signed else np.maximum(fixed, 0.0)).astype(np.float32), bad
 
 
-def box_downsample(image: NDArray[Any], scale: int, change: Callable[[Array], object] | None = None) -> Array:
+def box_downsample(image: NDArray[Any], scale: int) -> Array:
     """Mean over ``scale`` x ``scale`` pixels, of half or float: (H, W, ...) to (H/s, W/s, ...).
 
     It is finite if the pixels are.
-
-    Args:
-        change: changes a copy of some rows in place, before they are averaged.
     """
     height, width, *channels = image.shape
     result = np.empty((height // scale, width // scale, *channels), np.float32)
 
     def work(rows: slice) -> None:
         # Sums of strided views are ten times as fast as np.mean over short axes. Sums of half floats would be rounded.
-        block = image[rows].astype(np.float32, copy=change is not None)
-        if change is not None:
-            change(block)
+        block = image[rows].astype(np.float32, copy=False)
         with np.errstate(over="ignore"):
             row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
             sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))

@@ -67,7 +67,7 @@ class Inspection:
         """
         render = view or self.render
         assert render is not None and self.contract is not None
-        return render.table(self.contract.features)
+        return render.table(self.contract.hrls)
 
     def as_dict(self) -> dict[str, Any]:
         """The inspection as it is written to JSON."""

@@ -10,6 +10,7 @@ import OpenEXR
 import pytest
 
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
+from oiio_msspl.model.encoding import MAX_RADIANCE
 
 SHARED = Path(__file__).resolve().parents[2] / "shared"
 EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
@@ -107,10 +108,12 @@ def bilinear_models(tmp_path_factory):
     for scale in SCALES:
         contract = Contract(name=f"bilinear-x{scale}", scale=scale, overlap=2, bytes_per_pixel=300)
         nodes = [
-            helper.make_node("Resize", ["lrhs", "", "scales"], ["up"], mode="linear"),
+            helper.make_node("Mul", ["lrhs.rgb", "exposure"], ["exposed"]),
+            helper.make_node("Clip", ["exposed", "nothing", "largest"], ["clipped"]),
+            helper.make_node("Div", ["clipped", "exposure"], ["linear"]),
+            helper.make_node("Resize", ["linear", "", "scales"], ["up"], mode="linear"),
             # Reads the HRLS without using it: a graph must use its inputs.
-            helper.make_node("Slice", ["hrls", "zero", "three", "one"], ["head"]),
-            helper.make_node("Mul", ["head", "nothing"], ["none"]),
+            helper.make_node("Mul", ["hrls.rgb", "nothing"], ["none"]),
             helper.make_node("Add", ["up", "none"], ["fused"]),
             helper.make_node("Slice", ["none", "zero", "one", "one"], ["plane"]),
             helper.make_node("Add", ["plane", "error"], ["log_error"]),
@@ -118,17 +121,19 @@ def bilinear_models(tmp_path_factory):
         constants = [
             helper.make_tensor("scales", TensorProto.FLOAT, [4], [1, 1, scale, scale]),
             helper.make_tensor("zero", TensorProto.INT64, [1], [0]),
-            helper.make_tensor("three", TensorProto.INT64, [1], [3]),
             helper.make_tensor("one", TensorProto.INT64, [1], [1]),
             helper.make_tensor("nothing", TensorProto.FLOAT, [], [0.0]),
+            helper.make_tensor("largest", TensorProto.FLOAT, [], [MAX_RADIANCE]),
             helper.make_tensor("error", TensorProto.FLOAT, [], [np.log(0.1)]),
         ]
         graph = helper.make_graph(
             nodes,
             "bilinear",
             [
-                helper.make_tensor_value_info("lrhs", TensorProto.FLOAT, [1, 3, "h", "w"]),
-                helper.make_tensor_value_info("hrls", TensorProto.FLOAT, [1, 16, "H", "W"]),
+                helper.make_tensor_value_info(
+                    name, TensorProto.FLOAT, [1, count, *("hw" if name.startswith("lrhs") else "HW")] if count else []
+                )
+                for name, count in contract.inputs.items()
             ],
             [
                 helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, channels, "H", "W"])

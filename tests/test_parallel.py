@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import parallel
-from oiio_msspl.arrays import ReusedMemory, box_downsample
+from oiio_msspl.arrays import box_downsample
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.parallel import (
     _thread_limit,
@@ -208,16 +208,3 @@ def test_one_ahead_has_ended_when_its_caller_fails():
     with limit_threads(2), pytest.raises(ValueError, match="no tile"):
         fail()
     assert ended.is_set()
-
-
-def test_memory_is_used_again_by_images_that_fit():
-    memory, small, large = ReusedMemory(), np.zeros((4, 6, 3)), np.zeros((8, 6, 3))
-    first = memory.planes(small, 5)
-    second = memory.planes(small, 5)
-    first[:], second[:] = 1, 2
-    assert first.shape == (4, 6, 5) and first[..., 0].flags.c_contiguous and (first == 1).all()
-    memory.release(first)
-    assert np.shares_memory(memory.planes(small, 4), first)
-    memory.release(second)
-    third = memory.planes(large, 5)
-    assert third.shape == (8, 6, 5) and not np.shares_memory(third, second)

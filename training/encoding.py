@@ -13,10 +13,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
-from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, RADIANCE_FEATURES, VARIANCE
+from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
+from oiio_msspl.arrays import Array
 from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from oiio_msspl.model.encoding import BLOCK, KEY, MAX_ALBEDO, MAX_RADIANCE, MIN_BLOCKS, MU, NO_LIGHT, NOISY
-from oiio_msspl.model.pu_curve import (
+from training.pu_curve import (
     BOUNDS,
     EXPONENT,
     FACTOR,
@@ -49,7 +50,7 @@ def log_decode(encoded: Tensor) -> Tensor:
 
 
 def log_to_pu(encoded: Tensor) -> Tensor:
-    """Log-encoded radiance to PU-encoded radiance in [0, 1], as :func:`oiio_msspl.model.pu_curve.pu_encode`."""
+    """Log-encoded radiance to PU-encoded radiance in [0, 1], as :func:`training.pu_curve.pu_encode`."""
     radiance = log_decode(encoded.float()).clamp(0.0, MAX_RADIANCE)
     low, middle = BOUNDS
     power = FACTOR * radiance.clamp_min(low) ** EXPONENT + OFFSET
@@ -58,7 +59,7 @@ def log_to_pu(encoded: Tensor) -> Tensor:
 
 
 def pu_to_log(encoded: Tensor) -> Tensor:
-    """Inverse of :func:`log_to_pu`, as :func:`oiio_msspl.model.pu_curve.pu_decode`."""
+    """Inverse of :func:`log_to_pu`, as :func:`training.pu_curve.pu_decode`."""
     curve = encoded * PU_MAX
     low, middle = (pu_encode(np.asarray(BOUNDS)) * PU_MAX).tolist()
     # The branches are bounded: an infinity that torch.where discards would still make its gradient NaN.
@@ -119,18 +120,38 @@ def compress(radiance: Tensor, exposure: Tensor) -> Tensor:
     return log_encode((radiance * exposure[:, None, None, None]).clamp(0.0, MAX_RADIANCE))
 
 
+def exposed_feature(name: str, values: Tensor, exposure: Tensor) -> Tensor:
+    """A feature of :mod:`oiio_msspl.aovs.features` in the range that networks know, in linear values.
+
+    Radiance is multiplied by the exposure. A variance becomes a standard deviation, which is a radiance. Albedo and
+    normal are clipped.
+    """
+    if name == VARIANCE:
+        values = values.clamp_min(0.0).sqrt()
+    if name in (*RADIANCE_FEATURES, VARIANCE):
+        return (values * exposure).clamp(0.0, MAX_RADIANCE)
+    return values.clamp(0.0, MAX_ALBEDO) if name == ALBEDO else values.clamp(-1.0, 1.0)
+
+
+def encoded_feature(name: str, exposed: Tensor) -> Tensor:
+    """A feature of :func:`exposed_feature` as networks read it: radiance and deviation are log-encoded."""
+    return exposed if name in (ALBEDO, NORMAL) else log_encode(exposed)
+
+
 def pack(features: dict[str, Tensor], exposure: Tensor) -> Tensor:
-    """Encode all features of an HRLS, (N, H, W, C) each, and stack them in the schema's order: (N, H, W, 16)."""
-    stack = []
-    for name in HRLS_FEATURES:
-        values = features[name]
-        if name in RADIANCE_FEATURES:
-            values = compress(values, exposure)
-        elif name == VARIANCE:
-            values = compress(values.clamp_min(0.0).sqrt(), exposure)
-        elif name == ALBEDO:
-            values = values.clamp(0.0, MAX_ALBEDO)
-        else:
-            values = values.clamp(-1.0, 1.0)
-        stack.append(values)
+    """Encode all features of an HRLS, (N, H, W, C) each, and stack them in the schema's order: (N, H, W, 16). A missing
+    feature gets its default."""
+    factors, rgb = exposure[:, None, None, None], features[RGB]
+    stack = [
+        encoded_feature(name, exposed_feature(name, features[name], factors))
+        if name in features
+        else rgb.new_full((*rgb.shape[:3], count), DEFAULTS[name])
+        for name, count in HRLS_FEATURES.items()
+    ]
     return torch.cat(stack, dim=-1)
+
+
+def packed(features: dict[str, Array], exposure: float) -> Array:
+    """:func:`pack` for NumPy's arrays of one HRLS, (H, W, C)."""
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values))[None] for name, values in features.items()}
+    return pack(tensors, torch.tensor([exposure]))[0].numpy()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export a checkpoint's averaged weights as an ONNX file with its contract.
+"""Export a checkpoint's averaged weights as an ONNX file: a whole model with its contract.
 
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
@@ -27,23 +27,22 @@ import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
 from torch import nn
-from torch.utils._pytree import tree_map
 
 from datagen.views import Folder, View
-from oiio_msspl.aovs.features import channel_names
-from oiio_msspl.model.contract import METADATA_KEY, Contract, network_inputs
-from oiio_msspl.model.mean_denoiser import ALIGNMENT
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
-from training.joint import SIZES, JointFusion
+from training.encoding import log_encode
+from training.joint import FEATURES, SIZES, JointFusion, with_denoised_mean
+from training.mean_denoiser import ALIGNMENT, MeanDenoiser
 from training.networks import Network, denoiser_of, run
 from training.oidn import provenance
 from training.paper import MultiResolutionFusion
 from training.quantise import joint
+from training.tracing import IR_VERSION, shuffle, traced, unshuffle
 from training.validation import ValidationPair
-
-#: Operators and file format that ONNX Runtime 1.14 and newer understand.
-OPSET, IR_VERSION = 18, 8
+from training.whole_model import CHECKPOINTS, InTorch, example, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
@@ -56,12 +55,15 @@ HALF_ELEMENTS = 256
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """The contract of a checkpoint's network for one of its scales."""
     denoiser = denoiser_of(network, scale)
-    lrhs, hrls = network_inputs(denoiser)
     # Tiles begin on the grid of the denoiser's lowest level, too, so that it divides a tile as it divides the frame.
     alignment = ALIGNMENT if denoiser else network.multiple // scale
+    features = {}
+    if isinstance(network, JointFusion):
+        # At x2 the average of four HRLS pixels still has noise, and the LRHS's AOVs halve it. At x4 and x8 the average
+        # of 16 or 64 pixels has little, and the LRHS's AOVs differ from it where the pixel filter is not a box.
+        features = {"lrhs": [RGB, *((ALBEDO, NORMAL) if scale == 2 else ())], "hrls": list(FEATURES)}
     return Contract(
-        lrhs=channel_names(lrhs),
-        hrls=channel_names(hrls),
+        **features,
         denoiser=denoiser,
         bytes_per_pixel=MEMORY[name.rpartition("-x")[0]],
         name=name,
@@ -75,13 +77,20 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
     )
 
 
-def example(network: Network, scale: int, height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    """Random inputs ``lrhs`` and ``hrls`` for an LRHS of height x width."""
-    generator = torch.Generator().manual_seed(seed)
-    return (
-        torch.rand(1, network.lrhs_channels, height, width, generator=generator),
-        torch.rand(1, network.hrls_channels, height * scale, width * scale, generator=generator),
-    )
+def network_example(network: Network, scale: int, alignment: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random ``lrhs`` and ``hrls``, as a network reads them."""
+    lrhs = torch.rand(1, network.lrhs_channels, 4 * alignment, 6 * alignment)
+    return lrhs, torch.rand(1, network.hrls_channels, 4 * alignment * scale, 6 * alignment * scale)
+
+
+def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
+    """The denoiser of both renders' mean for a value of ``Contract.denoiser``. Where it is not the network's own, it is
+    that of `joint`."""
+    if network.denoiser(SCALES[0]) == mode:
+        return network.mean_denoiser
+    joint, _ = load(CHECKPOINTS / "joint.pt")
+    assert isinstance(joint, JointFusion)
+    return joint.mean_denoiser
 
 
 # Graph
@@ -89,13 +98,13 @@ def example(network: Network, scale: int, height: int, width: int, seed: int = 0
 
 @torch.inference_mode()
 def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
-    """Export a network with its contract.
+    """Export a network that needs no calibration.
 
-    Inputs are ``lrhs`` and ``hrls``, outputs ``fused`` and, except for the paper's network, ``log_error``. The batch
-    size is 1; height and width are any multiples of the contract's alignment.
+    Inputs are ``lrhs`` and ``hrls``, encoded; outputs ``fused``, log-encoded, and, except for the paper's network,
+    ``log_error``. The batch size is 1; height and width are any multiples of the contract's alignment.
     """
     scale, alignment = contract.scale, contract.alignment
-    inputs = example(network, scale, 4 * alignment, 6 * alignment)
+    inputs = network_example(network, scale, alignment)
     aten = torch.ops.aten
     module: nn.Module
     if isinstance(network, MultiResolutionFusion):
@@ -108,42 +117,7 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     if half:
         _store_as_half(model.graph)
     model.ir_version = IR_VERSION
-    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
     onnx.checker.check_model(model, full_check=True)
-    return model
-
-
-def traced(
-    module: nn.Module,
-    inputs: tuple[Any, ...],
-    names: list[str],
-    outputs: list[str],
-    alignment: int,
-    translations: dict[Any, Any] | None = None,
-) -> onnx.ModelProto:
-    """Export a module for images of any size.
-
-    Sides of the first input are multiples of ``alignment``; the other inputs keep their size relative to the first.
-    """
-    height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
-
-    def dynamic(image: torch.Tensor) -> dict[int, Any]:
-        size = alignment * image.shape[2] // inputs[0].shape[2]
-        return {2: size * height, 3: size * width}
-
-    program = torch.onnx.export(
-        module,
-        inputs,
-        input_names=names,
-        output_names=outputs,
-        opset_version=OPSET,
-        dynamo=True,
-        dynamic_shapes=tree_map(dynamic, inputs),
-        custom_translation_table=translations or {},
-        verbose=False,
-    )
-    model = program.model_proto
-    _strip_traces(model)
     return model
 
 
@@ -151,44 +125,21 @@ def traced(
 def joint_to_onnx(
     network: JointFusion, contract: Contract, pairs: list[tuple[torch.Tensor, torch.Tensor]]
 ) -> onnx.ModelProto:
-    """Export a joint network with 8-bit convolutions, calibrated on pairs."""
+    """Export a joint network with 8-bit convolutions, calibrated on pairs, as :func:`to_onnx`."""
     scale, alignment = contract.scale, contract.alignment
-    lrhs, hrls = example(network, scale, 4 * alignment, 6 * alignment)
+    lrhs, hrls = network_example(network, scale, alignment)
     levels = range(scale.bit_length())
     sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
     image = hrls[:, :3]
     inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
     names = [*joint.Blend.inputs, *(f"logits{level}" for level in levels)]
     mixing = traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
-    model = joint.to_onnx(network, scale, pairs, mixing)
-    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
-    return model
+    return joint.to_onnx(network, scale, pairs, mixing)
 
 
 def _space_to_depth(x, downscale_factor: int):
     """Pixel unshuffle as one operator instead of the exporter's dozen."""
     return opset18.SpaceToDepth(x, blocksize=downscale_factor)
-
-
-def unshuffle(x, downscale_factor: int):
-    """Pixel unshuffle as a grouped convolution with kernels of a single tap, in PyTorch's channel order.
-
-    It runs on all cores. The exporter's own translation has a Transpose, which takes four times as long.
-    """
-    weight = _taps(x.shape[1], downscale_factor)
-    return opset18.Conv(x, weight, group=x.shape[1], strides=[downscale_factor] * 2)
-
-
-def shuffle(x, upscale_factor: int):
-    """Pixel shuffle as a grouped transposed convolution, likewise."""
-    planes = x.shape[1] // upscale_factor**2
-    return opset18.ConvTranspose(x, _taps(planes, upscale_factor), group=planes, strides=[upscale_factor] * 2)
-
-
-def _taps(planes: int, size: int):
-    """Kernels (planes * size**2, 1, size, size), each with a single tap."""
-    taps = np.tile(np.eye(size**2, dtype=np.float32), (planes, 1)).reshape(-1, 1, size, size)
-    return opset18.Constant(value=numpy_helper.from_array(taps))
 
 
 def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:
@@ -201,15 +152,6 @@ def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionF
             reordered = weight.reshape(outputs, inputs // 4, 4, *kernel).transpose(1, 2).reshape_as(weight)
             weight.copy_(reordered.clone())
     return network
-
-
-def _strip_traces(model: onnx.ModelProto) -> None:
-    """Remove the exporter's metadata: stack traces with paths of this machine."""
-    graph = model.graph
-    for item in (model, graph, *graph.node, *graph.initializer, *graph.value_info, *graph.input, *graph.output):
-        item.doc_string = ""
-        del item.metadata_props[:]
-    del graph.value_info[:]
 
 
 def _store_as_half(graph: onnx.GraphProto) -> None:
@@ -229,20 +171,20 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
 # Checks
 
 
-def parity(network: Network, scale: int, path: Path) -> float:
+@torch.inference_mode()
+def parity(network: Network, path: Path) -> float:
     """Largest difference of an exported file's output from the network's, log-encoded."""
-    session = load_network(path)
-    block = network.multiple // scale
-    block *= -(-6 // block)  # at least six pixels
+    session, contract = load_network(path), Contract.of_file(path)
+    model = InTorch(contract, partial(run, network))
+    if isinstance(network, JointFusion):
+        model = InTorch(contract, network.fuse, denoiser_for(network, contract.denoiser))
+    block = contract.alignment * -(-6 // contract.alignment)  # at least six pixels
     worst = 0.0
     for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
-        lrhs, hrls = example(network, scale, height, width, seed=height)
-        (found,) = session.run(["fused"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
-        with torch.inference_mode():
-            # A joint network's denoiser of both renders' mean is a file of its own
-            fused = network.fuse if isinstance(network, JointFusion) else partial(run, network)
-            expected = fused(lrhs, hrls)[0].numpy()
-        worst = max(worst, float(np.abs(found - expected).max()))
+        inputs = example(contract, height, width, seed=height)
+        (found,) = session.run(["fused"], {name: values.numpy() for name, values in inputs.items()})
+        expected = model(inputs)
+        worst = max(worst, float((log_encode(torch.from_numpy(found)) - log_encode(expected)).abs().max()))
     return worst
 
 
@@ -296,14 +238,14 @@ def _check_casts(path: Path) -> None:
         )
 
 
-def describe(network: Network, scale: int, path: Path) -> None:
+def describe(path: Path) -> None:
     """Print the operators of a file, and how long ONNX Runtime takes."""
     model = onnx.load(path)
     counts = collections.Counter(node.op_type for node in model.graph.node)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
     session = load_network(path)
-    lrhs, hrls = (image.numpy() for image in example(network, scale, 64, 64))
-    seconds = min(timeit.repeat(lambda: session.run(None, {"lrhs": lrhs, "hrls": hrls}), number=1, repeat=3))
+    feed = {name: values.numpy() for name, values in example(Contract.of_file(path), 64, 64).items()}
+    seconds = min(timeit.repeat(lambda: session.run(None, feed), number=1, repeat=3))
     print(f"64x64 LRHS pixels: {seconds:.2f} s")
 
 
@@ -338,14 +280,15 @@ def main() -> None:
         if isinstance(network, JointFusion):
             if not args.int8:
                 raise SystemExit("a joint network can only be exported with --int8")
-            model = joint_to_onnx(network, contract, joint.calibration_pairs(args.int8, contract))
+            prepare = with_denoised_mean(denoiser_for(network, contract.denoiser))
+            graph = joint_to_onnx(network, contract, joint.calibration_pairs(args.int8, scale, prepare))
         else:
-            model = to_onnx(network, contract, half=args.half)
-        onnx.save(model, args.output)
+            graph = to_onnx(network, contract, half=args.half)
+        save({args.output: whole_model(graph, contract, quantised_denoiser(contract.denoiser))})
         if args.half:
             _check_casts(args.output)
-        describe(network, scale, args.output)
-        print(f"largest difference from PyTorch: {parity(network, scale, args.output):.2g}")
+        describe(args.output)
+        print(f"largest difference from PyTorch: {parity(network, args.output):.2g}")
 
 
 if __name__ == "__main__":

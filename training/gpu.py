@@ -8,7 +8,7 @@
 
 The arguments are a checkpoint of `joint` and the files for CPUs that were exported from it. Each file for GPUs lies in
 the folder `gpu` beside the one for CPUs and has the same contract, so every device cuts a frame into the same tiles.
-With `joint`, the denoiser of both renders' mean is written, too; `ensemble` uses the same.
+The denoiser of both renders' mean is in it, too.
 
 The log curve stays in float32, because half floats overflow in it. Weights are stored as 8-bit codes with a scale for
 each 3 x 3 kernel, and become half floats when the file is loaded. The networks of all scales have the same weights,
@@ -19,33 +19,28 @@ from __future__ import annotations
 
 import argparse
 import copy
-import json
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper, numpy_helper
-from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
-from oiio_msspl.model import mean_denoiser
-from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
+from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import GPU_FOLDER
 from training.checkpoints import load
 from training.ensemble import BandWeights, EnsembleFusion, load_weights
-from training.export import example, traced
+from training.export import denoiser_for, network_example
 from training.joint import JointFusion
-from training.mean_denoiser import MeanDenoiser
-from training.oidn import provenance
+from training.mean_denoiser import ALIGNMENT, MeanDenoiser
+from training.tracing import traced
+from training.whole_model import SMALL, save, whole_model
 
-IR_VERSION = 8
 #: What is added to the provenance of a file.
 PRECISION = {"precision": "convolutions in half floats, their weights stored in 8 bits with a scale for each kernel"}
-#: Tensors of fewer bytes, such as biases, stay in the graph and are stored as they are.
-SMALL = 1024
 
 
 class Fuse(nn.Module):
@@ -59,50 +54,50 @@ class Fuse(nn.Module):
         return self.network.fuse(lrhs, hrls)
 
 
-def in_half_floats(network: JointFusion) -> JointFusion:
+P = TypeVar("P", JointFusion, MeanDenoiser)
+
+
+def in_half_floats(network: P) -> P:
     """A copy whose convolutions compute in half floats, with one weight and one bias each."""
     network = copy.deepcopy(network)
-    for part in (network, network.mean_denoiser):
-        part.convs = nn.ModuleDict({name: conv.merged() for name, conv in part.convs.items()}).half()
-    network.heads.half()
-    network.error.half()
+    network.convs = nn.ModuleDict({name: conv.merged() for name, conv in network.convs.items()}).half()
     return network.eval()
 
 
+def joint_in_half_floats(network: JointFusion) -> JointFusion:
+    """The same with the heads of a `joint` network."""
+    network = in_half_floats(network)
+    network.heads.half()
+    network.error.half()
+    return network
+
+
 def ensemble_in_half_floats(network: JointFusion, weights: BandWeights) -> EnsembleFusion:
-    """The ensemble with a network of :func:`in_half_floats`."""
+    """The ensemble with a network of :func:`joint_in_half_floats`."""
     ensemble = EnsembleFusion(network, copy.deepcopy(weights).half())
     ensemble.oidn.half()
     return ensemble.eval()
 
 
 @torch.inference_mode()
-def to_onnx(network: JointFusion | EnsembleFusion, contract: Contract) -> onnx.ModelProto:
-    """The graph of a network in half floats for the contract's scale."""
+def to_onnx(network: JointFusion | EnsembleFusion, contract: Contract, denoiser: MeanDenoiser) -> onnx.ModelProto:
+    """The whole model of a network in half floats, with a denoiser in half floats."""
     joint, module = (network, Fuse(network)) if isinstance(network, JointFusion) else (network.joint, network)
-    inputs = example(joint, contract.scale, 4 * contract.alignment, 6 * contract.alignment)
+    inputs = network_example(joint, contract.scale, contract.alignment)
     outputs = ["fused", "log_error", *(["albedo", "normal"] if isinstance(network, EnsembleFusion) else [])]
-    model = traced(module, inputs, ["lrhs", "hrls"], outputs, contract.alignment)
+    graph = traced(module, inputs, ["lrhs", "hrls"], outputs, contract.alignment)
+    _store_kernels_in_8_bits(graph.graph)
     contract = replace(contract, provenance=contract.provenance | PRECISION)
-    helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
-    return _finished(model)
-
-
-@torch.inference_mode()
-def mean_denoiser_to_onnx(network: MeanDenoiser) -> onnx.ModelProto:
-    """The graph of the denoiser of both renders' mean. Inputs are the images of
-    :func:`oiio_msspl.model.render_mean.mean_of_renders`, the output is ``denoised``."""
-    alignment = mean_denoiser.ALIGNMENT
-    inputs = tuple(torch.rand(1, channels, 4 * alignment, 6 * alignment) for channels in (3, 1, 3, 3))
-    model = traced(network, inputs, ["colour", "noise", "albedo", "normal"], ["denoised"], alignment)
-    helper.set_model_props(model, {"provenance": json.dumps(provenance(network.start.network) | PRECISION)})
-    return _finished(model)
-
-
-def _finished(model: onnx.ModelProto) -> onnx.ModelProto:
-    model.ir_version = IR_VERSION
-    _store_kernels_in_8_bits(model.graph)
+    model = whole_model(graph, contract, _denoiser_graph(denoiser))
     onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+def _denoiser_graph(network: MeanDenoiser) -> onnx.ModelProto:
+    """The graph of a denoiser, whose inputs are the images of :func:`training.render_mean.mean_of_renders`."""
+    images = tuple(torch.rand(1, channels, 4 * ALIGNMENT, 6 * ALIGNMENT) for channels in (3, 1, 3, 3))
+    model = traced(network, images, ["colour", "noise", "albedo", "normal"], ["denoised"], ALIGNMENT)
+    _store_kernels_in_8_bits(model.graph)
     return model
 
 
@@ -130,22 +125,6 @@ def _store_kernels_in_8_bits(graph: onnx.GraphProto) -> None:
     graph.node.extend(nodes)
 
 
-def share_weights(models: Sequence[onnx.ModelProto], file: Path) -> None:
-    """Move the weights of models into one file, equal ones once. The models are saved into the same folder."""
-    places: dict[bytes, int] = {}
-    with file.open("wb") as out:
-        for model in models:
-            for tensor in model.graph.initializer:
-                data = tensor.raw_data
-                if len(data) < SMALL:
-                    continue
-                if data not in places:
-                    places[data] = out.tell()
-                    out.write(data)
-                set_external_data(tensor, file.name, places[data], len(data))
-                tensor.ClearField("raw_data")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
@@ -155,23 +134,18 @@ def main() -> None:
     joint, _ = load(args.checkpoint)
     if not isinstance(joint, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
-    joint = in_half_floats(joint)
+    modes = {Contract.of_file(path).denoiser for path in args.models}
+    denoisers = {mode: in_half_floats(denoiser_for(joint, mode)) for mode in modes}
+    joint = joint_in_half_floats(joint)
     network: JointFusion | EnsembleFusion = joint
-    folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
-    folder.mkdir(exist_ok=True)
     if args.ensemble:
         network = ensemble_in_half_floats(joint, load_weights(args.ensemble)[0])
-    else:
-        path = mean_denoiser.WEIGHTS[joint.denoiser(SCALES[0])]
-        denoiser = path.parent / GPU_FOLDER / path.name
-        denoiser.parent.mkdir(exist_ok=True)
-        onnx.save(mean_denoiser_to_onnx(joint.mean_denoiser), denoiser)
-
-    models = {path.name: to_onnx(network, Contract.of_file(path)) for path in args.models}
-    share_weights(list(models.values()), folder / f"{family}.weights")
-    for name, model in models.items():
-        onnx.save(model, folder / name)
-    for path in sorted([*folder.glob(f"{family}-x*"), folder / f"{family}.weights"]):
+    folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
+    folder.mkdir(exist_ok=True)
+    contracts = {folder / path.name: Contract.of_file(path) for path in args.models}
+    models = {path: to_onnx(network, each, denoisers[each.denoiser]) for path, each in contracts.items()}
+    save(models, family)
+    for path in sorted([*models, *folder.glob("*.weights")]):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 

@@ -21,16 +21,16 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
-import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, network_inputs
-from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
+from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER
+from oiio_msspl.model.render_mean import lrhs_share
 from training.encoding import log_decode, log_encode, log_to_pu, pu_to_log
 from training.mean_denoiser import MeanDenoiser
 from training.oidn import (
@@ -44,7 +44,10 @@ from training.oidn import (
 )
 from training.ops import box_downsample, highest_around, log2_scale, pyramid, upsample
 from training.paper import LRHS_CHANNELS
+from training.render_mean import mean_of_renders
 
+#: Features of the HRLS that the network reads.
+FEATURES = (RGB, ALBEDO, NORMAL)
 #: By size: the network of Open Image Denoise from which the U-Net starts.
 SIZES = {"small": SMALL_HDR, "usual": BASE_HDR}
 #: Initial logits at the LRHS's resolution: the denoised mean of both renders, the denoised HRLS, the HRLS, the LRHS.
@@ -88,7 +91,7 @@ class JointFusion(nn.Module):
         super().__init__()
         self.kept, self.size = dict(kept or {}), size
         self.config = {"kept": self.kept, "size": size}
-        self.lrhs_channels, self.hrls_channels = (sum(features.values()) for features in network_inputs(MEAN_DENOISER))
+        self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, sum(HRLS_FEATURES[name] for name in FEATURES)
         self.pretrained = pretrained_weights(SIZES[size])
         self.mean_denoiser = MeanDenoiser(size)
         self.convs = nn.ModuleDict()
@@ -150,10 +153,7 @@ class JointFusion(nn.Module):
         Returns:
             As :meth:`fuse`.
         """
-        low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
-        scale = 2 ** log2_scale(lrhs, hrls)
-        albedo, normal = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
-        return self.fuse(torch.cat([low, self.mean_denoiser(mean, noise, albedo, normal)], dim=1), hrls)
+        return self.fuse(denoise_mean(self.mean_denoiser, lrhs, hrls), hrls)
 
     def fuse(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
         """
@@ -181,6 +181,14 @@ class JointFusion(nn.Module):
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))
         return blend(lrhs, samples, albedo, denoised, logits), log_error
+
+
+def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
+    """The first argument of :meth:`JointFusion.fuse`, for the arguments of :meth:`JointFusion.forward`."""
+    low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
+    scale = 2 ** log2_scale(lrhs, hrls)
+    albedo, normal = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
+    return torch.cat([low, denoiser(mean, noise, albedo, normal)], dim=1)
 
 
 def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
@@ -263,5 +271,21 @@ def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
 
 def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
     """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
-    low = mean_of_renders(lrhs, denoiser_images(hrls))
-    return np.concatenate([lrhs, low["colour"], low["noise"]], axis=-1), hrls
+    low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (lrhs, hrls))
+    features = {RGB: log_decode(high[:, :3]), ALBEDO: high[:, 3:6], NORMAL: high[:, 6:9]}
+    means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(low, high)))
+    share = torch.tensor(lrhs_share(lrhs, means[0].permute(1, 2, 0).numpy()))
+    colour, noise, *_ = mean_of_renders({RGB: log_decode(low)}, features, {RGB: share})
+    return torch.cat([low, colour, noise], dim=1)[0].permute(1, 2, 0).numpy(), hrls
+
+
+def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """A function that appends the denoised mean of both renders to an encoded LRHS, as :meth:`JointFusion.fuse` reads
+    it."""
+
+    @torch.inference_mode()
+    def prepare(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+        images = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in with_mean(lrhs, hrls))
+        return denoise_mean(denoiser, *images)[0].permute(1, 2, 0).numpy(), hrls
+
+    return prepare

@@ -14,9 +14,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.arrays import Array
-from oiio_msspl.model.mean_denoiser import ALIGNMENT
-from oiio_msspl.model.render_mean import Images
 from training.encoding import log_to_pu, pu_to_log
 from training.oidn import (
     BASE,
@@ -30,6 +27,8 @@ from training.oidn import (
     run_unet_on_tensors,
 )
 
+#: Height and width of its input are multiples of this.
+ALIGNMENT = 16
 #: The extra input channel is the noise.
 EXTRA = 1
 
@@ -87,22 +86,18 @@ class MeanDenoiser(nn.Module):
         """
         Args:
             mean: (N, 3, h, w), the mean of both renders, log-encoded.
-            noise: (N, 1, h, w), see :func:`oiio_msspl.model.render_mean.mean_of_renders`.
-            albedo, normal: (N, 3, h, w), the HRLS's, means of s x s pixels.
+            noise, albedo, normal: see :func:`training.render_mean.mean_of_renders`.
 
         Returns:
             The denoised mean (N, 3, h, w), log-encoded.
         """
         inputs = torch.cat([log_to_pu(mean), albedo.clamp(0.0, 1.0), 0.5 * normal + 0.5, noise], dim=1)
         inputs = inputs.to(next(self.convs.parameters()).dtype)
-        height, width = mean.shape[2:]
-        if height % ALIGNMENT or width % ALIGNMENT:
-            inputs = F.pad(inputs, (0, -width % ALIGNMENT, 0, -height % ALIGNMENT), mode="replicate")
 
         def conv(name: str, values: Tensor) -> Tensor:
             return F.relu(self.convs[name](values))
 
-        colour = run_unet_on_tensors(self.start.shape, [inputs], conv)[..., :height, :width]
+        colour = run_unet_on_tensors(self.start.shape, [inputs], conv)
         return pu_to_log(colour.float().clamp_max(1.0))
 
     def weights(self) -> dict[str, Tensor]:
@@ -113,10 +108,3 @@ class MeanDenoiser(nn.Module):
             for name, pair in pairs.items()
             for kind, values in zip(("weight", "bias"), pair, strict=True)
         }
-
-    @torch.inference_mode()
-    def denoise(self, layers: Images) -> Array:
-        """Denoise one image given as NumPy layers; return log-encoded radiance (h, w, 3)."""
-        images = (layers[name] for name in ("colour", "noise", "albedo", "normal"))
-        result = self(*(torch.from_numpy(image).permute(2, 0, 1)[None] for image in images))
-        return result[0].permute(1, 2, 0).numpy()

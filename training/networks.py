@@ -18,7 +18,7 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {
 
 
 def denoiser_of(network: Network, scale: int) -> str:
-    """The denoising that precedes a network, see :func:`oiio_msspl.model.session.make_denoiser`."""
+    """What denoises the mean of both renders before a network: a value of ``Contract.denoiser``."""
     return network.denoiser(scale) if isinstance(network, JointFusion) else NO_DENOISER
 
 

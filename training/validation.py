@@ -11,10 +11,10 @@ import numpy as np
 import torch
 
 from datagen.views import Array, View, as_float32, mean_lrhs, read_hrls, split_features
-from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.metrics import psnr, relmse
-from oiio_msspl.model.encoding import decode_radiance, encode_features, encode_radiance, find_exposure
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from training.data import Prepare, to_tensor
+from training.encoding import packed
 from training.networks import Network, run
 from training.ops import upsample
 
@@ -39,7 +39,7 @@ class ValidationPair:
         rows, columns = slice(top, top + patch), slice(left, left + patch)
         lrhs = mean_lrhs(view, [0], scale)
         exposure = find_exposure(lrhs)
-        hrls = encode_features(split_features(read_hrls(view, [0], rows, columns)[0]), HRLS_FEATURES, exposure)
+        hrls = packed(split_features(read_hrls(view, [0], rows, columns)[0]), exposure)
         lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
         lrhs = encode_radiance(lrhs, exposure)
         if prepare is not None:

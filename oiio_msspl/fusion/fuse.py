@@ -11,13 +11,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import ALBEDO, LRHS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import HALF_MAX, Array, ReusedMemory, blank, planes, unload
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.alpha import encode_alpha, fuse_alpha
+from oiio_msspl.fusion.alpha import alpha_as_colour, fuse_alpha
 from oiio_msspl.fusion.guards import (
     FAR,
     LAYER_REACH,
@@ -43,9 +43,8 @@ from oiio_msspl.fusion.tiling import (
     sample_bands,
     strips_memory,
 )
-from oiio_msspl.model.contract import NO_DENOISER
-from oiio_msspl.model.encoding import decode_radiance, encode_feature, encode_features, find_exposure
-from oiio_msspl.model.render_mean import Images, MeanSettings, mean_settings
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
+from oiio_msspl.model.render_mean import Images, Shares, find_shares
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import half_of_the_threads, limit_threads, one_ahead
 
@@ -172,13 +171,12 @@ def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame:
         InputError: pixels can't be decoded.
         MssplError: the network failed, or returned NaN or infinite values.
     """
-    memory = ReusedMemory()
 
     def steps() -> Iterator[_Step]:
         for lr, hr in pairs:
             # The network works at the same time, and has threads on all cores.
             with half_of_the_threads():
-                pair = _Pair(lr, hr, frame.alignment, session, (), frame, memory)
+                pair = _Pair(lr, hr, frame.alignment, session, (), frame)
             result = FusedFrame(blank(frame.rgb.shape), None, None, frame.alignment, frame.exposure, {})
             for step in _steps(pair, result, half_of_the_threads):
                 for render in (lr, hr):
@@ -203,7 +201,7 @@ def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> in
     """The smallest ``max_memory`` with which a pair can be fused, from its headers."""
     grid = _grid(alignment, session)
     # Of the features that the LRHS may have; it is not read yet. Alpha has 1 channel, every other one 3.
-    lrhs_bytes = grid.width * grid.height * (3 * (1 + len(session.lrhs_aovs)) + 1) * 4
+    lrhs_bytes = grid.width * grid.height * (3 * len(session.contract.lrhs) + 1) * 4
     frame_bytes = result_bytes(alignment, error=error) + lrhs_bytes
     # The tiles of larger frames are as large. A damaged header may claim millions of tiles.
     part = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + 16384, grid.y0 + 16384))
@@ -241,11 +239,11 @@ def _blank_frame(alignment: Alignment, exposure: float, *, error: bool, half: bo
 
 
 @dataclass(frozen=True)
-class _FrameMeans:
-    """How a denoiser averages both renders of a frame; None: as each tile suggests."""
+class _FrameShares:
+    """How a model averages both renders of a frame."""
 
-    rgb: MeanSettings | None = None
-    alpha: MeanSettings | None = None
+    rgb: Shares = field(default_factory=dict)
+    alpha: Shares = field(default_factory=dict)
 
 
 @dataclass
@@ -255,11 +253,10 @@ class _Picture:
     place: Place
     """Its pixels in the tile."""
     pair: TilePair
-    """Without the features that the network input replaces."""
-    lrhs_aovs: Images
-    lrhs: Array | None = None
-    """Network input, encoded; None for a tile that is empty everywhere."""
-    hrls: Array | None = None
+    """Without the colour."""
+    lrhs: Images | None = None
+    """Inputs of the model; None for a tile that is empty everywhere."""
+    hrls: Images | None = None
     lights: Array | None = None
     """See :func:`oiio_msspl.fusion.guards.bright_lights`."""
     noise_free: bool = False
@@ -292,18 +289,16 @@ class _Pair:
         session: Session,
         aovs: Sequence[str],
         beauty: FusedFrame | None = None,
-        memory: ReusedMemory | None = None,
     ) -> None:
         """
         Args:
             aovs: see :attr:`_Picture.aovs`.
             beauty: that of the frame, if the pair shows a layer of it. Then there is no :meth:`check`.
-            memory: for network input; None for its own.
         """
         self._lr, self._hr, self._alignment, self._session, self._aovs = lr, hr, alignment, session, aovs
         self.grid = _grid(alignment, session)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
-        features = [RGB, *session.lrhs_aovs, "alpha"]
+        features = [*session.contract.lrhs, "alpha"]
         self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_counts)
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         self.exposure = find_exposure(self._lrhs_rgb) if beauty is None else beauty.exposure
@@ -311,7 +306,6 @@ class _Pair:
         self._empty_regions = EmptyRegions(self._lrhs[RGB], reach)
         self._part = None if beauty is None else self._lit_part(reach)
         self._averages = HrlsAverages(alignment) if beauty is None else None
-        self._memory = ReusedMemory() if memory is None else memory
 
     @property
     def lrhs_has_alpha(self) -> bool:
@@ -329,7 +323,7 @@ class _Pair:
     def prepare(self, tile: Tile) -> _PreparedTile:
         """Read a tile, dim fireflies and encode its features."""
         contract, grid = self._session.contract, self.grid
-        features = [*contract.features, "alpha"]
+        features = [*contract.hrls, "alpha"]
         pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
         if self._averages is not None:
             self._averages.add(pair)
@@ -351,39 +345,27 @@ class _Pair:
         both = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
         return Window(*both).intersect(self.grid)
 
-    def release(self, tile: _PreparedTile) -> None:
-        """Use the memory of a tile, which is fused, for another one."""
-        for picture in tile.pictures:
-            if picture.hrls is not None:
-                self._memory.release(picture.hrls)
-
     def _pictures(self, pair: TilePair) -> Iterable[tuple[Place, TilePair]]:
         """What the network reads at once of a tile."""
         return split(pair) if self._session.stride > 1 else [((slice(None), slice(None)), pair)]
 
     def _prepare_picture(self, place: Place, pair: TilePair, *, lit: bool) -> _Picture:
-        """Dim fireflies and encode the features, unless no pixel is ``lit``."""
-        contract, hrls = self._session.contract, pair.hrls
-        aovs = tuple(name for name in self._aovs if name in hrls)
-        # Copies, because views would keep the memory of all features.
-        kept = {*aovs, *(("alpha", ALBEDO, NORMAL) if "alpha" in hrls else ())}
-        copies = {name: values.copy("K") for name, values in hrls.items() if name in kept}
-        picture = _Picture(place, replace(pair, hrls=copies), self._lrhs_aovs(pair), aovs=aovs)
+        """Dim fireflies, unless no pixel is ``lit``."""
+        aovs = tuple(name for name in self._aovs if name in pair.hrls)
+        rest = {name: values for name, values in pair.hrls.items() if name != RGB}
+        picture = _Picture(place, replace(pair, hrls=rest), aovs=aovs)
         if lit:
-            lrhs_rgb, hrls = dim_fireflies(pair)
-            picture.lights = bright_lights(lrhs_rgb, hrls[RGB], self.exposure)
-            picture.lrhs = planes(lrhs_rgb, len(contract.lrhs))
-            picture.hrls = self._memory.planes(hrls[RGB], len(contract.hrls))
-            encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure, picture.lrhs)
-            encode_features(hrls, contract.features, self.exposure, picture.hrls)
-            picture.noise_free = is_noise_free(pair, picture.lrhs, hrls[RGB], self.exposure)
+            lrhs_rgb, picture.hrls = dim_fireflies(pair)
+            picture.lrhs = pair.lrhs | {RGB: lrhs_rgb}
+            picture.lights = bright_lights(lrhs_rgb, picture.hrls[RGB], self.exposure)
+            picture.noise_free = is_noise_free(pair, lrhs_rgb, picture.hrls[RGB], self.exposure)
         return picture
 
-    def sample_means(self) -> _FrameMeans:
+    def sample_shares(self) -> _FrameShares:
         """Decide how to average both renders, from a sample of the frame, so that neighbouring tiles agree."""
         contract = self._session.contract
-        if contract.denoiser == NO_DENOISER:
-            return _FrameMeans()
+        if not contract.denoiser:
+            return _FrameShares()
         rgb, alpha = [], []
         for band in sample_bands(self._alignment.grid, contract.scale):
             features, counts = [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts()
@@ -391,17 +373,10 @@ class _Pair:
             tile = read_tile(Tile(band, band), self._lrhs, self.grid, self._hr, self._alignment, features, counts)
             for _, pair in self._pictures(tile):
                 lrhs_rgb, hrls = dim_fireflies(pair)
-                lrhs_aovs = self._lrhs_aovs(pair)
-                lrhs = encode_features({RGB: lrhs_rgb}, LRHS_FEATURES, self.exposure)
-                rgb.append((lrhs, encode_features(hrls, contract.features, self.exposure), lrhs_aovs))
+                rgb.append((pair.lrhs | {RGB: lrhs_rgb}, hrls))
                 if "alpha" in pair.lrhs and "alpha" in pair.hrls:
-                    lrhs_alpha, hrls_alpha = encode_alpha(pair, contract)
-                    alpha.append((lrhs_alpha[..., : lrhs.shape[-1]], hrls_alpha, lrhs_aovs))
-        return _FrameMeans(mean_settings(rgb), mean_settings(alpha) if alpha else None)
-
-    def _lrhs_aovs(self, pair: TilePair) -> Images:
-        names = [name for name in self._session.lrhs_aovs if name in pair.lrhs]
-        return {name: encode_feature(name, pair.lrhs[name], 1.0) for name in names}
+                    alpha.append(alpha_as_colour(pair))
+        return _FrameShares(find_shares(rgb, self.exposure), find_shares(alpha, 1.0) if alpha else {})
 
     def luminances(self) -> tuple[Array, Array]:
         """Luminance of both renders over the grid, (h, w) each, once all tiles are prepared."""
@@ -420,7 +395,7 @@ class _Step:
 
     pair: _Pair
     tile: _PreparedTile
-    means: _FrameMeans
+    shares: _FrameShares
     result: FusedFrame
     """Gets the tile's core."""
     done: int
@@ -434,85 +409,84 @@ def _steps(
 ) -> Iterator[_Step]:
     """Prepare the tiles of a frame, one after the other, each inside of ``threads()``."""
     tiles = pair.tiles()
-    means = pair.sample_means() if len(tiles) > 1 else _FrameMeans()
+    shares = pair.sample_shares()
     for done, tile in enumerate(tiles, start=1):
         with threads():
             prepared = pair.prepare(tile)
-        yield _Step(pair, prepared, means, result, done, len(tiles))
+        yield _Step(pair, prepared, shares, result, done, len(tiles))
 
 
 def _run(steps: Iterable[_Step], session: Session) -> Iterator[_Step]:
     """Run the network on each tile; the next one is read and encoded meanwhile. Yield each when it is fused."""
     for step in one_ahead(steps):
-        _fuse_tile(step.tile, session, step.result, step.means)
-        step.pair.release(step.tile)
+        _fuse_tile(step.tile, session, step.result, step.shares)
         yield step
 
 
-def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, means: _FrameMeans) -> None:
+def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, shares: _FrameShares) -> None:
     """Run the network on a tile and write its core into the frame."""
     empty = tile.empty
     size = (tile.area.height, tile.area.width)
     target = tile.target.slices(frame.alignment.hr_data_window)
     core = tile.target.slices(tile.area)
     if tile.pictures[0].hrls is not None:
-        images = _fuse_pictures(tile.pictures, size, session, means, error=frame.error is not None)
-        encoded = images["fused"]
+        images = _fuse_pictures(tile.pictures, size, session, frame.exposure, shares, error=frame.error is not None)
         for name in tile.pictures[0].aovs:
             if name not in frame.clean_aovs:
                 frame.clean_aovs[name] = blank(frame.rgb.shape, np.float16)
             frame.clean_aovs[name][target] = images[name][core]
-        rgb = decode_radiance(encoded[core], frame.exposure)
+        rgb = images["fused"][core]
         lights = [(picture.place, picture.lights) for picture in tile.pictures]
         if any(image is not None for _, image in lights):
-            dark = np.zeros_like(tile.pictures[0].hrls[..., :3])
+            dark = np.zeros_like(tile.pictures[0].hrls[RGB])
             whole = join(((place, dark if image is None else image) for place, image in lights), size)
-            np.copyto(rgb, whole[core], where=np.any(whole[core] > 0, axis=-1, keepdims=True))
+            rgb = np.where(np.any(whole[core] > 0, axis=-1, keepdims=True), whole[core], rgb)
         if empty is not None:
-            rgb *= ~empty[core]
+            rgb = rgb * ~empty[core]
         if frame.rgb.dtype == np.float16:
             frame.clipped += int(np.count_nonzero(rgb > HALF_MAX))
-            np.minimum(rgb, HALF_MAX, out=rgb)
+            rgb = np.minimum(rgb, np.float32(HALF_MAX))
         frame.rgb[target] = rgb
         if frame.error is not None:
-            error = _scene_linear_error(encoded, images["error"], frame.exposure)
+            error = _scene_linear_error(images["fused"], images["error"], frame.exposure)
             if empty is not None:
                 error *= ~empty
             frame.error[target] = error[core]
     if "alpha" in tile.pictures[0].pair.hrls:
         if frame.alpha is None:
             frame.alpha = np.empty((*frame.rgb.shape[:2], 1), dtype=np.float32)
-        alpha = ((p.place, fuse_alpha(p.pair, session, p.lrhs_aovs, means.alpha)) for p in tile.pictures)
+        alpha = ((p.place, fuse_alpha(p.pair, session, shares.alpha)) for p in tile.pictures)
         frame.alpha[target] = join(alpha, size)[core]
 
 
 def _fuse_pictures(
-    pictures: Sequence[_Picture], size: tuple[int, int], session: Session, means: _FrameMeans, *, error: bool
+    pictures: Sequence[_Picture],
+    size: tuple[int, int],
+    session: Session,
+    exposure: float,
+    shares: _FrameShares,
+    *,
+    error: bool,
 ) -> Images:
     """What :meth:`Session.run` returns, for the pictures of a tile of ``size`` (h, w) together."""
-    images = [_fuse_picture(picture, session, means, error=error) for picture in pictures]
+    images = [_fuse_picture(picture, session, exposure, shares.rgb, error=error) for picture in pictures]
     places = [picture.place for picture in pictures]
     result = {name: join(zip(places, (each[name] for each in images), strict=True), size) for name in images[0]}
     if session.stride > 1 and not all(picture.noise_free for picture in pictures):
-        result |= {name: without_grid(image) for name, image in result.items() if name != "error"}
+        result |= {name: without_grid(result[name]) for name in (ALBEDO, NORMAL) if name in result}
+        encoded = without_grid(encode_radiance(result["fused"], exposure))
+        result["fused"] = decode_radiance(encoded, exposure, encoded)
     return result
 
 
-def _fuse_picture(picture: _Picture, session: Session, means: _FrameMeans, *, error: bool) -> Images:
+def _fuse_picture(picture: _Picture, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:
     """What :meth:`Session.run` returns for a picture, with its expected error if asked for."""
     assert picture.lrhs is not None and picture.hrls is not None
     if picture.noise_free:
         own = {name: picture.pair.hrls[name] for name in picture.aovs}
-        errors = {"error": np.zeros_like(picture.hrls[..., :1])} if error else {}
-        return {"fused": picture.hrls[..., :3], **errors, **own}
-    images = session.run(
-        picture.lrhs,
-        picture.hrls,
-        lrhs_aovs=picture.lrhs_aovs,
-        mean=means.rgb,
-        error=error,
-        aovs=picture.aovs,
-    )
+        errors = {"error": np.zeros_like(picture.hrls[RGB][..., :1])} if error else {}
+        return {"fused": picture.hrls[RGB], **errors, **own}
+    images = session.run(picture.lrhs, picture.hrls, exposure, shares, error=error, aovs=picture.aovs)
     check_finite(session, *images.values())
     if ALBEDO in images:
         # The albedo of an emitter may be its light. The network only knows albedos up to 1.
@@ -521,7 +495,7 @@ def _fuse_picture(picture: _Picture, session: Session, means: _FrameMeans, *, er
     return images
 
 
-def _scene_linear_error(encoded: Array, error: Array, exposure: float) -> Array:
-    """An error (h, w, 1) of log-encoded colour (h, w, 3) in scene-linear units, (h, w, 1)."""
-    grey = encoded.mean(axis=-1, keepdims=True)
+def _scene_linear_error(rgb: Array, error: Array, exposure: float) -> Array:
+    """An error (h, w, 1) of the log-encoded colour, in scene-linear units as the colour (h, w, 3)."""
+    grey = encode_radiance(rgb, exposure).mean(axis=-1, keepdims=True)
     return decode_radiance(grey + error, exposure) - decode_radiance(grey, exposure)

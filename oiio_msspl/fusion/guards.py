@@ -117,23 +117,22 @@ def max_3x3(values: Array) -> Array:
     return largest
 
 
-def is_noise_free(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: float) -> bool:
+def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
     """Whether the two renders of a tile agree so well that there is no noise to remove.
 
     Args:
-        lrhs: encoded LRHS (h, w, 3 or more).
-        hrls_rgb: the HRLS's colour, scene linear.
+        lrhs_rgb, hrls_rgb: their colour, scene linear.
     """
     # A few rows are enough to find noise; all rows are read only if these have none.
-    return all(_largest_difference(pair, lrhs, hrls_rgb, exposure, step) <= NOISE_FREE for step in (32, 1))
+    return all(_largest_difference(pair, lrhs_rgb, hrls_rgb, exposure, step) <= NOISE_FREE for step in (32, 1))
 
 
-def _largest_difference(pair: TilePair, lrhs: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
+def _largest_difference(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
     """Largest log-encoded difference of the renders inside the grid, in one of ``step`` LRHS rows."""
     rows = hrls_rgb.reshape(-1, pair.scale, *hrls_rgb.shape[1:])[pair.inside[0]][::step]
     means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), pair.scale)
-    difference = encode_radiance(means, exposure)[:, pair.inside[1]] - lrhs[pair.inside][::step, :, :3]
-    return float(np.abs(difference).max())
+    one, other = means[:, pair.inside[1]], lrhs_rgb[pair.inside][::step]
+    return float(np.abs(encode_radiance(one, exposure) - encode_radiance(other, exposure)).max())
 
 
 def check_finite(session: Session, *images: Array) -> None:

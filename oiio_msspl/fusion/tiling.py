@@ -60,7 +60,7 @@ def plan_tiles(grid: Window, contract: Contract, stride: int = 1, part: Window |
         stride: :attr:`oiio_msspl.model.session.Session.stride` of the model.
         part: the part of the grid that is to be covered, which the tiles may exceed; None for all of it.
     """
-    alignment = contract.tile_alignment * stride
+    alignment = contract.alignment * stride
     overlap = -(-contract.overlap * stride // alignment) * alignment
     largest = TILE_MEMORY // (_bytes_per_pixel(contract, stride) * contract.scale**2)
     part = grid if part is None else _aligned_part(part, grid, alignment)

@@ -429,7 +429,7 @@ def is_left_over(png: Path) -> bool:
 
 def _features_read(session: Session) -> list[str]:
     """The features that a model reads of either render, and those that tell it what they show."""
-    return list(dict.fromkeys([*session.contract.features, *session.lrhs_aovs, ALBEDO, NORMAL, "alpha"]))
+    return list(dict.fromkeys([*session.contract.hrls, *session.contract.lrhs, ALBEDO, NORMAL, "alpha"]))
 
 
 def _light_features(render: MappedRender) -> list[str]:

@@ -8,12 +8,11 @@ refused, so training and inference cannot disagree on scale, channel order, enco
 from __future__ import annotations
 
 import json
-import math
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, LRHS_FEATURES, NORMAL, RGB, channel_names
+from oiio_msspl.aovs.features import DEFAULTS, FEATURES, HRLS_FEATURES, RGB
 from oiio_msspl.errors import InputError
 from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, MAX_RADIANCE, MU
 from oiio_msspl.model.runtime import load_network
@@ -24,25 +23,13 @@ if TYPE_CHECKING:
 #: Upsampling factors from the LRHS to the HRLS.
 SCALES = (2, 4, 8)
 
-#: Values of ``Contract.denoiser``: none; the denoiser of both renders' mean
-#: (:class:`oiio_msspl.model.mean_denoiser.MeanDenoiser`); its small version.
+#: Values of ``Contract.denoiser``: none; a denoiser of both renders' mean; its small version.
 NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER = "", "mean", "mean-small"
-#: Both versions work on blocks of this many LRHS pixels.
-MEAN_DENOISER_ALIGNMENT = 16
-#: Channels of the denoised mean, behind the LRHS's own.
-DENOISED_FEATURES: dict[str, int] = {"denoised": 3}
 
 #: Key of the contract in the metadata of an ONNX file.
 METADATA_KEY = "msspl"
 #: Raised when the meaning of a field changes; older code refuses newer files.
-FORMAT = 1
-
-
-def network_inputs(denoiser: str) -> tuple[dict[str, int], dict[str, int]]:
-    """Features of the two network inputs, LRHS and HRLS, for a value of ``Contract.denoiser``."""
-    if denoiser == NO_DENOISER:
-        return LRHS_FEATURES, HRLS_FEATURES
-    return LRHS_FEATURES | DENOISED_FEATURES, {name: HRLS_FEATURES[name] for name in (RGB, ALBEDO, NORMAL)}
+FORMAT = 2
 
 
 def current_transforms() -> dict[str, Any]:
@@ -60,10 +47,19 @@ def current_transforms() -> dict[str, Any]:
 class Contract:
     """Everything that inference must know about a model.
 
-    ONNX inputs: ``lrhs`` (1, C_l, h, w) and ``hrls`` (1, C_h, s*h, s*w), float32, encoded. Output: ``fused``
-    (1, 3, s*h, s*w), log-encoded RGB. Some models also have ``log_error`` (1, 1, s*h, s*w): the natural logarithm
-    of the expected absolute error of the log-encoded RGB, mean of the channels. Some have ``albedo`` and ``normal``
-    (1, 3, s*h, s*w): those of the HRLS without noise, in [0, 1]; a normal n as (n + 1) / 2.
+    ONNX inputs, float32, see :attr:`inputs`:
+
+    - ``lrhs.rgb`` (1, 3, h, w), and ``hrls.rgb`` (1, 3, s*h, s*w): scene linear, finite and >= 0. The model clips what
+      is too bright.
+    - ``hrls.albedo`` and so on: further features, in the units of :mod:`oiio_msspl.aovs.features`.
+    - ``exposure``: a number that multiplies radiance, see :func:`oiio_msspl.model.encoding.find_exposure`.
+    - ``share.rgb``: how much the LRHS counts in the mean of both renders, in [0, 1], if the model denoises that mean.
+      ``share.albedo`` and ``share.normal``: the same for these features, if it reads those of the LRHS.
+
+    Output: ``fused`` (1, 3, s*h, s*w), scene linear, finite and >= 0. Some models also have ``log_error``
+    (1, 1, s*h, s*w): the natural logarithm of the expected absolute error of the log-encoded RGB, mean of the channels.
+    Some have ``albedo`` and ``normal`` (1, 3, s*h, s*w): those of the HRLS without noise, in [0, 1]; a normal n as
+    (n + 1) / 2.
     """
 
     name: str
@@ -78,16 +74,16 @@ class Contract:
     bytes_per_pixel: int = 1000
     """Peak memory of a tile for each of its HRLS pixels, rounded up. The size of tiles follows from it, so other values
     change the result a little."""
-    lrhs: list[str] = field(default_factory=lambda: channel_names(LRHS_FEATURES))
-    """Channels of the ``lrhs`` input, in order."""
-    hrls: list[str] = field(default_factory=lambda: channel_names(HRLS_FEATURES))
-    """Channels of the ``hrls`` input, in order."""
+    lrhs: list[str] = field(default_factory=lambda: [RGB])
+    """Features of the LRHS that the model reads."""
+    hrls: list[str] = field(default_factory=lambda: list(FEATURES))
+    """Features of the HRLS that the model reads."""
     transforms: dict[str, Any] = field(default_factory=current_transforms)
     """See :func:`current_transforms`."""
     defaults: dict[str, float] = field(default_factory=lambda: dict(DEFAULTS))
     """Encoded values of missing features."""
     denoiser: str = NO_DENOISER
-    """What is denoised before the model runs: ``NO_DENOISER``, ``MEAN_DENOISER`` or ``SMALL_MEAN_DENOISER``."""
+    """What denoises the mean of both renders: ``NO_DENOISER``, ``MEAN_DENOISER`` or ``SMALL_MEAN_DENOISER``."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -95,21 +91,15 @@ class Contract:
     format: int = FORMAT
 
     @property
-    def tile_alignment(self) -> int:
-        """Tiles begin at multiples of this many LRHS pixels, so that all networks divide them as the whole frame."""
-        return math.lcm(self.alignment, MEAN_DENOISER_ALIGNMENT if self.denoiser else 1)
-
-    @property
-    def features(self) -> dict[str, int]:
-        """Features of the HRLS that the model reads, with their numbers of channels."""
-        return {
-            name: count for name, count in HRLS_FEATURES.items() if any(c.startswith(f"{name}.") for c in self.hrls)
-        }
+    def inputs(self) -> dict[str, int]:
+        """Inputs of the model in order, with their numbers of channels; 0 for those that are numbers."""
+        images = [f"lrhs.{name}" for name in self.lrhs] + [f"hrls.{name}" for name in self.hrls]
+        shares = [f"share.{name}" for name in self.lrhs] if self.denoiser else []
+        return {name: HRLS_FEATURES[name[5:]] for name in images} | dict.fromkeys(["exposure", *shares], 0)
 
     def _wrong_field(self) -> str | None:
         """The name of a field whose value has another type or is out of range; None if all can be used."""
         numbers = {
-            "format": (0, 10**6),
             "scale": (1, 64),
             "alignment": (1, 1024),
             "overlap": (0, 4096),
@@ -121,6 +111,11 @@ class Contract:
                 return name
         if not isinstance(self.name, str) or not 0 < len(self.name) <= 100:
             return "name"
+        for name in ("lrhs", "hrls"):
+            features = getattr(self, name)
+            known = isinstance(features, list) and all(isinstance(each, str) and each in FEATURES for each in features)
+            if not known or features[:1] != [RGB]:
+                return name
         if self.denoiser not in (NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER):
             return "denoiser"
         if not isinstance(self.provenance, dict):
@@ -175,21 +170,13 @@ class Contract:
             raise InputError(
                 f"{source}: the '{METADATA_KEY}' metadata can't be read ({error}); export it again"
             ) from error
+        if contract.format != FORMAT:
+            found = str(contract.format)[:20]
+            raise InputError(f"{source}: contract format {found}, this version reads {FORMAT}; update one of them")
         wrong = contract._wrong_field()
         if wrong:
             raise InputError(f"{source}: the field {wrong} of its contract has a value that can't be; export it again")
-        if contract.format != FORMAT:
-            raise InputError(
-                f"{source}: contract format {contract.format}, this version reads {FORMAT}; update one of them"
-            )
-        lrhs, hrls = network_inputs(contract.denoiser)
-        expected = {
-            "lrhs": channel_names(lrhs),
-            "hrls": channel_names(hrls),
-            "transforms": current_transforms(),
-            "defaults": DEFAULTS,
-        }
-        for key, value in expected.items():
+        for key, value in {"transforms": current_transforms(), "defaults": DEFAULTS}.items():
             if getattr(contract, key) != value:
                 raise InputError(
                     f"{source}: made for {key} {str(getattr(contract, key))[:200]}, this version has {value}; "

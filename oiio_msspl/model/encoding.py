@@ -1,18 +1,20 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Between scene-linear features and what the networks read: exposure and a log curve, each with its inverse.
+"""Exposure, and the log curve in which networks see radiance.
 
-Training and inference share this file. Radiance is multiplied by the exposure of the LRHS, so every scene has the same
-brightness and a brighter scene gives the same picture, brighter. Then it is log-encoded, so errors in shadows and in
-highlights weigh alike. The paper clips linear values at 100; a log curve keeps highlights and does not let them
-dominate the loss.
+Radiance is multiplied by the exposure of the LRHS, so every scene has the same brightness and a brighter scene gives
+the same picture, brighter. Then it is log-encoded, so errors in shadows and in highlights weigh alike. The paper clips
+linear values at 100; a log curve keeps highlights and does not let them dominate the loss.
+
+Models encode and decode for themselves. Here is what is computed around them: the exposure, and the curve for
+comparisons that should see dark and bright pixels alike.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
-from oiio_msspl.arrays import HALF_MAX, Array, box_downsample, clip, map_rows, planes, quantile
+from oiio_msspl.aovs.features import DEFAULTS, VARIANCE
+from oiio_msspl.arrays import HALF_MAX, Array, box_downsample, map_rows, quantile
 from oiio_msspl.colour import luminance
 from oiio_msspl.parallel import BLOCK_VALUES
 
@@ -35,8 +37,8 @@ BLOCK, MIN_BLOCKS = 8, 64
 NOISY = 5.0
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
-#: Log-encoded ``MAX_RADIANCE``, in the arithmetic of :func:`decode_radiance`.
-_MAX_ENCODED = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
+#: Log-encoded ``MAX_RADIANCE``.
+MAX_ENCODED = float(np.log1p(MU * MAX_RADIANCE)) * float(_LOG_SCALE)
 
 
 def find_exposure(rgb: Array) -> float:
@@ -108,7 +110,7 @@ def decode_radiance(encoded: Array, exposure: float, out: Array | None = None) -
 
 def decode_in_place(encoded: Array, exposure: float) -> None:
     """:func:`decode_radiance` for a few rows, in their own memory."""
-    np.clip(encoded, 0.0, _MAX_ENCODED, out=encoded)
+    np.clip(encoded, 0.0, MAX_ENCODED, out=encoded)
     encoded /= _LOG_SCALE
     _expm1(encoded)
     encoded /= np.float32(MU)
@@ -139,50 +141,9 @@ def _expm1(values: Array) -> None:
     np.copyto(values, power, where=logarithm != 0)
 
 
-def encode_feature(feature: str, values: Array, exposure: float, out: Array | None = None) -> Array:
-    """Encode one feature of :mod:`oiio_msspl.aovs.features`, (..., channels), for the network.
-
-    Radiance is log-encoded. A variance becomes a standard deviation, which is a radiance, and is log-encoded too.
-    Albedo and normal are clipped.
-
-    Args:
-        exposure: see :func:`find_exposure`.
-        out: where to put the result; a new array if None.
-
-    Raises:
-        ValueError: there is no such feature.
-    """
-    if feature in RADIANCE_FEATURES:
-        return encode_radiance(values, exposure, out)
-    if feature == VARIANCE:
-        return encode_radiance(np.sqrt(np.maximum(values, 0.0)), exposure, out)
-    if feature == ALBEDO:
-        return clip(values, 0.0, MAX_ALBEDO, out)
-    if feature == NORMAL:
-        return clip(values, -1.0, 1.0, out)
-    raise ValueError(f"unknown feature {feature!r}")
-
-
-def encode_features(
-    layers: dict[str, Array], features: dict[str, int], exposure: float, out: Array | None = None
-) -> Array:
-    """Encode features and stack them along the channel axis. A missing feature gets its default.
-
-    Args:
-        layers: repaired features (h, w, c); ``rgb`` always.
-        features: names and numbers of channels, in the order of the stack.
-        out: where to put the result, (h, w, channels). It may have more channels, which stay as they are.
-
-    Returns:
-        ``out``, or if that is None a new array of :func:`oiio_msspl.arrays.planes`.
-    """
-    stack = planes(layers[RGB], sum(features.values())) if out is None else out
-    position = 0
-    for name, count in features.items():
-        target = stack[..., position : position + count]
-        if name in layers:
-            encode_feature(name, layers[name], exposure, target)
-        else:
-            target[...] = DEFAULTS[name]
-        position += count
-    return stack
+def default_value(feature: str, exposure: float) -> float:
+    """Value of a missing feature in the units of :mod:`oiio_msspl.aovs.features`: ``DEFAULTS`` are encoded ones."""
+    if feature != VARIANCE:
+        return DEFAULTS[feature]
+    deviation = float(decode_radiance(np.full(1, DEFAULTS[VARIANCE], np.float32), exposure)[0])
+    return min(deviation**2, float(np.finfo(np.float32).max))

@@ -13,13 +13,13 @@ from typing import Any
 
 import numpy as np
 
-from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.arrays import Array
+from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
+from oiio_msspl.arrays import planes
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.model.contract import NO_DENOISER, Contract
+from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
-from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
-from oiio_msspl.model.render_mean import NO_IMAGES, Images, MeanSettings, useful_lrhs_aovs
+from oiio_msspl.model.encoding import default_value
+from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
 
 log = logging.getLogger(__name__)
@@ -28,11 +28,6 @@ log = logging.getLogger(__name__)
 SMALLEST = 16
 #: Ending of the name of a model that fuses pairs whose noise the pixel filter has spread.
 SPREAD = "-spread"
-
-
-def make_denoiser(mode: str, threads: int = 0, device: str = "cpu") -> MeanDenoiser | None:
-    """The denoiser that runs before a model, for its contract's ``denoiser``."""
-    return None if mode == NO_DENOISER else MeanDenoiser(threads, device, WEIGHTS[mode])
 
 
 class Session:
@@ -72,23 +67,20 @@ class Session:
         self.contract = Contract.of_network(self._session, path)
         self.stride = 2 if spread else 1
         """Distance of the HRLS pixels that the model reads together, see :mod:`oiio_msspl.fusion.spread`."""
-        self._denoiser = make_denoiser(self.contract.denoiser, threads, device)
         self._outputs = [output.name for output in self._session.get_outputs()]
-        inputs = sorted(each.name for each in self._session.get_inputs())
-        if inputs != ["hrls", "lrhs"] or "fused" not in self._outputs:
+        inputs = [each.name for each in self._session.get_inputs()]
+        if inputs != list(self.contract.inputs) or "fused" not in self._outputs:
             raise InputError(
-                f"{path}: its network has the inputs {', '.join(inputs)[:99]} and the outputs "
-                f"{', '.join(self._outputs)[:99]}, not lrhs, hrls and fused; export it again"
+                f"{path}: has the inputs {', '.join(inputs)[:99]} and the outputs {', '.join(self._outputs)[:99]}, not "
+                f"{', '.join(self.contract.inputs)} and fused; export it again"
             )
         self.path, self.layers = Path(path), layers
         self.device, self.threads = device, threads
         self.seconds = 0.0
-        """Time spent in :meth:`run` so far, including the denoiser."""
+        """Time spent in :meth:`run` so far."""
         self._largest = 0
         """LRHS pixels of the largest picture since :meth:`release_memory`."""
         counts = collections.Counter(convolutions(self._session))
-        if self._denoiser is not None:
-            counts.update(self._denoiser.convolutions)
         self.convolutions = dict(counts)
         """Number of convolutions on each execution provider, see :func:`oiio_msspl.model.runtime.convolutions`."""
         if device != "cpu" and counts[CPU]:
@@ -129,57 +121,44 @@ class Session:
             return None
         return Session(self.layers, self.device, self.threads, spread=self.stride > 1)
 
-    @property
-    def lrhs_aovs(self) -> tuple[str, ...]:
-        """AOVs of the LRHS that are read if it has them."""
-        return useful_lrhs_aovs(self.contract.scale) if self._denoiser is not None else ()
-
     def run(
         self,
-        lrhs: Array,
-        hrls: Array,
+        lrhs: Images,
+        hrls: Images,
+        exposure: float,
+        shares: Shares,
         *,
-        lrhs_aovs: Images = NO_IMAGES,
-        mean: MeanSettings | None = None,
         error: bool = False,
         aovs: Sequence[str] = (),
     ) -> Images:
-        """Run the denoiser, if the model has one, and the model.
+        """Run the model.
 
         Args:
-            lrhs: (h, w, 3), encoded.
-            hrls: (s*h, s*w, 16), encoded, channels as in :data:`oiio_msspl.aovs.features.HRLS_FEATURES`. If both have
-                room for the denoised channels that the contract lists, these are filled in place; else in copies.
-            lrhs_aovs: those of :attr:`lrhs_aovs` that the LRHS has, encoded, (h, w, 3) each.
-            mean: how the denoiser averages both renders of the frame; decided from these images if None.
+            lrhs: ``rgb`` (h, w, 3), scene linear, repaired; further features of the contract as far as they are there.
+            hrls: the same, (s*h, s*w, c). Features that the contract lacks are ignored.
+            exposure: see :func:`oiio_msspl.model.encoding.find_exposure`.
+            shares: see :func:`oiio_msspl.model.render_mean.find_shares`; only read if the model averages both renders.
             error: also return the expected error of a model that predicts it.
             aovs: those of :attr:`clean_aovs` that are also returned.
 
         Returns:
-            ``fused``: the fused image, log-encoded (s*h, s*w, 3). ``error``: its expected absolute error in the same
-            values, mean of the channels, (s*h, s*w, 1). The AOVs of the HRLS without noise, (s*h, s*w, 3): albedo in
-            [0, 1], normal in [-1, 1].
+            ``fused``: the fused image, scene linear (s*h, s*w, 3). ``error``: the expected absolute error of the
+            log-encoded image, mean of the channels, (s*h, s*w, 1). The AOVs of the HRLS without noise, (s*h, s*w, 3):
+            albedo in [0, 1], normal in [-1, 1].
 
         Raises:
             MssplError: the model failed.
         """
         start = time.perf_counter()
-        pixels = lrhs.shape[0] * lrhs.shape[1]
+        pixels = lrhs[RGB].shape[0] * lrhs[RGB].shape[1]
         if pixels > self._largest:
             self.release_memory()  # it is divided for smaller pictures, and would be held beside that of this one
             self._largest = pixels
+        wanted = ["fused", *(["log_error"] if error else []), *aovs]
         try:
-            if self._denoiser is not None:
-                if (lrhs.shape[2], hrls.shape[2]) == (len(self.contract.lrhs), len(self.contract.hrls)):
-                    self._denoiser.fill(lrhs, hrls, lrhs_aovs, mean)
-                else:
-                    lrhs, hrls = self._denoiser(lrhs, hrls[..., : len(self.contract.hrls)], lrhs_aovs, mean)
-            feed: dict[str, Any] = {
-                "lrhs": np.ascontiguousarray(lrhs.transpose(2, 0, 1)[None]),
-                "hrls": np.ascontiguousarray(hrls.transpose(2, 0, 1)[None]),
-            }
-            wanted = ["fused", *(["log_error"] if error else []), *aovs]
-            results = dict(zip(wanted, self._session.run(wanted, feed), strict=True))
+            results = dict(
+                zip(wanted, self._session.run(wanted, self._feed(lrhs, hrls, exposure, shares)), strict=True)
+            )
         except Exception as cause:
             raise MssplError(
                 f"{self.contract.name} failed on {self.provider} ({str(cause).splitlines()[0]}); "
@@ -193,6 +172,23 @@ class Session:
             images[NORMAL] = 2 * images[NORMAL] - 1
         return images
 
+    def _feed(self, lrhs: Images, hrls: Images, exposure: float, shares: Shares) -> dict[str, Any]:
+        """The inputs of the contract."""
+        numbers = {"exposure": exposure} | {f"share.{name}": shares.get(name, 0.0) for name in self.contract.lrhs}
+        feed: dict[str, Any] = {}
+        for key, channels in self.contract.inputs.items():
+            render, _, name = key.partition(".")
+            if not channels:
+                feed[key] = np.asarray(numbers[key], np.float32)
+                continue
+            images = lrhs if render == "lrhs" else hrls
+            image = images.get(name)
+            if image is None:
+                image = planes(images[RGB], channels)
+                image[...] = default_value(name, exposure)
+            feed[key] = np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
+        return feed
+
     def release_memory(self) -> None:
         """Give the memory of intermediate results on the CPU back to the system. The next run asks for it again."""
         self._largest = 0
@@ -200,6 +196,7 @@ class Session:
             return
         contract = self.contract
         size = -(-SMALLEST // contract.alignment) * contract.alignment
-        lrhs = np.zeros((1, len(contract.lrhs), size, size), np.float32)
-        hrls = np.zeros((1, len(contract.hrls), size * contract.scale, size * contract.scale), np.float32)
-        release_memory(self._session, {"lrhs": lrhs, "hrls": hrls})
+        lrhs = {name: np.zeros((size, size, HRLS_FEATURES[name]), np.float32) for name in contract.lrhs}
+        size *= contract.scale
+        hrls = {name: np.zeros((size, size, HRLS_FEATURES[name]), np.float32) for name in contract.hrls}
+        release_memory(self._session, self._feed(lrhs, hrls, 1.0, {}))

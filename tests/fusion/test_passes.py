@@ -212,7 +212,7 @@ def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_
     monkeypatch.setattr(layers, "contract", replace(layers.contract, overlap=0))
     run, sizes, found = layers.run, [], []
     monkeypatch.setattr(
-        layers, "run", lambda lrhs, *args, **options: sizes.append(lrhs.size) or run(lrhs, *args, **options)
+        layers, "run", lambda lrhs, *args, **options: sizes.append(lrhs["rgb"].size) or run(lrhs, *args, **options)
     )
     for whole in (False, True):
         if whole:
@@ -282,7 +282,7 @@ def test_a_firefly_in_one_layer_leaves_no_speck_in_any(tmp_path, model, file, pi
     around = slice(34, 54), slice(64, 84)  # inside the spot
     for name, brightest in (("", 1.5), ("light_key", 1.75), ("light_spot", 1.75)):
         ratio = layer(out, name)[around] / layer(without, name)[around]
-        assert ratio.min() > 0.7 and ratio.max() < brightest
+        assert ratio.min() > 0.65 and ratio.max() < brightest
 
 
 @pytest.mark.parametrize(

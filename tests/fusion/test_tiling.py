@@ -9,32 +9,31 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion import tiling
 from oiio_msspl.fusion.tiling import aligned_grid, memory_for_tiles, plan_tiles, require_memory, sample_bands
 from oiio_msspl.model.catalogue import shipped_models
-from oiio_msspl.model.contract import MEAN_DENOISER, MEAN_DENOISER_ALIGNMENT, Contract
+from oiio_msspl.model.contract import Contract
 
 GRIDS = [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)]
 
 
-def contract_of(alignment, overlap, denoiser=""):
-    return Contract(name="test", scale=2, alignment=alignment, overlap=overlap, denoiser=denoiser, bytes_per_pixel=100)
+def contract_of(alignment, overlap):
+    return Contract(name="test", scale=2, alignment=alignment, overlap=overlap, bytes_per_pixel=100)
 
 
 @pytest.mark.parametrize("grid", GRIDS)
 @pytest.mark.parametrize("largest", [4096, 20000, 10**9])
-@pytest.mark.parametrize(("alignment", "overlap", "denoiser"), [(1, 8, ""), (8, 24, ""), (2, 16, MEAN_DENOISER)])
-def test_cores_cover_the_grid_once_and_areas_fit(monkeypatch, grid, largest, alignment, overlap, denoiser):
+@pytest.mark.parametrize(("alignment", "overlap"), [(1, 8), (8, 24), (16, 16)])
+def test_cores_cover_the_grid_once_and_areas_fit(monkeypatch, grid, largest, alignment, overlap):
     """All tiles begin on the blocks of pixels that the networks work on."""
     monkeypatch.setattr(tiling, "TILE_MEMORY", largest * 2**2 * 100)
-    contract = contract_of(alignment, overlap, denoiser)
-    block = MEAN_DENOISER_ALIGNMENT if denoiser else alignment
+    contract = contract_of(alignment, overlap)
     grid = aligned_grid(grid, alignment)
     covered = np.zeros((grid.height, grid.width), int)
     for tile in plan_tiles(grid, contract):
         covered[tile.core.slices(grid)] += 1
-        assert tile.area.width * tile.area.height <= max(largest, (2 * overlap + block) ** 2)
+        assert tile.area.width * tile.area.height <= max(largest, (2 * overlap + alignment) ** 2)
         assert tile.area.intersect(grid) == tile.area
         assert tile.area.intersect(tile.core) == tile.core
         for window in (tile.core, tile.area):
-            assert (window.x0 - grid.x0) % block == (window.y0 - grid.y0) % block == 0
+            assert (window.x0 - grid.x0) % alignment == (window.y0 - grid.y0) % alignment == 0
             assert window.width % alignment == window.height % alignment == 0
         for inner, outer, border in ((tile.core.x0, tile.area.x0, grid.x0), (tile.core.y0, tile.area.y0, grid.y0)):
             assert inner - outer == overlap or outer == border

@@ -17,17 +17,15 @@ from oiio_msspl import Session, find_model
 from oiio_msspl.errors import InputError
 from oiio_msspl.model import devices, runtime, session
 from oiio_msspl.model.catalogue import WEIGHTS
-from oiio_msspl.model.contract import MEAN_DENOISER, SCALES, Contract
+from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS, file_for, gpu_file, providers, require_device
-from oiio_msspl.model.mean_denoiser import WEIGHTS as DENOISERS
-from oiio_msspl.model.mean_denoiser import MeanDenoiser
+from oiio_msspl.model.encoding import encode_radiance
 from tests.conftest import SHARED, needs_shared
 
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 #: Files for GPUs, relative to the folder of the weights.
 FAMILIES = ("joint-small", "joint", "ensemble")
 GPU_FILES = [f"gpu/{family}-x{scale}.onnx" for family in FAMILIES for scale in SCALES]
-GPU_FILES += ["denoisers/gpu/mean_denoiser.onnx", "denoisers/gpu/mean_denoiser_small.onnx"]
 
 
 def test_a_gpu_gets_the_file_that_was_made_for_it(tmp_path):
@@ -56,31 +54,21 @@ def test_a_frame_has_the_same_tiles_on_a_gpu(family, scale):
 def test_the_files_for_gpus_compute_the_same(family, scale):
     """To less than the noise of the pair takes: the file for CPUs has activations of 8 bits."""
     rng = np.random.default_rng(0)
-    smooth = np.linspace(0.1, 0.9, 64)[:, None, None] * np.linspace(0.2, 1, 96)[None, :, None]
-    hrls = np.zeros((64 * 2, 96 * 2, 9), np.float32)
-    hrls[..., :3] = smooth.repeat(2, 0).repeat(2, 1) + 0.1 * rng.random((128, 192, 3))
-    hrls[..., 3:6] = 0.5
-    lrhs = hrls[::scale, ::scale, :3] + np.float32(0.02) * rng.random((128 // scale, 192 // scale, 3), np.float32)
+    smooth = np.linspace(0.1, 0.9, 128)[:, None, None] * np.linspace(0.2, 1, 256)[None, :, None]
+    colour = (smooth * rng.gamma(16, 1 / 16, (128, 256, 3))).astype(np.float32)
+    aov = np.full_like(colour, 0.5)
+    hrls = {"rgb": colour, "albedo": aov, "normal": aov}
+    lrhs = {name: np.ascontiguousarray(image[::scale, ::scale]) for name, image in hrls.items()}
+    lrhs["rgb"] = (smooth[::scale, ::scale] * rng.gamma(64, 1 / 64, lrhs["rgb"].shape)).astype(np.float32)
     on_cpu, on_gpu = (Session(path(find_model(scale, family))) for path in (Path, gpu_file))
-    on_gpu._denoiser = MeanDenoiser(path=gpu_file(DENOISERS[on_gpu.contract.denoiser]))
-    one, other = (s.run(lrhs, hrls, error=True, aovs=s.clean_aovs) for s in (on_cpu, on_gpu))
+    shares = dict.fromkeys(on_cpu.contract.lrhs, 0.6)
+    one, other = (s.run(lrhs, hrls, 1.0, shares, error=True, aovs=s.clean_aovs) for s in (on_cpu, on_gpu))
     assert one.keys() == other.keys() == {"fused", "error", *on_cpu.clean_aovs}
-    assert np.abs(one["fused"] - other["fused"]).mean() < 0.1 * np.abs(one["fused"] - hrls[..., :3]).mean()
+    encoded, gpu, samples = (encode_radiance(i, 1.0) for i in (one["fused"], other["fused"], colour))
+    assert np.abs(encoded - gpu).mean() < 0.1 * np.abs(encoded - samples).mean()
     assert np.abs(np.log(one["error"] / other["error"])).mean() < 0.2
     for name in on_cpu.clean_aovs:
         assert np.abs(one[name] - other[name]).mean() < 0.01
-
-
-def test_the_denoiser_for_gpus_takes_any_size():
-    """It repeats the edge pixels, so a part of an even image gives the same as the whole."""
-    denoiser = MeanDenoiser(1, path=gpu_file(DENOISERS[MEAN_DENOISER]))
-    part, whole = (
-        denoiser(np.full((h, w, 3), 0.5, np.float32), np.full((2 * h, 2 * w, 9), 0.5, np.float32))[0]
-        for h, w in ((21, 35), (32, 48))
-    )
-    assert part.shape == (21, 35, 6)
-    np.testing.assert_allclose(part, whole[:21, :35], atol=1e-5)
-    assert np.abs(part[..., 3:] - 0.5).max() < 0.05
 
 
 def test_onnxruntime_that_has_overwritten_the_package_for_gpus_is_named(monkeypatch):
@@ -136,11 +124,11 @@ def test_the_predicted_error_is_computed_when_it_is_wanted():
     model, asked = Session(find_model(2, "joint")), []
     run = model._session.run
     model._session.run = lambda outputs, *others: asked.append(outputs) or run(outputs, *others)
-    lrhs, hrls = np.zeros((32, 48, 3), np.float32), np.zeros((64, 96, 9), np.float32)
-    model.run(lrhs, hrls)
+    pair = {"rgb": np.zeros((32, 48, 3), np.float32)}, {"rgb": np.zeros((64, 96, 3), np.float32)}
+    model.run(*pair, 1.0, {})
     asked.clear()  # the first run also releases memory
-    assert model.run(lrhs, hrls).keys() == {"fused"}
-    assert model.run(lrhs, hrls, error=True)["error"].shape == (64, 96, 1)
+    assert model.run(*pair, 1.0, {}).keys() == {"fused"}
+    assert model.run(*pair, 1.0, {}, error=True)["error"].shape == (64, 96, 1)
     assert asked == [["fused"], ["fused", "log_error"]]
 
 

@@ -17,20 +17,23 @@ from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.encoding import encode_radiance
 from tests.conftest import noisy, picture, rgb, write_exr
 
-DENOISERS = ("denoisers/mean_denoiser", "denoisers/mean_denoiser_small")
+#: Names of models with the denoiser of both renders' mean.
+WITH_DENOISER = [name for name in shipped_models() if name.startswith(("joint", "ensemble"))]
 
 
-@pytest.mark.parametrize("name", [*shipped_models(), *DENOISERS])
-def test_files_are_whole(name):
-    """Only the ensemble shares weights of all scales, in a file beside it."""
+@pytest.mark.parametrize("name", shipped_models())
+def test_weights_that_models_share_lie_beside_them(name):
+    """Those of the denoiser; and the ensemble's, which are the same for all scales."""
     onnx = pytest.importorskip("onnx")
     model = onnx.load(WEIGHTS / f"{name}.onnx", load_external_data=False)
     files = {entry.value for t in model.graph.initializer for entry in t.external_data if entry.key == "location"}
-    assert files == ({"ensemble.weights"} if name.startswith("ensemble") else set())
+    expected = {"joint-small-x2": {"mean_denoiser_small.weights"}, "paper": set()}
+    expected |= {"ensemble": {"ensemble.weights", "mean_denoiser.weights"}}
+    assert files == next((e for start, e in expected.items() if name.startswith(start)), {"mean_denoiser.weights"})
     assert all((WEIGHTS / file).is_file() for file in files)
 
 
-@pytest.mark.parametrize("name", [*(n for n in shipped_models() if n.startswith(("joint", "ensemble"))), *DENOISERS])
+@pytest.mark.parametrize("name", WITH_DENOISER)
 def test_products_of_two_channels_fit_into_16_bits(name):
     """So processors without VNNI instructions, which add them in 16 bits, give the same result."""
     onnx = pytest.importorskip("onnx")
@@ -104,7 +107,7 @@ def test_rare_light_leaves_no_holes(family, scale):
 
 def test_layers_that_it_does_not_read_are_not_read():
     model = Session(find_model(2, "joint"), threads=1)
-    assert list(model.contract.features) == [RGB, ALBEDO, NORMAL]
+    assert model.contract.hrls == [RGB, ALBEDO, NORMAL]
     clean, asked = picture(64, 64), []
 
     class Watched(Render):

@@ -9,11 +9,23 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.arrays import box_downsample
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS, usable_devices
+from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
+from tests.conftest import noisy, picture
+
+
+def pair(session, height, width, value=0.0):
+    """Features of both renders for :meth:`Session.run`, all pixels alike."""
+    contract = session.contract
+    lrhs = {name: np.full((height, width, 3), value, np.float32) for name in contract.lrhs}
+    size = height * contract.scale, width * contract.scale
+    return lrhs, {name: np.full((*size, HRLS_FEATURES[name]), value, np.float32) for name in contract.hrls}
 
 
 def test_a_model_ships_for_every_scale():
@@ -26,27 +38,55 @@ def test_shipped_models_load_and_say_where_they_come_from(scale):
     assert session.contract.scale == scale
     assert session.contract.training_spp.keys() == {"hrls", "lrhs"}
     assert session.contract.provenance["steps"] > 0
-    size = 32 // scale * 2, 32 // scale * 3
-    high = size[0] * scale, size[1] * scale
-    values = session.run(np.zeros((*size, 3), np.float32), np.zeros((*high, 16), np.float32))["fused"]
-    assert values.shape == (*high, 3)
+    values = session.run(*pair(session, 32, 48), 1.0, {"rgb": 0.5})["fused"]
+    assert values.shape == (32 * scale, 48 * scale, 3)
     assert np.isfinite(values).all()
 
 
-@pytest.mark.parametrize("part", ["_denoiser", "_session"])
-def test_a_network_that_fails_is_named(monkeypatch, part):
-    """Either of the two of `joint`."""
+def test_a_network_that_fails_is_named(monkeypatch):
     session = Session(find_model(2))
-    pair = np.zeros((16, 16, 3), np.float32), np.zeros((32, 32, 16), np.float32)
-    session.run(*pair)
-    network = session._denoiser if part == "_denoiser" else session
+    session.run(*pair(session, 16, 16), 1.0, {"rgb": 0.5})
 
     def fail(*_):
         raise RuntimeError("out of memory\nand more")
 
-    monkeypatch.setattr(network, "_session", SimpleNamespace(run=fail))
+    monkeypatch.setattr(session, "_session", SimpleNamespace(run=fail))
     with pytest.raises(MssplError, match=r"^joint-x2 failed on CPUExecutionProvider \(out of memory\); try --device"):
-        session.run(*pair)
+        session.run(*pair(session, 16, 16), 1.0, {"rgb": 0.5})
+
+
+@pytest.mark.parametrize("family", ["paper", "joint"])
+def test_a_model_sees_the_exposed_scene(family):
+    """A scene that is ten stops darker, with an exposure that is ten stops higher, is the same picture."""
+    session, clean = Session(find_model(2, family)), picture(64, 96)
+    lrhs, hrls = {"rgb": box_downsample(noisy(clean, 16), 2)}, {"rgb": noisy(clean, 4, seed=1), "albedo": clean}
+    fused = session.run(lrhs, hrls, 1.0, {"rgb": 0.5})["fused"]
+    darker = lrhs | {"rgb": lrhs["rgb"] / 1024}, hrls | {"rgb": hrls["rgb"] / 1024}
+    np.testing.assert_allclose(session.run(*darker, 1024.0, {"rgb": 0.5})["fused"] * 1024, fused, rtol=1e-5)
+    assert np.abs(fused - clean).mean() < 0.5 * np.abs(hrls["rgb"] - clean).mean()
+
+
+@pytest.mark.parametrize("light", [0.0, 1e-30, 65504.0, 3e38])
+@pytest.mark.parametrize("family", ["paper", "joint", "ensemble"])
+def test_any_light_gives_a_finite_picture(family, light):
+    """Also where a float could overflow, and without the features that a render may lack."""
+    session = Session(find_model(2, family))
+    lrhs, hrls = pair(session, 32, 48, light)
+    for exposure in (2e-34, 1.0, 1e38):
+        for high in (hrls, {"rgb": hrls["rgb"]}):
+            fused = session.run(lrhs, high, exposure, {"rgb": 0.5})["fused"]
+            assert np.isfinite(fused).all() and fused.min() >= 0
+
+
+def test_features_that_are_missing_are_their_defaults():
+    """As the network reads them: a missing variance is a deviation of 0.5, log-encoded, at any exposure."""
+    session, exposure = Session(find_model(2, "paper")), 3.0
+    colour = np.ones((16, 16, 3), np.float32)
+    feed = session._feed({"rgb": colour[:8, :8]}, {"rgb": colour}, exposure, {})
+    assert feed.keys() == session.contract.inputs.keys()
+    assert (feed["hrls.albedo"] == 0.5).all() and not feed["hrls.normal"].any() and not feed["hrls.diffuse"].any()
+    np.testing.assert_allclose(encode_radiance(np.sqrt(feed["hrls.variance"]), exposure), 0.5, rtol=1e-5)
+    assert {name: values.shape[1] if values.ndim else 0 for name, values in feed.items()} == session.contract.inputs
 
 
 def test_a_contract_survives_its_json():
@@ -57,8 +97,9 @@ def test_a_contract_survives_its_json():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"format": 99}, "contract format 99, this version reads 1"),
-        ({"hrls": ["rgb.R"]}, "made for hrls"),
+        ({"format": 99}, "contract format 99, this version reads 2"),
+        ({"hrls": ["rgb.R"]}, "the field hrls of its contract has a value that can't be"),
+        ({"lrhs": ["albedo"]}, "the field lrhs of its contract has a value that can't be"),
         ({"transforms": {"curve": "linear"}}, "made for transforms"),
         ({"defaults": {"albedo": 0.4}}, "made for defaults"),
         ({"scale": 3}, "scale 3 is none of"),
@@ -129,6 +170,7 @@ def test_a_forged_contract_is_refused_or_can_be_used(name):
             continue
         numbers = [contract.scale, contract.alignment, contract.overlap, contract.bytes_per_pixel]
         assert all(type(number) is int for number in numbers)
+        assert contract.inputs["lrhs.rgb"] == contract.inputs["hrls.rgb"] == 3
         assert contract.alignment > 0 <= contract.overlap and contract.bytes_per_pixel > 0
         assert isinstance(contract.name, str) and isinstance(contract.provenance, dict)
         assert all(low <= 0 or high for low, high in contract.training_spp.values())
@@ -150,7 +192,7 @@ def test_a_network_with_other_inputs_or_outputs_is_refused(tmp_path, bilinear_mo
         for names in (node.input, node.output):
             names[:] = ["other" if each == old else each for each in names]
     onnx.save(model, tmp_path / "forged.onnx")
-    with pytest.raises(InputError, match=r"forged\.onnx: its network has the inputs"):
+    with pytest.raises(InputError, match=r"forged\.onnx: has the inputs"):
         Session(tmp_path / "forged.onnx")
 
 
@@ -160,7 +202,7 @@ def test_memory_is_given_back():
         return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
     session = Session(find_model(2, "joint"))
-    session.run(np.zeros((384, 384, 3), np.float32), np.zeros((768, 768, 9), np.float32))
+    session.run(*pair(session, 384, 384), 1.0, {"rgb": 0.5})
     held = resident()
     session.release_memory()
     assert held - resident() > 100 << 20

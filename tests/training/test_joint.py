@@ -9,11 +9,8 @@ import numpy as np
 import pytest
 
 from oiio_msspl.arrays import box_downsample
-from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, Contract
+from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
-from oiio_msspl.model.mean_denoiser import WEIGHTS
-from oiio_msspl.model.mean_denoiser import MeanDenoiser as QuantisedMeanDenoiser
-from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
 from oiio_msspl.model.runtime import load_network
 from tests.conftest import noisy, picture
 
@@ -24,10 +21,12 @@ pytest.importorskip("onnxscript")
 
 from benchmarks.oidn import run_filter  # noqa: E402
 from training import average, checkpoints, export, prune  # noqa: E402
-from training.joint import JointFusion, with_mean  # noqa: E402
+from training.joint import JointFusion, with_denoised_mean, with_mean  # noqa: E402
 from training.mean_denoiser import STARTS, MeanDenoiser  # noqa: E402
 from training.oidn import BASE  # noqa: E402
-from training.quantise.__main__ import CHECKPOINT  # noqa: E402
+from training.quantise.__main__ import CHECKPOINT, run_denoiser  # noqa: E402
+from training.quantise.codes import denoiser_codes  # noqa: E402
+from training.whole_model import CHECKPOINTS, DENOISERS  # noqa: E402
 
 #: Open Image Denoise's quality whose networks each size starts from.
 QUALITY = {"small": "fast", "usual": "high"}
@@ -46,36 +45,42 @@ def pairs(scale, prepare, count=2, size=64):
     return result
 
 
-def open_image_denoise(images, **flags):
-    """OIDN on encoded images, with their exposure: log-encoded (h, w, 3)."""
-    colour = decode_radiance(images["colour"], 1.0)
-    return encode_radiance(
-        run_filter(
-            {"color": colour, "albedo": images["albedo"], "normal": images["normal"]},
-            hdr=True,
-            input_scale=1.0,
-            **flags,
-        ),
-        1.0,
-    )
+@pytest.fixture(scope="module")
+def denoised_mean():
+    """Appends the mean of both renders, which `joint` has denoised."""
+    return with_denoised_mean(checkpoints.load(CHECKPOINT)[0].mean_denoiser)
+
+
+def means(size, scale=2):
+    """Colour, noise, albedo and normal of both renders' mean, (1, c, size, size)."""
+    ((lrhs, hrls),) = pairs(scale, with_mean, count=1, size=scale * size)
+    aovs = torch.nn.functional.avg_pool2d(hrls[:, 3:9], scale)
+    return lrhs[:, 3:6], lrhs[:, 6:7], aovs[:, :3], aovs[:, 3:]
+
+
+def open_image_denoise(colour, albedo, normal, **flags):
+    """OIDN on encoded images (1, 3, h, w), with their exposure: log-encoded (h, w, 3)."""
+    arrays = [np.ascontiguousarray(image[0].permute(1, 2, 0).numpy()) for image in (colour, albedo, normal)]
+    images = {"color": decode_radiance(arrays[0], 1.0), "albedo": arrays[1], "normal": arrays[2]}
+    return encode_radiance(run_filter(images, hdr=True, input_scale=1.0, **flags), 1.0)
 
 
 @pytest.mark.parametrize("size", QUALITY)
-def test_a_new_network_is_open_image_denoise(size):
+def test_a_new_network_is_open_image_denoise(size, denoised_mean):
     network = JointFusion(size=size).eval()
     for head in network.heads:  # blend with the U-Net's result only
         head.weight.data.zero_()
         head.bias.data[1] = 60.0
-    ((lrhs, hrls),) = pairs(2, QuantisedMeanDenoiser(threads=1), count=1)
+    ((lrhs, hrls),) = pairs(2, denoised_mean, count=1)
     with torch.inference_mode():
         fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
-    expected = open_image_denoise(denoiser_images(hrls[0].permute(1, 2, 0).numpy()), quality=QUALITY[size])
+    expected = open_image_denoise(*hrls.split(3, dim=1), quality=QUALITY[size])
     assert np.abs(fused - expected).mean() < 1e-3
     assert not any(parameter.any() for parameter in network.differences())
 
 
 @pytest.mark.parametrize(("scale", "size"), [(8, "usual"), (2, "small")])
-def test_the_graph_computes_what_the_network_does(scale, size, tmp_path):
+def test_the_graph_computes_what_the_network_does(scale, size, tmp_path, denoised_mean):
     """With random differences and pruned channels."""
     torch.manual_seed(0)
     ups = [name for level in BASE.up for name in level]
@@ -84,10 +89,9 @@ def test_the_graph_computes_what_the_network_does(scale, size, tmp_path):
         parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
     state = {"architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
     contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
-    drawn = pairs(scale, QuantisedMeanDenoiser(threads=1))
+    drawn = pairs(scale, denoised_mean, size=16 * scale)
     path = tmp_path / "joint.onnx"
     onnx.save(export.joint_to_onnx(network, contract, drawn), path)
-    contract = Contract.of_file(path)
     assert (contract.denoiser, contract.alignment) == (network.denoiser(scale), 16)
     assert "Open Image Denoise" in contract.provenance["initial_weights"]
     model = load_network(path)
@@ -137,12 +141,10 @@ def test_the_mean_may_include_the_initial_state():
 @pytest.mark.parametrize("size", QUALITY)
 def test_a_new_mean_denoiser_is_open_image_denoise(size):
     """The weights of the estimated noise start at zero."""
-    ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=96)
-    low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
-    layers = mean_of_renders(low, denoiser_images(high))
-    found = MeanDenoiser(size).eval().denoise(layers)
-    del layers["noise"]
-    expected = open_image_denoise(layers, cleanAux=True, quality=QUALITY[size])
+    colour, noise, albedo, normal = means(48)
+    with torch.inference_mode():
+        found = MeanDenoiser(size).eval()(colour, noise, albedo, normal)[0].permute(1, 2, 0).numpy()
+    expected = open_image_denoise(colour, albedo, normal, cleanAux=True, quality=QUALITY[size])
     assert np.abs(found - expected).mean() < 1e-3
 
 
@@ -151,14 +153,24 @@ def test_a_new_mean_denoiser_is_open_image_denoise(size):
     [("joint", MEAN_DENOISER, 0.1), ("joint_small", SMALL_MEAN_DENOISER, 0.125)],
 )
 def test_the_shipped_mean_denoiser_agrees_with_the_checkpoint(checkpoint, denoiser, share):
-    """To this share of the noise, also for sides that are no multiple of 16."""
-    ((lrhs, hrls),) = pairs(2, lambda lrhs, hrls: (lrhs, hrls), count=1, size=80)
-    low, high = (image[0].permute(1, 2, 0).numpy() for image in (lrhs, hrls))
-    layers = mean_of_renders(low, denoiser_images(high))
+    """To this share of the noise."""
+    images = means(48)
     network, _ = checkpoints.load(CHECKPOINT.with_stem(checkpoint))
-    expected = network.mean_denoiser.denoise(layers)
-    found = QuantisedMeanDenoiser(threads=1, path=WEIGHTS[denoiser])(low, high)[0][..., 3:]
-    assert np.abs(found - expected).mean() < share * np.abs(layers["colour"] - expected).mean()
+    with torch.inference_mode():
+        expected = network.mean_denoiser(*images)[0].permute(1, 2, 0).numpy()
+    found = run_denoiser(CHECKPOINTS / f"{DENOISERS[denoiser]}.onnx", denoiser_codes(*images))
+    noisy_mean = images[0][0].permute(1, 2, 0).numpy()
+    assert np.abs(found - expected).mean() < share * np.abs(noisy_mean - expected).mean()
+
+
+def test_the_shipped_mean_denoiser_is_about_as_good_as_open_image_denoise():
+    """In 8 bits its error is at most 1.3 times OIDN's, with prefiltered albedo."""
+    size = 96
+    images = means(size)
+    clean = encode_radiance(box_downsample(picture(2 * size, 2 * size), 2), 1.0)
+    found = run_denoiser(CHECKPOINTS / "mean_denoiser.onnx", denoiser_codes(*images))
+    theirs = open_image_denoise(images[0], *images[2:], cleanAux=True)
+    assert np.abs(found - clean).mean() < 1.3 * np.abs(theirs - clean).mean()
 
 
 def test_a_run_starts_from_a_pruned_checkpoint_with_older_names(tmp_path: Path):
@@ -174,9 +186,9 @@ def test_a_run_starts_from_a_pruned_checkpoint_with_older_names(tmp_path: Path):
     assert everything == differences + 2 + 2 + 2 * 5
 
 
-def test_the_predicted_error_has_no_gradient_into_the_features():
+def test_the_predicted_error_has_no_gradient_into_the_features(denoised_mean):
     network = JointFusion(size="small")
-    ((lrhs, hrls),) = pairs(2, QuantisedMeanDenoiser(threads=1), count=1)
+    ((lrhs, hrls),) = pairs(2, denoised_mean, count=1)
     _, log_error = network.fuse(lrhs, hrls)
     log_error.sum().backward()
     assert {name for name, p in network.named_parameters() if p.grad is not None} == {"error.weight", "error.bias"}

@@ -16,11 +16,20 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from datagen.views import Folder, mean_lrhs, read_hrls  # noqa: E402
-from oiio_msspl.aovs.features import DEFAULTS, HRLS_FEATURES, NORMAL, OPTIONAL_FEATURES, RGB  # noqa: E402
+from oiio_msspl.aovs.features import (  # noqa: E402
+    ALBEDO,
+    DEFAULTS,
+    HRLS_FEATURES,
+    NORMAL,
+    OPTIONAL_FEATURES,
+    RADIANCE_FEATURES,
+    RGB,
+    VARIANCE,
+)
 from oiio_msspl.colour import srgb  # noqa: E402
 from oiio_msspl.metrics import relmse  # noqa: E402
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract  # noqa: E402
-from oiio_msspl.model.encoding import KEY, decode_radiance, encode_features, encode_radiance, find_exposure  # noqa: E402
+from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, decode_radiance, encode_radiance, find_exposure  # noqa: E402
 from training import checkpoints, data, encoding, losses, train  # noqa: E402
 from training.encoding import log_decode  # noqa: E402
 from training.paper import RDB, MultiResolutionFusion  # noqa: E402
@@ -227,9 +236,15 @@ def test_training_transforms_as_inference_does() -> None:
     low[2:4] = 0
     exposure = encoding.exposure_of(torch.from_numpy(low)[None])
     assert exposure.item() == pytest.approx(find_exposure(low), rel=1e-3)
-    packed = encoding.pack({name: torch.from_numpy(values)[None] for name, values in layers.items()}, exposure)
-    expected = encode_features(layers, HRLS_FEATURES, exposure.item())
-    np.testing.assert_allclose(packed[0].numpy(), expected, atol=1e-5)
+    packed = features_of(encoding.packed(layers, exposure.item()))
+    for name in RADIANCE_FEATURES:
+        np.testing.assert_allclose(packed[name], encode_radiance(layers[name], exposure.item()), atol=1e-5)
+    deviation = encode_radiance(np.sqrt(layers[VARIANCE]), exposure.item())
+    np.testing.assert_allclose(packed[VARIANCE], deviation, atol=1e-5)
+    for name, lowest, highest in ((ALBEDO, 0, MAX_ALBEDO), (NORMAL, -1, 1)):
+        np.testing.assert_array_equal(packed[name], layers[name].clip(lowest, highest))
+    missing = features_of(encoding.packed({RGB: layers[RGB]}, exposure.item()))
+    assert all((missing[name] == value).all() for name, value in DEFAULTS.items())
     assert encoding.exposure_of(torch.zeros(1, 4, 4, 3)).item() == find_exposure(np.zeros((4, 4, 3), np.float32))
 
 
@@ -363,13 +378,15 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     onnx = pytest.importorskip("onnx")
     onnxruntime = pytest.importorskip("onnxruntime")
     from training import export
+    from training.whole_model import whole_model
 
     path = tmp_path / "tiny.onnx"
     contract = Contract(name="tiny-x4", scale=4, overlap=12, training_spp={"hrls": [1, 8], "lrhs": [16, 256]})
-    onnx.save(export.to_onnx(tiny_network, contract, half=half), path)
+    network = export.to_onnx(tiny_network, contract, half=half)
+    onnx.save(whole_model(network, contract, None), path)
 
-    assert export.parity(tiny_network, 4, path) < (5e-3 if half else 1e-5)
-    kinds = {node.op_type for node in onnx.load(path).graph.node}
+    assert export.parity(tiny_network, path) < (5e-3 if half else 1e-5)
+    kinds = {node.op_type for node in network.graph.node}
     assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
     assert str(Path(__file__).parents[2]).encode() not in path.read_bytes()
     session = onnxruntime.InferenceSession(path, providers=["CPUExecutionProvider"])

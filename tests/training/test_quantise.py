@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from oiio_msspl.model.encoding import encode_radiance
-from oiio_msspl.model.mean_denoiser import OUTPUT_SLICES
 from oiio_msspl.model.runtime import load_network
 from tests.conftest import noisy, picture
 
@@ -17,20 +16,33 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
 from training.oidn import LARGE, run_unet  # noqa: E402
+from training.pu_curve import pu_encode  # noqa: E402
 from training.quantise import gptq  # noqa: E402
+from training.quantise.codes import INPUT_CHANNELS, OUTPUT_SLICES, denoiser_codes  # noqa: E402
 from training.quantise.graph import COPIES, Graph, Nodes  # noqa: E402
 
 
-def layers(height, width, seed=0):
-    clean = picture(height, width)
-    noise = np.full((height, width, 1), 0.3, np.float32)
-    normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
-    return {
-        "colour": encode_radiance(noisy(clean, 4, seed), 1.0),
-        "albedo": clean.clip(0, 1),
-        "normal": normal,
-        "noise": noise,
-    }
+def codes_of(image, noise=0.3):
+    """Codes of a picture (h, w, 3) with an albedo and a normal."""
+    colour, albedo = (
+        torch.from_numpy(values).permute(2, 0, 1)[None] for values in (encode_radiance(image, 1.0), image.clip(0, 1))
+    )
+    normal = torch.tensor([0.6, -0.8, 0.0])[None, :, None, None].expand_as(albedo)
+    return denoiser_codes(colour, torch.full_like(albedo[:, :1], noise), albedo, normal)
+
+
+def test_the_slices_of_a_value_add_up_to_it():
+    """Of colours; other values have a code each."""
+    clean = picture(16, 32)
+    clean[0, 0] = 0, 1, 60000
+    codes = codes_of(clean, noise=0.25)
+    assert codes.shape == (1, INPUT_CHANNELS, 16, 32) and codes.min() >= 0 and codes.max() <= 255
+    slices = codes[0, :9].unflatten(0, (3, 3)).sum(dim=1).permute(1, 2, 0).numpy() / (3 * 255)
+    np.testing.assert_allclose(slices, pu_encode(clean.astype(np.float64)), atol=0.6 / (3 * 255))
+    rest = codes[0, 9:].permute(1, 2, 0).numpy() / 255
+    np.testing.assert_allclose(rest[..., :3], clean.clip(0, 1), atol=0.6 / 255)
+    np.testing.assert_allclose(rest[..., 3:6] * 2 - 1, np.broadcast_to([0.6, -0.8, 0], clean.shape), atol=1.01 / 255)
+    np.testing.assert_allclose(rest[..., 6], 0.25, atol=0.6 / 255)
 
 
 @pytest.mark.parametrize("shape", [(1, 3, 16, 16), (1, 16, 32, 3)])
@@ -103,11 +115,11 @@ def test_the_graph_computes_what_was_fitted(tmp_path):
         return channels
 
     run_unet(shape, [10], conv, same, same, lambda one, other: one + other)
-    images = [layers(64, 48, seed) for seed in range(2)]
-    fit = gptq.quantise_mean_denoiser(shape, weights, images)
+    drawn = [codes_of(noisy(picture(64, 48), 4, seed)) for seed in range(2)]
+    fit = gptq.quantise_mean_denoiser(shape, weights, drawn)
     onnx.save(Graph(fit).model(), tmp_path / "base.onnx")
     session = load_network(tmp_path / "base.onnx", 1)
-    codes = gptq.quantise_inputs(images).codes[0]
+    codes = drawn[0]
     found = session.run(["codes"], {"layers": codes[0].permute(1, 2, 0).numpy().astype(np.uint8)[None]})[0][0]
 
     expected = run_unet(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Write the denoiser of both renders' mean in 8 bits, which :mod:`oiio_msspl.model.mean_denoiser` runs.
+"""Write the denoiser of both renders' mean in 8 bits, which is part of the models that ship.
 
     python -m training.quantise VIEWS
 
@@ -16,28 +16,34 @@ from pathlib import Path
 
 import numpy as np
 import onnx
+import torch
 from onnx import helper
+from torch import Tensor
 
 from oiio_msspl.model.contract import SCALES
-from oiio_msspl.model.mean_denoiser import WEIGHTS, MeanDenoiser
-from oiio_msspl.model.render_mean import denoiser_images, mean_of_renders
+from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
 from training.data import fixed_batches
-from training.joint import JointFusion
+from training.joint import JointFusion, with_mean
 from training.oidn import provenance
+from training.ops import box_downsample
+from training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code
 from training.quantise.gptq import quantise_mean_denoiser
 from training.quantise.graph import Graph
+from training.whole_model import CHECKPOINTS, DENOISERS
 
-CHECKPOINT = Path(__file__).parents[1] / "checkpoints" / "joint.pt"
+CHECKPOINT = CHECKPOINTS / "joint.pt"
 #: Calibration images, and their width.
 IMAGES, PATCH = 96, 256
 
 
-def pairs(views: Path, split: str) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Encoded LRHS and HRLS, from views as training draws them."""
-    for batch in fixed_batches(views, split, SCALES, PATCH, 1):
-        lrhs, hrls = (batch[key][0].permute(1, 2, 0).numpy() for key in ("lrhs", "hrls"))
-        yield lrhs, hrls
+def means(views: Path, split: str) -> Iterator[tuple[Tensor, ...]]:
+    """Colour, noise, albedo and normal of both renders' mean, from views as training draws them."""
+    for batch in fixed_batches(views, split, SCALES, PATCH, 1, with_mean):
+        lrhs, hrls = batch["lrhs"], batch["hrls"]
+        scale = hrls.shape[-1] // lrhs.shape[-1]
+        aovs = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
+        yield lrhs[:, 3:6], lrhs[:, 6:7], *aovs
 
 
 def main() -> None:
@@ -50,18 +56,24 @@ def main() -> None:
     joint, _ = load(args.checkpoint)
     if not isinstance(joint, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
-    exact, path = joint.mean_denoiser, WEIGHTS[joint.denoiser(SCALES[0])]
-    drawn = islice(pairs(args.views, "train"), IMAGES)
-    images = [mean_of_renders(lrhs, denoiser_images(hrls)) for lrhs, hrls in drawn]
-    model = Graph(quantise_mean_denoiser(exact.start.shape, exact.weights(), images)).model()
+    exact, path = joint.mean_denoiser, CHECKPOINTS / f"{DENOISERS[joint.denoiser(SCALES[0])]}.onnx"
+    codes = [denoiser_codes(*images) for images in islice(means(args.views, "train"), IMAGES)]
+    model = Graph(quantise_mean_denoiser(exact.start.shape, exact.weights(), codes)).model()
     helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.start.network))})
     onnx.save(model, path)
-    network = MeanDenoiser(path=path)
     differences = []
-    for lrhs, hrls in islice(pairs(args.views, "validation"), 24):
-        expected = exact.denoise(mean_of_renders(lrhs, denoiser_images(hrls)))
-        differences.append(np.abs(network(lrhs, hrls)[0][..., 3:] - expected).mean())
+    for images in islice(means(args.views, "validation"), 24):
+        with torch.inference_mode():
+            expected = exact(*images)[0].permute(1, 2, 0).numpy()
+        differences.append(np.abs(run_denoiser(path, denoiser_codes(*images)) - expected).mean())
     print(f"mean difference of encoded values {np.mean(differences):.4f}, at most {np.max(differences):.4f}")
+
+
+def run_denoiser(path: Path, codes: Tensor) -> np.ndarray:
+    """The result of a quantised denoiser, log-encoded (h, w, 3), for :func:`training.quantise.codes.denoiser_codes`."""
+    layers = codes.permute(0, 2, 3, 1).to(torch.uint8).contiguous().numpy()
+    (sums,) = load_network(path).run(["codes"], {"layers": layers})
+    return log_encoded_of_code(OUTPUT_SLICES)[sums[0]]
 
 
 if __name__ == "__main__":

@@ -28,19 +28,21 @@ from torch.nn import functional as F
 
 from datagen.views import Folder
 from oiio_msspl.model.catalogue import WEIGHTS, find_model
-from oiio_msspl.model.contract import MEAN_DENOISER, METADATA_KEY, SCALES, Contract
-from oiio_msspl.model.mean_denoiser import log_encoded_of_code
+from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.runtime import load_network
-from oiio_msspl.model.session import make_denoiser
+from training.checkpoints import load
 from training.data import Sampling, draw, fixed_batches, view_tensors
 from training.encoding import from_srgb, log_to_pu, srgb
 from training.ensemble import BandWeights, load_weights
-from training.export import MEMORY, shuffle, traced, unshuffle
-from training.gpu import share_weights
+from training.export import MEMORY
+from training.joint import JointFusion, with_denoised_mean
 from training.oidn import ALBEDO_BASE, BASE, LARGE, LARGE_HDR, NORMAL_BASE, Shape, pretrained_weights
+from training.quantise.codes import log_encoded_of_code, sliced
 from training.quantise.gptq import Activations, CodeLayout, Fit, run_unet_on_activations
 from training.quantise.graph import ENTRIES, Graph, Nodes
-from training.quantise.joint import concatenated, embedded, sliced, sliced_layout
+from training.quantise.joint import concatenated, sliced_layout
+from training.tracing import shuffle, traced, unshuffle
+from training.whole_model import CHECKPOINTS, network_of, quantised_denoiser, save, whole_model
 
 #: Calibration images of each network, and their width.
 IMAGES, PATCH = 36, 256
@@ -50,8 +52,8 @@ BRIGHTER = (0.1, 1.0)
 AUXILIARY_SLICES, COLOUR_SLICES, COLOUR_SLICES_OUT = 5, 3, 10
 #: Stored pairs for training and validation.
 PAIRS = {"train": 480, "validation": 36}
-#: The file of the networks that the models of all scales share.
-SHARED = "ensemble.weights"
+#: The models' name; all scales share the weights of the networks.
+FAMILY = "ensemble"
 
 #: Outputs of the graph without the weights.
 RESULTS = ("joint", "large", "albedo", "normal", "joint_error")
@@ -105,9 +107,9 @@ class Results(Nodes):
 
     def __init__(self, scale: int, networks: dict[str, onnx.ModelProto]) -> None:
         super().__init__()
-        self.tensors: list[onnx.TensorProto] = []
         self.initializers["unseen"] = log_encoded_of_code(COLOUR_SLICES_OUT)
-        self._embed(onnx.load(find_model(scale, "joint")), "joint.", {"fused": "joint", "log_error": "joint_error"})
+        joint = network_of(onnx.load(find_model(scale, "joint")))
+        self.embed(joint, "joint.", {"fused": "joint", "log_error": "joint_error"})
         # OIDN denoises an albedo in sRGB, and reads it linear beside the colour.
         self.constant("srgb", srgb(torch.linspace(0, 1, ENTRIES)).numpy())
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
@@ -133,17 +135,8 @@ class Results(Nodes):
 
     def _run(self, network: onnx.ModelProto, name: str, layers: str) -> str:
         """Add a network that reads the codes ``layers``; return its sums of codes."""
-        self._embed(network, f"{name}.", {"layers": layers, "codes": f"{name}.codes"})
+        self.embed(network, f"{name}.", {"layers": layers, "codes": f"{name}.codes"})
         return f"{name}.codes"
-
-    def _embed(self, model: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:
-        """Add the graph of a model; its inputs and outputs get other names."""
-        graph = embedded(model, prefix).graph
-        for node in graph.node:
-            for tensors in (node.input, node.output):
-                tensors[:] = [names.get(name, name) for name in tensors]
-        self.nodes += graph.node
-        self.tensors += graph.initializer
 
     def model(self, weights: onnx.ModelProto | None = None) -> onnx.ModelProto:
         """The graph; with ``weights`` (:class:`training.ensemble.BandWeights`), the model that ships."""
@@ -151,12 +144,10 @@ class Results(Nodes):
         inputs = [info("lrhs", TensorProto.FLOAT, [1, 6, "h", "w"]), info("hrls", TensorProto.FLOAT, [1, 9, "H", "W"])]
         channels = dict.fromkeys(RESULTS, 3) | {"joint_error": 1}
         if weights is not None:
-            self._embed(weights, "weights.", {})
+            self.embed(weights, "weights.", {})
             channels = {"fused": 3, "log_error": 1, "albedo": 3, "normal": 3}
         outputs = [info(name, TensorProto.FLOAT, [1, count, "H", "W"]) for name, count in channels.items()]
-        model = self.finished("ensemble", inputs, outputs)
-        model.graph.initializer.extend(self.tensors)
-        return model
+        return self.finished(FAMILY, inputs, outputs)
 
 
 # The stored pairs
@@ -165,7 +156,9 @@ class Results(Nodes):
 def store_pairs(views: Path, out: Path) -> None:
     """Store the results of random pairs, see :func:`training.ensemble.read_pair`."""
     sessions = {scale: load_network(out / f"results-x{scale}.onnx") for scale in SCALES}
-    denoiser = make_denoiser(MEAN_DENOISER)
+    joint, _ = load(CHECKPOINTS / "joint.pt")
+    assert isinstance(joint, JointFusion)
+    prepare = with_denoised_mean(joint.mean_denoiser)
     for split, count in PAIRS.items():
         (out / split).mkdir(exist_ok=True)
         tensors = view_tensors(Folder(views), split, torch.device("cpu"))
@@ -176,7 +169,7 @@ def store_pairs(views: Path, out: Path) -> None:
                 continue
             rng = np.random.default_rng([zlib.crc32(split.encode()), index])
             with torch.no_grad():
-                batch = draw(tensors, scale, PATCH, 1, rng, Sampling(), denoiser)
+                batch = draw(tensors, scale, PATCH, 1, rng, Sampling(), prepare)
             feed = {name: batch[name].contiguous().numpy() for name in ("lrhs", "hrls")}
             feed["hrls"] = feed["hrls"][:, :9]
             results = dict(zip(RESULTS, sessions[scale].run(list(RESULTS), feed), strict=True))
@@ -219,21 +212,18 @@ def export(out: Path, networks: dict[str, onnx.ModelProto]) -> None:
     models = {}
     for scale in SCALES:
         contract = Contract.of_file(find_model(scale, "joint"))
-        name = f"ensemble-x{scale}"
+        name = f"{FAMILY}-x{scale}"
         provenance = contract.provenance | {
-            "network": "ensemble",
+            "network": FAMILY,
             "other_networks": f"Open Image Denoise 2.5.1, {ALBEDO_BASE}, {NORMAL_BASE}, {LARGE_HDR} (Apache-2.0)",
             "trained_weights": trained,
             "date": datetime.date.today().isoformat(),
         }
-        contract = replace(contract, name=name, bytes_per_pixel=MEMORY["ensemble"], provenance=provenance)
-        model = Results(scale, networks).model(weights_graph(weights, scale))
-        helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
-        models[f"{name}.onnx"] = model
-    share_weights(list(models.values()), WEIGHTS / SHARED)
-    for file, model in models.items():
-        onnx.save(model, WEIGHTS / file)
-    for path in sorted(WEIGHTS.glob("ensemble*")):
+        contract = replace(contract, name=name, bytes_per_pixel=MEMORY[FAMILY], provenance=provenance)
+        graph = Results(scale, networks).model(weights_graph(weights, scale))
+        models[WEIGHTS / f"{name}.onnx"] = whole_model(graph, contract, quantised_denoiser(contract.denoiser))
+    save(models, FAMILY)
+    for path in sorted(WEIGHTS.glob(f"{FAMILY}*")):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 

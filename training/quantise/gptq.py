@@ -20,11 +20,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from oiio_msspl.model.mean_denoiser import INPUT_SLICES, OUTPUT_SLICES
-from oiio_msspl.model.mean_denoiser import quantise as quantise_images
-from oiio_msspl.model.render_mean import Images
 from training.oidn import LARGE, Shape, Weights, run_unet
 from training.ops import upsample
+from training.quantise.codes import INPUT_SLICES, OUTPUT_SLICES
 
 #: Pixels of each image that a layer's weights are fitted to.
 PIXELS = 4000
@@ -106,15 +104,14 @@ class QuantisedConv:
 # The inputs of the denoiser of both renders' mean
 
 
-def quantise_inputs(images: Sequence[Images]) -> Activations:
-    """The inputs of a network as codes, and the values that the codes stand for."""
-    layout = input_layout()
-    codes = [torch.from_numpy(quantise_images(**layers)).permute(2, 0, 1).float() for layers in images]
-    return Activations([layout.dequantise(image)[None] for image in codes], [image[None] for image in codes], layout)
+def denoiser_inputs(codes: Sequence[Tensor]) -> Activations:
+    """Codes of :func:`training.quantise.codes.denoiser_codes` with the values that they stand for."""
+    layout = denoiser_layout()
+    return Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
 
 
-def input_layout() -> CodeLayout:
-    """The layout in which :func:`oiio_msspl.model.mean_denoiser.quantise` stores colour, albedo, normal and noise."""
+def denoiser_layout() -> CodeLayout:
+    """The layout of :func:`training.quantise.codes.denoiser_codes`."""
     scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
     return CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
 
@@ -301,14 +298,14 @@ def run_unet_on_activations(
         )
 
 
-def quantise_mean_denoiser(shape: Shape, weights: Weights, images: Sequence[Images]) -> Fit:
+def quantise_mean_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:
     """Quantise a denoiser of both renders' mean.
 
     Args:
         shape: of its U-Net.
         weights: in full precision.
-        images: inputs of the network.
+        codes: inputs of the network, see :func:`training.quantise.codes.denoiser_codes`.
     """
     fit = Fit(shape, weights)
-    run_unet_on_activations(fit.shape, [quantise_inputs(images)], fit.conv)
+    run_unet_on_activations(fit.shape, [denoiser_inputs(codes)], fit.conv)
     return fit

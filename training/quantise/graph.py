@@ -9,11 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 import onnx
-from onnx import TensorProto, helper, numpy_helper
+from onnx import TensorProto, compose, helper, numpy_helper
 
-from oiio_msspl.model.mean_denoiser import INPUT_CHANNELS
-from oiio_msspl.model.pu_curve import largest_log_encoded, pu_encode_log
 from training.oidn import run_unet
+from training.pu_curve import largest_log_encoded, pu_encode_log
+from training.quantise.codes import INPUT_CHANNELS
 from training.quantise.gptq import COLOURS, Fit
 
 #: Entries of the table from log-encoded to PU-encoded radiance.
@@ -27,14 +27,32 @@ class Nodes:
 
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
+        self.embedded: list[onnx.TensorProto] = []
         self.initializers: dict[str, np.ndarray] = {"zero": np.uint8(0)}
 
     def finished(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
         values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
-        graph = helper.make_graph(self.nodes, name, inputs, outputs, list(values))
+        graph = helper.make_graph(self.nodes, name, inputs, outputs, [*values, *self.embedded])
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+
+    def embed(self, model: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:
+        """Add the graph of a model.
+
+        Args:
+            prefix: of its tensors, but for its inputs and outputs.
+            names: other names for inputs and outputs.
+        """
+        outside = {value.name for value in (*model.graph.input, *model.graph.output)}
+        graph = compose.add_prefix(model, prefix).graph
+        for node in graph.node:
+            for tensors in (node.input, node.output):
+                for i, name in enumerate(tensors):
+                    own = name.removeprefix(prefix)
+                    tensors[i] = names.get(own, own) if own in outside else name
+        self.nodes += graph.node
+        self.embedded += graph.initializer
 
     def add(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
@@ -86,7 +104,7 @@ class Nodes:
         return self.table(values, largest_log_encoded(), "pu")
 
     def slices(self, values: str, count: int) -> list[str]:
-        """Quantise values in [0, 1] to the codes of slices, see :func:`training.quantise.joint.sliced`."""
+        """Quantise values in [0, 1] to the codes of slices, see :func:`training.quantise.codes.sliced`."""
         step = self.constant(f"slice{count}", np.float32(1 / count / 255))
         parts = []
         for i in range(count):

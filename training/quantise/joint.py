@@ -10,19 +10,17 @@ from pathlib import Path
 import numpy as np
 import onnx
 import torch
-from onnx import TensorProto, compose, helper
+from onnx import TensorProto, helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.model.contract import Contract
-from oiio_msspl.model.mean_denoiser import log_encoded_of_code
-from oiio_msspl.model.session import make_denoiser
-from training.data import fixed_batches
+from training.data import Prepare, fixed_batches
 from training.encoding import log_to_pu
 from training.joint import DECODED, OUTPUTS, JointFusion, blend
 from training.oidn import BASE
 from training.ops import upsample
 from training.paper import LRHS_CHANNELS
+from training.quantise.codes import log_encoded_of_code, sliced
 from training.quantise.gptq import (
     COLOURS,
     SIGNED_RANGE,
@@ -53,12 +51,6 @@ class Blend(nn.Module):
 
 
 # The U-Net's inputs as codes
-
-
-def sliced(values: Tensor, count: int) -> Tensor:
-    """Quantise values (N, C, H, W) in [0, 1] to codes of slices, (N, count * C, H, W)."""
-    slices = [(values * count - i).clamp(0, 1) for i in range(count)]
-    return torch.cat(slices, dim=1).mul(255).round()
 
 
 def sliced_layout(count: int, first: int) -> CodeLayout:
@@ -100,9 +92,13 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Acti
     ]
 
 
-def calibration_pairs(views: Path, contract: Contract, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
-    """Inputs of the network, from views as training draws them."""
-    batches = fixed_batches(views, "train", [contract.scale], PATCH, 1, make_denoiser(contract.denoiser))
+def calibration_pairs(views: Path, scale: int, prepare: Prepare, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
+    """Inputs of the network, from views as training draws them.
+
+    Args:
+        prepare: see :func:`training.joint.with_denoised_mean`.
+    """
+    batches = fixed_batches(views, "train", [scale], PATCH, 1, prepare)
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 
@@ -188,10 +184,8 @@ class JointGraph(Graph):
             if level == 1:
                 phases = self.cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
                 self.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
-        self.nodes += mixing.graph.node
-        model = self.finished("joint", inputs, outputs)
-        model.graph.initializer.extend(mixing.graph.initializer)
-        return model
+        self.embed(mixing, "mix.", {})
+        return self.finished("joint", inputs, outputs)
 
     def _planes(self, layer: str, start: int, count: int) -> str:
         """Dequantise signed outputs of a layer, as (1, C, H, W)."""
@@ -203,16 +197,6 @@ class JointGraph(Graph):
         return self.add("DequantizeLinear", [part, step, middle], f"{layer}.values")
 
 
-def embedded(model: onnx.ModelProto, prefix: str) -> onnx.ModelProto:
-    """A copy whose tensors have a prefix, except its inputs and outputs."""
-    outside = {value.name for value in (*model.graph.input, *model.graph.output)}
-    model = compose.add_prefix(model, prefix)
-    for node in model.graph.node:
-        for names in (node.input, node.output):
-            names[:] = [own if (own := name.removeprefix(prefix)) in outside else name for name in names]
-    return model
-
-
 def to_onnx(
     network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]], mixing: onnx.ModelProto
 ) -> onnx.ModelProto:
@@ -222,7 +206,6 @@ def to_onnx(
         pairs: calibration pairs, see :func:`calibration_pairs`.
         mixing: the graph of :class:`Blend` with its ``inputs``, ``logits0`` ... and the output ``fused``.
     """
-    mixing = embedded(mixing, "mix.")
     info = helper.make_tensor_value_info
     inputs = [
         info("lrhs", TensorProto.FLOAT, [1, network.lrhs_channels, "h", "w"]),

@@ -38,7 +38,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
                 "name": name,
                 "quality": quality_of.get(name.rpartition("-x")[0]),
                 "scale": contract.scale,
-                "layers": [feature for feature in contract.features if feature != RGB],
+                "layers": [feature for feature in contract.hrls if feature != RGB],
                 "measured": figures.get(name, {}),
                 "size_mb": round(path.stat().st_size / 1e6, 1),
                 "files": {"cpu": str(path), "gpu": str(for_gpus or path)},

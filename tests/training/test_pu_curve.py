@@ -3,9 +3,9 @@
 
 import numpy as np
 import pytest
-from training.pu_curve import pu_decode, pu_encode
 
 from oiio_msspl.model.encoding import MAX_RADIANCE
+from training.pu_curve import pu_decode, pu_encode
 
 
 def test_the_curve_rises_from_0_to_1_and_decoding_inverts_it():

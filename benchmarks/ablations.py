@@ -7,15 +7,20 @@ As in the paper, the HRLS has 1 spp, the LRHS has far more (all ``lr`` passes of
 that is not varied reads colour only. For every row a reduced network of the paper's architecture is trained from
 scratch, for the same few steps on the same batches, and scored on the validation views. Rows can be compared with each
 other, not with the shipped models. The LRHS's AOVs come from the ``hr`` passes that are not in the HRLS. Rows that the
-JSON file already has are kept.
+table already has are kept.
+
+    python -m benchmarks.ablations VIEWS --table benchmarks/results/growth.csv --only "growth rate*" --steps 300
+
+trains the whole network with either growth rate that the paper may mean.
 """
 
 from __future__ import annotations
 
 import argparse
+import fnmatch
 import functools
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -60,6 +65,8 @@ class Variant:
     lrhs: str = RGB
     hrls: str = RGB
     loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
+    network: Mapping[str, int] = field(default_factory=lambda: REDUCED)
+    """Sizes of the network that are not the whole one's."""
 
 
 def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
@@ -79,6 +86,8 @@ VARIANTS = [
     Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
     *(Variant(f"x{scale}, HRLS: {name}", scale, hrls=name) for scale in (2, 8) for name in (NONE, ALL)),
 ]
+#: The whole network, which reads what the models that ship do.
+GROWTH_RATES = [Variant(f"growth rate {rate}", hrls=ALL, network={"growth": rate}) for rate in (32, 64)]
 
 
 @dataclass(frozen=True)
@@ -136,10 +145,10 @@ def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tens
     return batches
 
 
-def train(variant: Variant, views: tuple[View, ...], steps: int) -> MultiResolutionFusion:
+def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
     """A network after ``steps`` training steps."""
     torch.manual_seed(0)
-    network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
+    network = MultiResolutionFusion(variant.scale, **variant.network, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
@@ -147,7 +156,7 @@ def train(variant: Variant, views: tuple[View, ...], steps: int) -> MultiResolut
     schedule = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / steps)))  # constant, then linear to zero
     for step in range(steps):
         lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
-        with torch.autocast("cpu", torch.bfloat16):
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
             output = network(lrhs * low_mask, hrls * high_mask)
         optimizer.zero_grad(set_to_none=True)
         variant.loss(output.float(), target).backward()
@@ -178,16 +187,19 @@ def main() -> None:
     parser.add_argument("views", type=Path, help="folder of views")
     parser.add_argument("--table", type=Path, required=True, help="table to write or complete")
     parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
+    parser.add_argument("--only", default="*", metavar="PATTERN", help="rows whose name matches")
+    parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16", help="(default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
-    torch.set_num_threads(1)
+    torch.set_num_threads(args.threads)
     rows = results.read(args.table) if args.table.exists() else []
     folder = Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
     effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in rows}
-    for variant in VARIANTS:
-        if variant.name not in done:
-            network = train(variant, views, args.steps)
+    for variant in (*VARIANTS, *GROWTH_RATES):
+        if variant.name not in done and fnmatch.fnmatch(variant.name, args.only):
+            network = train(variant, views, args.steps, bfloat16=args.precision == "bf16")
             row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
             print(row, flush=True)
             rows.append(row)

@@ -102,9 +102,11 @@ def exposure_of(lrhs: Tensor) -> Tensor:
     exposure = KEY / _log_mean(lit, NO_LIGHT * bright)
     rows, columns = (side // BLOCK for side in y.shape[1:])
     if rows * columns >= MIN_BLOCKS:
-        means = F.avg_pool2d(torch.minimum(y, bright[..., None]), BLOCK).flatten(1)
-        even = KEY / _log_mean(torch.where(means > 0, means, torch.nan), NO_LIGHT * bright)
-        exposure = torch.fmin(exposure, NOISY * even)  # where no block is lit, it is NaN
+        shares = (y / bright[..., None]).clamp_max(1.0)
+        light, squares = (F.avg_pool2d(values, BLOCK).flatten(1) for values in (shares, shares * shares))
+        levels = torch.where(squares > 0, squares / light, torch.nan)
+        most = NOISY / (_log_mean(levels, torch.full_like(bright, NO_LIGHT)) * bright[:, 0])
+        exposure = torch.fmin(exposure, most)  # where no block is lit, it is NaN
     return torch.nan_to_num(exposure, nan=1.0)
 
 

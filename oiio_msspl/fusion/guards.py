@@ -35,6 +35,10 @@ NOISE_FREE = 1 / 512
 LIGHT = 4096.0
 
 
+#: LRHS pixels on a side of the squares in which rare light is looked for.
+_SQUARE = 8
+
+
 def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
     """Limit the brightness of both renders to what the other one allows.
 
@@ -42,8 +46,8 @@ def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
         The LRHS's colour (h, w, 3), and the HRLS's features with its radiance limited.
     """
     lrhs_rgb, hrls = pair.lrhs[RGB], pair.hrls
-    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale))
-    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb), pair.scale)
+    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale), pair.scale)
+    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb, pair.scale), pair.scale)
     dimmed = {name: _limit(hrls[name], hrls_limit, pair.scale) for name in RADIANCE_FEATURES if name in hrls}
     return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
 
@@ -99,11 +103,29 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     return agreed
 
 
-def _brightness_limit(rgb: Array) -> Array:
-    """The largest values that the other render may have, (h, w, 3): none where this render is black."""
+def _brightness_limit(rgb: Array, scale: int) -> Array:
+    """The largest values that the other render may have, (h, w, 3): none where this render is black.
+
+    Where few samples find the light, all 3 x 3 pixels around may have missed it. So light that most squares of pixels
+    around have counts, too. A single sample of it may be s^2 times as bright as the LRHS.
+    """
     brightest = max_3x3(rgb)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
-        return np.where(brightest > 0, brightest * np.float32(FIREFLY_FACTOR), np.float32(np.inf))
+        limit, rare = brightest * np.float32(FIREFLY_FACTOR), _rare_light(rgb)
+        limit = np.where(rare > limit, rare * np.float32(scale**2), limit)
+        return np.where(brightest > 0, limit, np.float32(np.inf))
+
+
+def _rare_light(rgb: Array) -> Array:
+    """How bright the light is that most of the 3 x 3 squares around each pixel have somewhere, (h, w, 3)."""
+    height, width, channels = rgb.shape
+    rows, columns = (-(-side // _SQUARE) for side in (height, width))
+    padded = np.pad(rgb, ((0, rows * _SQUARE - height), (0, columns * _SQUARE - width), (0, 0)))
+    brightest = padded.reshape(rows, _SQUARE, columns, _SQUARE, channels).max(axis=(1, 3))
+    around = np.pad(brightest, ((1, 1), (1, 1), (0, 0)), mode="edge")
+    nine = np.stack([around[y : y + rows, x : x + columns] for y in range(3) for x in range(3)])
+    light = np.median(nine, axis=0)
+    return light.repeat(_SQUARE, axis=0).repeat(_SQUARE, axis=1)[:height, :width]
 
 
 def max_3x3(values: Array) -> Array:

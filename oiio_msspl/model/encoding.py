@@ -30,11 +30,12 @@ MAX_ALBEDO = 2.0
 EXPOSURE_BOUNDS = (2e-34, 1e38)
 #: Pixels darker than this share of a frame's bright pixels (33 stops below) do not count for its exposure.
 NO_LIGHT = 1e-10
-#: Side, in pixels, of the squares whose means show how bright a noisy frame is, and how many a frame has at least. In
-#: fewer of them, one lamp could decide.
+#: Side, in pixels, of the squares that show how noisy a frame is, and how many a frame has at least. In fewer of them,
+#: one lamp could decide.
 BLOCK, MIN_BLOCKS = 8, 64
-#: Most that the exposure may exceed that of these means. Frames with little noise are well below.
-NOISY = 5.0
+#: Largest exposed luminance at which half of a square's light may lie, as a log-mean over the squares. Frames with
+#: little noise are well below.
+NOISY = 1.25
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
 #: Log-encoded ``MAX_RADIANCE``.
@@ -45,9 +46,10 @@ def find_exposure(rgb: Array) -> float:
     """Factor that brings a render to a log-mean luminance of ``KEY``.
 
     Only lit pixels count, because a black pixel has no exposure. Noise makes most pixels darker than their mean, and a
-    few much brighter. So the log-mean of a very noisy frame is far too dark. The log-mean of ``BLOCK`` x ``BLOCK``
-    pixels' means shows that, and bounds the factor. In these means, the brightest pixels are limited, or small lamps
-    would decide.
+    few much brighter. So the log-mean of a very noisy frame is far too dark. And networks average log-encoded radiance,
+    which loses light if the few bright pixels are far up on the curve. So these bound the factor: the light of a square
+    of ``BLOCK`` x ``BLOCK`` pixels lies at the mean of their luminance, weighted by luminance. The brightest pixels of
+    the frame are limited there, or small lamps would decide.
 
     Args:
         rgb: (height, width, 3), scene linear, repaired.
@@ -64,10 +66,12 @@ def find_exposure(rgb: Array) -> float:
     exposure = KEY / _log_mean(lit if lit.min() >= darkest else lit[lit >= darkest])
     rows, columns = (side // BLOCK for side in y.shape)
     if rows * columns >= MIN_BLOCKS:
-        means = box_downsample(np.minimum(y[: rows * BLOCK, : columns * BLOCK], np.float32(bright)), BLOCK)
-        means = means[(means > 0) & (means >= darkest)]
-        if means.size:
-            exposure = min(exposure, NOISY * KEY / _log_mean(means))
+        shares = np.minimum(y[: rows * BLOCK, : columns * BLOCK] / np.float32(bright), np.float32(1))
+        light, squares = (box_downsample(values, BLOCK) for values in (shares, shares * shares))
+        levels = squares[squares > 0] / light[squares > 0]
+        levels = levels[levels >= NO_LIGHT]
+        if levels.size:
+            exposure = min(exposure, NOISY / (_log_mean(levels) * bright))
     return float(np.clip(exposure, *EXPOSURE_BOUNDS))
 
 

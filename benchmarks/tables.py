@@ -17,7 +17,17 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks import confidence, layers, quality, results, runtime_files, runtime_passes, runtime_temporal, versus
+from benchmarks import (
+    confidence,
+    goals,
+    layers,
+    quality,
+    results,
+    runtime_files,
+    runtime_passes,
+    runtime_temporal,
+    versus,
+)
 from benchmarks import pair_checks as pair_checks_benchmark
 from benchmarks import passes as passes_benchmark
 from benchmarks import runtime as runtimes
@@ -167,6 +177,16 @@ def against_oidn() -> str:
     )
     missing = [name for name, rows in tables.items() if not versus.compare(rows, DEFAULT, next(iter(AT_ITS_BEST)), 2)]
     return text + f"\nPrefiltered OIDN was not measured on these renders: {', '.join(missing)}.\n" * bool(missing)
+
+
+def goals_of_accuracy() -> str:
+    """What the qualities were to reach in accuracy, and what they reach."""
+    return goals.accuracy({title: results.read(table) for title, table in SETS.items()})
+
+
+def goals_of_time() -> str:
+    """The same for time."""
+    return goals.time({title: results.read(table) for title, (table, _) in MACHINES.items()})
 
 
 def spread_noise() -> str:
@@ -439,6 +459,8 @@ def temporal_counts() -> str:
 TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
     ROOT / "docs/design/results.md": (
+        goals_of_accuracy,
+        goals_of_time,
         against_oidn,
         scenes,
         runtime,

@@ -105,7 +105,9 @@ def exposure_of(lrhs: Tensor) -> Tensor:
         shares = (y / bright[..., None]).clamp_max(1.0)
         light, squares = (F.avg_pool2d(values, BLOCK).flatten(1) for values in (shares, shares * shares))
         levels = torch.where(squares > 0, squares / light, torch.nan)
-        most = NOISY / (_log_mean(levels, torch.full_like(bright, NO_LIGHT)) * bright[:, 0])
+        levels = torch.where(levels >= NO_LIGHT, levels, torch.nan)
+        mean = _log_mean(levels, torch.zeros_like(bright))
+        most = NOISY / (torch.minimum(levels.nanquantile(0.5, dim=1), mean) * bright[:, 0])
         exposure = torch.fmin(exposure, most)  # where no block is lit, it is NaN
     return torch.nan_to_num(exposure, nan=1.0)
 

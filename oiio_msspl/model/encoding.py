@@ -33,8 +33,8 @@ NO_LIGHT = 1e-10
 #: Side, in pixels, of the squares that show how noisy a frame is, and how many a frame has at least. In fewer of them,
 #: one lamp could decide.
 BLOCK, MIN_BLOCKS = 8, 64
-#: Largest exposed luminance at which half of a square's light may lie, as a log-mean over the squares. Frames with
-#: little noise are well below.
+#: Largest exposed luminance at which the light of a square may lie, as a mean over the squares. Frames with little
+#: noise are well below.
 NOISY = 1.25
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
@@ -47,9 +47,9 @@ def find_exposure(rgb: Array) -> float:
 
     Only lit pixels count, because a black pixel has no exposure. Noise makes most pixels darker than their mean, and a
     few much brighter. So the log-mean of a very noisy frame is far too dark. And networks average log-encoded radiance,
-    which loses light if the few bright pixels are far up on the curve. So these bound the factor: the light of a square
-    of ``BLOCK`` x ``BLOCK`` pixels lies at the mean of their luminance, weighted by luminance. The brightest pixels of
-    the frame are limited there, or small lamps would decide.
+    which loses light if the few bright pixels are far up on the curve. So these bound the factor: the light of a
+    square of ``BLOCK`` x ``BLOCK`` pixels lies at the mean of their luminance, weighted by luminance. The median of all
+    squares counts, or their log-mean if it is less. So neither lamps in some of them decide, nor a bright sky in most.
 
     Args:
         rgb: (height, width, 3), scene linear, repaired.
@@ -71,7 +71,7 @@ def find_exposure(rgb: Array) -> float:
         levels = squares[squares > 0] / light[squares > 0]
         levels = levels[levels >= NO_LIGHT]
         if levels.size:
-            exposure = min(exposure, NOISY / (_log_mean(levels) * bright))
+            exposure = min(exposure, NOISY / (min(quantile(levels, 0.5), _log_mean(levels)) * bright))
     return float(np.clip(exposure, *EXPOSURE_BOUNDS))
 
 

@@ -5,6 +5,7 @@ import pytest
 from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
 from oiio_msspl.arrays import repair
 from oiio_msspl.colour import srgb
+from oiio_msspl.model import encoding
 from oiio_msspl.model.encoding import NOISY, decode_radiance, encode_radiance, find_exposure
 from tests.conftest import noisy, picture
 
@@ -45,6 +46,15 @@ def test_noise_does_not_make_a_frame_brighter_to_the_network():
         noise = np.where(random < share, clean / np.float32(share), 1e-4 * clean)
         assert find_exposure(noise) * 0.02 / share == pytest.approx(NOISY, rel=0.2)
     assert find_exposure(noisy(clean, 1)) < 2 * find_exposure(clean)
+
+
+def test_a_bright_sky_does_not_darken_what_stands_before_it(monkeypatch):
+    """It is no noise."""
+    scene = picture(96, 96)
+    scene[:60] *= 1e4
+    exposure = find_exposure(scene)
+    monkeypatch.setattr(encoding, "NOISY", np.inf)
+    assert find_exposure(scene) == exposure
 
 
 @pytest.mark.parametrize("lamps", [1e2, 1e6])

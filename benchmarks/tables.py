@@ -399,10 +399,13 @@ def over_time() -> str:
 
 def stability() -> str:
     """How often each method holds, suffers and fails, and its holes and stamps."""
-    rows = results.read("stability")
-    count = len({(row["group"], row["case"]) for row in rows})
-    scales = ", ".join(f"x{scale}" for scale in dict.fromkeys(row["scale"] for row in rows))
-    return f"{count} cases at {scales}:\n\n{stability_report.summary(rows)}"
+    by_scale: dict[int, list[Row]] = {}
+    for row in results.read("stability"):
+        by_scale.setdefault(row["scale"], []).append(row)
+    return "\n\n".join(
+        f"{len({(row['group'], row['case']) for row in rows})} cases at x{scale}:\n\n{stability_report.summary(rows)}"
+        for scale, rows in sorted(by_scale.items())
+    )
 
 
 def pair_checks() -> str:

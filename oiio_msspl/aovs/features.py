@@ -48,9 +48,3 @@ OPTIONAL_FEATURES = (ALBEDO, NORMAL, DIFFUSE, SPECULAR, VARIANCE)
 #: value. Ours is the standard deviation of a pixel whose noise is as large as mid grey, about 0.5 when encoded: the
 #: network should expect noise.
 DEFAULTS: dict[str, float] = {ALBEDO: 0.5, NORMAL: 0.0, DIFFUSE: 0.0, SPECULAR: 0.0, VARIANCE: 0.5}
-
-
-def channel_names(features: dict[str, int]) -> list[str]:
-    """Names such as ``rgb.R``, ``normal.X`` and ``variance.Y`` for each channel of a stack of features, in order."""
-    suffixes = {1: "Y", 3: "RGB"}
-    return [f"{name}.{c}" for name, count in features.items() for c in ("XYZ" if name == NORMAL else suffixes[count])]

@@ -109,16 +109,14 @@ def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) 
 def decode_radiance(encoded: Array, exposure: float, out: Array | None = None) -> Array:
     """Inverse of :func:`encode_radiance`. Input is clipped to its range, so the result is finite and >= 0."""
 
-    return map_rows(lambda values: decode_in_place(values, exposure), encoded, out)
+    def decode(values: Array) -> None:
+        np.clip(values, 0.0, MAX_ENCODED, out=values)
+        values /= _LOG_SCALE
+        _expm1(values)
+        values /= np.float32(MU)
+        values /= np.float32(exposure)
 
-
-def decode_in_place(encoded: Array, exposure: float) -> None:
-    """:func:`decode_radiance` for a few rows, in their own memory."""
-    np.clip(encoded, 0.0, MAX_ENCODED, out=encoded)
-    encoded /= _LOG_SCALE
-    _expm1(encoded)
-    encoded /= np.float32(MU)
-    encoded /= np.float32(exposure)
+    return map_rows(decode, encoded, out)
 
 
 def _log1p(values: Array) -> None:

@@ -402,7 +402,7 @@ def stability() -> str:
     by_scale: dict[int, list[Row]] = {}
     for row in results.read("stability"):
         by_scale.setdefault(row["scale"], []).append(row)
-    return "\n\n".join(
+    return "\n".join(
         f"{len({(row['group'], row['case']) for row in rows})} cases at x{scale}:\n\n{stability_report.summary(rows)}"
         for scale, rows in sorted(by_scale.items())
     )

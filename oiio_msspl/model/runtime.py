@@ -60,7 +60,7 @@ def load_network(
     options = onnxruntime.SessionOptions()
     options.log_severity_level = 3
     options.intra_op_num_threads = threads
-    # A model and the denoiser that runs before it take turns, so both use the same memory.
+    # The models of the beauty and of its passes take turns, so both use the same memory.
     _share_memory()
     options.add_session_config_entry("session.use_env_allocators", "1")
     # A memory pattern allocates one block for each tile size, which holds all buffers side by side. The arena reuses

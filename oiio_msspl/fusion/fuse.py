@@ -417,7 +417,7 @@ def _steps(
 
 
 def _run(steps: Iterable[_Step], session: Session) -> Iterator[_Step]:
-    """Run the network on each tile; the next one is read and encoded meanwhile. Yield each when it is fused."""
+    """Run the network on each tile; the next one is read meanwhile. Yield each when it is fused."""
     for step in one_ahead(steps):
         _fuse_tile(step.tile, session, step.result, step.shares)
         yield step

@@ -187,7 +187,7 @@ def main() -> None:
     parser.add_argument("views", type=Path, help="folder of views")
     parser.add_argument("--table", type=Path, required=True, help="table to write or complete")
     parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
-    parser.add_argument("--only", default="*", metavar="PATTERN", help="rows whose name matches")
+    parser.add_argument("--only", metavar="PATTERN", help="rows whose name matches, the growth rates' included")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16", help="(default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
@@ -197,8 +197,10 @@ def main() -> None:
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
     effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in rows}
-    for variant in (*VARIANTS, *GROWTH_RATES):
-        if variant.name not in done and fnmatch.fnmatch(variant.name, args.only):
+    every = [*VARIANTS, *GROWTH_RATES]
+    chosen = [each for each in every if fnmatch.fnmatch(each.name, args.only)] if args.only else VARIANTS
+    for variant in chosen:
+        if variant.name not in done:
             network = train(variant, views, args.steps, bfloat16=args.precision == "bf16")
             row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
             print(row, flush=True)

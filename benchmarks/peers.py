@@ -58,7 +58,8 @@ def oidn_on_average(lrhs: ReadableRender, hrls: ReadableRender) -> Array:
         read_features(render, render.data_window, render.data_window, features=(RGB, ALBEDO, NORMAL))
         for render in (lrhs, hrls)
     )
-    high |= {name: clip(high[name], -1.0, 1.0) for name in (ALBEDO, NORMAL) if name in high}
+    for layers in (low, high):
+        layers |= {name: clip(layers[name], -1.0, 1.0) for name in (ALBEDO, NORMAL) if name in layers}
     scale = len(high[RGB]) // len(low[RGB])
     shares = find_shares([(low if scale == 2 else {RGB: low[RGB]}, high)], find_exposure(low[RGB]))
     means = {name: box_downsample(image, scale) for name, image in high.items()}

@@ -102,7 +102,7 @@ def exposure_of(lrhs: Tensor) -> Tensor:
     exposure = KEY / _log_mean(lit, NO_LIGHT * bright)
     rows, columns = (side // BLOCK for side in y.shape[1:])
     if rows * columns >= MIN_BLOCKS:
-        shares = (y / bright[..., None]).clamp_max(1.0)
+        shares = torch.minimum(y, bright[..., None]) / bright[..., None]
         light, squares = (F.avg_pool2d(values, BLOCK).flatten(1) for values in (shares, shares * shares))
         levels = torch.where(squares > 0, squares / light, torch.nan)
         levels = torch.where(levels >= NO_LIGHT, levels, torch.nan)

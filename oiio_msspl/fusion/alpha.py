@@ -5,7 +5,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from oiio_msspl.aovs.features import RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.arrays import Array
 from oiio_msspl.fusion.guards import check_finite, holds_around
 from oiio_msspl.fusion.tile_features import TilePair
@@ -37,8 +37,11 @@ def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
 
 
 def alpha_as_colour(pair: TilePair) -> tuple[Images, Images]:
-    """The features of both renders of a tile, with their alpha as a grey colour."""
+    """Albedo and normal of both renders of a tile, with their alpha as a grey colour. Layers of light have no meaning
+    beside it."""
     lrhs, hrls = (
-        render | {RGB: np.repeat(np.clip(render["alpha"], 0.0, 1.0), 3, axis=-1)} for render in (pair.lrhs, pair.hrls)
+        {name: render[name] for name in (ALBEDO, NORMAL) if name in render}
+        | {RGB: np.repeat(np.clip(render["alpha"], 0.0, 1.0), 3, axis=-1)}
+        for render in (pair.lrhs, pair.hrls)
     )
     return lrhs, hrls

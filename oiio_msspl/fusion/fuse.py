@@ -253,7 +253,7 @@ class _Picture:
     place: Place
     """Its pixels in the tile."""
     pair: TilePair
-    """Without the colour."""
+    """With alpha, albedo and normal of the HRLS only."""
     lrhs: Images | None = None
     """Inputs of the model; None for a tile that is empty everywhere."""
     hrls: Images | None = None
@@ -321,7 +321,7 @@ class _Pair:
         return plan_tiles(self.grid, self._session.contract, self._session.stride, self._part)
 
     def prepare(self, tile: Tile) -> _PreparedTile:
-        """Read a tile, dim fireflies and encode its features."""
+        """Read a tile and dim fireflies."""
         contract, grid = self._session.contract, self.grid
         features = [*contract.hrls, "alpha"]
         pair = read_tile(tile, self._lrhs, grid, self._hr, self._alignment, features, self._hrls_counts)
@@ -352,7 +352,7 @@ class _Pair:
     def _prepare_picture(self, place: Place, pair: TilePair, *, lit: bool) -> _Picture:
         """Dim fireflies, unless no pixel is ``lit``."""
         aovs = tuple(name for name in self._aovs if name in pair.hrls)
-        rest = {name: values for name, values in pair.hrls.items() if name != RGB}
+        rest = {name: values for name, values in pair.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
         picture = _Picture(place, replace(pair, hrls=rest), aovs=aovs)
         if lit:
             lrhs_rgb, picture.hrls = dim_fireflies(pair)
@@ -409,7 +409,8 @@ def _steps(
 ) -> Iterator[_Step]:
     """Prepare the tiles of a frame, one after the other, each inside of ``threads()``."""
     tiles = pair.tiles()
-    shares = pair.sample_shares()
+    with threads():
+        shares = pair.sample_shares()
     for done, tile in enumerate(tiles, start=1):
         with threads():
             prepared = pair.prepare(tile)

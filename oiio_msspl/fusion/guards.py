@@ -24,19 +24,18 @@ from oiio_msspl.parallel import for_row_blocks
 Mask = NDArray[np.bool_]
 
 #: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
-#: render. The LRHS is the mean of s x s HRLS pixels, so s^2 would be the exact bound without noise; 64 leaves room for
-#: the noise of the LRHS.
+#: render, but for rare light (:func:`_rare_light`). The LRHS is the mean of s x s HRLS pixels, so s^2 would be the
+#: exact bound without noise; 64 leaves room for the noise of the LRHS.
 FIREFLY_FACTOR = 64.0
+#: LRHS pixels on a side of the squares in which rare light is looked for, and the share of their pixels that it reaches
+#: at most. What reaches more is a surface or a lamp.
+_SQUARE, _RARE = 8, 0.25
 #: A tile has no noise to remove if its renders differ nowhere by more than this, log-encoded: half a step of an 8-bit
 #: picture.
 NOISE_FREE = 1 / 512
 #: Exposed radiance above which light that both renders show is that of the HRLS. Noise is hardly ever so bright in
 #: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
 LIGHT = 4096.0
-
-
-#: LRHS pixels on a side of the squares in which rare light is looked for.
-_SQUARE = 8
 
 
 def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
@@ -46,8 +45,8 @@ def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
         The LRHS's colour (h, w, 3), and the HRLS's features with its radiance limited.
     """
     lrhs_rgb, hrls = pair.lrhs[RGB], pair.hrls
-    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale), pair.scale)
-    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb, pair.scale), pair.scale)
+    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale), pair)
+    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb, pair), pair.scale)
     dimmed = {name: _limit(hrls[name], hrls_limit, pair.scale) for name in RADIANCE_FEATURES if name in hrls}
     return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
 
@@ -103,29 +102,37 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     return agreed
 
 
-def _brightness_limit(rgb: Array, scale: int) -> Array:
+def _brightness_limit(rgb: Array, pair: TilePair) -> Array:
     """The largest values that the other render may have, (h, w, 3): none where this render is black.
 
-    Where few samples find the light, all 3 x 3 pixels around may have missed it. So light that most squares of pixels
-    around have counts, too. A single sample of it may be s^2 times as bright as the LRHS.
+    Where few samples find the light, all 3 x 3 pixels around may have missed it. So light that is rare, but in most
+    squares of pixels around, counts, too. A single sample of it may be s^2 times as bright as the mean of s x s.
     """
     brightest = max_3x3(rgb)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
-        limit, rare = brightest * np.float32(FIREFLY_FACTOR), _rare_light(rgb)
-        limit = np.where(rare > limit, rare * np.float32(scale**2), limit)
+        limit = brightest * np.float32(FIREFLY_FACTOR)
+        rare = _rare_light(rgb, pair.lrhs_area.y0 % _SQUARE, pair.lrhs_area.x0 % _SQUARE)
+        limit = np.where(rare > limit, rare * np.float32(pair.scale**2), limit)
         return np.where(brightest > 0, limit, np.float32(np.inf))
 
 
-def _rare_light(rgb: Array) -> Array:
-    """How bright the light is that most of the 3 x 3 squares around each pixel have somewhere, (h, w, 3)."""
+def _rare_light(rgb: Array, top: int, left: int) -> Array:
+    """How bright the light is that reaches a few pixels in most of the 3 x 3 squares around each pixel, (h, w, 3).
+
+    Args:
+        top, left: rows and columns that the first square begins before the tile, so that tiles have the same squares.
+    """
     height, width, channels = rgb.shape
-    rows, columns = (-(-side // _SQUARE) for side in (height, width))
-    padded = np.pad(rgb, ((0, rows * _SQUARE - height), (0, columns * _SQUARE - width), (0, 0)))
-    brightest = padded.reshape(rows, _SQUARE, columns, _SQUARE, channels).max(axis=(1, 3))
+    rows, columns = (-(-side // _SQUARE) for side in (top + height, left + width))
+    margins = [(top, rows * _SQUARE - top - height), (left, columns * _SQUARE - left - width), (0, 0)]
+    squares = np.pad(rgb, margins).reshape(rows, _SQUARE, columns, _SQUARE, channels)
+    brightest = squares.max(axis=(1, 3))
+    reached = (squares > brightest[:, None, :, None] / np.float32(FIREFLY_FACTOR)).mean(axis=(1, 3))
+    brightest[reached > _RARE] = 0
     around = np.pad(brightest, ((1, 1), (1, 1), (0, 0)), mode="edge")
     nine = np.stack([around[y : y + rows, x : x + columns] for y in range(3) for x in range(3)])
     light = np.median(nine, axis=0)
-    return light.repeat(_SQUARE, axis=0).repeat(_SQUARE, axis=1)[:height, :width]
+    return light.repeat(_SQUARE, axis=0).repeat(_SQUARE, axis=1)[top : top + height, left : left + width]
 
 
 def max_3x3(values: Array) -> Array:

@@ -53,7 +53,7 @@ def plan_tiles(grid: Window, contract: Contract, stride: int = 1, part: Window |
     """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
     There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
-    The offsets of all tiles are multiples of the model's tile alignment, so that a network that works on blocks of
+    The offsets of all tiles are multiples of the contract's alignment, so that a network that works on blocks of
     pixels divides a tile as it divides the frame.
 
     Args:

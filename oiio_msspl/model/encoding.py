@@ -33,8 +33,8 @@ NO_LIGHT = 1e-10
 #: Side, in pixels, of the squares that show how noisy a frame is, and how many a frame has at least. In fewer of them,
 #: one lamp could decide.
 BLOCK, MIN_BLOCKS = 8, 64
-#: Largest exposed luminance at which the light of a square may lie, as a mean over the squares. Frames with little
-#: noise are well below.
+#: Largest exposed luminance at which the light of a square may lie: the median of all lit squares, or their log-mean if
+#: that is less. Frames with little noise are well below.
 NOISY = 1.25
 
 _LOG_SCALE = np.float32(1.0 / np.log1p(MU))
@@ -66,7 +66,7 @@ def find_exposure(rgb: Array) -> float:
     exposure = KEY / _log_mean(lit if lit.min() >= darkest else lit[lit >= darkest])
     rows, columns = (side // BLOCK for side in y.shape)
     if rows * columns >= MIN_BLOCKS:
-        shares = np.minimum(y[: rows * BLOCK, : columns * BLOCK] / np.float32(bright), np.float32(1))
+        shares = np.minimum(y[: rows * BLOCK, : columns * BLOCK], np.float32(bright)) / np.float32(bright)
         light, squares = (box_downsample(values, BLOCK) for values in (shares, shares * shares))
         levels = squares[squares > 0] / light[squares > 0]
         levels = levels[levels >= NO_LIGHT]

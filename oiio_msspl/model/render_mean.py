@@ -77,6 +77,8 @@ def lrhs_share(lrhs: Array, hrls: Array) -> float:
         A share in [0.05, 0.95]; 0.5 if both are equally noisy, or not noisy.
     """
     a, b = (x[..., 1:, 1:, :] - x[..., 1:, :-1, :] - x[..., :-1, 1:, :] + x[..., :-1, :-1, :] for x in (lrhs, hrls))
+    if a.size == 0:  # one row or column
+        return 0.5
     covariance = np.mean(a * b)
     lrhs_noise, hrls_noise = (max(float(np.mean(x * x) - covariance), 1e-9) for x in (a, b))
     return float(np.clip(hrls_noise / (lrhs_noise + hrls_noise), *_BOUNDS))

@@ -644,3 +644,24 @@ def test_a_model_that_predicts_no_error_says_so():
     low, high, _ = pair_of(4)
     with pytest.raises(InputError, match="paper-x4 does not predict its error; choose another --model"):
         fuse(low, high, Session(find_model(4, "paper")), error=True)
+
+
+@pytest.mark.parametrize("size", [(1, 32), (32, 1), (2, 2)])
+def test_the_smallest_frames_are_fused(size):
+    rng = np.random.default_rng(0)
+    low, high = (rng.random((n * size[0], n * size[1], 3), np.float32) for n in (1, 2))
+    fused = fuse(Render.from_arrays("lr", rgb=low), Render.from_arrays("hr", rgb=high), Session(find_model(2)))
+    assert np.isfinite(fused.rgb).all() and fused.rgb.shape == high.shape
+
+
+def test_alpha_does_not_depend_on_layers_of_light():
+    """Though `paper` reads them beside the beauty."""
+    rng, session = np.random.default_rng(0), Session(find_model(2, "paper"))
+    alpha = rng.random((64, 96, 1), np.float32)
+    low = Render.from_arrays("lr", rgb=downsample(picture(64, 96), 2).astype(np.float32), alpha=alpha[::2, ::2])
+    light = {name: noisy(picture(64, 96), 1) for name in ("diffuse", "specular")} | {"variance": alpha}
+    one, other = (
+        fuse(low, Render.from_arrays("hr", rgb=picture(64, 96), alpha=alpha, **layers), session).alpha
+        for layers in ({}, light)
+    )
+    np.testing.assert_array_equal(one, other)

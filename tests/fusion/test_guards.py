@@ -6,15 +6,19 @@ import pytest
 
 from oiio_msspl.aovs.features import ALBEDO, RADIANCE_FEATURES, RGB
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.guards import FIREFLY_FACTOR, dim_fireflies
+from oiio_msspl.fusion.guards import FIREFLY_FACTOR, _rare_light, dim_fireflies
 from oiio_msspl.fusion.tile_features import TilePair
 
 
-def tile(lrhs, hrls):
-    """A tile of x2 without a border."""
+def tile(lrhs, hrls, scale=2):
+    """A tile without a border."""
     size = len(lrhs)
-    area, whole, pixels = Window(0, 0, size, size), Window(0, 0, 2 * size, 2 * size), (slice(0, size), slice(0, size))
-    return TilePair({RGB: lrhs}, hrls, 2, area, whole, whole, pixels, pixels)
+    area, whole, pixels = (
+        Window(0, 0, size, size),
+        Window(0, 0, scale * size, scale * size),
+        (slice(0, size), slice(0, size)),
+    )
+    return TilePair({RGB: lrhs}, hrls, scale, area, whole, whole, pixels, pixels)
 
 
 @pytest.mark.parametrize("feature", RADIANCE_FEATURES)
@@ -67,3 +71,28 @@ def test_a_lamp_makes_no_fireflies_around_it_believable():
     _, dimmed = dim_fireflies(tile(low, {RGB: high}))
     assert dimmed[RGB][80, 80].max() == np.float32(0.01) * FIREFLY_FACTOR
     assert (dimmed[RGB][48:64, 48:64] == 1e4).all()
+
+
+@pytest.mark.parametrize("edge", [24, 25, 31])
+@pytest.mark.parametrize("scale", [2, 4, 8])
+def test_a_firefly_near_the_edge_of_a_bright_area_is_one(scale, edge):
+    """As beside a window, wherever squares of pixels lie."""
+    for diagonal in (0, 1):
+        y, x = np.mgrid[:48, :48]
+        low = np.where(x + diagonal * (y - 24) < edge, 10, 0.01)[..., None].repeat(3, 2).astype(np.float32)
+        high = low.repeat(scale, 0).repeat(scale, 1)
+        pixel = 24 * scale, (edge + 4) * scale
+        high[pixel] = 5000
+        _, dimmed = dim_fireflies(tile(low, {RGB: high}, scale))
+        assert dimmed[RGB][pixel].max() == np.float32(0.01) * FIREFLY_FACTOR
+
+
+def test_tiles_have_the_same_squares():
+    """Wherever they begin."""
+    rng = np.random.default_rng(0)
+    low = (1e-4 + 40 * (rng.random((64, 64, 1)) < 0.1)).repeat(3, 2).astype(np.float32)
+    whole = _rare_light(low, 0, 0)
+    assert whole.any()
+    for y, x in ((3, 5), (8, 2)):
+        part = _rare_light(low[y:, x:], y % 8, x % 8)
+        np.testing.assert_array_equal(part[24:, 24:], whole[y + 24 :, x + 24 :])

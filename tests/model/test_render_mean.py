@@ -23,6 +23,12 @@ def test_without_noise_both_renders_count_alike():
     assert lrhs_share(image, image) == 0.5
 
 
+@pytest.mark.parametrize("shape", [(1, 32, 3), (32, 1, 3)])
+def test_of_one_row_both_renders_count_alike(shape):
+    """There is nothing to compare."""
+    assert lrhs_share(np.ones(shape, np.float32), np.ones(shape, np.float32)) == 0.5
+
+
 def test_layers_of_the_lrhs_count_if_they_show_the_same():
     """And only if both renders have them."""
     clean = 0.3 + 0.4 * picture(192, 192).clip(0, 1)

@@ -23,7 +23,7 @@ class Goal:
     method: str
     other: str
     wanted: tuple[float, float, float]
-    """For each of ``AVERAGES``."""
+    """For each of ``AVERAGES``. With unequal shares, 2 spp can't be rendered."""
     measure: str = "PSNR"
 
     def cell(self, rows: Sequence[Row]) -> tuple[list[str], int, int]:
@@ -49,7 +49,7 @@ ACCURACY = (
     Goal("`fast` and OIDN's quality fast on the HRLS", FAST, "OIDN fast on the HRLS", (0, 0, 0)),
     Goal("`best` and OIDN with the same samples", BEST, SAME_SAMPLES, (-0.1, 0, 0)),
     Goal("`best` and OIDN with the same samples", BEST, SAME_SAMPLES, (1, 1, 1), "RelMSE"),
-    Goal("the same, HRLS with 3/4 of the samples", f"{BEST}, 3:1", SAME_SAMPLES, (-0.1, 0, 0)),
+    Goal("the same, HRLS with 3/4 of the samples", f"{BEST}, 3:1", SAME_SAMPLES, (0, 0, 0)),
     Goal("the same, HRLS with 3/4 of the samples", f"{BEST}, 3:1", SAME_SAMPLES, (1, 1, 1), "RelMSE"),
 )
 #: A method, what its time is compared with, and the largest ratio.
@@ -70,7 +70,7 @@ def accuracy(tables: Mapping[str, Sequence[Row]]) -> str:
     for goal in ACCURACY:
         cells = [goal.cell(rows) for rows in tables.values()]
         sign = "at least" if goal.measure == "PSNR" else "at most"
-        wanted = ", ".join(f"{value:g}" for value in dict.fromkeys(goal.wanted))
+        wanted = ", ".join(f"{value:g}" for value in (goal.wanted if len(set(goal.wanted)) > 1 else goal.wanted[:1]))
         reached = f"{sum(cell[1] for cell in cells)} of {sum(cell[2] for cell in cells)}"
         body.append([goal.title, goal.measure, f"{sign} {wanted}", *(", ".join(cell[0]) for cell in cells), reached])
     return results.markdown(["compared", "measure", "wanted", *tables, "reached"], body)

@@ -2,7 +2,8 @@
 """Training: networks, data, the run, and export to ONNX. The only part of the project that needs PyTorch.
 
 Networks: ``paper`` is the paper's, ``joint`` and ``ensemble`` are ours; ``networks`` lists those that ``train`` trains.
-``ops``, ``encoding``, ``oidn`` and ``mean_denoiser`` are what they are made of.
+``ops``, ``encoding``, ``pu_curve``, ``oidn``, ``render_mean`` and ``mean_denoiser`` are what they are made of.
 Training: ``data`` draws pairs from views of :mod:`datagen`, ``losses``, ``validation``, ``train``, ``checkpoints``.
-Checkpoints: ``average``, ``prune`` and ``error`` change one; ``export`` and ``quantise`` make a model of it.
+Checkpoints: ``average``, ``prune`` and ``error`` change one. ``export``, ``gpu`` and ``quantise`` make a model of it:
+``tracing`` and ``whole_model`` write its graph.
 """

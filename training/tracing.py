@@ -13,8 +13,8 @@ from onnxscript import opset18
 from torch import nn
 from torch.utils._pytree import tree_leaves, tree_map
 
-#: Operators and file format that ONNX Runtime 1.14 and newer understand.
-OPSET, IR_VERSION = 18, 8
+#: Operators and file format of all models.
+OPSET, IR_VERSION = 18, 9
 
 
 def traced(

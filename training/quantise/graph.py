@@ -15,6 +15,7 @@ from training.oidn import run_unet
 from training.pu_curve import largest_log_encoded, pu_encode_log
 from training.quantise.codes import INPUT_CHANNELS
 from training.quantise.gptq import COLOURS, Fit
+from training.tracing import IR_VERSION, OPSET
 
 #: Entries of the table from log-encoded to PU-encoded radiance.
 ENTRIES = 1 << 16
@@ -35,7 +36,7 @@ class Nodes:
     ) -> onnx.ModelProto:
         values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
         graph = helper.make_graph(self.nodes, name, inputs, outputs, [*values, *self.embedded])
-        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", 18)], ir_version=9)
+        return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
 
     def embed(self, model: onnx.ModelProto, prefix: str, names: dict[str, str]) -> None:
         """Add the graph of a model.

@@ -33,8 +33,8 @@ from oiio_msspl.metrics import psnr
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.devices import gpu_file
 from oiio_msspl.model.render_mean import Images, Shares
+from training import ensemble
 from training.checkpoints import load as load_checkpoint
-from training.ensemble import EnsembleFusion, load_weights
 from training.export import denoiser_for
 from training.joint import JointFusion
 from training.whole_model import InTorch
@@ -83,7 +83,7 @@ class InPyTorch(Session):
         assert isinstance(network, JointFusion)
         fuse: Callable[..., Sequence[torch.Tensor]] = network.fuse
         if family == "ensemble":
-            fuse = EnsembleFusion(network, load_weights(CHECKPOINTS[family])[0]).eval()
+            fuse, _ = ensemble.load(CHECKPOINTS[family], network)
         self._model = InTorch(self.contract, fuse, denoiser_for(network, self.contract.denoiser))
 
     @torch.inference_mode()

@@ -5,12 +5,12 @@ from __future__ import annotations
 
 import numpy as np
 
+from benchmarks.every_second_pixel import on_every_second_pixel, without_grid
 from benchmarks.oidn import denoise, denoise_prefiltered, run_filter
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.arrays import Array, box_downsample, clip, repair
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.exr.render import ReadableRender
-from oiio_msspl.fusion.spread import STRIDE, join, without_grid
 from oiio_msspl.fusion.tile_features import read_features
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import find_shares
@@ -27,16 +27,10 @@ def oidn_prefiltered(source: ReadableRender) -> Array:
 
 
 def oidn_split(source: ReadableRender) -> Array:
-    """:func:`oidn_prefiltered` on every second pixel, put together as :mod:`oiio_msspl.fusion.spread` does."""
+    """:func:`oidn_prefiltered` on every second pixel, see :mod:`benchmarks.every_second_pixel`."""
     inputs = _inputs(source)
     exposure = find_exposure(inputs["color"])
-    places = [(slice(y, None, STRIDE), slice(x, None, STRIDE)) for y in range(STRIDE) for x in range(STRIDE)]
-    pictures = (
-        denoise_prefiltered(**{name: np.ascontiguousarray(image[place]) for name, image in inputs.items()})
-        for place in places
-    )
-    height, width = inputs["color"].shape[:2]
-    joined = join(zip(places, pictures, strict=True), (height, width))
+    joined = on_every_second_pixel(denoise_prefiltered, inputs)
     return decode_radiance(without_grid(encode_radiance(joined, exposure)), exposure)
 
 

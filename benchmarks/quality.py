@@ -16,9 +16,8 @@ Methods that get an LRHS and an HRLS, each with half of the samples as in the pa
 
 Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), "full resolution" and
 "OIDN, same samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
-:func:`benchmarks.oidn.denoise_prefiltered`. "OIDN prefiltered and split" is that on every second pixel, put together as
-``joint-x2-spread`` does (:mod:`oiio_msspl.fusion.spread`); no tool offers it. All others are OIDN's plain call with the
-quality "high".
+:func:`benchmarks.oidn.denoise_prefiltered`. "OIDN prefiltered and split" is that on every second pixel
+(:mod:`benchmarks.every_second_pixel`). All others are OIDN's plain call with the quality "high".
 """
 
 from __future__ import annotations

@@ -40,7 +40,7 @@ from benchmarks.temporal import report as temporal_report
 from benchmarks.temporal.methods import ALONE, NEIGHBOURS, QUALITIES
 from benchmarks.temporal.methods import SCALES as TEMPORAL_SCALES
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
-from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.contract import SCALES, SPREAD
 
 ROOT = Path(__file__).parents[1]
 FAMILIES = ("paper", "joint-small", "joint", "ensemble")
@@ -110,15 +110,15 @@ Found = Mapping[Hashable, Row]
 SPREAD_NOISE = {
     "HRLS": "HRLS alone",
     "joint-x2": "`joint-x2`",
-    "joint-small-x2-spread": "`--quality fast` (`joint-small-x2-spread`)",
-    "joint-x2-spread": "`--quality balanced` (`joint-x2-spread`)",
-    "ensemble-x2-spread": "`--quality best` (`ensemble-x2-spread`)",
+    "joint-small-spread-x2": "`--quality fast` (`joint-small-spread-x2`)",
+    "joint-spread-x2": "`--quality balanced` (`joint-spread-x2`)",
+    "ensemble-spread-x2": "`--quality best` (`ensemble-spread-x2`)",
     "paper-x2": "`paper-x2`",
     "OIDN on the HRLS": "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS": "OIDN on the HRLS, prefiltered",
     "OIDN, same samples": "OIDN at full resolution",
     "OIDN prefiltered, same samples": "OIDN at full resolution, prefiltered",
-    "OIDN prefiltered and split, same samples": "the same on every second pixel, as `joint-x2-spread` does",
+    "OIDN prefiltered and split, same samples": "the same on every second pixel",
 }
 
 
@@ -210,15 +210,45 @@ def same_views() -> str:
     clean = versus.clean_scenes(films["box"])
     body = []
     for method in SAME_VIEWS:
-        names = {"box": method, "gaussian": f"{method}-spread" if method.startswith(FAMILIES) else method}
+        spread = method.replace("-x", f"{SPREAD}-x") if method.startswith(FAMILIES) else method
+        names = {"box": method, "gaussian": spread}
         line = [title(method)]
         for spp in (2, 8):
             line += [quality.cell(found[film][MEAN, spp, name], "psnr", "relmse") for film, name in names.items()]
-            box, spread = ([found[film][n, spp, name]["psnr"] for n in clean] for film, name in names.items())
-            line.append(versus.cell(versus.with_interval(np.subtract(spread, box)), "+.2f"))
+            box, gaussian = ([found[film][n, spp, name]["psnr"] for n in clean] for film, name in names.items())
+            line.append(versus.cell(versus.with_interval(np.subtract(gaussian, box)), "+.2f"))
         body.append(line)
     head = [f"{spp} spp, {name}" for spp in (2, 8) for name in ("box", "Gaussian", "difference, dB")]
     return f"{results.markdown(['PSNR / RelMSE', *head], body)}\n{quality.mean_note(films['box'])}\n"
+
+
+def gpu_times() -> str:
+    """Milliseconds a frame on a GPU."""
+    found = results.index(rows := results.read("gpu"), "size", "method")
+    sizes = dict.fromkeys(row["size"] for row in rows)
+    body = []
+    for method in dict.fromkeys(row["method"] for row in rows):
+        taken = [found[size, method] for size in sizes]
+        last = taken[-1]
+        cells = [f"{row['ms']:.1f} ms" for row in taken]
+        cells += [f"{last['ms'] / found[last['size'], peer]['ms']:.2f}" for peer in ("OIDN", "OIDN prefiltered")]
+        cells += [f"{last[name]:.1f} ms" if name in last else "" for name in ("with_copies_ms", "floor_ms")]
+        body.append([title(method), *cells])
+    of_last = [f"time / {peer}'s" for peer in ("OIDN", "prefiltered OIDN")] + ["with copies", "convolutions, at least"]
+    (card,) = {row["card"] for row in rows}
+    return f"{results.markdown([card, *sizes, *of_last], body)}\n"
+
+
+def by_filter(rows: Sequence[Row] | None = None) -> str:
+    """Accuracy for each pixel filter, by :mod:`benchmarks.pixel_filters`."""
+    rows = rows or results.read("pixel_filters")
+    found = results.index(rows, "filter", "spp", "method")
+    columns = list(dict.fromkeys((row["spp"], row["method"]) for row in rows))
+    body = [
+        [kind, *(quality.cell(found[kind, *column], "psnr", "relmse") for column in columns)]
+        for kind in dict.fromkeys(row["filter"] for row in rows)
+    ]
+    return results.markdown(["PSNR / RelMSE", *(f"{spp} spp, {title(method)}" for spp, method in columns)], body)
 
 
 def layer_worth() -> str:
@@ -470,6 +500,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         total,
         filters,
         same_views,
+        by_filter,
         layer_worth,
         cycles,
         luxcore,
@@ -479,6 +510,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         stability,
         pair_checks,
     ),
+    ROOT / "docs/guide/gpu.md": (gpu_times,),
     ROOT / "docs/design/passes.md": (passes, single_passes, passes_time),
     ROOT / "docs/design/temporal.md": (temporal_passes, temporal_time, temporal_counts),
 }
@@ -486,10 +518,11 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
 
 def measured_models() -> str:
     """The table of :func:`oiio_msspl.model.catalogue.measured`, which ``msspl models`` prints."""
-    means = means_of(results.read("quality"))
+    sets = {noise: means_of(results.read(table)) for noise, table in (("", "quality"), (SPREAD, "quality_gauss"))}
     runs = [results.index(results.read(table), "method") for table, _ in MACHINES.values()]
     lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
+        means = sets[SPREAD if f"{SPREAD}-x" in name else ""]
         cells = [
             f"{means[spp, name][m]:.4g}" if (spp, name) in means else "" for spp in (2, 8) for m in ("psnr", "relmse")
         ]

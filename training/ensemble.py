@@ -9,6 +9,9 @@ Open Image Denoise (OIDN) denoises the HRLS as its documentation recommends: bas
 and the large network denoises the colour with them. Its result and that of ``joint`` err in different places, so a
 weighted mean has a smaller error than either. Only the weights are learnt here. The first command writes the two
 results for many training pairs, from the 8-bit networks that ship; the second trains on them.
+
+``ensemble-spread`` is the plain mean of ``joint-spread`` and of a large network that reads its result, see
+:mod:`training.large`.
 """
 
 from __future__ import annotations
@@ -18,6 +21,7 @@ import itertools
 from collections.abc import Iterator, Sequence
 from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -27,19 +31,9 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from oiio_msspl.metrics import psnr, relmse
 from training import losses
-from training.encoding import from_srgb, log_decode, log_to_pu, pu_to_log, srgb
-from training.joint import JointFusion, highest_allowed
-from training.oidn import (
-    ALBEDO_BASE,
-    BASE,
-    LARGE,
-    LARGE_HDR,
-    NORMAL_BASE,
-    Shape,
-    convolutions,
-    pretrained_weights,
-    run_unet_on_tensors,
-)
+from training.encoding import log_decode
+from training.joint import JointFusion, within_renders
+from training.large import LargeDenoiser, LayerDenoisers
 from training.ops import box_downsample, conv3x3, log2_scale, upsample
 from training.paper import LRHS_CHANNELS
 from training.train import lr_factor, warming_ema
@@ -68,7 +62,7 @@ class BandWeights(nn.Module):
     """A U-Net that weighs the results of ``joint`` and of OIDN's large network, in three bands of each pixel.
 
     Weights lie in [0, 1] and start at one half. The result stays near the range of the two (``AGREED``), and is clamped
-    to that of ``joint``, see :func:`training.joint.highest_allowed`. Sizes are multiples of ``multiple`` HRLS pixels.
+    to that of ``joint``, see :func:`training.joint.within_renders`. Sizes are multiples of ``multiple`` HRLS pixels.
     """
 
     multiple = 16
@@ -107,7 +101,6 @@ class BandWeights(nn.Module):
             The weighted mean, and the logarithm of its expected error, as :meth:`training.joint.JointFusion.fuse`.
         """
         samples = hrls[:, :3]
-        low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
         full = F.pixel_unshuffle(torch.cat([joint, large, samples, albedo, normal], dim=1), 2)
         values = torch.cat([full, upsample(lrhs, 2 ** (log2_scale(lrhs, hrls) - 1))], dim=1)
         values = F.relu(self.enter(values.to(self.enter.weight.dtype)))
@@ -130,10 +123,24 @@ class BandWeights(nn.Module):
         for band, weight in zip(bands, torch.sigmoid(logits).split(1, dim=1), strict=True):
             fused = fused + weight * band
         fused = torch.clamp(fused, AGREED[0] * torch.minimum(joint, large), AGREED[1] * torch.maximum(joint, large))
-        lowest, highest = (
-            upsample(sign * highest_allowed(sign * low, sign * mean, sign * samples), 2) for sign in (-1.0, 1.0)
-        )
-        return torch.clamp(fused, lowest, highest), log_error
+        return within_renders(fused, lrhs, samples), log_error
+
+
+class PlainMean(nn.Module):
+    """The mean of the two results, within the range of the renders; its arguments are those of :class:`BandWeights`."""
+
+    def forward(
+        self,
+        joint: Tensor,
+        large: Tensor,
+        albedo: Tensor,
+        normal: Tensor,
+        lrhs: Tensor,
+        hrls: Tensor,
+        joint_error: Tensor,
+    ) -> tuple[Tensor, Tensor]:
+        """See :meth:`BandWeights.forward`."""
+        return within_renders(0.5 * (joint + large), lrhs, hrls[:, :3]), joint_error
 
 
 class EnsembleFusion(nn.Module):
@@ -141,43 +148,34 @@ class EnsembleFusion(nn.Module):
 
     Args:
         joint: a finished network; only its part after the denoiser runs.
-        weights: of the two results.
+        large: denoises the HRLS.
+        weights: of the two results, a :class:`BandWeights` or a :class:`PlainMean`.
     """
 
-    def __init__(self, joint: JointFusion, weights: BandWeights) -> None:
+    def __init__(self, joint: JointFusion, large: LargeDenoiser, weights: nn.Module) -> None:
         super().__init__()
-        self.joint, self.weights = joint, weights
-        self.oidn = nn.ModuleDict({name: _convolutions(name) for name in (ALBEDO_BASE, NORMAL_BASE, LARGE_HDR)})
+        self.joint, self.large, self.weights = joint, large, weights
+        self.layers = LayerDenoisers()
 
     def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """See :meth:`training.joint.JointFusion.fuse`. Also returns the denoised albedo and normal, in [0, 1]."""
         joint, error = self.joint.fuse(lrhs, hrls)
-        albedo = from_srgb(self._run(ALBEDO_BASE, BASE, srgb(hrls[:, 3:6])))
-        normal = self._run(NORMAL_BASE, BASE, 0.5 * hrls[:, 6:9] + 0.5)
-        large = self._run(LARGE_HDR, LARGE, torch.cat([log_to_pu(hrls[:, :3]), albedo, normal], dim=1))
-        return *self.weights(joint, pu_to_log(large), albedo, normal, lrhs, hrls, error), albedo, normal
-
-    def _run(self, network: str, shape: Shape, image: Tensor) -> Tensor:
-        convs = self.oidn[network]
-        image = image.to(next(convs.parameters()).dtype)
-        return run_unet_on_tensors(shape, [image], lambda name, values: F.relu(convs[name](values))).float().clamp(0, 1)
+        albedo, normal = self.layers(hrls[:, 3:6], hrls[:, 6:9])
+        large = self.large(hrls[:, :3], albedo, normal, joint)
+        return *self.weights(joint, large, albedo, normal, lrhs, hrls, error), albedo, normal
 
 
-def _convolutions(network: str) -> nn.ModuleDict:
-    weights = pretrained_weights(network)
-    convs = {}
-    for name in convolutions(weights):
-        kernels, bias = weights[f"{name}.weight"], weights[f"{name}.bias"]
-        convs[name] = nn.Conv2d(kernels.shape[1], len(kernels), 3, padding=1)
-        convs[name].load_state_dict({"weight": kernels, "bias": bias})
-    return nn.ModuleDict(convs)
+def load(path: Path, joint: JointFusion) -> tuple[EnsembleFusion, dict[str, Any]]:
+    """The ensemble of a checkpoint with its ``joint``, and how it was trained.
 
-
-def load_weights(path: Path) -> tuple[BandWeights, dict[str, int]]:
-    """The network that :func:`main` has written, and how many steps and pairs it was trained with."""
-    network = BandWeights()
+    A checkpoint of :func:`main` has the weights of the results; one of :mod:`training.large` the large network.
+    """
     stored = torch.load(path, map_location="cpu", weights_only=True)
-    network.load_state_dict({name: values.float() for name, values in stored.pop("network").items()})
+    large, weights = LargeDenoiser(reads_joint="large" in stored), BandWeights()
+    learnt: nn.Module = large if large.reads_joint else weights
+    state = stored.pop("large" if large.reads_joint else "network")
+    learnt.load_state_dict({name: values.float() for name, values in state.items()})
+    network = EnsembleFusion(joint, large, PlainMean() if large.reads_joint else weights)
     return network.requires_grad_(False).eval(), stored
 
 

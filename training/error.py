@@ -21,7 +21,7 @@ from training.joint import JointFusion
 from training.networks import preparation, run
 from training.train import lr_factor
 
-PATCH, BATCH, LEARNING_RATE = 192, 4, 2e-3
+PATCH, BATCH, LEARNING_RATE = 256, 3, 2e-3
 
 
 def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prepare | None, steps: int) -> float:

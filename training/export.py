@@ -30,7 +30,7 @@ from torch import nn
 
 from datagen.views import Folder, View
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.contract import SCALES, SPREAD, Contract
 from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
 from training.encoding import log_encode
@@ -65,7 +65,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
     return Contract(
         **features,
         denoiser=denoiser,
-        bytes_per_pixel=MEMORY[name.rpartition("-x")[0]],
+        bytes_per_pixel=MEMORY[name.rpartition("-x")[0].removesuffix(SPREAD)],
         name=name,
         scale=scale,
         alignment=alignment,
@@ -85,10 +85,10 @@ def network_example(network: Network, scale: int, alignment: int) -> tuple[torch
 
 def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
     """The denoiser of both renders' mean for a value of ``Contract.denoiser``. Where it is not the network's own, it is
-    that of `joint`."""
+    that of `joint`, or of `joint-spread`."""
     if network.denoiser(SCALES[0]) == mode:
         return network.mean_denoiser
-    joint, _ = load(CHECKPOINTS / "joint.pt")
+    joint, _ = load(CHECKPOINTS / ("joint_spread.pt" if network.spread else "joint.pt"))
     assert isinstance(joint, JointFusion)
     return joint.mean_denoiser
 

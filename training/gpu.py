@@ -31,11 +31,13 @@ from torch import Tensor, nn
 
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import GPU_FOLDER
+from training import ensemble
 from training.checkpoints import load
-from training.ensemble import BandWeights, EnsembleFusion, load_weights
+from training.ensemble import EnsembleFusion
 from training.export import denoiser_for, network_example
 from training.joint import JointFusion
 from training.mean_denoiser import ALIGNMENT, MeanDenoiser
+from training.oidn import FineTunedUNet
 from training.tracing import traced
 from training.whole_model import SMALL, save, whole_model
 
@@ -54,7 +56,7 @@ class Fuse(nn.Module):
         return self.network.fuse(lrhs, hrls)
 
 
-P = TypeVar("P", JointFusion, MeanDenoiser)
+P = TypeVar("P", JointFusion, FineTunedUNet)
 
 
 def in_half_floats(network: P) -> P:
@@ -72,11 +74,14 @@ def joint_in_half_floats(network: JointFusion) -> JointFusion:
     return network
 
 
-def ensemble_in_half_floats(network: JointFusion, weights: BandWeights) -> EnsembleFusion:
-    """The ensemble with a network of :func:`joint_in_half_floats`."""
-    ensemble = EnsembleFusion(network, copy.deepcopy(weights).half())
-    ensemble.oidn.half()
-    return ensemble.eval()
+def ensemble_in_half_floats(ensemble: EnsembleFusion) -> EnsembleFusion:
+    """A copy of an ensemble whose convolutions compute in half floats."""
+    layers = copy.deepcopy(ensemble.layers)
+    layers.albedo, layers.normal = in_half_floats(layers.albedo), in_half_floats(layers.normal)
+    weights = copy.deepcopy(ensemble.weights).half()
+    result = EnsembleFusion(joint_in_half_floats(ensemble.joint), in_half_floats(ensemble.large), weights)
+    result.layers = layers
+    return result.eval()
 
 
 @torch.inference_mode()
@@ -129,17 +134,18 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("models", type=Path, nargs="+", help="the network's files for CPUs, one for each scale")
-    parser.add_argument("--ensemble", type=Path, metavar="WEIGHTS", help="weights of the ensemble models")
+    parser.add_argument("--ensemble", type=Path, metavar="CHECKPOINT", help="checkpoint of the ensemble models")
     args = parser.parse_args()
     joint, _ = load(args.checkpoint)
     if not isinstance(joint, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
     modes = {Contract.of_file(path).denoiser for path in args.models}
     denoisers = {mode: in_half_floats(denoiser_for(joint, mode)) for mode in modes}
-    joint = joint_in_half_floats(joint)
-    network: JointFusion | EnsembleFusion = joint
+    network: JointFusion | EnsembleFusion
     if args.ensemble:
-        network = ensemble_in_half_floats(joint, load_weights(args.ensemble)[0])
+        network = ensemble_in_half_floats(ensemble.load(args.ensemble, joint)[0])
+    else:
+        network = joint_in_half_floats(joint)
     folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
     folder.mkdir(exist_ok=True)
     contracts = {folder / path.name: Contract.of_file(path) for path in args.models}

@@ -29,7 +29,7 @@ from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER
+from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, SPREAD
 from oiio_msspl.model.render_mean import lrhs_share
 from training.encoding import log_decode, log_encode, log_to_pu, pu_to_log
 from training.mean_denoiser import MeanDenoiser
@@ -83,14 +83,17 @@ class JointFusion(nn.Module):
     Args:
         kept: output channels that pruning has kept, by convolution; all channels of the others.
         size: a key of ``SIZES``.
+        spread: it has learnt from pixel filters that spread each sample, too, and has a denoiser of its own.
     """
 
     multiple = 16
 
-    def __init__(self, kept: Mapping[str, Sequence[int]] | None = None, size: str = "usual") -> None:
+    def __init__(
+        self, kept: Mapping[str, Sequence[int]] | None = None, size: str = "usual", *, spread: bool = False
+    ) -> None:
         super().__init__()
-        self.kept, self.size = dict(kept or {}), size
-        self.config = {"kept": self.kept, "size": size}
+        self.kept, self.size, self.spread = dict(kept or {}), size, spread
+        self.config = {"kept": self.kept, "size": size, "spread": spread}
         self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, sum(HRLS_FEATURES[name] for name in FEATURES)
         self.pretrained = pretrained_weights(SIZES[size])
         self.mean_denoiser = MeanDenoiser(size)
@@ -114,7 +117,8 @@ class JointFusion(nn.Module):
     def denoiser(self, scale: int) -> str:
         """The value of ``Contract.denoiser``. At x4 and x8 the LRHS is so small that the large denoiser takes hardly
         longer than the small one, and is better."""
-        return SMALL_MEAN_DENOISER if self.size == "small" and scale == 2 else MEAN_DENOISER
+        kind = SMALL_MEAN_DENOISER if self.size == "small" and scale == 2 else MEAN_DENOISER
+        return kind + SPREAD if self.spread else kind
 
     def pretrained_channels(self, name: str) -> tuple[list[int], list[int]]:
         """Indices of the outputs and inputs of a pretrained convolution that this network has."""
@@ -241,6 +245,11 @@ def blend(lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logit
                 log_encode(means[level]) if level else samples,
             ],
         )
+    return within_renders(fused, lrhs, samples)
+
+
+def within_renders(fused: Tensor, lrhs: Tensor, samples: Tensor) -> Tensor:
+    """Clamp a result to what the renders allow, see :func:`highest_allowed`; arguments as of :func:`blend`."""
     low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
     lowest, highest = (
         upsample(sign * highest_allowed(sign * low, sign * mean, sign * samples), 2) for sign in (-1.0, 1.0)
@@ -269,14 +278,21 @@ def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
     return torch.maximum(highest_around(lrhs, samples), upsample(expected, scale // 2))
 
 
+def mean_and_noise(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean of an encoded LRHS (1, 3, h, w) and HRLS (1, 16, s*h, s*w), log-encoded (1, 3, h, w), and its noise
+    (1, 1, h, w)."""
+    features = {RGB: log_decode(hrls[:, :3]), ALBEDO: hrls[:, 3:6], NORMAL: hrls[:, 6:9]}
+    means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(lrhs, hrls)))
+    images = (image[0].permute(1, 2, 0).cpu().numpy() for image in (lrhs, means))
+    share = torch.tensor(lrhs_share(*images), device=lrhs.device)
+    colour, noise, *_ = mean_of_renders({RGB: log_decode(lrhs)}, features, {RGB: share})
+    return colour, noise
+
+
 def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
     """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
     low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (lrhs, hrls))
-    features = {RGB: log_decode(high[:, :3]), ALBEDO: high[:, 3:6], NORMAL: high[:, 6:9]}
-    means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(low, high)))
-    share = torch.tensor(lrhs_share(lrhs, means[0].permute(1, 2, 0).numpy()))
-    colour, noise, *_ = mean_of_renders({RGB: log_decode(low)}, features, {RGB: share})
-    return torch.cat([low, colour, noise], dim=1)[0].permute(1, 2, 0).numpy(), hrls
+    return torch.cat([low, *mean_and_noise(low, high)], dim=1)[0].permute(1, 2, 0).numpy(), hrls
 
 
 def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Array, Array], tuple[Array, Array]]:

@@ -7,6 +7,7 @@ No file of this project holds the original weights.
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
@@ -160,3 +161,56 @@ class FineTunedConv(nn.Module):
         result = nn.Conv2d(weight.shape[1], len(weight), 3, padding=1)
         result.load_state_dict({"weight": weight, "bias": bias})
         return result
+
+
+@dataclass(frozen=True)
+class Start:
+    """What the fine-tuning of a whole network starts from."""
+
+    network: str
+    """A key of :data:`training.oidn_weights.NETWORKS`."""
+    shape: Shape
+    readers: tuple[str, ...]
+    """The convolutions that read the input."""
+    extra: int
+    """Input channels that the pretrained network lacks."""
+    frozen: tuple[str, ...] = ()
+    """Convolutions that keep the pretrained weights."""
+
+
+class FineTunedUNet(nn.Module):
+    """A network of Open Image Denoise, fine-tuned to read further channels after its own."""
+
+    def __init__(self, start: Start) -> None:
+        super().__init__()
+        self.start = start
+        pretrained = pretrained_weights(start.network)
+        self.convs = nn.ModuleDict(
+            {
+                name: FineTunedConv(
+                    pretrained[f"{name}.weight"],
+                    pretrained[f"{name}.bias"],
+                    start.extra if name in start.readers else 0,
+                    frozen=name in start.frozen,
+                )
+                for name in convolutions(pretrained)
+            }
+        )
+
+    def run(self, image: Tensor) -> Tensor:
+        """Run the network on an image (N, C, H, W); H and W are multiples of 16."""
+
+        def conv(name: str, values: Tensor) -> Tensor:
+            return F.relu(self.convs[name](values))
+
+        dtype = next(itertools.chain(self.convs.parameters(), self.convs.buffers())).dtype
+        return run_unet_on_tensors(self.start.shape, [image.to(dtype)], conv).float()
+
+    def weights(self) -> dict[str, Tensor]:
+        """Weights and biases of all convolutions, by Open Image Denoise's names."""
+        pairs = {name: conv.total() for name, conv in self.convs.items()}
+        return {
+            f"{name}.{kind}": values.detach()
+            for name, pair in pairs.items()
+            for kind, values in zip(("weight", "bias"), pair, strict=True)
+        }

@@ -34,6 +34,7 @@ from training.data import PAPER_PATCH, PAPER_SAMPLING, Batches, Sampling, spp_ra
 from training.joint import SIZES, JointFusion
 from training.networks import NETWORKS, Network, preparation, run
 from training.paper import MultiResolutionFusion
+from training.pool import PooledBatches
 from training.validation import ValidationPair, evaluate
 
 log = logging.getLogger(__name__)
@@ -130,7 +131,7 @@ def new_network(args: argparse.Namespace) -> Network:
         started = args.out / "checkpoint.pt"
         earlier = started if started.exists() else args.init
         config = checkpoints.read(earlier)["config"] if earlier else {"size": args.size}
-        return JointFusion(**config)
+        return JointFusion(**config | ({"spread": True} if args.spread else {}))
     if len(args.scale) > 1:
         raise SystemExit("--network paper: a network has one --scale")
     return MultiResolutionFusion(args.scale[0])
@@ -189,10 +190,15 @@ class Run:
             self.best_gain = state.get("best_gain", -math.inf)
             log.info("continues at step %d, minute %.1f", self.step, self.elapsed / 60)
         self.schedule = self.new_schedule()
-        self.pairs = Batches(
-            args.data, self.scales, self.patch, self.batch, self.recipe.sampling, args.seed + self.step, self.device,
-            functools.partial(preparation, args.network),
-        )  # fmt: skip
+        seed = args.seed + self.step
+        self.pairs: Batches | PooledBatches
+        if args.pool:
+            self.pairs = PooledBatches(args.pool, self.scales, self.patch, self.batch, seed, self.device)
+        else:
+            self.pairs = Batches(
+                args.data, self.scales, self.patch, self.batch, self.recipe.sampling, seed, self.device,
+                functools.partial(preparation, args.network),
+            )  # fmt: skip
         self.reset_statistics()
 
     def new_schedule(self) -> LambdaLR:
@@ -316,6 +322,14 @@ class Run:
         log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
         write_row(self.args.out / "log.csv", row)
 
+    def spp_range(self, views: list[View | SampleView], scale: int) -> dict[str, list[int]]:
+        """Lowest and highest spp of all pairs, by render."""
+        ranges = [spp_range(view, self.recipe.sampling, scale) for view in views]
+        return {
+            render: [min(each[render][0] for each in ranges), max(each[render][1] for each in ranges)]
+            for render in ranges[0]
+        }
+
     def state(self, scores: dict[str, float]) -> checkpoints.State:
         """The checkpoint, see :mod:`training.checkpoints`."""
         views = self.train_views()
@@ -328,7 +342,7 @@ class Run:
             "step": self.step,
             "seconds": self.elapsed,
             "best_gain": self.best_gain,
-            "training_spp": {str(scale): spp_range(views[0], self.recipe.sampling, scale) for scale in self.scales},
+            "training_spp": {str(scale): self.spp_range(views, scale) for scale in self.scales},
             "provenance": {
                 "steps": self.step,
                 "minutes": round(self.elapsed / 60, 1),
@@ -337,6 +351,7 @@ class Run:
                 "loss": self.loss_name,
                 "preset": self.args.preset,
                 "seed": self.args.seed,
+                **({"init": self.args.init.name} if self.args.init else {}),
                 "views": len(views),
                 "scenes": len({view.scene for view in views}),
                 "sources": sorted({view.source for view in views}),
@@ -375,10 +390,12 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         help="upsampling factors; the paper's network has one",
     )
     parser.add_argument("--data", type=Path, required=True, help="folder of views (.npz)")
+    parser.add_argument("--pool", type=Path, help="joint on a GPU: folder of pairs drawn ahead by training.pool")
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
     parser.add_argument("--network", choices=NETWORKS, default="paper", help="(default: %(default)s)")
     parser.add_argument("--size", choices=SIZES, default="usual", help="joint: (default: %(default)s)")
+    parser.add_argument("--spread", action="store_true", help="joint: for noise that a pixel filter has spread")
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
     parser.add_argument("--only", default="", help="train only the part of the network with this name, such as heads")

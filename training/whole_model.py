@@ -26,7 +26,7 @@ from onnx.external_data_helper import set_external_data
 from torch import Tensor, nn
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.model.contract import MEAN_DENOISER, METADATA_KEY, SMALL_MEAN_DENOISER, Contract
+from oiio_msspl.model.contract import DENOISERS, METADATA_KEY, Contract
 from oiio_msspl.model.encoding import MAX_ENCODED
 from training.encoding import encoded_feature, exposed_feature, log_decode, log_encode
 from training.quantise.codes import INPUT_SLICES, OUTPUT_SLICES, log_encoded_of_code
@@ -36,8 +36,6 @@ from training.tracing import traced
 
 #: Prefixes of tensors in the graph of a model.
 NETWORK, DENOISER = "network.", "denoiser."
-#: Files of the denoisers, by the value of ``Contract.denoiser``.
-DENOISERS = {MEAN_DENOISER: "mean_denoiser", SMALL_MEAN_DENOISER: "mean_denoiser_small"}
 CHECKPOINTS = Path(__file__).parent / "checkpoints"
 #: Tensors of fewer bytes, such as biases, stay in the graph.
 SMALL = 1024
@@ -227,9 +225,14 @@ def network_of(model: onnx.ModelProto) -> onnx.ModelProto:
     return helper.make_model(graph, opset_imports=model.opset_import, ir_version=model.ir_version)
 
 
+def denoiser_file(mode: str) -> str:
+    """Name, without its ending, of the files of a denoiser, a value of ``Contract.denoiser``."""
+    return mode.replace("mean", "mean_denoiser").replace("-", "_")
+
+
 def quantised_denoiser(mode: str) -> onnx.ModelProto | None:
     """The denoiser in 8 bits for a value of ``Contract.denoiser``, as :mod:`training.quantise` has written it."""
-    return onnx.load(CHECKPOINTS / f"{DENOISERS[mode]}.onnx") if mode else None
+    return onnx.load(CHECKPOINTS / f"{denoiser_file(mode)}.onnx") if mode else None
 
 
 def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
@@ -242,10 +245,10 @@ def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
         family: if not empty, the models share all other weights, too, in ``FAMILY.weights``.
     """
     (folder,) = {path.parent for path in models}
-    for mode, name in DENOISERS.items():
+    for mode in DENOISERS:
         group = [model for model in models.values() if _contract(model).denoiser == mode]
         if group:
-            _share_weights(group, folder / f"{name}.weights", DENOISER)
+            _share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
     if family:
         _share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
     for path, model in models.items():

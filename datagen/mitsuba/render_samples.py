@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen import command_line, quality, samples, views
-from datagen.mitsuba.start import start
+from datagen.mitsuba.start import VARIANT, start
 from oiio_msspl.arrays import box_downsample
 
 _RENDERS = 2  # cameras that are rendered, at most, until a reference is clean enough
@@ -125,8 +125,9 @@ def main() -> int:
     )
     parser.add_argument("--rooms", type=Path, help="folder with bathroom2/ and living-room-3/, Mitsuba scenes")
     parser.add_argument("--max-gib", type=float, default=6.0, help="start no new scene above this size (%(default)s)")
+    parser.add_argument("--variant", default=VARIANT, help="of Mitsuba; cuda_ad_rgb for a GPU (%(default)s)")
     args = parser.parse_args()
-    start(args.threads)
+    start(args.threads, args.variant)
     from datagen.mitsuba.assets import Assets
 
     assets = Assets(args.assets)

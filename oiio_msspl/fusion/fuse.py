@@ -31,7 +31,6 @@ from oiio_msspl.fusion.guards import (
 )
 from oiio_msspl.fusion.pair_checks import HrlsAverages, bounded_luminance, check_pair
 from oiio_msspl.fusion.passes import FusedPasses, LayerFuser
-from oiio_msspl.fusion.spread import Place, join, split, without_grid
 from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
 from oiio_msspl.fusion.tiling import (
     MAX_MEMORY,
@@ -205,18 +204,18 @@ def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> in
     frame_bytes = result_bytes(alignment, error=error) + lrhs_bytes
     # The tiles of larger frames are as large. A damaged header may claim millions of tiles.
     part = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + 16384, grid.y0 + 16384))
-    tiles = plan_tiles(part, session.contract, session.stride)
-    return memory_for_tiles(session.contract, tiles, frame_bytes, session.stride)
+    tiles = plan_tiles(part, session.contract)
+    return memory_for_tiles(session.contract, tiles, frame_bytes)
 
 
 def tile_count(alignment: Alignment, session: Session) -> int:
     """The number of tiles that a pair is fused in."""
-    return len(plan_tiles(_grid(alignment, session), session.contract, session.stride))
+    return len(plan_tiles(_grid(alignment, session), session.contract))
 
 
 def _grid(alignment: Alignment, session: Session) -> Window:
     """The LRHS pixels that the network reads: the alignment's grid, extended to a size that the network takes."""
-    return aligned_grid(alignment.grid, session.contract.alignment * session.stride)
+    return aligned_grid(alignment.grid, session.contract.alignment)
 
 
 def result_bytes(alignment: Alignment, *, error: bool) -> int:
@@ -247,11 +246,15 @@ class _FrameShares:
 
 
 @dataclass
-class _Picture:
-    """What the network reads at once: a tile, or every second pixel of one (:mod:`oiio_msspl.fusion.spread`)."""
+class _PreparedTile:
+    """A tile that is ready for the network."""
 
-    place: Place
-    """Its pixels in the tile."""
+    area: Window
+    """The tile's area in HRLS pixels."""
+    target: Window
+    """The part of the HRLS's data window that the tile contributes."""
+    empty: Mask | None
+    """See :meth:`oiio_msspl.fusion.guards.EmptyRegions.mask`."""
     pair: TilePair
     """With alpha, albedo and normal of the HRLS only."""
     lrhs: Images | None = None
@@ -263,19 +266,6 @@ class _Picture:
     """There is no noise to remove: the HRLS is the result."""
     aovs: tuple[str, ...] = ()
     """AOVs of the HRLS whose denoised pixels are kept."""
-
-
-@dataclass
-class _PreparedTile:
-    """A tile that is ready for the network."""
-
-    area: Window
-    """The tile's area in HRLS pixels."""
-    target: Window
-    """The part of the HRLS's data window that the tile contributes."""
-    empty: Mask | None
-    """See :meth:`oiio_msspl.fusion.guards.EmptyRegions.mask`."""
-    pictures: list[_Picture]
 
 
 class _Pair:
@@ -292,7 +282,7 @@ class _Pair:
     ) -> None:
         """
         Args:
-            aovs: see :attr:`_Picture.aovs`.
+            aovs: see :attr:`_PreparedTile.aovs`.
             beauty: that of the frame, if the pair shows a layer of it. Then there is no :meth:`check`.
         """
         self._lr, self._hr, self._alignment, self._session, self._aovs = lr, hr, alignment, session, aovs
@@ -318,7 +308,7 @@ class _Pair:
 
     def tiles(self) -> list[Tile]:
         """The tiles in which the pair is fused. A layer is black where none of them is."""
-        return plan_tiles(self.grid, self._session.contract, self._session.stride, self._part)
+        return plan_tiles(self.grid, self._session.contract, self._part)
 
     def prepare(self, tile: Tile) -> _PreparedTile:
         """Read a tile and dim fireflies."""
@@ -330,8 +320,15 @@ class _Pair:
         empty = self._empty_regions.mask(pair, tile.area.slices(grid))
         # An empty tile may still show surfaces.
         lit = empty is None or not empty.all() or bool(self._aovs)
-        pictures = [self._prepare_picture(place, part, lit=lit) for place, part in self._pictures(pair)]
-        return _PreparedTile(pair.hrls_area, pair.hrls_target, empty, pictures)
+        rest = {name: values for name, values in pair.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
+        aovs = tuple(name for name in self._aovs if name in pair.hrls)
+        prepared = _PreparedTile(pair.hrls_area, pair.hrls_target, empty, replace(pair, hrls=rest), aovs=aovs)
+        if lit:
+            lrhs_rgb, prepared.hrls = dim_fireflies(pair)
+            prepared.lrhs = pair.lrhs | {RGB: lrhs_rgb}
+            prepared.lights = bright_lights(lrhs_rgb, prepared.hrls[RGB], self.exposure)
+            prepared.noise_free = is_noise_free(pair, lrhs_rgb, prepared.hrls[RGB], self.exposure)
+        return prepared
 
     def _lit_part(self, reach: int) -> Window | None:
         """The part of the grid beyond which both renders are black, and as far from light as ``reach``, see
@@ -345,22 +342,6 @@ class _Pair:
         both = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
         return Window(*both).intersect(self.grid)
 
-    def _pictures(self, pair: TilePair) -> Iterable[tuple[Place, TilePair]]:
-        """What the network reads at once of a tile."""
-        return split(pair) if self._session.stride > 1 else [((slice(None), slice(None)), pair)]
-
-    def _prepare_picture(self, place: Place, pair: TilePair, *, lit: bool) -> _Picture:
-        """Dim fireflies, unless no pixel is ``lit``."""
-        aovs = tuple(name for name in self._aovs if name in pair.hrls)
-        rest = {name: values for name, values in pair.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
-        picture = _Picture(place, replace(pair, hrls=rest), aovs=aovs)
-        if lit:
-            lrhs_rgb, picture.hrls = dim_fireflies(pair)
-            picture.lrhs = pair.lrhs | {RGB: lrhs_rgb}
-            picture.lights = bright_lights(lrhs_rgb, picture.hrls[RGB], self.exposure)
-            picture.noise_free = is_noise_free(pair, lrhs_rgb, picture.hrls[RGB], self.exposure)
-        return picture
-
     def sample_shares(self) -> _FrameShares:
         """Decide how to average both renders, from a sample of the frame, so that neighbouring tiles agree."""
         contract = self._session.contract
@@ -369,13 +350,11 @@ class _Pair:
         rgb, alpha = [], []
         for band in sample_bands(self._alignment.grid, contract.scale):
             features, counts = [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts()
-            band = aligned_grid(band, self._session.stride)
-            tile = read_tile(Tile(band, band), self._lrhs, self.grid, self._hr, self._alignment, features, counts)
-            for _, pair in self._pictures(tile):
-                lrhs_rgb, hrls = dim_fireflies(pair)
-                rgb.append((pair.lrhs | {RGB: lrhs_rgb}, hrls))
-                if "alpha" in pair.lrhs and "alpha" in pair.hrls:
-                    alpha.append(alpha_as_colour(pair))
+            pair = read_tile(Tile(band, band), self._lrhs, self.grid, self._hr, self._alignment, features, counts)
+            lrhs_rgb, hrls = dim_fireflies(pair)
+            rgb.append((pair.lrhs | {RGB: lrhs_rgb}, hrls))
+            if "alpha" in pair.lrhs and "alpha" in pair.hrls:
+                alpha.append(alpha_as_colour(pair))
         return _FrameShares(find_shares(rgb, self.exposure), find_shares(alpha, 1.0) if alpha else {})
 
     def luminances(self) -> tuple[Array, Array]:
@@ -427,21 +406,18 @@ def _run(steps: Iterable[_Step], session: Session) -> Iterator[_Step]:
 def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, shares: _FrameShares) -> None:
     """Run the network on a tile and write its core into the frame."""
     empty = tile.empty
-    size = (tile.area.height, tile.area.width)
     target = tile.target.slices(frame.alignment.hr_data_window)
     core = tile.target.slices(tile.area)
-    if tile.pictures[0].hrls is not None:
-        images = _fuse_pictures(tile.pictures, size, session, frame.exposure, shares, error=frame.error is not None)
-        for name in tile.pictures[0].aovs:
+    if tile.hrls is not None:
+        images = _run_network(tile, session, frame.exposure, shares.rgb, error=frame.error is not None)
+        for name in tile.aovs:
             if name not in frame.clean_aovs:
                 frame.clean_aovs[name] = blank(frame.rgb.shape, np.float16)
             frame.clean_aovs[name][target] = images[name][core]
         rgb = images["fused"][core]
-        lights = [(picture.place, picture.lights) for picture in tile.pictures]
-        if any(image is not None for _, image in lights):
-            dark = np.zeros_like(tile.pictures[0].hrls[RGB])
-            whole = join(((place, dark if image is None else image) for place, image in lights), size)
-            rgb = np.where(np.any(whole[core] > 0, axis=-1, keepdims=True), whole[core], rgb)
+        if tile.lights is not None:
+            lights = tile.lights[core]
+            rgb = np.where(np.any(lights > 0, axis=-1, keepdims=True), lights, rgb)
         if empty is not None:
             rgb = rgb * ~empty[core]
         if frame.rgb.dtype == np.float16:
@@ -453,45 +429,24 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, shares:
             if empty is not None:
                 error *= ~empty
             frame.error[target] = error[core]
-    if "alpha" in tile.pictures[0].pair.hrls:
+    if "alpha" in tile.pair.hrls:
         if frame.alpha is None:
             frame.alpha = np.empty((*frame.rgb.shape[:2], 1), dtype=np.float32)
-        alpha = ((p.place, fuse_alpha(p.pair, session, shares.alpha)) for p in tile.pictures)
-        frame.alpha[target] = join(alpha, size)[core]
+        frame.alpha[target] = fuse_alpha(tile.pair, session, shares.alpha)[core]
 
 
-def _fuse_pictures(
-    pictures: Sequence[_Picture],
-    size: tuple[int, int],
-    session: Session,
-    exposure: float,
-    shares: _FrameShares,
-    *,
-    error: bool,
-) -> Images:
-    """What :meth:`Session.run` returns, for the pictures of a tile of ``size`` (h, w) together."""
-    images = [_fuse_picture(picture, session, exposure, shares.rgb, error=error) for picture in pictures]
-    places = [picture.place for picture in pictures]
-    result = {name: join(zip(places, (each[name] for each in images), strict=True), size) for name in images[0]}
-    if session.stride > 1 and not all(picture.noise_free for picture in pictures):
-        result |= {name: without_grid(result[name]) for name in (ALBEDO, NORMAL) if name in result}
-        encoded = without_grid(encode_radiance(result["fused"], exposure))
-        result["fused"] = decode_radiance(encoded, exposure, encoded)
-    return result
-
-
-def _fuse_picture(picture: _Picture, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:
-    """What :meth:`Session.run` returns for a picture, with its expected error if asked for."""
-    assert picture.lrhs is not None and picture.hrls is not None
-    if picture.noise_free:
-        own = {name: picture.pair.hrls[name] for name in picture.aovs}
-        errors = {"error": np.zeros_like(picture.hrls[RGB][..., :1])} if error else {}
-        return {"fused": picture.hrls[RGB], **errors, **own}
-    images = session.run(picture.lrhs, picture.hrls, exposure, shares, error=error, aovs=picture.aovs)
+def _run_network(tile: _PreparedTile, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:
+    """What :meth:`Session.run` returns for a tile, with its expected error if asked for."""
+    assert tile.lrhs is not None and tile.hrls is not None
+    if tile.noise_free:
+        own = {name: tile.pair.hrls[name] for name in tile.aovs}
+        errors = {"error": np.zeros_like(tile.hrls[RGB][..., :1])} if error else {}
+        return {"fused": tile.hrls[RGB], **errors, **own}
+    images = session.run(tile.lrhs, tile.hrls, exposure, shares, error=error, aovs=tile.aovs)
     check_finite(session, *images.values())
     if ALBEDO in images:
         # The albedo of an emitter may be its light. The network only knows albedos up to 1.
-        albedo = np.minimum(picture.pair.hrls[ALBEDO], np.float32(HALF_MAX))
+        albedo = np.minimum(tile.pair.hrls[ALBEDO], np.float32(HALF_MAX))
         images[ALBEDO] = np.where((albedo > 1).any(axis=-1, keepdims=True), albedo, images[ALBEDO])
     return images
 

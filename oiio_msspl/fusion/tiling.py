@@ -26,9 +26,6 @@ STRIPS_SHARE = 1 / 6
 #: Memory of a tile. It is as large as ``MAX_MEMORY`` allows beside an 8K frame. Other tiles give other pixels, so this
 #: does not depend on what the user allows.
 TILE_MEMORY = 1720 << 20
-#: Further memory for each HRLS pixel of a tile that is split into pictures (:mod:`oiio_msspl.fusion.spread`): its
-#: features before and after they are split, of this tile and the next one.
-SPLIT_BYTES = 160
 #: Bands of rows that :func:`sample_bands` spreads over a frame.
 SAMPLE_BANDS = 8
 
@@ -49,7 +46,7 @@ def aligned_grid(grid: Window, alignment: int) -> Window:
     return Window(grid.x0, grid.y0, grid.x0 + width, grid.y0 + height)
 
 
-def plan_tiles(grid: Window, contract: Contract, stride: int = 1, part: Window | None = None) -> list[Tile]:
+def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> list[Tile]:
     """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
     There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
@@ -57,12 +54,11 @@ def plan_tiles(grid: Window, contract: Contract, stride: int = 1, part: Window |
     pixels divides a tile as it divides the frame.
 
     Args:
-        stride: :attr:`oiio_msspl.model.session.Session.stride` of the model.
         part: the part of the grid that is to be covered, which the tiles may exceed; None for all of it.
     """
-    alignment = contract.alignment * stride
-    overlap = -(-contract.overlap * stride // alignment) * alignment
-    largest = TILE_MEMORY // (_bytes_per_pixel(contract, stride) * contract.scale**2)
+    alignment = contract.alignment
+    overlap = -(-contract.overlap // alignment) * alignment
+    largest = TILE_MEMORY // (contract.bytes_per_pixel * contract.scale**2)
     part = grid if part is None else _aligned_part(part, grid, alignment)
     # The fewest pixels that are computed, in the fewest tiles; where even the smallest tile is too large, that one.
     columns, rows = min(
@@ -104,20 +100,14 @@ def sample_bands(grid: Window, scale: int) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, top + rows) for top in tops]
 
 
-def _bytes_per_pixel(contract: Contract, stride: int) -> int:
-    """Peak memory of a tile for each of its HRLS pixels. The network sees one of stride^2 pixels at a time."""
-    return contract.bytes_per_pixel if stride == 1 else contract.bytes_per_pixel // stride**2 + SPLIT_BYTES
-
-
-def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int, stride: int = 1) -> int:
+def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int) -> int:
     """Memory of a process that fuses a frame in these tiles.
 
     Args:
         frame_bytes: memory for the whole frame: the result, the LRHS, and what the caller holds.
-        stride: as for :func:`plan_tiles`.
     """
     pixels = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
-    return FIXED_MEMORY + frame_bytes + pixels * _bytes_per_pixel(contract, stride)
+    return FIXED_MEMORY + frame_bytes + pixels * contract.bytes_per_pixel
 
 
 def strips_memory(max_memory: int, held: int) -> int:

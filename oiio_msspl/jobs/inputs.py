@@ -19,7 +19,7 @@ from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of
-from oiio_msspl.model.session import SPREAD
+from oiio_msspl.model.contract import SPREAD
 
 
 @dataclass(frozen=True)
@@ -147,7 +147,7 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     """The model that is meant: a quality, ``auto`` and None are a family that suits the pair.
 
     ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
-    filter has spread needs the family that reads every second pixel. Notes of the HRLS tell.
+    filter has spread needs the family that was trained for it. Notes of the HRLS tell.
 
     Raises:
         InputError: the pair does not fit together.

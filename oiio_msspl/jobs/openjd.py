@@ -22,7 +22,6 @@ from oiio_msspl.jobs.shot_checks import check_no_input, model_of_shot
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS
-from oiio_msspl.model.session import SPREAD
 
 #: Seconds between SIGTERM and SIGKILL, in which msspl-fuse finishes the frame that it is writing.
 GRACE = 120
@@ -104,8 +103,7 @@ def make_job(
     shot = find_shot(lr, hr, output, frames)
     # The job names its model: a worker with another version, which would choose another family, then refuses the frame.
     name = model_of_shot(shot, inputs, model)
-    network = name.removesuffix(SPREAD)
-    if shipped_models().keys() & {network, *(f"{network}-x{scale}" for scale in SCALES)}:
+    if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in SCALES)}:
         options += ["--model", name]
     else:
         files["--model"] = find_model(0, name)

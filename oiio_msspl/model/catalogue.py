@@ -7,7 +7,8 @@ import csv
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.session import SPREAD, Session
+from oiio_msspl.model.contract import SPREAD
+from oiio_msspl.model.session import Session
 
 #: Folder of the models: ``NAME.onnx`` for each.
 WEIGHTS = Path(__file__).parent / "weights"
@@ -48,7 +49,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
     Args:
         scale: 2, 4 or 8.
         name: a quality, ``auto`` or None for the default quality, a family (``paper``), a model (``paper-x4``), or an
-            ONNX file. A model or a family may end in ``SPREAD``: the network is the same.
+            ONNX file.
 
     Raises:
         InputError: there is no such model.
@@ -56,8 +57,7 @@ def find_model(scale: int, name: str | None = None) -> Path:
     models = shipped_models()
     name = family_of(name) or name
     assert name is not None
-    network = name.removesuffix(SPREAD)
-    for known in (network, f"{network}-x{scale}"):
+    for known in (name, f"{name}-x{scale}"):
         if known in models:
             return models[known]
     if Path(name).is_file():
@@ -70,16 +70,14 @@ def load_model(scale: int, name: str | None = None, device: str = "cpu", threads
     """Load a model.
 
     Args:
-        scale, name: see :func:`find_model`. A name that ends in ``SPREAD`` is for pairs whose noise the pixel filter
-            has spread.
+        scale, name: see :func:`find_model`.
         device, threads: see :class:`oiio_msspl.model.session.Session`.
 
     Raises:
         InputError: there is no such model, or it can't run on this device.
     """
     path = find_model(scale, name)
-    spread = name is not None and path != Path(name) and name.endswith(SPREAD)
-    # The best model would take too long for every layer.
-    best = path == WEIGHTS / f"{QUALITIES['best']}-x{scale}.onnx"
-    layers = find_model(scale, QUALITIES["fast"]) if best else None
-    return Session(path, device, threads, spread=spread, layers=layers)
+    # The best models would take too long for every layer
+    of_layers = {WEIGHTS / f"{QUALITIES['best']}{noise}-x{scale}.onnx": noise for noise in ("", SPREAD)}
+    layers = find_model(scale, QUALITIES["fast"] + of_layers[path]) if path in of_layers else None
+    return Session(path, device, threads, layers=layers)

@@ -23,8 +23,11 @@ if TYPE_CHECKING:
 #: Upsampling factors from the LRHS to the HRLS.
 SCALES = (2, 4, 8)
 
-#: Values of ``Contract.denoiser``: none; a denoiser of both renders' mean; its small version.
+#: Ending of the name of a family of models for renders whose pixel filter has spread the noise.
+SPREAD = "-spread"
+#: Values of ``Contract.denoiser``: none; a denoiser of both renders' mean; its small version. ``SPREAD`` may follow.
 NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER = "", "mean", "mean-small"
+DENOISERS = tuple(kind + noise for kind in (MEAN_DENOISER, SMALL_MEAN_DENOISER) for noise in ("", SPREAD))
 
 #: Key of the contract in the metadata of an ONNX file.
 METADATA_KEY = "msspl"
@@ -83,7 +86,7 @@ class Contract:
     defaults: dict[str, float] = field(default_factory=lambda: dict(DEFAULTS))
     """Encoded values of missing features."""
     denoiser: str = NO_DENOISER
-    """What denoises the mean of both renders: ``NO_DENOISER``, ``MEAN_DENOISER`` or ``SMALL_MEAN_DENOISER``."""
+    """What denoises the mean of both renders: ``NO_DENOISER`` or one of ``DENOISERS``."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -116,7 +119,7 @@ class Contract:
             known = isinstance(features, list) and all(isinstance(each, str) and each in FEATURES for each in features)
             if not known or features[:1] != [RGB]:
                 return name
-        if self.denoiser not in (NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER):
+        if self.denoiser not in (NO_DENOISER, *DENOISERS):
             return "denoiser"
         if not isinstance(self.provenance, dict):
             return "provenance"

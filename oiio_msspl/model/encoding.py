@@ -106,7 +106,7 @@ def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) 
     return map_rows(encode, radiance, out)
 
 
-def decode_radiance(encoded: Array, exposure: float, out: Array | None = None) -> Array:
+def decode_radiance(encoded: Array, exposure: float) -> Array:
     """Inverse of :func:`encode_radiance`. Input is clipped to its range, so the result is finite and >= 0."""
 
     def decode(values: Array) -> None:
@@ -116,7 +116,7 @@ def decode_radiance(encoded: Array, exposure: float, out: Array | None = None) -
         values /= np.float32(MU)
         values /= np.float32(exposure)
 
-    return map_rows(decode, encoded, out)
+    return map_rows(decode, encoded)
 
 
 def _log1p(values: Array) -> None:

@@ -26,8 +26,6 @@ log = logging.getLogger(__name__)
 
 #: LRHS pixels on a side that every network takes.
 SMALLEST = 16
-#: Ending of the name of a model that fuses pairs whose noise the pixel filter has spread.
-SPREAD = "-spread"
 
 
 class Session:
@@ -38,7 +36,6 @@ class Session:
             there is one.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
-        spread: the model fuses pairs whose noise the pixel filter has spread.
         layers: ONNX file of the model that fuses single layers of passes; None if no network does.
 
     Raises:
@@ -52,7 +49,6 @@ class Session:
         device: str = "cpu",
         threads: int = 0,
         *,
-        spread: bool = False,
         layers: Path | None = None,
     ) -> None:
         require_device(device)
@@ -65,8 +61,6 @@ class Session:
                 "that it needs, which the lines above name; use --device cpu meanwhile"
             )
         self.contract = Contract.of_network(self._session, path)
-        self.stride = 2 if spread else 1
-        """Distance of the HRLS pixels that the model reads together, see :mod:`oiio_msspl.fusion.spread`."""
         self._outputs = [output.name for output in self._session.get_outputs()]
         inputs = [each.name for each in self._session.get_inputs()]
         if inputs != list(self.contract.inputs) or "fused" not in self._outputs:
@@ -96,7 +90,7 @@ class Session:
     @property
     def name(self) -> str:
         """The model's name, as ``--model`` takes it."""
-        return f"{self.contract.name}{SPREAD}" if self.stride > 1 else self.contract.name
+        return self.contract.name
 
     def require_error(self) -> None:
         """Raise InputError if the model does not predict its error."""
@@ -119,7 +113,7 @@ class Session:
         does."""
         if self.layers is None:
             return None
-        return Session(self.layers, self.device, self.threads, spread=self.stride > 1)
+        return Session(self.layers, self.device, self.threads)
 
     def run(
         self,

@@ -9,6 +9,7 @@ import pytest
 pytest.importorskip("torch")
 
 from benchmarks import chart, paper, peers, quality, results, runtime, scenes, tables, versus
+from benchmarks.every_second_pixel import on_every_second_pixel, without_grid
 from datagen import views
 from oiio_msspl import Render
 from oiio_msspl.model.encoding import find_exposure
@@ -284,3 +285,21 @@ def test_curves_of_a_log_go_on_from_run_to_run(tmp_path):
     pytest.importorskip("matplotlib")
     curves.draw([tmp_path / "training_x.csv"], tmp_path / "curves.png")
     assert (tmp_path / "curves.png").stat().st_size > 1000
+
+
+def test_oidn_on_every_second_pixel_gets_four_pictures_of_the_frame():
+    image = np.random.default_rng(0).random((8, 10, 3), np.float32)
+    seen = []
+    joined = on_every_second_pixel(lambda color: seen.append(color.copy()) or color, {"color": image})
+    np.testing.assert_array_equal(joined, image)
+    np.testing.assert_array_equal(seen[1], image[::2, 1::2])
+
+
+def test_a_grid_goes_and_an_edge_stays():
+    image = np.full((16, 20, 3), 0.4, np.float32)
+    image[:, 10:] = 0.9
+    grid = np.zeros_like(image)
+    grid[::2, ::2], grid[1::2, 1::2] = 0.02, -0.02
+    smooth = without_grid(image + grid)
+    assert np.abs(smooth - image)[1:-1, 1:-1].max() < 0.005
+    assert np.abs(without_grid(image) - image).max() < 1e-5

@@ -123,10 +123,10 @@ def test_a_bucket_that_failed_is_filled_from_the_lrhs():
     assert error < 3 * expected
 
 
-@pytest.mark.parametrize("spread", [False, True])
-def test_albedo_and_normal_without_noise(monkeypatch, spread):
+@pytest.mark.parametrize("family", ["ensemble", "ensemble-spread"])
+def test_albedo_and_normal_without_noise(monkeypatch, family):
     """They are cleaner, tiles or not, and the beauty is the same bit for bit."""
-    session = Session(find_model(2, "ensemble"), spread=spread)
+    session = Session(find_model(2, family))
     albedo = 0.2 + 0.5 * picture(160, 224).clip(0, 1)
     clean = {"albedo": albedo, "normal": np.broadcast_to(np.float32([0, 0.6, 0.8]), (160, 224, 3))}
     rng = np.random.default_rng(0)

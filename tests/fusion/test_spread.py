@@ -7,11 +7,8 @@ import pytest
 from oiio_msspl import Render, fuse
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.colour import srgb
-from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion import tiling
 from oiio_msspl.fusion.fuse import tile_count
-from oiio_msspl.fusion.spread import join, split, without_grid
-from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture
 from tests.fusion.test_noise import spread
@@ -33,34 +30,8 @@ def spread_pair(clean, scale, **layers):
     return Render.from_arrays("lr", rgb=spread(low, 0.5)), Render.from_arrays("hr", rgb=spread(high, 0.5), **layers)
 
 
-@pytest.mark.parametrize("scale", SCALES)
-def test_pictures_lie_over_their_lrhs_and_join_to_the_tile(scale):
-    """On a ramp, each LRHS pixel is the mean of its HRLS pixels, wherever the picture's pixels are."""
-    y, x = np.mgrid[: 8 * scale, : 12 * scale].astype(np.float32)
-    high = np.stack([y, x, 3 * y - x], axis=-1)
-    low, whole = box_downsample(high, scale), (slice(0, 8), slice(0, 12))
-    window = Window(0, 0, 12, 8)
-    pair = TilePair({"rgb": low}, {"rgb": high}, scale, window, window, window, whole, whole)
-    pictures = list(split(pair))
-    for _, picture_of in pictures:
-        assert picture_of.inside == (slice(0, 4), slice(0, 6))
-        np.testing.assert_allclose(picture_of.lrhs["rgb"], box_downsample(picture_of.hrls["rgb"], scale), rtol=1e-5)
-    joined = join(((place, picture_of.hrls["rgb"]) for place, picture_of in pictures), high.shape[:2])
-    np.testing.assert_array_equal(joined, high)
-
-
-def test_a_grid_goes_and_an_edge_stays():
-    image = np.full((16, 20, 3), 0.4, np.float32)
-    image[:, 10:] = 0.9
-    grid = np.zeros_like(image)
-    grid[::2, ::2], grid[1::2, 1::2] = 0.02, -0.02
-    smooth = without_grid(image + grid)
-    assert np.abs(smooth - image)[1:-1, 1:-1].max() < 0.005
-    assert np.abs(without_grid(image) - image).max() < 1e-5
-
-
 def test_spread_noise_is_removed(session):
-    """The same network leaves most of it in, if it reads neighbouring pixels."""
+    """The network for independent noise leaves most of it in."""
     clean = picture(256, 384)
     pair = spread_pair(clean, session.contract.scale)
     whole = load_model(session.contract.scale, "joint")

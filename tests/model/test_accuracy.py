@@ -14,12 +14,21 @@ from oiio_msspl.model.catalogue import shipped_models
 
 #: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``.
 SCORES = {
+    "ensemble-spread-x2": (24.52, 0.0248),
+    "ensemble-spread-x4": (24.34, 0.0255),
+    "ensemble-spread-x8": (24.20, 0.0257),
     "ensemble-x2": (24.85, 0.0227),
     "ensemble-x4": (24.62, 0.0236),
     "ensemble-x8": (24.49, 0.0236),
+    "joint-small-spread-x2": (23.94, 0.0293),
+    "joint-small-spread-x4": (23.69, 0.0312),
+    "joint-small-spread-x8": (23.50, 0.0326),
     "joint-small-x2": (24.22, 0.0287),
     "joint-small-x4": (23.93, 0.0304),
     "joint-small-x8": (23.74, 0.0309),
+    "joint-spread-x2": (24.36, 0.0267),
+    "joint-spread-x4": (24.07, 0.0281),
+    "joint-spread-x8": (23.90, 0.0285),
     "joint-x2": (24.67, 0.0251),
     "joint-x4": (24.35, 0.0246),
     "joint-x8": (24.14, 0.0241),

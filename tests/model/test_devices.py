@@ -24,7 +24,7 @@ from tests.conftest import SHARED, needs_shared
 
 CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 #: Files for GPUs, relative to the folder of the weights.
-FAMILIES = ("joint-small", "joint", "ensemble")
+FAMILIES = tuple(family + noise for family in ("joint-small", "joint", "ensemble") for noise in ("", "-spread"))
 GPU_FILES = [f"gpu/{family}-x{scale}.onnx" for family in FAMILIES for scale in SCALES]
 
 

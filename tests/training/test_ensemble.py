@@ -22,12 +22,19 @@ pytest.importorskip("onnxscript")
 from benchmarks.oidn import run_filter  # noqa: E402
 from training import checkpoints, ensemble  # noqa: E402
 from training.encoding import from_srgb, srgb  # noqa: E402
-from training.ensemble import AGREED, BandWeights, EnsembleFusion, batches, evaluate, load_weights, train  # noqa: E402
+from training.ensemble import (  # noqa: E402
+    AGREED,
+    BandWeights,
+    EnsembleFusion,
+    PlainMean,
+    batches,
+    evaluate,
+    train,
+)
 from training.joint import JointFusion  # noqa: E402
+from training.large import LargeDenoiser, Training  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT  # noqa: E402
 from training.whole_model import network_of  # noqa: E402
-
-WEIGHTS = CHECKPOINT.parent / "ensemble.pt"
 
 
 def tensor(image):
@@ -57,6 +64,16 @@ def test_new_weights_give_the_mean_of_both_results():
         fused, log_error = BandWeights()(**given)
     torch.testing.assert_close(fused, (given["joint"] + given["large"]) / 2)
     torch.testing.assert_close(log_error, given["joint_error"])
+
+
+def test_a_plain_mean_keeps_to_the_range_of_the_renders():
+    given = arguments()
+    with torch.no_grad():
+        fused, log_error = PlainMean()(**given)
+        torch.testing.assert_close(fused, (given["joint"] + given["large"]) / 2)
+        assert log_error is given["joint_error"]
+        brighter, _ = PlainMean()(**given | {"large": given["large"] + 50})
+    assert brighter.max() <= max(given["hrls"][:, :3].max(), given["lrhs"].max())
 
 
 @pytest.mark.parametrize(("bias", "name"), [(-20.0, "joint"), (20.0, "large")])
@@ -101,7 +118,7 @@ def test_the_second_result_is_open_image_denoise_with_prefiltered_layers():
     colour = noisy(clean, 4)
     albedo = noisy(clean.clip(0, 1), 64, seed=2).clip(0, 1)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape).copy()
-    network, taken = EnsembleFusion(JointFusion(), BandWeights()).eval(), {}
+    network, taken = EnsembleFusion(JointFusion(), LargeDenoiser(), BandWeights()).eval(), {}
     network.weights.register_forward_pre_hook(
         lambda _, values: taken.update(zip(("joint", "large", "albedo", "normal"), values, strict=False))
     )
@@ -129,21 +146,22 @@ def test_the_second_result_is_open_image_denoise_with_prefiltered_layers():
     np.testing.assert_allclose(decode_radiance(large, 1.0), expected, rtol=1e-2, atol=1e-3)
 
 
-@pytest.mark.parametrize("scale", [2, 4])
-def test_the_files_for_cpus_are_close_to_the_network_in_32_bits(scale, tmp_path):
+@pytest.mark.parametrize(("scale", "noise"), [(2, ""), (4, ""), (2, "-spread")])
+def test_the_files_for_cpus_are_close_to_the_network_in_32_bits(scale, noise, tmp_path):
     """To less than a fifth of the noise that it removes."""
     clean = picture(64, 96)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)
     hrls = np.concatenate([encode_radiance(noisy(clean, 4), 1.0), clean.clip(0, 1), normal], axis=-1)
     low = box_downsample(clean, scale)
     lrhs = np.concatenate([encode_radiance(noisy(low, 4 * scale**2), 1.0), encode_radiance(low, 1.0)], axis=-1)
-    joint, _ = checkpoints.load(CHECKPOINT)
-    network = EnsembleFusion(joint, load_weights(WEIGHTS)[0]).eval()
+    ending = noise.replace("-", "_")
+    joint, _ = checkpoints.load(CHECKPOINT.with_stem(f"joint{ending}"))
+    network, _ = ensemble.load(CHECKPOINT.with_stem(f"ensemble{ending}"), joint)
     with torch.inference_mode():
         exact, log_error, albedo, normal = (image.numpy() for image in network(tensor(lrhs), tensor(hrls)))
     feed = {"lrhs": tensor(lrhs).numpy(), "hrls": tensor(hrls).numpy()}
     outputs = ["fused", "log_error", "albedo", "normal"]
-    onnx.save(network_of(onnx.load(find_model(scale, "ensemble"))), tmp_path / "network.onnx")
+    onnx.save(network_of(onnx.load(find_model(scale, f"ensemble{noise}"))), tmp_path / "network.onnx")
     fused, predicted, *aovs = load_network(tmp_path / "network.onnx").run(outputs, feed)
     assert np.abs(fused - exact).mean() < 0.2 * np.abs(feed["hrls"][:, :3] - exact).mean()
     assert np.abs(predicted - log_error).mean() < 0.3
@@ -162,6 +180,24 @@ def test_training_learns_which_result_is_right(tmp_path, monkeypatch):
     before = evaluate(None, files)
     after = evaluate(train(files, files, steps=20), files)
     assert after["psnr"] > before["psnr"] + 0.5
+
+
+def test_the_large_network_learns_from_the_result_of_joint(tmp_path):
+    """It starts as Open Image Denoise's: what it also reads has no weight yet."""
+    hrls = torch.rand(1, 9, 64, 64, generator=torch.Generator().manual_seed(0))
+    images = hrls[:, :3], hrls[:, 3:6], hrls[:, 6:9], hrls.flip(2)[:, :3]
+    training = Training(JointFusion().eval(), torch.device("cpu"))
+    with torch.inference_mode():
+        torch.testing.assert_close(training.large(*images), LargeDenoiser()(*images))
+    lrhs = torch.rand(1, 7, 32, 32, generator=torch.Generator().manual_seed(1))
+    batch = {"lrhs": lrhs, "hrls": hrls, "target": 0.5 * hrls[:, :3]}
+    given = [training.step(batch) for _ in range(3)]
+    assert given[-1] < given[0]
+    torch.save(training.state({"minutes": 0}), tmp_path / "large.pt")
+    network, how = ensemble.load(tmp_path / "large.pt", JointFusion())
+    assert network.large.reads_joint and isinstance(network.weights, PlainMean)
+    assert how["steps"] == 3
+    assert network.large.convs["enc_conv1a"].extra.abs().max() > 0
 
 
 def test_albedo_and_colour_are_permuted_alike(tmp_path):

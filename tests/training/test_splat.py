@@ -170,35 +170,9 @@ def test_radiance_is_stored_within_half_a_step() -> None:
     np.testing.assert_array_equal(read[0, :, 0].T.numpy(), stored)
 
 
-@pytest.fixture
-def folder(tmp_path: Path) -> Path:
-    """A view with samples that all show a grey wall of radiance 0.5, and its file."""
-    rng = np.random.default_rng(0)
-    size = samples.SIZE
-
-    def layer(k: int, channels: int, value: float) -> np.ndarray:
-        return np.full((k, size, size, channels), value, np.float32)
-
-    def layers(k: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
-        values = {"color": 0.5, "diffuse": 0.4, "specular": 0.1, "albedo": 0.6, "normal": 0.5, "depth": 2.0}
-        flat = {name: layer(k, 1 if name == "depth" else 3, values[name]) for name in names}
-        return {"place": rng.random((k, size, size, 2), np.float32), **flat}
-
-    cells = views.REF_CELLS * size
-    arrays = samples.pack(
-        layers(samples.HR_SAMPLES, ("color", "albedo", "normal", "diffuse", "specular", "depth")),
-        layers(samples.LR_SAMPLES, ("color", "albedo", "normal")),
-        np.full((cells, cells, 3), 0.5, np.float32),
-        rng,
-        {"seed": 3, "split": "train", "renderer": "none", "generator": 0},
-    )
-    views.save(samples.path_of(tmp_path, "mitsuba", 3, 0), arrays)
-    return tmp_path
-
-
-def test_training_draws_filters_from_sample_views(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_draws_filters_from_sample_views(sample_folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """They are no views with passes, and every filter gives the pairs that training reads."""
-    found = views.Folder(folder)
+    found = views.Folder(sample_folder)
     assert not found.split("train")
     (view,) = found.sample_views("train")
     assert json.loads(str(view.arrays["meta"]))["exposure"]["log_mean"] > 0

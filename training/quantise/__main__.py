@@ -30,7 +30,7 @@ from training.ops import box_downsample
 from training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code
 from training.quantise.gptq import quantise_mean_denoiser
 from training.quantise.graph import Graph
-from training.whole_model import CHECKPOINTS, DENOISERS
+from training.whole_model import CHECKPOINTS, denoiser_file
 
 CHECKPOINT = CHECKPOINTS / "joint.pt"
 #: Calibration images, and their width.
@@ -56,7 +56,7 @@ def main() -> None:
     joint, _ = load(args.checkpoint)
     if not isinstance(joint, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
-    exact, path = joint.mean_denoiser, CHECKPOINTS / f"{DENOISERS[joint.denoiser(SCALES[0])]}.onnx"
+    exact, path = joint.mean_denoiser, CHECKPOINTS / f"{denoiser_file(joint.denoiser(SCALES[0]))}.onnx"
     codes = [denoiser_codes(*images) for images in islice(means(args.views, "train"), IMAGES)]
     model = Graph(quantise_mean_denoiser(exact.start.shape, exact.weights(), codes)).model()
     helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.start.network))})

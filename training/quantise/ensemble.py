@@ -3,10 +3,12 @@
 
     python -m training.quantise.ensemble VIEWS --out RUN
     python -m training.quantise.ensemble VIEWS --out RUN --export
+    python -m training.quantise.ensemble VIEWS --out RUN2 --export --spread
 
 The first command quantises Open Image Denoise's networks on training views, joins them with the files of ``joint``, and
 stores the results of many training pairs, with which :mod:`training.ensemble` trains. It continues where it stopped.
-The second adds what was trained, and writes the files into the package.
+The second adds what was trained, and writes the files into the package. The third writes ``ensemble-spread``, which
+needs no such pairs.
 """
 
 from __future__ import annotations
@@ -23,20 +25,21 @@ import numpy as np
 import onnx
 import torch
 from onnx import TensorProto, helper
-from torch import Tensor
+from torch import Tensor, nn
 from torch.nn import functional as F
 
 from datagen.views import Folder
 from oiio_msspl.model.catalogue import WEIGHTS, find_model
-from oiio_msspl.model.contract import SCALES, Contract
+from oiio_msspl.model.contract import SCALES, SPREAD, Contract
 from oiio_msspl.model.runtime import load_network
-from training.checkpoints import load
+from training import checkpoints
 from training.data import Sampling, draw, fixed_batches, view_tensors
 from training.encoding import from_srgb, log_to_pu, srgb
-from training.ensemble import BandWeights, load_weights
+from training.ensemble import BandWeights, EnsembleFusion, load
 from training.export import MEMORY
 from training.joint import JointFusion, with_denoised_mean
-from training.oidn import ALBEDO_BASE, BASE, LARGE, LARGE_HDR, NORMAL_BASE, Shape, pretrained_weights
+from training.large import LargeDenoiser
+from training.oidn import ALBEDO_BASE, LARGE_HDR, NORMAL_BASE, FineTunedUNet
 from training.quantise.codes import log_encoded_of_code, sliced
 from training.quantise.gptq import Activations, CodeLayout, Fit, run_unet_on_activations
 from training.quantise.graph import ENTRIES, Graph, Nodes
@@ -69,33 +72,37 @@ def auxiliary_codes(image: Tensor) -> Activations:
     return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
 
 
-def colour_codes(colour: Tensor, albedo: Tensor, normal: Tensor) -> Activations:
-    """A log-encoded colour and denoised layers in [0, 1], (1, 3, H, W), as the input of the large network."""
-    plain = CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
+def colour_codes(colour: Tensor, *layers: Tensor) -> Activations:
+    """A log-encoded colour and layers in [0, 1], (1, 3, H, W), as the input of the large network."""
+    plain = CodeLayout(torch.full((3 * len(layers),), 1 / 255), torch.arange(3, 3 + 3 * len(layers)))
     layout = concatenated(sliced_layout(COLOUR_SLICES, 0), plain)
-    layers = [(image.clamp(0, 1) * 255).round() for image in (albedo, normal)]
-    codes = F.pad(torch.cat([sliced(log_to_pu(colour), COLOUR_SLICES), *layers], dim=1), (0, 0, 0, 0, 0, 1))
+    rounded = [(image.clamp(0, 1) * 255).round() for image in layers]
+    codes = torch.cat([sliced(log_to_pu(colour), COLOUR_SLICES), *rounded], dim=1)
+    codes = F.pad(codes, (0, 0, 0, 0, 0, len(layout.scale) - codes.shape[1]))
     return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
 
 
-def fitted(network: str, shape: Shape, slices_out: int, images: Sequence[Activations]) -> tuple[Fit, list[Tensor]]:
+def fitted(network: FineTunedUNet, slices_out: int, images: Sequence[Activations]) -> tuple[Fit, list[Tensor]]:
     """Quantise a network; also return its exact outputs (1, 3, H, W)."""
-    fit = Fit(shape, pretrained_weights(network), slices_out)
+    shape = network.start.shape
+    fit = Fit(shape, network.weights(), slices_out)
     exact, codes = ([getattr(image, kind)[0] for image in images] for kind in ("exact", "codes"))
     result = run_unet_on_activations(shape, [Activations(exact, codes, images[0].layout)], fit.conv)
     return fit, [image[:, :3].clamp(0, 1) for image in result.exact]
 
 
-def fit_networks(hrls: Sequence[Tensor]) -> dict[str, Fit]:
-    """Quantise the three networks on HRLS (1, 9, H, W), encoded."""
-    albedo, albedos = fitted(
-        ALBEDO_BASE, BASE, AUXILIARY_SLICES, [auxiliary_codes(srgb(image[:, 3:6])) for image in hrls]
-    )
+def fit_networks(ensemble: EnsembleFusion, pairs: Sequence[tuple[Tensor, Tensor]]) -> dict[str, Fit]:
+    """Quantise the three networks on encoded pairs, the arguments of the ensemble."""
+    layers, large, hrls = ensemble.layers, ensemble.large, [pair[1] for pair in pairs]
+    albedo, albedos = fitted(layers.albedo, AUXILIARY_SLICES, [auxiliary_codes(srgb(image[:, 3:6])) for image in hrls])
     normal, normals = fitted(
-        NORMAL_BASE, BASE, AUXILIARY_SLICES, [auxiliary_codes(0.5 * image[:, 6:9] + 0.5) for image in hrls]
+        layers.normal, AUXILIARY_SLICES, [auxiliary_codes(0.5 * image[:, 6:9] + 0.5) for image in hrls]
     )
-    images = [colour_codes(h[:, :3], from_srgb(a), n) for h, a, n in zip(hrls, albedos, normals, strict=True)]
-    colour, _ = fitted(LARGE_HDR, LARGE, COLOUR_SLICES_OUT, images)
+    inputs = [[h[:, :3], from_srgb(a), n] for h, a, n in zip(hrls, albedos, normals, strict=True)]
+    if large.reads_joint:
+        for images, pair in zip(inputs, pairs, strict=True):
+            images.append(log_to_pu(ensemble.joint.fuse(*pair)[0]))
+    colour, _ = fitted(large, COLOUR_SLICES_OUT, [colour_codes(*images) for images in inputs])
     return {"albedo": albedo, "normal": normal, "colour": colour}
 
 
@@ -105,11 +112,12 @@ def fit_networks(hrls: Sequence[Tensor]) -> dict[str, Fit]:
 class Results(Nodes):
     """The graph up to the two results: inputs ``lrhs`` and ``hrls``, outputs :data:`RESULTS`."""
 
-    def __init__(self, scale: int, networks: dict[str, onnx.ModelProto]) -> None:
+    def __init__(self, scale: int, networks: dict[str, onnx.ModelProto], noise: str = "") -> None:
         super().__init__()
+        self.noise = noise
         self.initializers["unseen"] = log_encoded_of_code(COLOUR_SLICES_OUT)
-        joint = network_of(onnx.load(find_model(scale, "joint")))
-        self.embed(joint, "joint.", {"fused": "joint", "log_error": "joint_error"})
+        joint = network_of(onnx.load(find_model(scale, f"joint{noise}")))
+        self.embed(joint, "first.", {"fused": "joint", "log_error": "joint_error"})
         # OIDN denoises an albedo in sRGB, and reads it linear beside the colour.
         self.constant("srgb", srgb(torch.linspace(0, 1, ENTRIES)).numpy())
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
@@ -120,8 +128,10 @@ class Results(Nodes):
         normal = self._denoised(networks["normal"], "normal", self.add("Add", [scaled, half], "normal.shifted"), zeros)
         slices = self.slices(self.log_to_pu(colour), COLOUR_SLICES)
         step = self.constant("step", np.float32(1 / 255))
-        rounded = [self.add("QuantizeLinear", [image, step, "zero"], f"{image}.rounded") for image in (albedo, normal)]
-        packed = self.packed([*slices, *rounded, zeros], "colour.layers")
+        layers = [albedo, normal, *([self.log_to_pu("joint")] if noise else [])]
+        rounded = [self.add("QuantizeLinear", [image, step, "zero"], f"{image}.rounded") for image in layers]
+        # As many as :func:`training.quantise.joint.concatenated` appends
+        packed = self.packed([*slices, *rounded, *[zeros] * (2 if noise else 1)], "colour.layers")
         pixels = self.look_up("unseen", self._run(networks["colour"], "colour", packed), "large.pixels")
         self.add("Transpose", [pixels], "large", perm=[0, 3, 1, 2])
 
@@ -139,7 +149,7 @@ class Results(Nodes):
         return f"{name}.codes"
 
     def model(self, weights: onnx.ModelProto | None = None) -> onnx.ModelProto:
-        """The graph; with ``weights`` (:class:`training.ensemble.BandWeights`), the model that ships."""
+        """The graph; with ``weights`` (:func:`weights_graph`), the model that ships."""
         info = helper.make_tensor_value_info
         inputs = [info("lrhs", TensorProto.FLOAT, [1, 6, "h", "w"]), info("hrls", TensorProto.FLOAT, [1, 9, "H", "W"])]
         channels = dict.fromkeys(RESULTS, 3) | {"joint_error": 1}
@@ -147,17 +157,15 @@ class Results(Nodes):
             self.embed(weights, "weights.", {})
             channels = {"fused": 3, "log_error": 1, "albedo": 3, "normal": 3}
         outputs = [info(name, TensorProto.FLOAT, [1, count, "H", "W"]) for name, count in channels.items()]
-        return self.finished(FAMILY, inputs, outputs)
+        return self.finished(FAMILY + self.noise, inputs, outputs)
 
 
 # The stored pairs
 
 
-def store_pairs(views: Path, out: Path) -> None:
+def store_pairs(views: Path, out: Path, joint: JointFusion) -> None:
     """Store the results of random pairs, see :func:`training.ensemble.read_pair`."""
     sessions = {scale: load_network(out / f"results-x{scale}.onnx") for scale in SCALES}
-    joint, _ = load(CHECKPOINTS / "joint.pt")
-    assert isinstance(joint, JointFusion)
     prepare = with_denoised_mean(joint.mean_denoiser)
     for split, count in PAIRS.items():
         (out / split).mkdir(exist_ok=True)
@@ -179,25 +187,25 @@ def store_pairs(views: Path, out: Path) -> None:
             partial.rename(file)
 
 
-def calibration_images(views: Path, count: int = IMAGES) -> list[Tensor]:
-    """HRLS (1, 9, H, W) of training views. Every second one has a brighter albedo, up to white, in some channels.
+def calibration_pairs(views: Path, joint: JointFusion, count: int = IMAGES) -> list[tuple[Tensor, Tensor]]:
+    """Encoded pairs of training views. Every second one has a brighter albedo, up to white, in some channels.
 
     Codes only cover the range that calibration has seen.
     """
-    batches = islice(fixed_batches(views, "train", [2], PATCH, 1), count)
-    images = [batch["hrls"][:, :9].contiguous() for batch in batches]
+    batches = islice(fixed_batches(views, "train", [2], PATCH, 1, with_denoised_mean(joint.mean_denoiser)), count)
+    pairs = [(batch["lrhs"].contiguous(), batch["hrls"][:, :9].contiguous()) for batch in batches]
     generator = torch.Generator().manual_seed(0)
-    for image in images[1::2]:
+    for _, image in pairs[1::2]:
         power = BRIGHTER[0] + (BRIGHTER[1] - BRIGHTER[0]) * torch.rand(1, 3, 1, 1, generator=generator)
         image[:, 3:6] = image[:, 3:6].clamp(0, 1) ** power
-    return images
+    return pairs
 
 
 # The files that ship
 
 
-def weights_graph(weights: BandWeights, scale: int) -> onnx.ModelProto:
-    """The graph of the network that weighs the results."""
+def weights_graph(weights: nn.Module, scale: int) -> onnx.ModelProto:
+    """The graph of what weighs the results, a part of :class:`training.ensemble.EnsembleFusion`."""
     height, width = 64, 96
     full = {name: torch.rand(1, 3, height * scale, width * scale) for name in ("joint", "large", "albedo", "normal")}
     lrhs, hrls = torch.rand(1, 6, height, width), torch.rand(1, 9, height * scale, width * scale)
@@ -206,13 +214,12 @@ def weights_graph(weights: BandWeights, scale: int) -> onnx.ModelProto:
     return traced(weights, tuple(inputs.values()), list(inputs), ["fused", "log_error"], 16 * scale, translations)
 
 
-def export(out: Path, networks: dict[str, onnx.ModelProto]) -> None:
+def export(ensemble: EnsembleFusion, networks: dict[str, onnx.ModelProto], noise: str, trained: dict[str, int]) -> None:
     """Write the models into the package."""
-    weights, trained = load_weights(out / "weights.pt")
     models = {}
     for scale in SCALES:
-        contract = Contract.of_file(find_model(scale, "joint"))
-        name = f"{FAMILY}-x{scale}"
+        contract = Contract.of_file(find_model(scale, f"joint{noise}"))
+        name = f"{FAMILY}{noise}-x{scale}"
         provenance = contract.provenance | {
             "network": FAMILY,
             "other_networks": f"Open Image Denoise 2.5.1, {ALBEDO_BASE}, {NORMAL_BASE}, {LARGE_HDR} (Apache-2.0)",
@@ -220,10 +227,10 @@ def export(out: Path, networks: dict[str, onnx.ModelProto]) -> None:
             "date": datetime.date.today().isoformat(),
         }
         contract = replace(contract, name=name, bytes_per_pixel=MEMORY[FAMILY], provenance=provenance)
-        graph = Results(scale, networks).model(weights_graph(weights, scale))
+        graph = Results(scale, networks, noise).model(weights_graph(ensemble.weights, scale))
         models[WEIGHTS / f"{name}.onnx"] = whole_model(graph, contract, quantised_denoiser(contract.denoiser))
-    save(models, FAMILY)
-    for path in sorted(WEIGHTS.glob(f"{FAMILY}*")):
+    save(models, FAMILY + noise)
+    for path in sorted(WEIGHTS.glob(f"{FAMILY}{noise}*")):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")
 
 
@@ -235,20 +242,30 @@ def main() -> None:
     )
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("--out", type=Path, required=True, help="folder of the stored results and of what was trained")
-    parser.add_argument("--export", action="store_true", help="write the models, once their weights are trained")
+    parser.add_argument("--export", action="store_true", help="write the models, once all is trained")
+    parser.add_argument("--spread", action="store_true", help="of ensemble-spread")
     args = parser.parse_args()
     args.out.mkdir(parents=True, exist_ok=True)
+    noise = SPREAD if args.spread else ""
+    joint, _ = checkpoints.load(CHECKPOINTS / ("joint_spread.pt" if noise else "joint.pt"))
+    assert isinstance(joint, JointFusion)
+    ensemble = EnsembleFusion(joint, LargeDenoiser(), BandWeights()).eval()
+    trained: dict[str, int] = {}
+    if noise or args.export:
+        ensemble, trained = load(CHECKPOINTS / "ensemble_spread.pt" if noise else args.out / "weights.pt", joint)
     files = {name: args.out / f"{name}.onnx" for name in ("albedo", "normal", "colour")}
     if not all(file.exists() for file in files.values()):
-        for name, fit in fit_networks(calibration_images(args.views)).items():
+        with torch.no_grad():
+            fits = fit_networks(ensemble, calibration_pairs(args.views, joint))
+        for name, fit in fits.items():
             onnx.save(Graph(fit).model(), files[name])
     networks = {name: onnx.load(file) for name, file in files.items()}
     if args.export:
-        export(args.out, networks)
+        export(ensemble, networks, noise, trained)
         return
     for scale in SCALES:
         onnx.save(Results(scale, networks).model(), args.out / f"results-x{scale}.onnx")
-    store_pairs(args.views, args.out)
+    store_pairs(args.views, args.out, joint)
 
 
 if __name__ == "__main__":

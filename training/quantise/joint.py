@@ -59,8 +59,12 @@ def sliced_layout(count: int, first: int) -> CodeLayout:
 
 
 def concatenated(*parts: CodeLayout) -> CodeLayout:
-    """Concatenate layouts and a code channel of zeros, for 16 channels."""
-    parts = (*parts, CodeLayout(torch.zeros(1), torch.zeros(1, dtype=torch.long)))
+    """Concatenate layouts, and code channels of zeros up to a multiple of four channels.
+
+    For other numbers, ONNX Runtime's convolutions take more than twice the memory.
+    """
+    count = -sum(len(part.scale) for part in parts) % 4
+    parts = (*parts, CodeLayout(torch.zeros(count), torch.zeros(count, dtype=torch.long)))
     scale, source = ([getattr(part, name) for part in parts] for name in ("scale", "source_channel"))
     return CodeLayout(torch.cat(scale), torch.cat(source))
 

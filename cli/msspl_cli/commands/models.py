@@ -19,13 +19,14 @@ EXAMPLES = """[bold]Examples[/bold]
 def models(as_json: options.Json = False, debug: options.Debug = False, help_all: options.HelpAll = False) -> None:
     """List the models in the package, and the devices on which they can run.
 
-    PSNR and RelMSE are those of five scenes with 2 and 8 samples per pixel in all.
+    PSNR and RelMSE are those of five scenes with 2 and 8 samples per pixel in all, for
+    models with -spread of the same scenes with a filter that spreads each sample.
     Time is a multiple of that of Open Image Denoise, on processors with AMX, with
     VNNI and with neither. Layers are those that a model reads beside the beauty.
     """
     from oiio_msspl.aovs.features import RGB
     from oiio_msspl.model.catalogue import QUALITIES, measured, shipped_models
-    from oiio_msspl.model.contract import Contract
+    from oiio_msspl.model.contract import SPREAD, Contract
     from oiio_msspl.model.devices import PROVIDERS, gpu_file, usable_devices
 
     rows: list[dict[str, Any]] = []
@@ -36,7 +37,7 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
         rows.append(
             {
                 "name": name,
-                "quality": quality_of.get(name.rpartition("-x")[0]),
+                "quality": quality_of.get(name.rpartition("-x")[0].removesuffix(SPREAD)),
                 "scale": contract.scale,
                 "layers": [feature for feature in contract.hrls if feature != RGB],
                 "measured": figures.get(name, {}),

@@ -1,0 +1,62 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pairs that are drawn ahead."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+torch = pytest.importorskip("torch", reason="training is an extra")
+
+from datagen.samples import SIZE  # noqa: E402
+from datagen.views import Folder  # noqa: E402
+from training.pool import PooledBatches, draw_pairs  # noqa: E402
+
+CPU = torch.device("cpu")
+
+
+def test_views_are_drawn_whole(sample_folder: Path) -> None:
+    """Of the grey wall, all images show the same. The mean of both renders and its noise follow the LRHS."""
+    (view,) = Folder(sample_folder).sample_views("train")
+    (pair,) = draw_pairs(view, (4,), 1, CPU)
+    assert {name: image.shape for name, image in pair.items()} == {
+        "lrhs": (7, SIZE // 4, SIZE // 4), "hrls": (9, SIZE, SIZE), "target": (3, SIZE, SIZE),
+    }  # fmt: skip
+    colours = pair["target"].mean(dim=(1, 2))
+    for image in (pair["hrls"][:3], pair["lrhs"][:3], pair["lrhs"][3:6]):
+        torch.testing.assert_close(image.mean(dim=(1, 2)), colours, atol=0.01, rtol=0)
+    assert pair["lrhs"][6].max() < 0.01
+
+
+def write_pool(folder: Path, scale: int) -> Path:
+    """A pair whose images are one gradient, with another offset for each channel."""
+    place = torch.arange(160 * 160).reshape(1, 160, 160) / 160**2 + torch.arange(3).reshape(3, 1, 1)
+    low = torch.nn.functional.avg_pool2d(place, scale)
+    pair = {"hrls": place.repeat(3, 1, 1), "lrhs": torch.cat([low, low, low[:1]]), "target": place}
+    torch.save([{name: image.half() for name, image in pair.items()}], folder / f"x{scale}.pt")
+    return folder
+
+
+@pytest.mark.parametrize("scale", [2, 8])
+def test_crops_of_all_images_show_the_same_place(tmp_path: Path, scale: int) -> None:
+    """However they are mirrored and their channels permuted."""
+    batches = PooledBatches(write_pool(tmp_path, scale), (scale,), 128, 3, 0, CPU).loader()
+    for _, batch in zip(range(6), batches, strict=False):
+        assert batch["hrls"].shape == (3, 9, 128, 128) and batch["lrhs"].shape == (3, 7, 128 // scale, 128 // scale)
+        for part in batch["hrls"].split(3, dim=1)[:2]:
+            torch.testing.assert_close(part, batch["target"], atol=2e-3, rtol=0)
+        small = torch.nn.functional.avg_pool2d(batch["target"], scale)
+        for part in batch["lrhs"].split(3, dim=1)[:2]:
+            torch.testing.assert_close(part, small, atol=2e-3, rtol=0)
+
+
+def test_a_pool_that_grows_is_read_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("training.pool.RESCAN_SECONDS", 0.0)
+    batches = PooledBatches(write_pool(tmp_path, 2), (2, 8), 64, 1, 0, CPU)
+    loader = batches.loader()
+    next(loader)
+    assert not batches.pairs[8]
+    write_pool(tmp_path, 8)
+    next(loader)
+    assert batches.pairs[8]

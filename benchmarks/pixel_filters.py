@@ -59,7 +59,7 @@ def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: i
     rows, columns = (slice(0, side) for side in view.size)
     stored = len(view.arrays[f"{prefix}color"])
     # Importance sampling leaves pixels without enough samples, unless there are more to choose from
-    count = spp if pixel_filter.spread else min(2 * spp + 4, stored)
+    count = spp if pixel_filter.spread else 2 * spp + 4
     samples = torch.arange(min(count, stored))
     values = [view.read(prefix + STORED[name], samples, rows, columns) for name in FEATURES]
     place = view.read(f"{prefix}place", samples, rows, columns)

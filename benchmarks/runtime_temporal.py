@@ -52,7 +52,7 @@ def clean_frame(number: int, count: int, width: int, height: int, lamps: int) ->
     Args:
         count: frames of the shot.
     """
-    shares = np.ones((1, 1, 1, 1), np.float32)
+    shares = np.ones((1, height, width + STEP * count, 1), np.float32)
     if lamps:
         stains = np.random.default_rng(1).random(
             (lamps, -(-height // LIT), -(-(width + STEP * count) // LIT), 1), np.float32

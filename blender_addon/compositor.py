@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Showing the fused frame in the scene's compositor, as an Image node."""
+"""Showing fused frames in the scene's compositor, as an Image node."""
 
 import bpy
 
@@ -8,12 +8,13 @@ from .render_settings import BLENDER_5
 NODE = "MSSPL Fused"
 
 
-def show(scene, path, connect):
+def show(scene, path, connect, frames=None):
     """Load a fused EXR into the node ``MSSPL Fused``. A new node is made if there is none; an old one keeps its links.
 
     Args:
         path: may begin with ``//``, which stands for the folder of the .blend.
         connect: connect the node to the compositor's output even if another node is connected there.
+        frames: numbers of the frames of an animation, whose first file ``path`` is. None: it is a single frame.
 
     Returns:
         The node. Its outputs are the passes of the file.
@@ -27,8 +28,12 @@ def show(scene, path, connect):
         node.image = bpy.data.images.load(path)
     else:
         node.image.filepath = path
-        node.image.reload()
-        node.image = node.image  # Blender then lists the passes of the new file.
+    node.image.source = "SEQUENCE" if frames else "FILE"
+    node.image.reload()
+    node.image = node.image  # Blender then lists the passes of the new file.
+    if frames:  # The file of frame n is shown at frame n.
+        node.frame_duration, node.frame_start = frames[-1] - frames[0] + 1, frames[0]
+        node.frame_offset, node.use_auto_refresh = frames[0] - 1, True
     # The file holds scene-linear values, as the scene's own render does, so no colour conversion is wanted.
     node.image.colorspace_settings.is_data = True
     output = _output(tree)

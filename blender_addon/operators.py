@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The button "Render and Fuse". It runs step by step in a window and blocks in a script."""
+"""The buttons "Render and Fuse" and "Render and Fuse Animation". They run step by step in a window and block in a
+script."""
 
 import functools
 import re
@@ -8,7 +9,8 @@ import time
 
 import bpy
 
-from . import compositor, frame, fuse, overrides
+from . import compositor, frame, overrides, programs
+from .checks import check_scene
 from .errors import Cancelled, Failure
 from .panel import status
 
@@ -17,11 +19,9 @@ _CONTINUE = {"PASS_THROUGH"}
 _CONSUME_EVENT = {"RUNNING_MODAL"}
 
 
-class MSSPL_OT_fuse(bpy.types.Operator):
-    """Render the frame at low and at full resolution, fuse the two renders, and show the result in the compositor"""
+class _Job:
+    """An operator that does a job, which its ``_job`` yields step by step."""
 
-    bl_idname = "msspl.fuse"
-    bl_label = "Render and Fuse"
     bl_options = {"UNDO"}
 
     @classmethod
@@ -93,38 +93,109 @@ class MSSPL_OT_fuse(bpy.types.Operator):
         except StopIteration:
             return {"FINISHED"}
         except Cancelled:
-            self.report({"WARNING"}, "Cancelled; nothing was written")
+            self.report({"WARNING"}, self._cancelled)
             return {"CANCELLED"}
         except Failure as error:
             self.report({"ERROR"}, str(error))
             return {"CANCELLED"}
         return _CONTINUE
 
+    def _finish(self, scene, path, reports, text, frames=None):
+        """Show what is written in the compositor, and report it."""
+        compositor.show(scene, path, scene.msspl.connect, frames)
+        for warning in dict.fromkeys(warning for report in reports for warning in report):
+            self.report({"WARNING"}, warning)
+        self.report({"INFO"}, text)
+
+
+class MSSPL_OT_fuse(_Job, bpy.types.Operator):
+    """Render the frame at low and at full resolution, fuse the two renders, and show the result in the compositor"""
+
+    bl_idname = "msspl.fuse"
+    bl_label = "Render and Fuse"
+    _cancelled = "Cancelled; nothing was written"
+
     def _job(self, context, window=False):
         scene, settings = context.scene, context.scene.msspl
         identity, overwrite = (scene.name, scene.session_uid), scene.render.use_overwrite
-        addon = context.preferences.addons.get(__package__)
-        program = fuse.find_program(bpy.path.abspath(addon.preferences.program) if addon else "")
+        program = programs.find_fuse(_preference(context))
         options = settings.options(context.view_layer.name)
-        # The frame number replaces # in the file name only, because a folder's name may contain #.
-        path = re.sub(r"#+(?=[^/\\]*$)", lambda signs: f"{scene.frame_current:0{len(signs[0])}d}", settings.output)
+        path = _numbered(settings.output, scene.frame_current)
         if path.startswith("//") and not bpy.data.filepath:
             raise Failure(f"{path}: save the .blend first, or give a full path")
         with tempfile.TemporaryDirectory(prefix="msspl-") as work:
             output = bpy.path.abspath(path)
-            run = functools.partial(fuse.run, program, work=work, overwrite=overwrite, threads=options.threads)
+            run = functools.partial(programs.fuse, program, work=work, overwrite=overwrite, threads=options.threads)
             report = yield from frame.render_and_fuse(
                 scene, options, output, work, run, overwrite=overwrite, window=window
             )
+        self._finish(overrides.find_scene(*identity), path, [report.warnings], f"{path}: {report}")
+
+
+class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
+    """Render all frames of the scene at low and at full resolution, in another Blender, and fuse them. Show the result
+    in the compositor"""
+
+    bl_idname = "msspl.fuse_animation"
+    bl_label = "Render and Fuse Animation"
+    _cancelled = "Cancelled; the frames that were written stay"
+
+    def _job(self, context, window=False):
+        scene, settings = context.scene, context.scene.msspl
+        identity, file = (scene.name, scene.session_uid), bpy.data.filepath
+        program = programs.find_render(_preference(context))
+        options = settings.options(context.view_layer.name)
+        check_scene(scene, options)
+        # Without a window, Blender does not know whether a file has changed.
+        if not file or (bpy.data.is_dirty and not bpy.app.background):
+            raise Failure(f"{file or 'the scene'}: save the .blend first; another Blender renders the saved file")
+        frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
+        pattern = settings.output
+        if not _NUMBER.search(pattern):
+            raise Failure(f"{pattern}: names one file for {len(frames)} frames; write #### for the frame number")
+        outputs = {number: bpy.path.abspath(_numbered(pattern, number)) for number in frames}
+        with tempfile.TemporaryDirectory(prefix="msspl-") as work:
+            reports = yield from programs.render_shot(
+                program,
+                file,
+                outputs,
+                bpy.path.abspath(pattern),
+                options,
+                work,
+                scene.render.use_overwrite,
+                settings.average,
+            )
         scene = overrides.find_scene(*identity)
-        compositor.show(scene, path, scene.msspl.connect)
-        for warning in report.warnings:
-            self.report({"WARNING"}, warning)
-        self.report({"INFO"}, f"{path}: {report}")
+        self._finish(
+            scene,
+            _numbered(pattern, frames[0]),
+            [report["warnings"] for report in reports],
+            f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused",
+            frames,
+        )
+
+
+#: The frame number in the name of a file. The name of a folder may contain #.
+_NUMBER = re.compile(r"#+(?=[^/\\]*$)")
+
+
+def _numbered(pattern, number):
+    """The file of a frame."""
+    return _NUMBER.sub(lambda signs: f"{number:0{len(signs[0])}d}", pattern)
+
+
+def _preference(context):
+    """Path of msspl-fuse in the add-on's preferences; empty if there is none."""
+    addon = context.preferences.addons.get(__package__)
+    return bpy.path.abspath(addon.preferences.program) if addon else ""
+
+
+_CLASSES = (MSSPL_OT_fuse, MSSPL_OT_fuse_animation)
 
 
 def register():
-    bpy.utils.register_class(MSSPL_OT_fuse)
+    for each in _CLASSES:
+        bpy.utils.register_class(each)
     bpy.app.handlers.save_pre.append(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
         after.append(overrides.override_after_save)
@@ -134,4 +205,5 @@ def unregister():
     bpy.app.handlers.save_pre.remove(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
         after.remove(overrides.override_after_save)
-    bpy.utils.unregister_class(MSSPL_OT_fuse)
+    for each in reversed(_CLASSES):
+        bpy.utils.unregister_class(each)

@@ -56,6 +56,12 @@ class MSSPLSettings(bpy.types.PropertyGroup):
         description="Render diffuse, glossy, transmission, emission, environment and volume passes, from which the "
         "beauty can be built again. Passes and light groups that the view layer has on are always rendered and fused",
     )
+    average: BoolProperty(
+        name="Average Neighbouring Frames",
+        description="In an animation: average each frame with four frames before and four after it, along the motion "
+        "of the surfaces. This needs motion blur to be off, and renders the pass Vector",
+        default=True,
+    )
     output: StringProperty(
         name="Output",
         description="The EXR to write. # stands for the frame number",
@@ -102,7 +108,7 @@ class MSSPL_PT_fuse(bpy.types.Panel):
         layout, scene = self.layout, context.scene
         settings = scene.msspl
         layout.use_property_split = True
-        for name in ("scale", "hr_spp", "lr_spp", "filter", "components", "output", "connect"):
+        for name in ("scale", "hr_spp", "lr_spp", "filter", "components", "average", "output", "connect"):
             layout.prop(settings, name)
         options = settings.options("")
         sizes = lrhs_size(scene, options.scale), hrls_size(scene)
@@ -113,6 +119,7 @@ class MSSPL_PT_fuse(bpy.types.Panel):
             layout.progress(text=status.text, factor=status.fraction)
         else:
             layout.operator("msspl.fuse", icon="RENDER_STILL")
+            layout.operator("msspl.fuse_animation", icon="RENDER_ANIMATION")
 
 
 CLASSES = (MSSPLSettings, MSSPLPreferences, MSSPL_PT_fuse)

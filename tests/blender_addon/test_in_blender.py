@@ -71,6 +71,20 @@ def test_the_composited_frame_equals_the_fused_file(results):
         assert fused.std() > 0.01
 
 
+def test_each_frame_of_the_composited_animation_equals_its_fused_file(results):
+    fused = layer(results / "shot_13.exr", "ViewLayer.Combined.", "RGBA")
+    np.testing.assert_array_equal(layer(results / "composited_shot.exr", "", "RGBA"), fused)
+    assert fused.std() > 0.01
+
+
+def test_the_animation_button_renders_what_averaging_needs(results):
+    names = [channel.name for part in open_exr(results / "shot_12.exr").parts for channel in part.channels]
+    assert "ViewLayer.Vector.X" in names
+    assert "ViewLayer.Vector.X" not in [
+        c.name for part in open_exr(results / "fused_012.exr").parts for c in part.channels
+    ]
+
+
 #: What the checks in Blender rebuild the beauty from. A component is light, or light times a colour.
 GROUPS = ("Combined_key", "Combined_rest", "Combined_world")
 COMPONENTS = (

@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 
 import bpy
-from check_button import check_button, check_cancel, check_modes, check_panel
+from check_button import check_animation_button, check_button, check_cancel, check_modes, check_panel
 from check_motion import render_motion
 from check_passes import check_passes
 from check_scene import check_animated, check_changes, check_samples, check_sentences, render_ramps
@@ -45,6 +45,7 @@ if __name__ == "__main__":
     check_changes(scene)
     check_modes(scene)
     check_cancel(scene)
+    check_animation_button(build_scene())
     render_ramps()
     check_passes()
     render_motion()

@@ -46,6 +46,35 @@ def check_button(scene):
         composite(scene, WORK / f"composited_{name}.exr")
 
 
+def check_animation_button(scene):
+    """Frames of the saved file are rendered, averaged, fused and shown; those that exist are left alone."""
+    assert "write #### for the frame number" in sentence("fuse_animation", **{"msspl.output": "//shot.exr"})
+    assert "turn Render Region off" in sentence("fuse_animation", **{"render.use_border": True})
+    scene.frame_start, scene.frame_end, scene.frame_step = 11, 13, 1
+    scene.msspl.output = "//shot_##.exr"
+    bpy.ops.wm.save_mainfile()
+    files = [WORK / f"shot_{number}.exr" for number in (11, 12, 13)]
+    before = snapshot(scene), scene.frame_current
+    assert bpy.ops.msspl.fuse_animation() == {"FINISHED"}
+    assert (snapshot(scene), scene.frame_current) == before
+    written = [file.stat().st_mtime_ns for file in files]
+    assert not [path for path in WORK.iterdir() if path.name.startswith(".msspl")]
+
+    tree = scene.compositing_node_group if BLENDER_5 else scene.node_tree
+    node = tree.nodes["MSSPL Fused"]
+    assert node.image.source == "SEQUENCE"
+    output = module("compositor")._output(tree)
+    tree.links.new(node.outputs["Combined"], output.inputs[0])
+    scene.frame_set(13)
+    composite(scene, WORK / "composited_shot.exr")
+
+    files[1].unlink()
+    scene.render.use_overwrite = False
+    bpy.ops.wm.save_mainfile()
+    assert bpy.ops.msspl.fuse_animation() == {"FINISHED"}
+    assert [files[i].stat().st_mtime_ns == written[i] for i in range(3)] == [True, False, True]
+
+
 def composite(scene, path):
     image = scene.render.image_settings
     image.file_format, image.color_mode, image.color_depth = "OPEN_EXR", "RGBA", "32"
@@ -58,7 +87,7 @@ def check_panel():
     layout = MagicMock()
     module("panel").MSSPL_PT_fuse.draw(SimpleNamespace(layout=layout), bpy.context)
     layout.label.assert_called_once_with(text="26x19 at 16 spp, 101x75 at 1 spp")
-    layout.operator.assert_called_once_with("msspl.fuse", icon="RENDER_STILL")
+    assert [call.args[0] for call in layout.operator.call_args_list] == ["msspl.fuse", "msspl.fuse_animation"]
 
 
 def check_modes(scene):

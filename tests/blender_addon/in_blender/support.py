@@ -59,13 +59,13 @@ def snapshot(scene):
     ]
 
 
-def sentence(**values):
-    """The error of the operator while ``{data path: value}`` is set. Also checks that the operator changes nothing."""
+def sentence(operator="fuse", **values):
+    """The error of an operator while ``{data path: value}`` is set. Also checks that the operator changes nothing."""
     scene = bpy.context.scene
     with module("overrides").override(scene, values):
         before = snapshot(scene)
         try:
-            bpy.ops.msspl.fuse()
+            getattr(bpy.ops.msspl, operator)()
         except RuntimeError as error:
             assert snapshot(scene) == before
             return str(error)

@@ -36,6 +36,16 @@ def run_job(job, send, receive):
             bpy.ops.wm.open_mainfile(filepath=job["scene"])
         except RuntimeError as error:
             raise Failure(f"{job['scene']}: can't be opened ({str(error).strip()})") from error
+    if job["scene_name"]:
+        if job["scene_name"] not in bpy.data.scenes:
+            known = ", ".join(each.name for each in bpy.data.scenes)
+            raise Failure(f"{job['scene']}: has no scene '{job['scene_name']}'; it has {known}")
+        bpy.context.window.scene = bpy.data.scenes[job["scene_name"]]
+    if bpy.app.autoexec_fail:
+        send(
+            warning=f"Blender did not run the scripts and drivers of {job['scene']} ({bpy.app.autoexec_fail_message}); "
+            "allow them with Auto Run Python Scripts in Blender's preferences"
+        )
     scene, options = bpy.context.scene, Options(**job["options"])
     if options.vectors and scene.render.use_motion_blur:
         send(no_vectors="motion blur is on, and Cycles then writes no motion vectors; turn it off")

@@ -7,6 +7,7 @@
 The job is a JSON object:
 
     scene      the .blend to open
+    scene_name the scene to render, or "" for the active one
     frames     list of [frame number or null for the current frame, EXR to write or null]. A frame without an EXR is
                rendered because its neighbours need it
     work       folder for temporary files, on the same file system as the results
@@ -18,7 +19,8 @@ Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON
 ``MSSPL {"fuse": {"lrhs": file, "hrls": file}}``, msspl-render fuses these files, and deletes them when no frame needs
 them any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
 
-The line ``MSSPL {"no_vectors": reason}`` says that frames can't be fused with their neighbours.
+The line ``MSSPL {"no_vectors": reason}`` says that frames can't be fused with their neighbours, ``MSSPL {"warning":
+sentence}`` that all frames may be wrong.
 """
 
 import importlib

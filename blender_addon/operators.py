@@ -151,13 +151,15 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
             raise Failure(f"{file or 'the scene'}: save the .blend first; another Blender renders the saved file")
         frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         pattern = settings.output
-        if not _NUMBER.search(pattern):
-            raise Failure(f"{pattern}: names one file for {len(frames)} frames; write #### for the frame number")
-        outputs = {number: bpy.path.abspath(_numbered(pattern, number)) for number in frames}
+        if not _LAST_NUMBER.search(pattern):
+            raise Failure(f"{pattern}: name the frames with #### as the last number, such as //fused_####.exr")
+        outputs = [bpy.path.abspath(_numbered(pattern, number)) for number in frames]
         with tempfile.TemporaryDirectory(prefix="msspl-") as work:
             reports = yield from programs.render_shot(
                 program,
                 file,
+                identity[0],
+                frames,
                 outputs,
                 bpy.path.abspath(pattern),
                 options,
@@ -170,13 +172,16 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
             scene,
             _numbered(pattern, frames[0]),
             [report["warnings"] for report in reports],
-            f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused",
+            f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused"
+            + (f" {reports[0]['temporal']}" if reports else ""),
             frames,
         )
 
 
 #: The frame number in the name of a file. The name of a folder may contain #.
 _NUMBER = re.compile(r"#+(?=[^/\\]*$)")
+#: The same as Blender's compositor takes it: the last number of the name.
+_LAST_NUMBER = re.compile(r"(?<![\d#])#+[^/\\\d#]*$")
 
 
 def _numbered(pattern, number):

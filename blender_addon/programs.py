@@ -81,13 +81,15 @@ def fuse(program, lrhs, hrls, output, work, overwrite, threads):
     return (yield from _run("msspl-fuse", command, work, progress))
 
 
-def render_shot(program, scene, outputs, pattern, options, work, overwrite, average):
+def render_shot(program, file, scene, frames, outputs, pattern, options, work, overwrite, average):
     """Render and fuse frames of a .blend in another Blender.
 
     Args:
         program: of :func:`find_render`.
-        scene: the .blend.
-        outputs: the EXR of each frame, by its number.
+        file: the .blend.
+        scene: the name of the scene in it.
+        frames: a range of their numbers.
+        outputs: the EXR of each.
         pattern: the name of all of them, with # for the number.
         options: :class:`.options.Options`.
         work: a folder for temporary files.
@@ -100,18 +102,23 @@ def render_shot(program, scene, outputs, pattern, options, work, overwrite, aver
     Raises:
         Failure: msspl-render failed. The message is its own.
     """
-    command = [program, scene, "-o", pattern, "--frames", ",".join(map(str, outputs)), "--json"]
-    command += ["--blender", bpy.app.binary_path or sys.executable, "--view-layer", options.view_layer]
+    first, last, step = frames[0], frames[-1], frames.step
+    command = [program, file, "-o", pattern, "--frames", f"{first}-{last}x{step}", "--json"]
+    command += ["--blender", bpy.app.binary_path or sys.executable]
+    command += ["--scene-name", scene, "--view-layer", options.view_layer]
     command += ["--scale", options.scale, "--hr-spp", options.hr_spp, "--filter", options.filter.lower()]
     command += ["--lr-spp", options.lr_spp] if options.lr_spp else []
     command += ["--components"] if options.components else []
     command += ["--threads", options.threads] if options.threads else []
     command += ["--temporal", "auto" if average else "off", "--overwrite" if overwrite else "--skip-existing"]
-    before = {path: _written(path) for path in outputs.values()} if overwrite else {}
+    before = [_written(path) for path in outputs] if overwrite else [None] * len(outputs)
+    done = 0
 
     def progress(_):
-        count = sum(_written(path) not in (None, before.get(path)) for path in outputs.values())
-        return f"{count} of {len(outputs)} frames", count / len(outputs)
+        nonlocal done  # frames are written in order
+        while done < len(outputs) and _written(outputs[done]) not in (None, before[done]):
+            done += 1
+        return f"{done} of {len(outputs)} frames", done / len(outputs)
 
     return (yield from _run("msspl-render", command, work, progress))
 

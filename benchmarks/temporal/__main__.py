@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 import sys
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -29,7 +30,7 @@ from benchmarks.scenes import beauty
 from benchmarks.temporal.measures import flicker, jod, psnr, relmse, warp_error
 from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
 from benchmarks.temporal.report import REFERENCE, film, layout, strip, summary
-from benchmarks.temporal.sequence import Sequence, load
+from benchmarks.temporal.sequence import Sequence, load, without_vectors
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError, MssplError
@@ -65,6 +66,9 @@ def main() -> int:
     parser.add_argument("folder", type=Path, help="the sequences")
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
+    parser.add_argument(
+        "--without-vectors", action="store_true", help="leave the motion vectors of Mitsuba's sequences out"
+    )
     parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
@@ -96,7 +100,10 @@ def run(args: argparse.Namespace) -> None:
     rows: list[Row] = []
     for index, name in enumerate(names):
         sequence = load(args.folder / name, args.motion_format)
-        made = list(all_methods(sequence, TemporalOptions(args.temporal, args.motion_format)))
+        options = TemporalOptions(args.temporal, args.motion_format)
+        with tempfile.TemporaryDirectory() as folder:
+            judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
+            made = list(all_methods(judged, options))
         of_sequence = list(measure(sequence, made, with_jod=args.jod))
         print(layout(of_sequence), flush=True)
         rows += of_sequence

@@ -7,10 +7,11 @@
 from __future__ import annotations
 
 import itertools
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
+import OpenEXR
 import OpenImageIO as oiio
 
 from benchmarks.render.sequences import MOTION, STATIC
@@ -88,6 +89,21 @@ def load(folder: Path, motion_format: str | None = None) -> Sequence:
         folder, numbers, (truth[0], truth[1]), np.stack(forth[:-1]), np.stack(seen),
         {name: mask for name, mask in masks.items() if mask.any()},
     )  # fmt: skip
+
+
+def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
+    """The same sequence without its motion vectors: its files are linked into a folder, its HRLS is written there."""
+    target = folder / sequence.name
+    target.mkdir(parents=True)
+    for path in sequence.folder.iterdir():
+        if not path.name.startswith("hr."):
+            (target / path.name).symlink_to(path.resolve())
+            continue
+        with OpenEXR.File(str(path), separate_channels=True) as file:
+            kept = {name: c.pixels for name, c in file.channels().items() if name not in MOTION}
+            with OpenEXR.File(file.header(), kept) as written:
+                written.write(str(target / path.name))
+    return replace(sequence, folder=target)
 
 
 def _channels(path: Path) -> dict[str, Array]:

@@ -119,7 +119,7 @@ class Light:
         noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
         scale = alignment.scale
         #: For each radius in LRHS pixels: the variance of the mean of both renders.
-        self._noise = {reach: _wide_mean(noise, reach) for reach in (max(1, round(r / scale)) for r in RADII)}
+        self._noise = {reach: wide_mean(noise, reach) for reach in (max(1, round(r / scale)) for r in RADII)}
 
     def trust(self, lrhs: Array, hrls: Array, area: Window) -> Array:
         """How much a neighbour counts, from 0 to 1, (h, w) over :func:`grid_rows` of ``area``.
@@ -140,12 +140,12 @@ class Light:
             noise = variance[rows]
             own_error = noise * np.float32(self._alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
             uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
-            change = np.maximum(_wide_mean(product, reach) - uncertainty - own_error, 0)
+            change = np.maximum(wide_mean(product, reach) - uncertainty - own_error, 0)
             np.minimum(trust, own_error / (own_error + change), out=trust)
         return trust
 
 
-def _wide_mean(plane: Array, radius: int) -> Array:
+def wide_mean(plane: Array, radius: int) -> Array:
     """Mean over the pixels up to ``radius`` rows and columns away that exist, in a time that does not depend on it."""
     for axis in (0, 1):
         plane = _mean_along(plane, radius, axis)

@@ -18,6 +18,7 @@ from functools import partial
 
 import numpy as np
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionField, user_fields
 from oiio_msspl.arrays import Array
@@ -26,9 +27,10 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion_check import FieldCheck, check_field
-from oiio_msspl.fusion.motion_guides import FramePair, open_pair, still_and_moved
+from oiio_msspl.fusion.motion_guides import FramePair, has_guide, open_pair, still_and_moved
 from oiio_msspl.fusion.motion_vectors import Mask, channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
+from oiio_msspl.fusion.surface_check import other_surfaces
 from oiio_msspl.parallel import in_parallel
 
 #: Kinds of sources.
@@ -48,6 +50,8 @@ class MotionFrame:
     """Fused beauty (h, w, 3) over the data window; only optical flow needs it."""
     vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
     """What :meth:`MotionSource.vectors_of` returns, if the frame is in memory."""
+    pixels: ReadableRender | None = None
+    """Its features, if they are in memory, with albedo and normal as far as there are any."""
 
 
 @dataclass(frozen=True)
@@ -100,6 +104,28 @@ class MotionSource:
             if not self.fields and not _camera_stands(*still_and_moved(open_pair(frame.hr, neighbour.hr, LOOK))):
                 known[:] = False
         return vectors, known
+
+    def things(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
+        """Where a frame shows another surface than its neighbour, because a thing has moved that :meth:`read` does not
+        follow: (h, w) over the data window of ``frame``. None if the source follows all things.
+
+        Args:
+            vectors, known: what :meth:`read` returns.
+
+        Raises:
+            InputError: pixels can't be decoded.
+        """
+        if self.kind not in (STATIC, CAMERA):
+            return None
+        both, moves = (frame, neighbour), self.kind == CAMERA
+        names = [name for name in (ALBEDO, NORMAL) if all(has_guide(each.hr, name, moves=moves) for each in both)]
+        here, there = (each.pixels or each.hr for each in both)
+        return other_surfaces(here, there, names, vectors if moves else None, known)
+
+    @property
+    def same_both_ways(self) -> bool:
+        """Whether :meth:`things` finds the same on the way back, if all pixels are known and the windows are equal."""
+        return self.kind == STATIC
 
     @property
     def reads_one_frame(self) -> bool:

@@ -104,12 +104,17 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
 def _readers(first: MappedRender, second: MappedRender) -> Iterator[tuple[str, tuple[Reader, Reader]]]:
     """The guides that both frames have, and how to read them from each."""
     for name in (ALBEDO, NORMAL):
-        formulas = [render.features.get(name) for render in (first, second)]
-        if all(f is not None and "camera" not in f.note and "screen" not in f.note for f in formulas):
+        if has_guide(first, name) and has_guide(second, name):
             yield name, (partial(_read_feature, first, name), partial(_read_feature, second, name))
     positions = first.motion.position, second.motion.position
     if positions[0] and positions[1]:
         yield POSITION, (partial(first.file.read, positions[0]), partial(second.file.read, positions[1]))
+
+
+def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
+    """Whether a frame has a feature that a surface keeps. If the camera moves, normals in camera space change."""
+    formula = render.features.get(name)
+    return formula is not None and not (moves and ("camera" in formula.note or "screen" in formula.note))
 
 
 def _read_feature(render: MappedRender, name: str, window: Window) -> Array:

@@ -25,7 +25,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, blank, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid
+from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid, wide_mean
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
 from oiio_msspl.fusion.warp import Mask, Path, Step, nearest_indices, sample_cubic
@@ -34,6 +34,9 @@ from oiio_msspl.parallel import for_row_blocks
 
 #: An LRHS pixel of a neighbour counts if this share of its HRLS pixels shows the same surface.
 COVERED = 0.9
+#: A neighbour counts less near things that move and are not followed: less the more of the HRLS pixels up to so many
+#: away on each side show them, and not at all from this share on.
+NEAR_THINGS, FEW = 8, 0.125
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
 #: With more channels, as passes have, bands have fewer rows.
@@ -129,23 +132,22 @@ def average_renders(
 
 
 def shared_noise(frame: RenderPair, other: RenderPair) -> float:
-    """Correlation, from -1 to 1, of the noise of two frames: of what their LRHS and HRLS differ by.
+    """Correlation, from -1 to 1, of the signs of the noise of two frames: of what their LRHS and HRLS differ by.
 
-    A renderer that uses one seed for all frames gives each pixel the same noise in all of them. 0 for frames whose
-    pixels lie over different places.
+    A renderer that uses one seed for all frames gives each pixel the same noise in all of them. Only signs are
+    compared: at edges the two renders differ by more than noise, in every frame if the camera stands still. 0 for
+    frames whose pixels lie over different places.
 
     Raises:
         InputError: pixels can't be decoded.
     """
-    noise, both = [], [each.luminances for each in (frame, other)]
+    both = [each.luminances for each in (frame, other)]
     if frame.alignment.grid != other.alignment.grid:
         return 0.0
-    for low, high in both:
-        light = low + high
-        # The difference relative to the light is at most 1, so fireflies do not decide.
-        noise.append(np.divide(low - high, light, out=np.zeros_like(light), where=light > 0).ravel())
-    lengths = np.linalg.norm(noise[0]) * np.linalg.norm(noise[1])
-    return float(np.dot(*noise) / lengths) if lengths > 0 else 0.0
+    first, second = (np.sign(low - high) for low, high in both)
+    alike = first * second
+    count = np.count_nonzero(alike)
+    return float(alike.sum(dtype=np.float64) / count) if count else 0.0
 
 
 def lacking_passes(frame: RenderPair, other: RenderPair) -> list[str]:
@@ -228,11 +230,22 @@ class _Band:
             trust = self._light.trust(lrhs, hrls, self._area)
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = trust if trusted is None else np.minimum(trusted, trust)
-            weight = from_grid(self._alignment, trusted, self._area) * valid
+            counted = trusted if path.things is None else trusted * self._far_from(path.things)
+            weight = from_grid(self._alignment, counted, self._area) * valid
             self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)
-            self._low.add(rows_of({name: values[place] for name, values in low.items()}), (trusted * usable)[place])
+            self._low.add(rows_of({name: values[place] for name, values in low.items()}), (counted * usable)[place])
             step.frame.unload()
+
+    def _far_from(self, things: Mask) -> Array:
+        """How much a neighbour counts around things that are not followed: 0 to 1, (h, w) at the LRHS's resolution.
+
+        Beside them it does not count. Otherwise the noise would change from pixel to pixel, and the network takes
+        single noisy pixels for detail.
+        """
+        share = to_grid(self._alignment, things.astype(np.float32), self._area)
+        near = wide_mean(share, max(1, round(NEAR_THINGS / self._alignment.scale)))
+        return np.maximum(1 - near / np.float32(FEW), 0)
 
     def finish(self) -> Array:
         """Turn the sums into means. Returns the number of frames of each pixel, as :attr:`AveragedPair.frames`."""

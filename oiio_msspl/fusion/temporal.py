@@ -24,7 +24,7 @@ from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, to_grid
-from oiio_msspl.fusion.warp import Mask, Path, Step, near_borders, sample_cubic
+from oiio_msspl.fusion.warp import Mask, Path, Step, grown, near_borders, sample_cubic
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
@@ -118,9 +118,14 @@ def _add_side(
 
 def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) -> Mask | None:
     """Pixels (h, w) over ``area`` that may show two surfaces; None if nothing moves."""
-    if not steps or steps[0].vectors is None:
+    if not steps:
         return None
-    return near_borders(steps[0].vectors[area.slices(window)], steps[0].tolerance)
+    first, part = steps[0], area.slices(window)
+    borders = None if first.vectors is None else near_borders(first.vectors[part], first.tolerance)
+    if first.things is None:
+        return borders
+    things = grown(grown(first.things[part]))
+    return things if borders is None else borders | things
 
 
 def _likeness(own: Array, other: Array, darkest: float) -> Array:

@@ -29,12 +29,15 @@ if TYPE_CHECKING:
 F = TypeVar("F", bound=Placed)
 T = TypeVar("T")
 
-#: Frames have the same noise above this correlation. Independent ones stay below 0.1.
+#: Frames have the same noise above this correlation. Independent ones stay below 0.1, with little noise below 0.4.
 SAME_NOISE = 0.5
 SAME_SEED = "have the same noise, which no average removes; let the renderer change its seed from frame to frame"
 #: Vectors of frames with more pixels are read one way after the other.
 LARGEST_READ = 1 << 22
 
+#: Vectors to a neighbour, where they can be believed, and where things have moved that they do not follow, as
+#: :class:`oiio_msspl.fusion.warp.Step` has them.
+Way = tuple[Array | None, Mask | None, Mask | None]
 #: The ways to the neighbours whose renders are averaged: those before a frame, and those after it.
 Neighbours = tuple[Sequence[Step[RenderPair]], Sequence[Step[RenderPair]]]
 
@@ -76,7 +79,9 @@ class FrameWindow:
         self._loaded: dict[int, LoadedFrame | Exception] = {}
         self._fused: dict[int, FusedAlone | Exception] = {}
         self._pairs: dict[int, RenderPair] = {}
-        self._vectors: dict[tuple[int, int], tuple[Array | None, Mask | None]] = {}
+        self._vectors: dict[tuple[int, int], Way] = {}
+        #: Things that have moved between two frames, where they are the same both ways.
+        self._things: dict[frozenset[int], Mask | None] = {}
         self._warnings: dict[int, list[str]] = {}
 
     def order(self) -> list[Frame]:
@@ -135,6 +140,7 @@ class FrameWindow:
         self._release_renders()
         known = self._loaded.keys() | self._fused.keys()
         self._vectors = {(a, b): found for (a, b), found in self._vectors.items() if a in known and b in known}
+        self._things = {pair: found for pair, found in self._things.items() if pair <= known}
 
     def _release_renders(self) -> None:
         """Forget the renders that no frame needs that is still to be fused."""
@@ -197,11 +203,11 @@ class FrameWindow:
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {number} and {n} {SAME_SEED}")
-                (vectors, valid), (back, back_valid) = self._read_both_ways(n - step, n)
+                (vectors, valid, things), (back, back_valid, _) = self._read_both_ways(n - step, n)
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
                 break
-            steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance))
+            steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance, things))
             if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
                 names = " and ".join(lacking_passes(here[1], there[1]))
                 if names:
@@ -213,9 +219,7 @@ class FrameWindow:
             raise outcome
         return placed(outcome)
 
-    def _read_both_ways(
-        self, start: int, end: int
-    ) -> tuple[tuple[Array | None, Mask | None], tuple[Array | None, Mask | None]]:
+    def _read_both_ways(self, start: int, end: int) -> tuple[Way, Way]:
         """Motion from one frame to the next or the previous one, and back."""
         there, back = partial(self._read_vectors, start, end), partial(self._read_vectors, end, start)
         assert self._temporal.motion is not None
@@ -225,21 +229,41 @@ class FrameWindow:
             return in_parallel(there, back)
         return there(), back()
 
-    def _read_vectors(self, start: int, end: int) -> tuple[Array | None, Mask | None]:
+    def _read_vectors(self, start: int, end: int) -> Way:
         """Motion from one frame to the next or the previous one."""
         if (start, end) not in self._vectors:
-            assert self._temporal.motion is not None
+            motion = self._temporal.motion
+            assert motion is not None
             frame, neighbour = (self._motion_frame(n) for n in (start, end))
-            vectors, valid = self._temporal.motion.read(frame, neighbour, end - start)
-            self._vectors[start, end] = kept(vectors) if vectors.any() else None, None if valid.all() else kept(valid)
+            vectors, known = motion.read(frame, neighbour, end - start)
+            things = self._find_things(frame, neighbour, vectors, known, {start, end})
+            if things is not None:
+                known &= ~things
+            way = kept(vectors) if vectors.any() else None, None if known.all() else kept(known), things
+            self._vectors[start, end] = way
         return self._vectors[start, end]
+
+    def _find_things(
+        self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask, numbers: set[int]
+    ) -> Mask | None:
+        """What :meth:`MotionSource.things` finds; None if there are none. ``numbers`` are those of the two frames."""
+        motion, pair = self._temporal.motion, frozenset(numbers)
+        assert motion is not None
+        same_back = motion.same_both_ways and frame.hr.data_window == neighbour.hr.data_window and bool(known.all())
+        if same_back and pair in self._things:
+            return self._things[pair]
+        found = motion.things(frame, neighbour, vectors, known) if known.any() else None
+        things = kept(found) if found is not None and found.any() else None
+        if same_back:
+            self._things[pair] = things
+        return things
 
     def _motion_frame(self, number: int) -> MotionFrame:
         fused, loaded = self._fused.get(number), self._loaded.get(number)
         if isinstance(fused, FusedAlone):
-            return MotionFrame(fused.loaded.hr, fused.fused.rgb, fused.loaded.vectors)
+            return MotionFrame(fused.loaded.hr, fused.fused.rgb, fused.loaded.vectors, fused.loaded.hr_pixels)
         assert loaded is not None and not isinstance(loaded, Exception)
-        return MotionFrame(loaded.hr, vectors=loaded.vectors)
+        return MotionFrame(loaded.hr, vectors=loaded.vectors, pixels=loaded.hr_pixels)
 
 
 def _fused_frame(alone: FusedAlone) -> tuple[LoadedFrame, FusedFrame]:

@@ -75,6 +75,7 @@ job = json.loads(Path(sys.argv[-1]).read_text())
 def tell(**what): print("MSSPL", json.dumps(what), flush=True)
 print("Blender 5.0.1 (hash unknown)")
 if "NO_VECTORS" in os.environ: tell(no_vectors=os.environ["NO_VECTORS"])
+if "WARNING" in os.environ: tell(warning=os.environ["WARNING"])
 for number, output in job["frames"]:
     tell(frame=number, step="LRHS 16x9, 16 spp", fraction=0.0)
     print("Fra:1 Mem:8M | Sample 1/2", flush=True)
@@ -360,3 +361,18 @@ def test_cancelling_ends_blender_and_what_it_started(farm, how):
                 os.kill(int(pid), 0)
                 time.sleep(0.02)
     assert sorted(p.name for p in folder.iterdir()) == ["blender", "pids", "scene.blend"]
+
+
+@posix
+def test_the_report_says_how_frames_are_averaged_and_what_is_wrong_with_all_of_them(farm, monkeypatch):
+    """A program that starts msspl-render, such as the add-on, reads nothing else."""
+    monkeypatch.setenv("WARNING", "no script was run")
+    monkeypatch.setenv("NO_VECTORS", "motion blur is on")
+    _, run, _ = farm
+    arguments = ["-o", "out.##.exr", "--frames", "1-2", "--temporal", "auto", "--scene-name", "Night", "--json"]
+    code, out, _, _ = run(*arguments)
+    assert code == 0
+    for report in json.loads(out):
+        assert report["temporal"] == "frame by frame: motion blur is on"
+        assert report["warnings"] == ["the moon is full", "no script was run"]
+        assert json.loads(Path(report["output"]).read_text())[1]["scene_name"] == "Night"

@@ -7,11 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.motion import MotionFormat
 from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion import motion
-from oiio_msspl.fusion.motion import MotionFrame, find_motion
+from oiio_msspl.fusion.motion import MotionFrame, MotionSource, find_motion
+from tests.conftest import rgb, write_exr
 from tests.moving_plane import (
     FOCAL,
     HEIGHT,
@@ -20,8 +23,10 @@ from tests.moving_plane import (
     encode,
     frame,
     layer,
+    positions,
     screen_matrix,
     standing,
+    texture,
     truck,
     truck_and_dolly,
     vectors,
@@ -432,3 +437,44 @@ def test_vectors_that_are_read_with_the_pixels_are_those_of_the_file(tmp_path, s
     for ours, theirs in zip(source.read(loaded[1], loaded[1 + step], step), read(source, frames, 1, step), strict=True):
         assert theirs.any()
         np.testing.assert_array_equal(ours, theirs)
+
+
+@pytest.mark.parametrize("camera", [standing, truck_and_dolly], ids=["standing", "moving"])
+def test_things_that_move_by_themselves_are_found(tmp_path, camera):
+    """A thing comes in front of a wall. Single noisy pixels of the wall are no thing, nor are unknown ones."""
+    rng = np.random.default_rng(3)
+    frames = []
+    for t in (0, 1):
+        albedo = 0.4 + 0.3 * texture(*np.moveaxis(positions(camera, t)[..., :2], -1, 0))
+        if t:
+            albedo[30:50, 60:90] = 0.9, 0.2, 0.1
+        noisy = (albedo + rng.normal(0, 0.03, albedo.shape)).astype(np.float32)
+        noisy[70, 100] = np.nan
+        matrix = {} if camera is standing else {"worldToScreen": screen_matrix(camera, t)}
+        guides = () if camera is standing else ("position",)
+        frames.append(frame(tmp_path, t, layer("albedo", noisy, "RGB"), camera, guides=guides, **matrix))
+    source = find_motion(*frames, required=True)
+    assert source.kind == ("static" if camera is standing else "camera")
+    ahead, way = (MotionFrame(frames[1]), MotionFrame(frames[0])), read(source, frames, 1, -1)
+    things = source.things(*ahead, *way)
+    assert things[30:50, 60:90].all()
+    far = things.copy()
+    far[26:54, 56:94] = False
+    assert far.mean() < 0.03
+    unknown = way[1].copy()
+    unknown[28:52, 58:92] = False
+    assert not source.things(*ahead, way[0], unknown)[35:45, 65:85].any()
+    found = source.things(*ahead[::-1], *read(source, frames, 0, 1))
+    assert found.sum() > 500 and (camera is not standing or (found == things).all())
+
+
+@pytest.mark.parametrize("size", [(2200, 2100), (1, 1), (3, 2)])
+def test_without_layers_that_tell_no_thing_is_found(tmp_path, size):
+    height, width = size
+    light = rgb(np.full((height, width, 3), 0.5, np.float32))
+    for name in ("a", "b"):
+        write_exr(tmp_path / f"{name}.exr", light)
+    pair = [MotionFrame(map_render(open_exr(tmp_path / f"{name}.exr"))) for name in ("a", "b")]
+    still, known = np.zeros((height, width, 2), np.float32), np.ones((height, width), bool)
+    assert not MotionSource("static", "").things(*pair, still, known).any()
+    assert MotionSource("vectors", "").things(*pair, still, known) is None

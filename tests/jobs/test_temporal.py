@@ -240,6 +240,63 @@ def test_a_static_camera_needs_no_vectors(tmp_path, bilinear_models):
     assert together < 0.6 * alone
 
 
+def make_standing_shot(folder, crop=0, fades=COUNT, count=5):
+    """Pairs at x4 of a wall before a standing camera, with a thing that moves.
+
+    It is as bright as the wall, so the light does not tell where it was. Its albedo does.
+
+    Args:
+        crop: rows at the top that every second frame lacks, as a renderer that crops the data window does.
+        fades: from this frame on, the left of the wall has less contrast.
+
+    Returns:
+        The clean frames (h, w, 3).
+    """
+    frames = []
+    for name in ("lr", "hr"):
+        (folder / name).mkdir(parents=True)
+    clean = texture(*np.moveaxis(positions(standing, 0)[..., :2], -1, 0))
+    height, width = clean.shape[:2]
+    thing = np.float32((0.15, 0.55, 0.9)) * clean.mean() / np.dot((0.2126, 0.7152, 0.0722), (0.15, 0.55, 0.9))
+    for t in range(count):
+        frames.append(clean.copy())
+        if t >= fades:
+            frames[t][:, :64] = 0.5 + 0.5 * (frames[t][:, :64] - 0.5)
+        frames[t][20:60, 40 + 8 * t : 72 + 8 * t] = thing
+        top = crop * (t % 2)
+        low, high = noisy(downsample(frames[t], 4), 16, 100 + t), noisy(frames[t], 1, t)
+        channels = rgb(high[top:]) | rgb(frames[t][top:], "albedo.")
+        for name, image, y, factor in (("lr", rgb(low[top // 4 :]), top // 4, 4), ("hr", channels, top, 1)):
+            size = np.array([0, 0], np.int32), np.array([width // factor - 1, height // factor - 1], np.int32)
+            write_exr(folder / f"{name}/{name}.{FIRST + t}.exr", [("", image, (0, y))], display=size)
+    return frames
+
+
+@pytest.mark.parametrize("crop", [0, 4])
+def test_a_thing_that_moves_before_a_standing_camera_leaves_no_ghost(tmp_path, bilinear_models, crop):
+    frames = make_standing_shot(tmp_path, crop)
+    for temporal in ("auto", "off"):
+        report = run(tmp_path, bilinear_models[4], temporal, temporal)
+        assert ("the camera stands still" in report.temporal) == (temporal == "auto")
+    together, alone = (
+        np.square(beauty(tmp_path / name / f"hr.{FIRST + 2}.exr") - frames[2]).mean(axis=-1) for name in ("auto", "off")
+    )
+    for beside in (slice(36, 54), slice(90, 108)):  # the wall that the thing hides in other frames, and its edges
+        assert together[20:60, beside].mean() < 1.02 * alone[20:60, beside].mean()
+    assert together[8:, 120:].mean() < 0.6 * alone[8:, 120:].mean()
+
+
+def test_things_before_a_standing_camera_are_the_same_in_chunks(tmp_path, bilinear_models):
+    """From a frame on, the wall has less contrast: by the frame before, the camera stands, by the frame after, it does
+    not."""
+    make_standing_shot(tmp_path, fades=4, count=7)
+    whole = run(tmp_path, bilinear_models[4], "whole")
+    assert "the camera stands still" in whole.temporal
+    for number in range(FIRST, FIRST + 7):
+        run(tmp_path, bilinear_models[4], "chunks", frames=str(number))
+    assert contents(tmp_path / "chunks") == contents(tmp_path / "whole")
+
+
 def test_frames_with_one_seed_are_named(tmp_path, bilinear_models):
     """The noise stays where it is while the picture moves."""
     folder = make_moving_shot(tmp_path, count=3, seeds=[0, 0, 5])

@@ -49,6 +49,16 @@ def render(
             rich_help_panel=options.INPUT,
         ),
     ] = "",
+    scene_name: Annotated[
+        str,
+        typer.Option(
+            metavar="NAME",
+            help="Scene to render, if the file has several. Without it: the one that was active when it was saved.",
+            show_default=False,
+            rich_help_panel=options.INPUT,
+            hidden=True,
+        ),
+    ] = "",
     blender: Annotated[
         str | None,
         typer.Option(
@@ -212,6 +222,7 @@ def render(
     fuser = _make_fuser(shot, wanted, scale, model, device, threads, memory, write, overwrite, over_time, keep)
     job = {
         "scene": str(scene.absolute()),
+        "scene_name": scene_name,
         # A neighbour of a frame has no result. Without a range, there is one frame: that at which the scene was saved.
         "frames": [
             (None if frames is None else frame.number, str(frame.output) if frame.output in wanted else None)
@@ -234,6 +245,7 @@ def render(
         folder.mkdir(exist_ok=True)
     reports: list[dict[str, Any]] = []
     waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
+    warnings: list[str] = []  # about all frames
     bar = console.ProgressBar(shown=not quiet and not verbose)
     label = ""
 
@@ -241,7 +253,8 @@ def render(
         """Report the frames that are written."""
         while waiting and not fuser.waits(result := Path(waiting[0]["output"])):
             report = waiting.pop(0)
-            report["warnings"] += fuser.warnings(result)
+            report["temporal"] = fuser.text
+            report["warnings"] += [*warnings, *fuser.warnings(result)]
             for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
                 report[render]["file"] = str(beside(result, suffix)) if keep else None
             reports.append(report)
@@ -253,6 +266,8 @@ def render(
         nonlocal label
         if "no_vectors" in event:
             fuser.fuse_alone(event["no_vectors"])
+        if "warning" in event:
+            warnings.append(event["warning"])
         if "report" in event:
             waiting.append(event["report"])
             finish()

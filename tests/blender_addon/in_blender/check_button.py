@@ -48,11 +48,14 @@ def check_button(scene):
 
 def check_animation_button(scene):
     """Frames of the saved file are rendered, averaged, fused and shown; those that exist are left alone."""
-    assert "write #### for the frame number" in sentence("fuse_animation", **{"msspl.output": "//shot.exr"})
+    for name in ("shot.exr", "shot_##_v2.exr", "take2##.exr"):
+        assert "with #### as the last number" in sentence("fuse_animation", **{"msspl.output": f"//{name}"})
     assert "turn Render Region off" in sentence("fuse_animation", **{"render.use_border": True})
     scene.frame_start, scene.frame_end, scene.frame_step = 11, 13, 1
     scene.msspl.output = "//shot_##.exr"
+    bpy.context.window.scene = bpy.data.scenes.new("Other")
     bpy.ops.wm.save_mainfile()
+    bpy.context.window.scene = scene  # the window shows another scene than the file
     files = [WORK / f"shot_{number}.exr" for number in (11, 12, 13)]
     before = snapshot(scene), scene.frame_current
     assert bpy.ops.msspl.fuse_animation() == {"FINISHED"}

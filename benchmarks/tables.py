@@ -39,6 +39,7 @@ from benchmarks.stability import report as stability_report
 from benchmarks.temporal import report as temporal_report
 from benchmarks.temporal.methods import ALONE, NEIGHBOURS, QUALITIES
 from benchmarks.temporal.methods import SCALES as TEMPORAL_SCALES
+from benchmarks.temporal.sequence import MASKS
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SCALES, SPREAD
 
@@ -427,6 +428,28 @@ def over_time() -> str:
     return temporal_report.layout(results.read("temporal"))
 
 
+def without_vectors() -> str:
+    """What averaging gains if the HRLS has no motion vectors, beside what it gains with them."""
+    tables = [results.read(name) for name in ("temporal_without_vectors", "temporal")]
+    found = [results.index(rows, "sequence", "scale", "method") for rows in tables]
+    measures = ["psnr", *(mask for mask in MASKS if any(mask in row for row in tables[0]))]
+    body = []
+    for (name, prefix), row in itertools.product(QUALITIES.items(), tables[0]):
+        if row["method"] != prefix + NEIGHBOURS:
+            continue
+        cells = [f"`{name}`", row["sequence"], f"x{row['scale']}"]
+        for measure in measures:
+            for rows in found:
+                pair = (rows[row["sequence"], row["scale"], prefix + way] for way in (NEIGHBOURS, ALONE))
+                averaged, alone = (each[measure] for each in pair)
+                cells.append(f"{averaged - alone:+.2f}")
+        body.append(cells)
+    head = ["quality", "sequence", "scale"]
+    for measure in ("all pixels", *measures[1:]):
+        head += [f"{measure}, dB", "with vectors"]
+    return results.markdown(head, body)
+
+
 def stability() -> str:
     """How often each method holds, suffers and fails, and its holes and stamps."""
     by_scale: dict[int, list[Row]] = {}
@@ -507,6 +530,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         division,
         errors,
         over_time,
+        without_vectors,
         stability,
         pair_checks,
     ),

@@ -179,7 +179,11 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
     """
     path = _next_frame(result.path)
     if path is not None:
-        following = map_render(open_exr(path), inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+        try:
+            following = map_render(open_exr(path), inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+        except InputError as error:  # it may still be rendered
+            result.facts.append(f"motion: not verified, because the next frame can't be read: {error}")
+            return
         result.motion = find_motion(render, following, wanted)
         result.facts.append(f"motion, by {path.name}: {result.motion.text}")
     elif render.motion.fields:

@@ -170,6 +170,8 @@ def run_blender(
         finally:
             if process.poll() is None:
                 _end(process, group=posix)
+            with contextlib.suppress(BrokenPipeError):  # leaving the `with` would write what Blender has not read
+                process.stdin.close()
     if failure is not None:
         raise failure
     if error is not None:

@@ -211,9 +211,10 @@ MotionFormat = Annotated[
     str | None,
     typer.Option(
         "--motion-format",
-        metavar="LAYER",
-        help="How motion vectors are stored, if the pixels can't tell: layer=NAME, and any of to=next|previous, "
-        "x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5.",
+        metavar="FORMAT",
+        help="How motion vectors are stored, if the pixels can't tell: layer=NAME, and any of channels=XY, "
+        "to=next|previous, x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5, premultiplied. "
+        "A second layer follows after +.",
         rich_help_panel=INPUT,
         hidden=True,
     ),

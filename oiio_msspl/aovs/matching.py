@@ -162,7 +162,7 @@ def _drop_unusable_variance(render: MappedRender) -> None:
         del render.features[VARIANCE]
         render.notes.append(
             f"variance: '{formula.text}' is {formula.kind.replace('_', ' ')}, which needs the samples per pixel; "
-            "the header does not say, so it is not used (give --hr-spp)"
+            "the header does not say, so it is not used (give --hr-spp to msspl-fuse)"
         )
 
 

@@ -101,6 +101,18 @@ def check_folder(path: Path) -> None:
         raise InputError(f"{path}: the folder {folder} is not writable")
 
 
+def make_folder(folder: Path) -> None:
+    """Make a folder if it does not exist.
+
+    Raises:
+        InputError: it can't be made.
+    """
+    try:
+        folder.mkdir(exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: the folder can't be made ({error.strerror})") from error
+
+
 @contextmanager
 def replacing(path: Path, *, overwrite: bool = False, stale: Path | None = None) -> Iterator[Path]:
     """Give the ``with`` block a temporary file, and rename it to ``path`` when the block ends.

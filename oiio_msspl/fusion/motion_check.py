@@ -82,7 +82,7 @@ def _check_offset(pair: FramePair, field: MotionField, stored: tuple[Array, Arra
         return FieldCheck(field, "is zero everywhere", zero=True)
     if not pair.guides:
         return FieldCheck(field, "there is no albedo, world-space normal or position to verify it by")
-    trial = _Trial(pair, field, stored, offset)
+    trial = _Trial(pair, stored, offset)
     if not trial.usable:
         return FieldCheck(field, "albedo, normal and position are too even to verify it by")
     fits = trial.fits(_formats(field, encoded=offset != 0))
@@ -163,7 +163,7 @@ class _Place:
 class _Trial:
     """Compares what formats make of the guides."""
 
-    def __init__(self, pair: FramePair, field: MotionField, stored: tuple[Array, Array], offset: float) -> None:
+    def __init__(self, pair: FramePair, stored: tuple[Array, Array], offset: float) -> None:
         self._frame = (pair.first.display_window.width, pair.first.display_window.height)
         self._reduction = pair.reduction
         self._places: list[_Place] = []

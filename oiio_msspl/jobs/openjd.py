@@ -8,6 +8,7 @@ contain spaces and quotes. Paths are job parameters, which a farm can map to its
 from __future__ import annotations
 
 import json
+import shutil
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -213,9 +214,13 @@ def write_bundle(folder: Path, job: Job) -> None:
     except OSError as error:
         raise MssplError(f"{folder}: can't be made ({error.strerror})") from error
     for_deadline = {"parameterValues": [{"name": name, "value": value} for name, value in job.values.items()]}
-    for name, content in ((VALUES, for_deadline), (OPENJD_VALUES, job.values), (TEMPLATE, job.template)):
-        with replacing(folder / name) as temporary:
-            temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    try:
+        for name, content in ((VALUES, for_deadline), (OPENJD_VALUES, job.values), (TEMPLATE, job.template)):
+            with replacing(folder / name) as temporary:
+                temporary.write_text(json.dumps(content, indent=2, ensure_ascii=False) + "\n", encoding="utf-8")
+    except BaseException:
+        shutil.rmtree(folder, ignore_errors=True)
+        raise
 
 
 def _literal(text: str) -> str:

@@ -9,13 +9,18 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
+from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
+from oiio_msspl.exr.contents import dropped_channels
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.jobs.frame import require_outputs
 from oiio_msspl.jobs.inputs import InputOptions, map_pair, resolve_auto
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import Stages, is_left_over
-from oiio_msspl.model.catalogue import family_of
+from oiio_msspl.jobs.views import check_passes, find_other_views
+from oiio_msspl.model.catalogue import family_of, load_model
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +39,7 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
     folder = shot.output.folder
     if not folder.exists():
         check_folder(folder)
-        folder.mkdir(exist_ok=True)
+        make_folder(folder)
     check_folder(shot.output.path(0))
     check_no_input(shot, inputs, model, more_targets)
 
@@ -86,6 +91,27 @@ def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]
             problems = [] if check.problem is None else [f"can't be checked here: {check.problem}"]
             return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings, *check.passed_on]]
     return []
+
+
+def check_wanted_outputs(frames: Sequence[Frame], inputs: InputOptions, write: WriteOptions, model: str | None) -> None:
+    """Check on the first pair that can be read whether what is to be written can be, before a farm is asked for it.
+
+    Raises:
+        InputError: a layer or a set of passes that an option names is not there, or the model does not make a layer.
+    """
+    for frame in frames:
+        if frame.lr is None or frame.hr is None:
+            continue
+        try:
+            lr, hr = map_pair(frame.lr, frame.hr, inputs)
+            others = find_other_views(lr, hr, inputs, write)
+        except InputError:  # files that an option names may exist on the workers only
+            continue
+        dropped_channels(hr.file, hr.beauty_channels, write.layers)
+        check_passes(hr, others, write)
+        if write.error_layer or write.data_passes:
+            require_outputs(load_model(align(lr, hr).scale, model), write)
+        return
 
 
 def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None:

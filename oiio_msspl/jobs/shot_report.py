@@ -14,6 +14,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import Frame, Shot
 
+#: What is read of ``first_fused`` in an earlier report. A report of another version may lack some of it.
+FIRST_FUSED = {"frame", "renderer", "scale", "aovs", "notes"}
+
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
 
 
@@ -151,8 +154,9 @@ def read_earlier(
         entries = {
             entry["frame"]: {k: entry[k] for k in ("warnings", "repaired", "seconds")} for entry in data["frames"]
         }
-        if skip_existing:
-            report.first = data["first_fused"]
-    except (ValueError, KeyError, TypeError, RecursionError) as error:
+        first = data["first_fused"]
+        if skip_existing and first is not None and first.keys() >= FIRST_FUSED:
+            report.first = first
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: exists and is no report of a shot; name another file") from error
     return entries if skip_existing else {}

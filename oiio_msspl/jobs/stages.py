@@ -280,7 +280,7 @@ class Stages:
             MssplError: the network failed.
         """
         start = time.perf_counter()
-        held = self._held_bytes(loaded, session)
+        held = self._held_bytes(loaded)
         check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, held)
         pair, frames, averaged = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None, None
         if any(neighbours):
@@ -323,7 +323,7 @@ class Stages:
             InputError, MssplError: see :meth:`fuse`.
         """
         start, busy = time.perf_counter(), alone.seconds
-        loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded, alone.session)
+        loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded)
         fused.replaced, reports = fuse_other_views(
             loaded.others, session, self.write_options, self.max_memory, held=held
         )
@@ -356,10 +356,10 @@ class Stages:
     def _fuse_passes(self, alone: FusedAlone, fused: FusedFrame) -> None:
         """Fuse the passes of a view, given its final beauty."""
         loaded, session = alone.loaded, alone.session
-        room = self.max_memory - self._held_bytes(loaded, session)
+        room = self.max_memory - self._held_bytes(loaded)
         fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, room, averaged=alone.averaged)
 
-    def _held_bytes(self, loaded: LoadedFrame, session: Session) -> int:
+    def _held_bytes(self, loaded: LoadedFrame) -> int:
         """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
         lr, hr = loaded.averaged_lr, loaded.averaged_hr
         held = result_bytes(align(lr, hr), error=self.write_options.error_layer)

@@ -63,8 +63,8 @@ class TemporalOptions:
     """How motion vectors are stored, see :func:`oiio_msspl.aovs.motion.user_fields`; None to find it out."""
 
     def __post_init__(self) -> None:
-        if self.frames not in (AUTO, OFF) and not (str(self.frames).isdecimal() and int(self.frames) <= MOST):
-            raise InputError(f"--temporal {self.frames}: give auto, off, or a number of frames up to {MOST}")
+        if self.frames not in (AUTO, OFF) and not (str(self.frames).isdecimal() and 1 <= int(self.frames) <= MOST):
+            raise InputError(f"--temporal {self.frames}: give auto, off, or a number of frames from 1 to {MOST}")
 
     def count(self, model: str | None = None) -> int:
         """Frames before and after each frame, if their motion is known.

@@ -376,3 +376,12 @@ def test_the_report_says_how_frames_are_averaged_and_what_is_wrong_with_all_of_t
         assert report["temporal"] == "frame by frame: motion blur is on"
         assert report["warnings"] == ["the moon is full", "no script was run"]
         assert json.loads(Path(report["output"]).read_text())[1]["scene_name"] == "Night"
+
+
+@posix
+def test_a_blender_that_ends_while_its_frame_is_fused_is_named(farm, model):
+    _, run, _ = farm
+    crash = ASKS.replace("    sys.stdin.readline() or sys.exit(1)\n", "    os._exit(3)\n")
+    assert crash != ASKS
+    code, _, err, _ = run("--model", model, code=crash)
+    assert code == 1 and "ended with code 3" in err

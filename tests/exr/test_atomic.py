@@ -9,7 +9,7 @@ import pytest
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr import atomic
-from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers, replacing
+from oiio_msspl.exr.atomic import check_separate, check_target, make_folder, remove_leftovers, replacing
 from tests.programs import leave_temporary
 
 
@@ -134,3 +134,13 @@ def test_what_is_read_is_not_written_under_any_name(tmp_path, named):
     with pytest.raises(InputError, match="is the same file as"):
         check_separate([], [source, target])
     check_separate([source], [tmp_path / "out.exr", tmp_path / "out.png"])
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="links need rights there")
+def test_a_folder_behind_a_link_that_leads_nowhere_is_refused(tmp_path):
+    (tmp_path / "out").symlink_to(tmp_path / "nowhere" / "else")
+    with pytest.raises(InputError, match="the folder can't be made"):
+        make_folder(tmp_path / "out")
+    make_folder(tmp_path / "new")
+    make_folder(tmp_path / "new")
+    assert (tmp_path / "new").is_dir()

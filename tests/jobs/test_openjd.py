@@ -13,6 +13,8 @@ from pathlib import Path
 
 import pytest
 
+from oiio_msspl.errors import MssplError
+from oiio_msspl.jobs import openjd as bundles
 from tests.conftest import write_exr
 from tests.jobs.test_temporal import make_shot_with_passes
 from tests.programs import fuse, run
@@ -153,3 +155,13 @@ def test_a_canceled_job_ends_with_whole_frames(tmp_path, bilinear_models):
     assert files == [f"beauty.{n}.exr" for n in range(1001, 1001 + len(files))]
     assert re.findall(r"frame (\d+) fused", said)[-1] == files[-1].split(".")[1]
     assert 3 <= len(files) < 100
+
+
+def test_a_bundle_that_cannot_be_completed_leaves_no_folder(tmp_path, monkeypatch):
+    def full(*_, **__):
+        raise MssplError("the disk is full")
+
+    monkeypatch.setattr(bundles, "replacing", full)
+    with pytest.raises(MssplError, match="full"):
+        bundles.write_bundle(tmp_path / "job", bundles.Job(None, {}, {}))
+    assert not (tmp_path / "job").exists()

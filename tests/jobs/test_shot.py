@@ -5,6 +5,7 @@ import json
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from types import SimpleNamespace
 
 import numpy as np
 import OpenEXR
@@ -17,7 +18,7 @@ from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs import shot, stages
 from oiio_msspl.jobs.frame import write_frame
-from oiio_msspl.jobs.shot_report import fused_result
+from oiio_msspl.jobs.shot_report import fused_result, read_earlier
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.session import Session
@@ -558,3 +559,12 @@ def test_write_protected_frames_are_not_replaced(tmp_path, bilinear_models):
     assert [result.status for result in report.results.values()] == ["failed", "fused"]
     assert "is write-protected" in report.results[1001].message
     assert published.stat().st_ino == before
+
+
+def test_a_report_of_another_version_does_not_stop_a_resumed_shot(tmp_path):
+    path, report = tmp_path / "report.json", SimpleNamespace(first=None)
+    path.write_text(json.dumps({"frames": [], "first_fused": {"frame": 1001, "aovs": []}}))
+    assert read_earlier(report, path, overwrite=False, skip_existing=True) == {} and report.first is None
+    path.write_text(json.dumps({"frames": [], "first_fused": "1001"}))
+    with pytest.raises(InputError, match="is no report of a shot"):
+        read_earlier(report, path, overwrite=False, skip_existing=True)

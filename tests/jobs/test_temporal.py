@@ -307,8 +307,8 @@ def test_frames_with_one_seed_are_named(tmp_path, bilinear_models):
 
 
 def test_the_number_of_neighbours_is_checked():
-    for wrong in ("two", "-1", "99", 2.5):
-        with pytest.raises(InputError, match="give auto, off, or a number of frames up to"):
+    for wrong in ("two", "-1", "0", 0, "99", 2.5):
+        with pytest.raises(InputError, match="give auto, off, or a number of frames from 1 to"):
             TemporalOptions(wrong)
 
 

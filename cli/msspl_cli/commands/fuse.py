@@ -195,7 +195,7 @@ def fuse(
 ) -> None:
     """Fuse a low-resolution, high-spp render with a high-resolution, low-spp render of the same frame.
 
-    OUT gets the fused beauty first and then every other layer of HR, unchanged.
+    OUT gets the fused beauty and passes, and every other layer of HR unchanged.
     The scale (x2, x4, x8) follows from the two display windows. Layers are found
     under the names that renderers give them; --map names others.
 

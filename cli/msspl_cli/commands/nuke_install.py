@@ -11,7 +11,7 @@ import typer
 from msspl_cli import options
 from msspl_cli.installed import find_msspl_fuse, shipped_folder
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import replacing
+from oiio_msspl.exr.atomic import make_folder, replacing
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -80,7 +80,7 @@ def set_line(path: Path, line: str | None) -> bool:
         after += (newline if kept and not kept.endswith(b"\n") else b"") + line.encode() + newline
     if after == before:
         return False
-    path.parent.mkdir(exist_ok=True)
+    make_folder(path.parent)
     with replacing(path, overwrite=True) as temporary:
         temporary.write_bytes(after)
     return True

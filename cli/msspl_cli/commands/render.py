@@ -12,7 +12,7 @@ import typer
 from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_folder, check_separate, check_target
+from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
 
 if TYPE_CHECKING:
     from msspl_cli.rendered_shot import RenderedShot
@@ -100,7 +100,7 @@ def render(
         typer.Option(
             "--filter",
             metavar="NAME",
-            help="Pixel filter: box, which the model expects, or scene for the scene's own.",
+            help="Pixel filter: box, which is sharpest, or scene for the scene's own.",
             rich_help_panel=RENDER,
             hidden=True,
         ),
@@ -242,7 +242,7 @@ def render(
         "compare": compare,
     }
     if makes_folder:
-        folder.mkdir(exist_ok=True)
+        make_folder(folder)
     reports: list[dict[str, Any]] = []
     waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
     warnings: list[str] = []  # about all frames

@@ -53,23 +53,23 @@ def submit(
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import format_frames
-    from oiio_msspl.jobs.shot_checks import check_first_pair
+    from oiio_msspl.jobs.shot_checks import check_first_pair, check_wanted_outputs
 
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
-    options.make_write_options(
-        *(given[name] for name in ("layout", "compression", "half", "layers", "error_layer", "passes"))
-    )
+    names = ("layout", "compression", "half", "layers", "error_layer", "passes", "data_passes")
+    write = options.make_write_options(**{name: given[name] for name in names})
     options.make_temporal_options(given["temporal"], given["motion_format"])
     options.parse_bytes(given["max_memory"])
+    model = options.choose_model(given["model"], given["quality"])
     job = make_job(
         given["lr"],
         given["hr"],
         given["output"],
         frames=given["frames"],
         inputs=inputs,
-        model=options.choose_model(given["model"], given["quality"]),
+        model=model,
         map_file=given["map_file"],
         device=given["device"],
         view=given["view"],
@@ -77,6 +77,7 @@ def submit(
         chunk=chunk,
         timeout=timeout,
     )
+    check_wanted_outputs(job.shot.frames, inputs, write, model)
     doubts = check_first_pair(job.shot.frames, inputs)
     write_bundle(bundle, job)
     for doubt in doubts:

@@ -100,10 +100,10 @@ class _Job:
             return {"CANCELLED"}
         return _CONTINUE
 
-    def _finish(self, scene, path, reports, text, frames=None):
+    def _finish(self, scene, path, warnings, text, frames=None):
         """Show what is written in the compositor, and report it."""
         compositor.show(scene, path, scene.msspl.connect, frames)
-        for warning in dict.fromkeys(warning for report in reports for warning in report):
+        for warning in dict.fromkeys(warnings):
             self.report({"WARNING"}, warning)
         self.report({"INFO"}, text)
 
@@ -129,7 +129,7 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
             report = yield from frame.render_and_fuse(
                 scene, options, output, work, run, overwrite=overwrite, window=window
             )
-        self._finish(overrides.find_scene(*identity), path, [report.warnings], f"{path}: {report}")
+        self._finish(overrides.find_scene(*identity), path, report.warnings, f"{path}: {report}")
 
 
 class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
@@ -171,7 +171,7 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
         self._finish(
             scene,
             _numbered(pattern, frames[0]),
-            [report["warnings"] for report in reports],
+            [warning for report in reports for warning in report["warnings"]],
             f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused"
             + (f" {reports[0]['temporal']}" if reports else ""),
             frames,

@@ -15,15 +15,13 @@ from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.warp import Mask, nearest_indices
 from oiio_msspl.parallel import for_row_blocks
 
-#: Two frames differ at a pixel if they do so by more than this: a constant, for layers without texture, and a multiple
-#: of what pixels of one surface differ by, which are its texture and its noise.
+#: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of what pixels of
+#: one surface differ by. That is the surface's texture and noise.
 DIFFERENCE, MULTIPLE = 0.03, 3.0
 #: The surface is another one if so many of 3 x 3 pixels differ. Single ones are noise.
 PIXELS = 4
 #: Rows and columns around a pixel that decide on it.
 REACH = 4
-
-
 #: Pixels that are compared at a time, which bounds memory.
 PIXELS_AT_ONCE = 1 << 22
 

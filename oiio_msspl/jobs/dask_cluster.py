@@ -24,7 +24,7 @@ from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 
 if TYPE_CHECKING:
-    from dask.distributed import Client
+    from dask.distributed import Client, Future
 
 
 log = logging.getLogger(__name__)
@@ -86,20 +86,29 @@ def fuse_frames(
     find_model(2, stages.model)  # refuses an unknown model before any task is submitted
     address = client.scheduler.address
     run = uuid.uuid4().hex
-    futures = {}
+    #: What is under way, and how often a frame of it may still be tried again.
+    futures: dict[Future, tuple[list[Frame], int]] = {}
     stages = replace(stages, temporal=stages.temporal.absolute())
-    size = CHUNK if stages.temporal.count else 1
-    for chunk in (frames[start : start + size] for start in range(0, len(frames), size)):
-        key = f"msspl-fuse-{chunk[0].number}-{run}"
+
+    def submit(chunk: list[Frame], tries: int) -> Future:
+        key = f"msspl-fuse-{chunk[0].number}-{tries}-{run}"
         task = [frame.absolute() for frame in chunk]
         future = client.submit(_fuse_chunk, run, stages, task, neighbours, key=key, retries=RETRIES)
-        futures[future] = chunk
+        futures[future] = chunk, tries
+        return future
+
+    size = CHUNK if stages.temporal.count else 1
     try:
-        for future in as_completed(list(futures)):
-            chunk = futures.pop(future)
+        ended = as_completed([submit(frames[start : start + size], RETRIES) for start in range(0, len(frames), size)])
+        for future in ended:
+            chunk, tries = futures.pop(future)
             failure: Exception | None = None
             try:
-                yield from zip(chunk, future.result(), strict=True)
+                outcomes = dict(zip(chunk, future.result(), strict=True))
+                failed = [frame for frame, outcome in outcomes.items() if tries and _may_pass(outcome)]
+                if failed:
+                    ended.add(submit(failed, tries - 1))
+                yield from (item for item in outcomes.items() if item[0] not in failed)
             except KilledWorker:
                 failure = MssplError("every worker that tried it died; if for lack of memory, lower --max-memory")
             except (CancelledError, CommClosedError) as error:
@@ -114,6 +123,11 @@ def fuse_frames(
                 yield from ((frame, None if fused else failure) for frame, fused in zip(chunk, done, strict=True))
     finally:
         client.cancel(list(futures))
+
+
+def _may_pass(outcome: dict[str, Any] | Exception | None) -> bool:
+    """Whether a frame has failed for a reason that another try may not meet."""
+    return isinstance(outcome, Exception) and not isinstance(outcome, InputError)
 
 
 def _most_workers_on_a_machine(client: Client) -> int:
@@ -146,7 +160,7 @@ def _sessions(run: str) -> dict[tuple[int, str | None], Session]:
 
 def _fuse_chunk(
     run: str, stages: Stages, frames: list[Frame], neighbours: int
-) -> list[dict[str, Any] | InputError | None]:
+) -> list[dict[str, Any] | Exception | None]:
     """Take frames through the three stages, in a worker.
 
     Args:
@@ -155,11 +169,7 @@ def _fuse_chunk(
         neighbours: workers on this machine, which share its cores.
 
     Returns:
-        For each frame its report as a dict; the caller's mistake, which another try can't mend; or None if the EXR
-        exists.
-
-    Raises:
-        Exception: any other failure, which Dask answers with another try.
+        For each frame its report as a dict, the reason for its failure, or None if the EXR exists.
     """
     from dask.system import CPU_COUNT
 
@@ -176,15 +186,12 @@ def _fuse_chunk(
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
     if missing:
         run_pipeline(stages, missing, lambda frame, outcome: outcomes.update({frame.number: outcome}), lambda: None)
-    results: list[dict[str, Any] | InputError | None] = []
+    results: list[dict[str, Any] | Exception | None] = []
     for frame in frames:
         outcome = outcomes[frame.number]
         if isinstance(outcome, InputError):
             # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
             replaces = stages.replaces(frame.lr, frame.hr, frame.output)
-            results.append(None if not replaces and frame.output.exists() else outcome)
-        elif isinstance(outcome, Exception):
-            raise outcome
-        else:
-            results.append(outcome)
+            outcome = None if not replaces and frame.output.exists() else outcome
+        results.append(outcome)
     return results

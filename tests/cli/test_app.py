@@ -46,7 +46,7 @@ SHOWN = {
         "--view-layer --max-memory --blender --scale --lr-spp --hr-spp --components --quality --device --output "
         "--layout --passes --error-layer --compare --overwrite --json --frames --temporal --skip-existing "
         "--help --help-all",
-        8,
+        9,
     ),
 }
 

@@ -7,16 +7,19 @@ import re
 import signal
 import time
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from oiio_msspl import InputError, fuse_shot
+from oiio_msspl import InputError, MssplError, fuse_shot
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
-from oiio_msspl.jobs.dask_cluster import _sessions
+from oiio_msspl.jobs import dask_cluster
+from oiio_msspl.jobs.dask_cluster import _sessions, fuse_frames
+from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import TemporalOptions
+from oiio_msspl.jobs.temporal import Temporal, TemporalOptions
 from tests.jobs.test_temporal import make_shot_with_passes
 from tests.programs import fuse
 from tests.shots import contents, make_shot
@@ -167,3 +170,29 @@ def test_an_address_without_a_scheduler_is_a_mistake(tmp_path):
     assert done.returncode == 2
     assert done.stderr.startswith("error: --scheduler nobody: no Dask scheduler answers there")
     assert done.stderr.count("\n") == 1
+
+
+#: Frames of the tasks that :func:`fail_once` has got.
+TASKS: list[list[int]] = []
+
+
+def fail_once(run, stages, frames, neighbours):
+    """In place of a task, in this process: the server is away for frame 2, at first."""
+    TASKS.append([frame.number for frame in frames])
+    away = MssplError("the server is away") if len(TASKS) == 1 else {"warnings": []}
+    outcomes = {1: {"warnings": ["a"]}, 2: away, 3: InputError("no file"), 4: None}
+    return [outcomes[frame.number] for frame in frames]
+
+
+def test_only_the_frames_of_a_chunk_that_failed_are_tried_again(monkeypatch):
+    """The others keep their reports, and are not fused again."""
+    distributed = pytest.importorskip("distributed")
+    monkeypatch.setattr(dask_cluster, "_fuse_chunk", fail_once)
+    frames = [Frame(number, Path("lr.exr"), Path("hr.exr"), Path(f"{number}.exr")) for number in (1, 2, 3, 4)]
+    with distributed.Client(
+        processes=False, n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
+    ) as made:
+        outcomes = {f.number: outcome for f, outcome in fuse_frames(made, Stages(temporal=Temporal(1, 1)), frames)}
+    assert TASKS == [[1, 2, 3, 4], [2]]
+    assert outcomes[1] == {"warnings": ["a"]} and outcomes[2] == {"warnings": []} and outcomes[4] is None
+    assert isinstance(outcomes[3], InputError)

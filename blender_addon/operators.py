@@ -158,14 +158,14 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
             reports = yield from programs.render_shot(
                 program,
                 file,
-                identity[0],
-                frames,
-                outputs,
-                bpy.path.abspath(pattern),
-                options,
-                work,
-                scene.render.use_overwrite,
-                settings.average,
+                scene=identity[0],
+                frames=frames,
+                outputs=outputs,
+                pattern=bpy.path.abspath(pattern),
+                options=options,
+                work=work,
+                overwrite=scene.render.use_overwrite,
+                average=settings.average,
             )
         scene = overrides.find_scene(*identity)
         self._finish(

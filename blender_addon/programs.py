@@ -81,7 +81,7 @@ def fuse(program, lrhs, hrls, output, work, overwrite, threads):
     return (yield from _run("msspl-fuse", command, work, progress))
 
 
-def render_shot(program, file, scene, frames, outputs, pattern, options, work, overwrite, average):
+def render_shot(program, file, *, scene, frames, outputs, pattern, options, work, overwrite, average):
     """Render and fuse frames of a .blend in another Blender.
 
     Args:

@@ -105,9 +105,10 @@ class MotionSource:
                 known[:] = False
         return vectors, known
 
-    def things(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
-        """Where a frame shows another surface than its neighbour, because a thing has moved that :meth:`read` does not
-        follow: (h, w) over the data window of ``frame``. None if the source follows all things.
+    def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
+        """Where an object has moved that :meth:`read` does not follow, so that both frames show different surfaces.
+
+        (h, w) over the data window of ``frame``. None if the source follows all objects.
 
         Args:
             vectors, known: what :meth:`read` returns.
@@ -124,7 +125,7 @@ class MotionSource:
 
     @property
     def same_both_ways(self) -> bool:
-        """Whether :meth:`things` finds the same on the way back, if all pixels are known and the windows are equal."""
+        """Whether :meth:`moved_objects` finds the same on the way back if all pixels are known and windows equal."""
         return self.kind == STATIC
 
     @property

@@ -34,9 +34,9 @@ from oiio_msspl.parallel import for_row_blocks
 
 #: An LRHS pixel of a neighbour counts if this share of its HRLS pixels shows the same surface.
 COVERED = 0.9
-#: A neighbour counts less near things that move and are not followed: less the more of the HRLS pixels up to so many
+#: A neighbour counts less near objects that move and are not followed: less the more of the HRLS pixels up to so many
 #: away on each side show them, and not at all from this share on.
-NEAR_THINGS, FEW = 8, 0.125
+NEAR_OBJECTS, FEW = 8, 0.125
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
 #: With more channels, as passes have, bands have fewer rows.
@@ -230,21 +230,21 @@ class _Band:
             trust = self._light.trust(lrhs, hrls, self._area)
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = trust if trusted is None else np.minimum(trusted, trust)
-            counted = trusted if path.things is None else trusted * self._far_from(path.things)
+            counted = trusted if path.moved_objects is None else trusted * self._far_from(path.moved_objects)
             weight = from_grid(self._alignment, counted, self._area) * valid
             self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)
             self._low.add(rows_of({name: values[place] for name, values in low.items()}), (counted * usable)[place])
             step.frame.unload()
 
-    def _far_from(self, things: Mask) -> Array:
-        """How much a neighbour counts around things that are not followed: 0 to 1, (h, w) at the LRHS's resolution.
+    def _far_from(self, moved_objects: Mask) -> Array:
+        """How much a neighbour counts around objects that are not followed: 0 to 1, (h, w) at the LRHS's resolution.
 
         Beside them it does not count. Otherwise the noise would change from pixel to pixel, and the network takes
         single noisy pixels for detail.
         """
-        share = to_grid(self._alignment, things.astype(np.float32), self._area)
-        near = wide_mean(share, max(1, round(NEAR_THINGS / self._alignment.scale)))
+        share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
+        near = wide_mean(share, max(1, round(NEAR_OBJECTS / self._alignment.scale)))
         return np.maximum(1 - near / np.float32(FEW), 0)
 
     def finish(self) -> Array:

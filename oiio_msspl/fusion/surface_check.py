@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Does a pixel show another surface in a neighbouring frame? The albedo and the normals of both tell.
 
-Where no motion vector says so, a thing may have come in front of a surface, or may have gone.
+Without motion vectors, nothing else says that an object has moved in front of a surface, or away from it.
 """
 
 from __future__ import annotations

@@ -122,10 +122,10 @@ def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) ->
         return None
     first, part = steps[0], area.slices(window)
     borders = None if first.vectors is None else near_borders(first.vectors[part], first.tolerance)
-    if first.things is None:
+    if first.moved_objects is None:
         return borders
-    things = grown(grown(first.things[part]))
-    return things if borders is None else borders | things
+    moved_objects = grown(grown(first.moved_objects[part]))
+    return moved_objects if borders is None else borders | moved_objects
 
 
 def _likeness(own: Array, other: Array, darkest: float) -> Array:

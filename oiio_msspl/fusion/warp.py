@@ -51,9 +51,9 @@ class Step(Generic[F]):
     back_valid: Mask | None
     tolerance: float = ROUND_TRIP
     """How far the way back may miss the pixel, in HRLS pixels."""
-    things: Mask | None = None
-    """(h, w): where a thing that vectors do not follow has moved, see
-    :meth:`oiio_msspl.fusion.motion.MotionSource.things`. Such pixels are not ``valid``."""
+    moved_objects: Mask | None = None
+    """(h, w): where an object has moved that the vectors do not follow, see
+    :meth:`oiio_msspl.fusion.motion.MotionSource.moved_objects`. Such pixels are not ``valid``."""
 
 
 class Path:
@@ -66,8 +66,8 @@ class Path:
         self.x: Array | None = None
         self.y: Array | None = None
         self.valid: Mask = np.ones((area.height, area.width), bool)
-        #: Where a thing has moved that is not followed (h, w); None if no step says so.
-        self.things: Mask | None = None
+        #: Where an object has moved that is not followed (h, w); None if no step says so.
+        self.moved_objects: Mask | None = None
         #: Flat indices (h, w) of the nearest pixels in the data window of the last frame; None with ``x``.
         self.nearest: NDArray[np.intp] | None = None
         self._last = window
@@ -78,10 +78,10 @@ class Path:
         valid = self.valid.copy()
         moves = step.vectors is not None
         # A complex number is gathered in half the time of two real ones.
-        moved = step.things
+        moved = step.moved_objects
         vectors, back = (None if v is None else _as_complex(v) for v in (step.vectors, step.back))
         shape = valid.shape
-        things = np.zeros(shape, np.bool_)
+        moved_objects = np.zeros(shape, np.bool_)
         found: tuple[Array, Array, NDArray[np.intp]] | None = None
         if moves or start != end:
             found = np.empty(shape, np.float32), np.empty(shape, np.float32), np.empty(shape, np.intp)
@@ -94,7 +94,7 @@ class Path:
             if step.valid is not None:
                 good &= self._at_pixels(step.valid, rows) if at is None else step.valid.reshape(-1).take(at)
             if moved is not None:
-                things[rows] = self._at_pixels(moved, rows) if at is None else moved.reshape(-1).take(at)
+                moved_objects[rows] = self._at_pixels(moved, rows) if at is None else moved.reshape(-1).take(at)
             if vectors is not None:
                 vector = self._at_pixels(vectors, rows) if at is None else vectors.reshape(-1).take(at)
                 good &= np.isfinite(vector)
@@ -118,7 +118,7 @@ class Path:
         if found is not None:
             self.x, self.y, self.nearest = found
         if moved is not None:
-            self.things = things if self.things is None else self.things | things
+            self.moved_objects = moved_objects if self.moved_objects is None else self.moved_objects | moved_objects
         self.valid, self._last = valid, end
 
     def _at_pixels(self, values: NDArray[Any], rows: slice) -> NDArray[Any]:

@@ -35,7 +35,7 @@ SAME_SEED = "have the same noise, which no average removes; let the renderer cha
 #: Vectors of frames with more pixels are read one way after the other.
 LARGEST_READ = 1 << 22
 
-#: Vectors to a neighbour, where they can be believed, and where things have moved that they do not follow, as
+#: Vectors to a neighbour, where they can be believed, and where objects have moved that they do not follow, as
 #: :class:`oiio_msspl.fusion.warp.Step` has them.
 Way = tuple[Array | None, Mask | None, Mask | None]
 #: The ways to the neighbours whose renders are averaged: those before a frame, and those after it.
@@ -80,8 +80,8 @@ class FrameWindow:
         self._fused: dict[int, FusedAlone | Exception] = {}
         self._pairs: dict[int, RenderPair] = {}
         self._vectors: dict[tuple[int, int], Way] = {}
-        #: Things that have moved between two frames, where they are the same both ways.
-        self._things: dict[frozenset[int], Mask | None] = {}
+        #: Where objects have moved between two frames, where they are the same both ways.
+        self._moved_objects: dict[frozenset[int], Mask | None] = {}
         self._warnings: dict[int, list[str]] = {}
 
     def order(self) -> list[Frame]:
@@ -140,7 +140,7 @@ class FrameWindow:
         self._release_renders()
         known = self._loaded.keys() | self._fused.keys()
         self._vectors = {(a, b): found for (a, b), found in self._vectors.items() if a in known and b in known}
-        self._things = {pair: found for pair, found in self._things.items() if pair <= known}
+        self._moved_objects = {pair: found for pair, found in self._moved_objects.items() if pair <= known}
 
     def _release_renders(self) -> None:
         """Forget the renders that no frame needs that is still to be fused."""
@@ -203,11 +203,11 @@ class FrameWindow:
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {number} and {n} {SAME_SEED}")
-                (vectors, valid, things), (back, back_valid, _) = self._read_both_ways(n - step, n)
+                (vectors, valid, moved_objects), (back, back_valid, _) = self._read_both_ways(n - step, n)
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
                 break
-            steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance, things))
+            steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance, moved_objects))
             if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
                 names = " and ".join(lacking_passes(here[1], there[1]))
                 if names:
@@ -236,27 +236,27 @@ class FrameWindow:
             assert motion is not None
             frame, neighbour = (self._motion_frame(n) for n in (start, end))
             vectors, known = motion.read(frame, neighbour, end - start)
-            things = self._find_things(frame, neighbour, vectors, known, {start, end})
-            if things is not None:
-                known &= ~things
-            way = kept(vectors) if vectors.any() else None, None if known.all() else kept(known), things
+            moved_objects = self._find_moved_objects(frame, neighbour, vectors, known, {start, end})
+            if moved_objects is not None:
+                known &= ~moved_objects
+            way = kept(vectors) if vectors.any() else None, None if known.all() else kept(known), moved_objects
             self._vectors[start, end] = way
         return self._vectors[start, end]
 
-    def _find_things(
+    def _find_moved_objects(
         self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask, numbers: set[int]
     ) -> Mask | None:
-        """What :meth:`MotionSource.things` finds; None if there are none. ``numbers`` are those of the two frames."""
+        """What :meth:`MotionSource.moved_objects` finds between two frames with these numbers; None if nothing."""
         motion, pair = self._temporal.motion, frozenset(numbers)
         assert motion is not None
         same_back = motion.same_both_ways and frame.hr.data_window == neighbour.hr.data_window and bool(known.all())
-        if same_back and pair in self._things:
-            return self._things[pair]
-        found = motion.things(frame, neighbour, vectors, known) if known.any() else None
-        things = kept(found) if found is not None and found.any() else None
+        if same_back and pair in self._moved_objects:
+            return self._moved_objects[pair]
+        found = motion.moved_objects(frame, neighbour, vectors, known) if known.any() else None
+        moved_objects = kept(found) if found is not None and found.any() else None
         if same_back:
-            self._things[pair] = things
-        return things
+            self._moved_objects[pair] = moved_objects
+        return moved_objects
 
     def _motion_frame(self, number: int) -> MotionFrame:
         fused, loaded = self._fused.get(number), self._loaded.get(number)

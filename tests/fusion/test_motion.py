@@ -440,8 +440,8 @@ def test_vectors_that_are_read_with_the_pixels_are_those_of_the_file(tmp_path, s
 
 
 @pytest.mark.parametrize("camera", [standing, truck_and_dolly], ids=["standing", "moving"])
-def test_things_that_move_by_themselves_are_found(tmp_path, camera):
-    """A thing comes in front of a wall. Single noisy pixels of the wall are no thing, nor are unknown ones."""
+def test_objects_that_move_by_themselves_are_found(tmp_path, camera):
+    """An object comes in front of a wall. Single noisy pixels of the wall are none, nor are unknown ones."""
     rng = np.random.default_rng(3)
     frames = []
     for t in (0, 1):
@@ -456,25 +456,25 @@ def test_things_that_move_by_themselves_are_found(tmp_path, camera):
     source = find_motion(*frames, required=True)
     assert source.kind == ("static" if camera is standing else "camera")
     ahead, way = (MotionFrame(frames[1]), MotionFrame(frames[0])), read(source, frames, 1, -1)
-    things = source.things(*ahead, *way)
-    assert things[30:50, 60:90].all()
-    far = things.copy()
+    moved_objects = source.moved_objects(*ahead, *way)
+    assert moved_objects[30:50, 60:90].all()
+    far = moved_objects.copy()
     far[26:54, 56:94] = False
     assert far.mean() < 0.03
     unknown = way[1].copy()
     unknown[28:52, 58:92] = False
-    assert not source.things(*ahead, way[0], unknown)[35:45, 65:85].any()
-    found = source.things(*ahead[::-1], *read(source, frames, 0, 1))
-    assert found.sum() > 500 and (camera is not standing or (found == things).all())
+    assert not source.moved_objects(*ahead, way[0], unknown)[35:45, 65:85].any()
+    found = source.moved_objects(*ahead[::-1], *read(source, frames, 0, 1))
+    assert found.sum() > 500 and (camera is not standing or (found == moved_objects).all())
 
 
 @pytest.mark.parametrize("size", [(2200, 2100), (1, 1), (3, 2)])
-def test_without_layers_that_tell_no_thing_is_found(tmp_path, size):
+def test_without_layers_that_tell_no_object_is_found(tmp_path, size):
     height, width = size
     light = rgb(np.full((height, width, 3), 0.5, np.float32))
     for name in ("a", "b"):
         write_exr(tmp_path / f"{name}.exr", light)
     pair = [MotionFrame(map_render(open_exr(tmp_path / f"{name}.exr"))) for name in ("a", "b")]
     still, known = np.zeros((height, width, 2), np.float32), np.ones((height, width), bool)
-    assert not MotionSource("static", "").things(*pair, still, known).any()
-    assert MotionSource("vectors", "").things(*pair, still, known) is None
+    assert not MotionSource("static", "").moved_objects(*pair, still, known).any()
+    assert MotionSource("vectors", "").moved_objects(*pair, still, known) is None

@@ -241,7 +241,7 @@ def test_a_static_camera_needs_no_vectors(tmp_path, bilinear_models):
 
 
 def make_standing_shot(folder, crop=0, fades=COUNT, count=5):
-    """Pairs at x4 of a wall before a standing camera, with a thing that moves.
+    """Pairs at x4 of a wall before a standing camera, with an object that moves.
 
     It is as bright as the wall, so the light does not tell where it was. Its albedo does.
 
@@ -257,12 +257,12 @@ def make_standing_shot(folder, crop=0, fades=COUNT, count=5):
         (folder / name).mkdir(parents=True)
     clean = texture(*np.moveaxis(positions(standing, 0)[..., :2], -1, 0))
     height, width = clean.shape[:2]
-    thing = np.float32((0.15, 0.55, 0.9)) * clean.mean() / np.dot((0.2126, 0.7152, 0.0722), (0.15, 0.55, 0.9))
+    object_colour = np.float32((0.15, 0.55, 0.9)) * clean.mean() / np.dot((0.2126, 0.7152, 0.0722), (0.15, 0.55, 0.9))
     for t in range(count):
         frames.append(clean.copy())
         if t >= fades:
             frames[t][:, :64] = 0.5 + 0.5 * (frames[t][:, :64] - 0.5)
-        frames[t][20:60, 40 + 8 * t : 72 + 8 * t] = thing
+        frames[t][20:60, 40 + 8 * t : 72 + 8 * t] = object_colour
         top = crop * (t % 2)
         low, high = noisy(downsample(frames[t], 4), 16, 100 + t), noisy(frames[t], 1, t)
         channels = rgb(high[top:]) | rgb(frames[t][top:], "albedo.")
@@ -273,7 +273,7 @@ def make_standing_shot(folder, crop=0, fades=COUNT, count=5):
 
 
 @pytest.mark.parametrize("crop", [0, 4])
-def test_a_thing_that_moves_before_a_standing_camera_leaves_no_ghost(tmp_path, bilinear_models, crop):
+def test_an_object_that_moves_before_a_standing_camera_leaves_no_ghost(tmp_path, bilinear_models, crop):
     frames = make_standing_shot(tmp_path, crop)
     for temporal in ("auto", "off"):
         report = run(tmp_path, bilinear_models[4], temporal, temporal)
@@ -281,12 +281,12 @@ def test_a_thing_that_moves_before_a_standing_camera_leaves_no_ghost(tmp_path, b
     together, alone = (
         np.square(beauty(tmp_path / name / f"hr.{FIRST + 2}.exr") - frames[2]).mean(axis=-1) for name in ("auto", "off")
     )
-    for beside in (slice(36, 54), slice(90, 108)):  # the wall that the thing hides in other frames, and its edges
+    for beside in (slice(36, 54), slice(90, 108)):  # the wall that the object hides in other frames, and its edges
         assert together[20:60, beside].mean() < 1.02 * alone[20:60, beside].mean()
     assert together[8:, 120:].mean() < 0.6 * alone[8:, 120:].mean()
 
 
-def test_things_before_a_standing_camera_are_the_same_in_chunks(tmp_path, bilinear_models):
+def test_objects_before_a_standing_camera_are_the_same_in_chunks(tmp_path, bilinear_models):
     """From a frame on, the wall has less contrast: by the frame before, the camera stands, by the frame after, it does
     not."""
     make_standing_shot(tmp_path, fades=4, count=7)

@@ -129,6 +129,11 @@ class MotionSource:
         return self.kind == STATIC
 
     @property
+    def reads_same_back(self) -> bool:
+        """Whether :meth:`read` finds the same on the way back if windows are equal."""
+        return self.kind == STATIC and not self.fields
+
+    @property
     def reads_one_frame(self) -> bool:
         """Whether :meth:`read` opens the file of ``frame`` alone, so that both ways can be read at the same time."""
         return self.kind == VECTORS and all(self._field(step) is not None for step in (-1, 1))

@@ -140,10 +140,11 @@ def reduced(read: Reader, window: Window, reduction: int) -> Array:
 def smooth(image: Array) -> Array:
     """Mean over 3 x 3 pixels of (h, w, c), to lower the noise of few samples; the edge is repeated."""
     for axis in (0, 1):
-        padded = np.concatenate([image.take([0], axis), image, image.take([-1], axis)], axis=axis)
-        count = image.shape[axis]
-        before, here, after = (padded.take(range(i, i + count), axis) for i in range(3))
-        image = (before + here + after) / np.float32(3)
+        lines = np.concatenate([image.take([0], axis), image, image.take([-1], axis)], axis=axis).swapaxes(0, axis)
+        total = lines[:-2] + lines[1:-1]
+        total += lines[2:]
+        total /= np.float32(3)
+        image = total.swapaxes(0, axis)
     return image
 
 
@@ -177,7 +178,7 @@ def still_and_moved(pair: FramePair) -> tuple[Mask, Mask]:
         change = second - first
         near = [np.roll(first, NEAR, axis) - first for axis in (0, 1)]
         xx, xy, yy, xt, yt, tt, apart = (
-            _tile_sums(sum((a * b).sum(axis=-1) for a, b in pairs), shape)
+            _tile_sums(sum(np.einsum("hwc,hwc->hw", a, b) for a, b in pairs), shape)
             for pairs in (
                 [(right, right)], [(right, down)], [(down, down)], [(right, change)], [(down, change)],
                 [(change, change)], [(v, v) for v in near],

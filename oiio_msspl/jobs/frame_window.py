@@ -231,10 +231,13 @@ class FrameWindow:
 
     def _read_vectors(self, start: int, end: int) -> Way:
         """Motion from one frame to the next or the previous one."""
+        motion = self._temporal.motion
+        assert motion is not None
+        frame, neighbour = (self._motion_frame(n) for n in (start, end))
+        if motion.reads_same_back and start > end and frame.hr.data_window == neighbour.hr.data_window:
+            # Always in this order, so that pixels do not depend on which frame comes first.
+            start, end, frame, neighbour = end, start, neighbour, frame
         if (start, end) not in self._vectors:
-            motion = self._temporal.motion
-            assert motion is not None
-            frame, neighbour = (self._motion_frame(n) for n in (start, end))
             vectors, known = motion.read(frame, neighbour, end - start)
             moved_objects = self._find_moved_objects(frame, neighbour, vectors, known, {start, end})
             if moved_objects is not None:

@@ -18,6 +18,8 @@ from datagen.meshes import Mesh
 ROOM = (6.0, 5.0, 3.0)
 #: Where the camera stands and looks.
 CAMERA, TARGET = np.array([0.3, -2.2, 1.5]), np.array([0.1, 2.4, 0.9])
+#: Where the block in the middle stands: the object that slides or turns.
+BLOCK = np.array([0.1, 0.6, 0.0])
 #: Horizontal angle of view, degrees.
 ANGLE = 62.0
 #: The frame at which the second lamp of "lamp_on" is on.
@@ -40,6 +42,10 @@ class Animation:
     """A mirror and a glass ball stand in the room."""
     foliage: bool = False
     """Grass and leaves stand in the room."""
+    flakes: float = 0.0
+    """Metres that flakes of 1 to 4 pixels fall."""
+    aperture: float = 0.0
+    """Radius of the camera's lens, metres; 0 is a pinhole. It is focused on the block in the middle."""
     truck: float = 0.0
     """Metres that the camera moves, to its right."""
     dolly: float = 0.0
@@ -54,6 +60,8 @@ ANIMATIONS = {
     "lamp_on": Animation(lamp_on=True),
     "mirror": Animation(mirror=True, truck=0.03),
     "foliage": Animation(foliage=True, truck=0.02),
+    "particles": Animation(flakes=0.03),
+    "defocus": Animation(aperture=0.03, truck=0.03),
 }
 
 
@@ -79,11 +87,17 @@ def camera_matrix(animation: Animation, at: float) -> np.ndarray:
     return matrix
 
 
+def focus_distance() -> float:
+    """Metres from the camera to the block in the middle, along the camera's axis."""
+    forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
+    return float((BLOCK + (0, 0, 0.3) - CAMERA) @ forward)
+
+
 def object_matrix(animation: Animation, at: float) -> np.ndarray:
     """Where the moving object is, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3, :3] = meshes.rotation((0, 0, 1), at * animation.turn)
-    matrix[:3, 3] = (0.1 + at * animation.slide, 0.6, 0.0)
+    matrix[:3, 3] = BLOCK + at * np.array([animation.slide, 0, -animation.flakes])
     return matrix
 
 
@@ -125,9 +139,15 @@ def build_room(animation: Animation, frame: int, at: float) -> Room:
 
     block = meshes.block(0.45, 0.45, 0.6)
     place = object_matrix(animation, at)
-    marked(moved, block.rotated(place[:3, :3]).moved(*place[:3, 3]), materials.diffuse(textures.glyphs(rng)))
+    stands = object_matrix(Animation(), 0) if animation.flakes else place
+    marked(moved, block.rotated(stands[:3, :3]).moved(*stands[:3, 3]), materials.diffuse(textures.glyphs(rng)))
     if not (animation.slide or animation.turn):
         moved = []
+    if animation.flakes:
+        centres = rng.uniform((-2.0, -0.6, 0.3), (2.2, 2.2, 2.8), (700, 3)) + place[:3, 3] - BLOCK
+        radii = rng.uniform(0.006, 0.02, len(centres))
+        flakes = [meshes.sphere(r, 8).moved(*centre) for r, centre in zip(radii, centres, strict=True)]
+        marked(moved, meshes.merge(flakes), materials.diffuse(np.full((2, 2, 3), 0.85, np.float32)))
     if animation.shadow:
         flat(meshes.block(0.5, 0.5, 0.05).moved(0.5 + at * animation.shadow, 0.5, 2.5), np.full((2, 2, 3), 0.5))
     if animation.mirror:

@@ -32,7 +32,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.render.film import set_crop, write_exr
-from benchmarks.render.moving_scenes import ANGLE, ANIMATIONS, Room, build_room, camera_matrix, object_matrix
+from benchmarks.render.moving_scenes import (
+    ANGLE,
+    ANIMATIONS,
+    Room,
+    build_room,
+    camera_matrix,
+    focus_distance,
+    object_matrix,
+)
 from datagen.mitsuba.start import start as start_mitsuba
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
@@ -63,14 +71,17 @@ SCENES = {"staircase2": (0.53, 0.60), "lamp": (0.47, 0.40)}
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole at ``to_world`` (4 x 4), with x to the left as Mitsuba's.
+    """A camera at ``to_world`` (4 x 4), with x to the left as Mitsuba's.
 
-    ``focal`` is in pixels; ``centre`` is where the axis meets the picture.
+    ``focal`` is in pixels; ``centre`` is where the axis meets the picture. ``aperture`` is the lens's radius, 0 for a
+    pinhole, and ``focus`` the distance at which it is sharp.
     """
 
     to_world: Array
     focal: float
     centre: tuple[float, float]
+    aperture: float = 0.0
+    focus: float = 1.0
 
     def project(self, positions: Array) -> Array:
         """World positions (..., 3) to pixels (..., 2), y downwards."""
@@ -132,7 +143,8 @@ class _AnimatedRoom:
 
     def camera(self, at: float) -> Camera:
         focal = WIDTH / 2 / np.tan(np.radians(ANGLE) / 2)
-        return Camera(camera_matrix(self._animation, at), focal, (WIDTH / 2, HEIGHT / 2))
+        centre, aperture = (WIDTH / 2, HEIGHT / 2), self._animation.aperture
+        return Camera(camera_matrix(self._animation, at), focal, centre, aperture, focus_distance())
 
     def room(self, frame: int, at: float) -> Room:
         return build_room(self._animation, frame, at)
@@ -205,8 +217,11 @@ def render_sequence(mi: Any, scene: Any, folder: Path) -> None:
 def _shoot(mi: Any, loaded: Any, integrator: Any, scene: Any, camera: Camera, spp: int, scale: int, seed: int) -> Array:
     """A frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
     angle = np.degrees(2 * np.arctan(scene.size[0] / 2 / camera.focal))
+    lens = {"type": "perspective"}
+    if camera.aperture:
+        lens = {"type": "thinlens", "aperture_radius": camera.aperture, "focus_distance": camera.focus}
     sensor = mi.load_dict({
-        "type": "perspective", "fov": angle, "fov_axis": "x", "to_world": mi.ScalarTransform4f(camera.to_world),
+        **lens, "fov": angle, "fov_axis": "x", "to_world": mi.ScalarTransform4f(camera.to_world),
         "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, "pixel_format": "rgb"},
         "sampler": {"type": "independent"},
     })  # fmt: skip

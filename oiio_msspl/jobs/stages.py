@@ -31,7 +31,7 @@ from oiio_msspl.fusion.warp import Mask
 from oiio_msspl.jobs.frame import check_frame_memory, require_outputs, write_frame, write_frame_preview
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
-from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
+from oiio_msspl.jobs.report import FrameReport, add_other_views, name_of, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.jobs.views import (
@@ -334,10 +334,16 @@ class Stages:
         self._fuse_passes(alone, fused)
         preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
-        add_other_views(report, reports, loaded.others.passed_on)
+        add_other_views(report, reports, [*loaded.others.passed_on, *self._not_planned(loaded.others)])
         busy += time.perf_counter() - start
         report.seconds = {"read": loaded.seconds, "fuse": busy, "network": report.network_seconds}
         return report
+
+    def _not_planned(self, others: OtherViews) -> list[str]:
+        """A sentence for each view that is fused frame by frame because the plan for the shot does not know it."""
+        names = [view.hr.view for view in others.views if self.temporal.count]
+        new = [name_of(name) for name in names if name not in self.temporal.looked_at]
+        return [f"{name} is fused frame by frame: the frames by which its motion is found lack it" for name in new]
 
     def _complete_views(
         self, fused: FusedFrame, views: Iterable[tuple[FusedAlone, FusedFrame]]

@@ -92,6 +92,8 @@ class Temporal:
     """One sentence for the user; empty if the user has switched it off."""
     views: Mapping[str, Temporal] = field(default_factory=dict)
     """The same for those views beside the first one that are averaged, too. All have the same ``count``."""
+    looked_at: frozenset[str] = frozenset()
+    """All views beside the first one that the plan is about. ``text`` says why some are fused frame by frame."""
 
     @property
     def count(self) -> int:
@@ -189,14 +191,15 @@ def plan_temporal(
     if not first.count:
         return first
     views, text = {}, first.text
-    for label in _other_views(mapped, looked_at, inputs, write):
+    others = _other_views(mapped, looked_at, inputs, write)
+    for label in others:
         source = _motion_of(mapped, looked_at, inputs, options, label, required=False)
         plan = _plan(source, count, frames, asked=asked)
         if plan.count:
             views[label] = plan
         else:
             text += f"; {name_of(label)} {plan.text}"
-    return replace(first, views=views, text=text)
+    return replace(first, views=views, looked_at=frozenset(others), text=text)
 
 
 def _plan(source: MotionSource, count: int, frames: Mapping[int, Frame], *, asked: bool) -> Temporal:

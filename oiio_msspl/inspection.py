@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
@@ -22,7 +23,7 @@ from oiio_msspl.fusion.motion import MotionSource, find_motion
 from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
-from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls
+from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -49,8 +50,10 @@ class Inspection:
     """How the movement to the next frame is known; None if there is no next frame beside this one."""
     noise: str | None = None
     """``independent`` or ``spread`` over neighbouring pixels; None unless :func:`inspect_noise` has looked."""
-    passed_through: list[str] = field(default_factory=list)
-    """Names of the layers and channels that no feature is read from."""
+    fused_sets: list[AdditiveSet] = field(default_factory=list)
+    """The sets of all views that sum to their beauty."""
+    unused: list[str] = field(default_factory=list)
+    """Names of the layers and channels that are neither read nor fused."""
     problems: list[str] = field(default_factory=list)
     """Why the file can't be used, one sentence each; empty if it can."""
 
@@ -99,7 +102,7 @@ class Inspection:
                 "model": self.model,
                 "aovs": self.aovs(),
                 "notes": self.render.notes,
-                "passed_through": self.passed_through,
+                "unused": self.unused,
                 "motion_layers": {each.name: str(each.format) for each in self.render.motion.fields},
                 "noise": self.noise,
                 "motion": {"kind": self.motion.kind, "text": self.motion.text} if self.motion else None,
@@ -131,18 +134,18 @@ def inspect_file(
     try:
         file = result.file = open_exr(path)
         result.facts = _facts(file)
-        render = result.render = map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
+        render = result.render = map_hrls(file, inputs)
         result.facts.append(_renderer_fact(render))
-        result.facts += [*_pixel_facts(render), *_set_facts(render)]
+        result.facts += [*_pixel_facts(render), *_look_at_sets(result, render)]
         for label in render.other_views if inputs.view is None else ():
             try:
                 view = map_other_hrls(render, label, inputs)
-                facts = [*_pixel_facts(view), *_set_facts(view)]
+                facts = [*_pixel_facts(view), *_look_at_sets(result, view)]
                 result.other_views.append(view)
             except InputError as error:
                 facts = [f"can't be fused: {str(error).removeprefix(f'{path}: ')}"]
             result.facts += [f"{label or '(unnamed)'}: {fact}" for fact in facts]
-        result.passed_through = render.unread_layers(result.other_views)
+        result.unused = render.unused_layers(result.other_views, result.fused_sets)
         _inspect_motion(result, render, inputs, motion_format)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
@@ -164,11 +167,18 @@ def inspect_noise(found: Sequence[Inspection]) -> None:
         return
     high.noise = "spread" if spread else "independent"
     text = "the pixel filter has spread it over neighbouring pixels" if spread else "independent in each pixel"
-    high.facts.append(f"noise, by {low.path.name}: {text}")
+    high.facts.append(f"noise, compared with {low.path.name}: {text}")
 
 
-def _set_facts(render: MappedRender) -> list[str]:
-    return [f"{each.name} ({each.layer_names}): {check_sum(render, each).text}" for each in render.additive_sets]
+def _look_at_sets(result: Inspection, render: MappedRender) -> list[str]:
+    """A line for each additive set of a view. Those that sum to the beauty are added to the result."""
+    facts = []
+    for each in render.additive_sets:
+        check = check_sum(render, each)
+        facts.append(f"{each.name} ({each.layer_names}): {check.text}")
+        if not check.problem:
+            result.fused_sets.append(each)
+    return facts
 
 
 def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptions, wanted: str | None) -> None:
@@ -185,7 +195,7 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
             result.facts.append(f"motion: not verified, because the next frame can't be read: {error}")
             return
         result.motion = find_motion(render, following, wanted)
-        result.facts.append(f"motion, by {path.name}: {result.motion.text}")
+        result.facts.append(f"motion, checked with {path.name}: {result.motion.text}")
     elif render.motion.fields:
         layers = " and ".join(f"{each.name} ({each.format})" for each in render.motion.fields)
         result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")

@@ -92,9 +92,12 @@ def print_table(report: ShotReport) -> None:
     if first := report.first:
         fused = [each["view"] or "(unnamed)" for each in first.get("fused_views", ())]
         view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
-        console.say(f"{first['renderer']} pairs at x{first['scale']}{view}; layers of frame {first['frame']}:")
+        pairs = f"{first['renderer']} pairs at x{first['scale']}, {first['model']}"
+        console.say(f"{pairs}{view}; layers of frame {first['frame']}:")
         console.aov_table(first["aovs"], first["notes"])
-    if report.temporal:
+        for name, done in first["passes"].items():
+            console.say(f"  {name}: {done}")
+    if report.temporal and any(result.status == "fused" for result in report.results.values()):
         console.say(f"Fused {report.temporal}")
     # Sentences that differ only in their numbers share a row, which shows the first of them.
     groups: dict[tuple[str, str], tuple[list[int], str]] = {}
@@ -103,7 +106,9 @@ def print_table(report: ShotReport) -> None:
         rows = [(result.status, result.message)] if result else [("not done", "run again with --skip-existing")]
         rows += [("warning", text) for text in (result.warnings if result else ())]
         for kind, text in rows:
-            groups.setdefault((kind, re.sub(r"-?[\d.]+", "0", text)), ([], text))[0].append(frame.number)
+            numbers, _ = groups.setdefault((kind, re.sub(r"-?[\d.]+", "0", text)), ([], text))
+            if frame.number not in numbers[-1:]:
+                numbers.append(frame.number)
     order = ("fused", "skipped", "failed", "missing", "not done", "warning")
     rows_in_order = sorted(groups.items(), key=lambda item: order.index(item[0][0]))
     print("frames")

@@ -95,10 +95,12 @@ class MappedRender:
         rows.append(_row("alpha", "found", self.alpha.name) if self.alpha else _row("alpha", "absent"))
         return rows
 
-    def unread_layers(self, others: Sequence[MappedRender] = ()) -> list[str]:
+    def unused_layers(self, others: Sequence[MappedRender], fused: Iterable[AdditiveSet]) -> list[str]:
         """Names of the layers, or of single channels, that no feature is read from, in this view or in one of
-        ``others``. Those of another view than the chosen one are followed by the view in brackets."""
+        ``others``, and that are in none of the ``fused`` sets. Those of another view than the chosen one are followed
+        by the view in brackets."""
         used = {c for each in (self, *others) for formula in each.features.values() for c in formula.channels}
+        used |= {channel for each in fused for layer in each.layers for channel in layer.channels}
         used |= {each.alpha for each in (self, *others) if each.alpha}
         names = []
         for layer in layers_of(self.file):

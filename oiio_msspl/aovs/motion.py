@@ -168,6 +168,8 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
         matching = [each for each in known if not letters or "".join(each.components) == letters] or list(
             _fields(layers.layers, layer, list(letters) or None, MotionFormat())
         )
+        # A layer may hold vectors to both frames, in different channels.
+        matching = [each for each in matching if each.format.to == words.get("to", each.format.to)] or matching
         if not matching:
             raise InputError(
                 f"--motion-format {text!r}: {path} has no layer {layer!r} with two channels {letters}".strip()

@@ -186,6 +186,8 @@ class _Trial:
         formats = {(f.to, f.offset, *f.pixels_per_unit(*self._frame)): f for f in reversed(list(formats))}.values()
         left = {form: {p.guide.name: self._left(p, form) for p in self._of(form)} for form in formats}
         names = {name for each in left.values() for name in each}
+        if not names:
+            return dict.fromkeys(left, 1.0)  # nothing moves in the frames in which these formats are tried
         deciding = [n for n in names if min(each.get(n, 1.0) for each in left.values()) * MARGIN < 1] or list(names)
         return {
             form: float(np.exp(np.mean([np.log(max(each.get(n, 1.0), FLOOR)) for n in deciding])))

@@ -99,6 +99,8 @@ class FusedPasses:
     """Why other sets were not fused, by name."""
     hrls_alone: dict[str, str] = field(default_factory=dict)
     """By name of a fused set: the layers that were read from the HRLS alone, see :attr:`_Job.hrls_alone`."""
+    lacking: dict[str, float] = field(default_factory=dict)
+    """By name of a fused set: the share of the beauty's light that is in no layer, for those that lack some."""
     warnings: list[str] = field(default_factory=list)
     """A sentence for each set of which the LRHS has some layers only, or layers that do not sum to its beauty."""
 
@@ -142,7 +144,8 @@ def fuse_passes(
     in_order = sorted(jobs, key=lambda job: sets.index(job.layers))
     fused_sets = [replace(job.layers, coarser=tuple(job.coarser)) for job in in_order]
     hrls_alone = {job.layers.name: job.hrls_alone for job in in_order if job.hrls_alone}
-    fused = FusedPasses(fused_sets, pixels, refused, hrls_alone, warnings)
+    lacking = {job.layers.name: job.lacking for job in in_order if job.remainder}
+    fused = FusedPasses(fused_sets, pixels, refused, hrls_alone, lacking, warnings)
     later = {part for job in jobs for parts in job.known.values() for part in parts}
     tell = progress or (lambda done, count: None)
     by_network = fuse_layers is not None and any(job.lrhs for job in jobs)
@@ -335,8 +338,8 @@ class _Job:
     """Names, as features, of the light of the layers."""
     lrhs: dict[str, AdditiveLayer]
     """The same layers in the LRHS, as far as it has them, by these names."""
-    remainder: bool
-    """Some light is in no layer."""
+    lacking: float
+    """Share of the beauty's light that is in no layer; 0 if only rounding is lacking."""
     known: _Sums
     """Layers of this set that are sums of layers of an earlier set, or that both sets have. The other layers are
     fitted, and share what these leave of the beauty."""
@@ -344,6 +347,11 @@ class _Job:
     """See :attr:`oiio_msspl.fusion.sums.SumCheck.noise_free`."""
     coarser: _Sums = field(default_factory=dict)
     """Layers outside of all sets that are sums of layers of this one."""
+
+    @property
+    def remainder(self) -> bool:
+        """Some light is in no layer."""
+        return self.lacking > 0
 
     @property
     def fitted(self) -> list[AdditiveLayer]:
@@ -386,7 +394,7 @@ def _checked(
             continue
         keys = {layer: names[layer] for layer in layers.layers}
         theirs = {key: lrhs[layer] for layer, key in keys.items() if layer in lrhs}
-        job = _Job(layers, keys, theirs, check.remainder, known, check.noise_free)
+        job = _Job(layers, keys, theirs, check.residual if check.remainder else 0.0, known, check.noise_free)
         jobs.append(job)
         if problem:
             warnings.append(

@@ -49,8 +49,9 @@ class SumCheck:
         """In words."""
         if self.problem:
             return f"does not sum to the beauty: {self.problem}"
-        share = f"{self.residual:.1%} of the light" if self.remainder else f"{self.residual:.2g} of it"
-        return f"sums to the beauty but for {share}" + (" that is in no layer" if self.remainder else "")
+        if self.remainder:
+            return f"sums to the beauty but for {self.residual:.1%} of its light, which is in no layer"
+        return f"sums to the beauty (residual {self.residual:.2g})"
 
 
 def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool = True) -> SumCheck:

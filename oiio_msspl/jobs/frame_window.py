@@ -202,7 +202,7 @@ class FrameWindow:
                 if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
-                        warnings.append(f"frames {number} and {n} {SAME_SEED}")
+                        warnings.append(f"frames {min(number, n)} and {max(number, n)} {SAME_SEED}")
                 (vectors, valid, moved_objects), (back, back_valid, _) = self._read_both_ways(n - step, n)
             except Exception as error:
                 warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")

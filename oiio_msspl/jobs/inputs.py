@@ -15,6 +15,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, space_of
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.noise import is_noise_spread
@@ -65,7 +66,7 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
     if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
         raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
-    lr, hr = _map_lrhs(lr_file, inputs), _map_hrls(hr_file, inputs)
+    lr, hr = _map_lrhs(lr_file, inputs), map_hrls(hr_file, inputs)
     lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
     return lr, hr
 
@@ -101,10 +102,7 @@ def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedR
         sums = ()  # the other views need not have the layers of the user's sums
         other = _map_hrls(hr.file, replace(inputs, sums=sums))
     firsts = {name for name, each in other.features.items() if name in hr.features and each == hr.features[name]}
-    if firsts.isdisjoint(inputs.mapping):
-        return other
-    mapping = {name: each for name, each in inputs.mapping.items() if name not in firsts}
-    return _map_hrls(hr.file, replace(inputs, sums=sums, mapping=mapping))
+    return _without_entries(other, replace(inputs, sums=sums), firsts | _features_of_others(other))
 
 
 def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:
@@ -123,9 +121,40 @@ def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> Colou
     return high or low or REC709
 
 
+def map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
+    """Map the HRLS for its first view, or for the one that is asked for. Unless one is, an entry of the mapping that
+    means a layer of another view layer by its full name does not apply.
+
+    Raises:
+        InputError: see :func:`oiio_msspl.aovs.matching.map_render`.
+    """
+    render = _map_hrls(file, inputs)
+    return _without_entries(render, inputs, _features_of_others(render)) if inputs.view is None else render
+
+
 def _map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
-    """Map the HRLS: all that the user says applies to it."""
+    """All that the user says applies to the HRLS."""
     return map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
+
+
+def _features_of_others(render: MappedRender) -> set[str]:
+    """The features that are read from layers of another view layer."""
+    names = {channel: layer.name for layer in layers_of(render.file) for channel in layer.channels.values()}
+    own, *others = (f"{label.rpartition('/')[2]}." for label in (render.view, *render.other_views))
+    others = [each for each in others if each not in (own, ".")]
+    return {
+        feature
+        for feature, formula in render.features.items()
+        if feature != RGB and all(names.get(channel, "").startswith(tuple(others)) for channel in formula.channels)
+    }
+
+
+def _without_entries(render: MappedRender, inputs: InputOptions, features: set[str]) -> MappedRender:
+    """The render, mapped again without the user's entries for some features if there are any."""
+    if features.isdisjoint(inputs.mapping):
+        return render
+    mapping = {name: each for name, each in inputs.mapping.items() if name not in features}
+    return _map_hrls(render.file, replace(inputs, mapping=mapping))
 
 
 def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:

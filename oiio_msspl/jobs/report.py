@@ -186,6 +186,8 @@ def _passes(fused: FusedFrame) -> dict[str, str]:
         return {}
     done = {each.name: f"fused: {each.layer_names}" for each in fused.passes.sets}
     done |= {name: f"{done[name]} ({layers} from the HRLS alone)" for name, layers in fused.passes.hrls_alone.items()}
+    for name, share in fused.passes.lacking.items():
+        done[name] += f"; {share:.1%} of the beauty's light is in none of them"
     return done | {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in done}
 
 

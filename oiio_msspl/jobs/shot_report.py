@@ -15,7 +15,7 @@ from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import Frame, Shot
 
 #: What is read of ``first_fused`` in an earlier report. A report of another version may lack some of it.
-FIRST_FUSED = {"frame", "renderer", "scale", "aovs", "notes"}
+FIRST_FUSED = {"frame", "renderer", "scale", "model", "aovs", "notes", "passes"}
 
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
 

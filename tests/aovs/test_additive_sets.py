@@ -75,7 +75,7 @@ def test_raw_light_is_multiplied_by_its_filter(tmp_path, attributes, layers, raw
     found = map_render(open_exr(write_exr(tmp_path / "in.exr", channels, **attributes)))
     (components,) = (each for each in found.additive_sets if each.name == "raw components")
     assert [each.name for each in components.layers] == raw
-    assert check_sum(found, components).text == "sums to the beauty but for 0 of it"
+    assert check_sum(found, components).text == "sums to the beauty (residual 0)"
 
 
 def test_a_set_without_its_raw_layers_is_none(tmp_path):
@@ -113,8 +113,8 @@ def test_a_sum_that_cannot_be_read_is_refused(tmp_path, text):
 @pytest.mark.parametrize(
     ("layers", "remainder", "text"),
     [
-        ({"light_a": 1, "light_b": 2}, False, "sums to the beauty but for 0 of it"),
-        ({"light_a": 1, "other": 3, "light_b": 2}, True, "25.0% of the light that is in no layer"),
+        ({"light_a": 1, "light_b": 2}, False, "sums to the beauty (residual 0)"),
+        ({"light_a": 1, "other": 3, "light_b": 2}, True, "25.0% of its light, which is in no layer"),
         ({"light_a": 1, "light_b": 2, "light_c": 3}, False, "100.0% more light; without light_c they would sum to it"),
         ({f"light_{c}": 2 for c in "abcd"}, False, "they have 100.0% more light; some layers overlap"),
     ],
@@ -154,12 +154,12 @@ def test_pxr24_loses_bits_of_floats_alone(tmp_path, dtype, lossy):
 @pytest.mark.parametrize(
     ("file", "text"),
     [
-        ("cycles-4.2/cycles_viewlayer_zip32.exr", "sums to the beauty but for 2.7e-08"),
-        ("cycles-4.2/cycles_border_region.exr", "sums to the beauty but for 4.9e-08"),
+        ("cycles-4.2/cycles_viewlayer_zip32.exr", "sums to the beauty (residual 2.7e-08"),
+        ("cycles-4.2/cycles_border_region.exr", "sums to the beauty (residual 4.9e-08"),
         ("cycles-4.2/cycles_viewlayer_dwaa16.exr", "both ways; the compression dwaa is lossy"),
-        ("cycles-5.0/cycles_viewlayer_zip32.exr", "sums to the beauty but for 6.5e-08"),
-        ("cycles-5.0/cycles_two_dotted_viewlayers_piz16.exr", "sums to the beauty but for 0.00025"),
-        ("arnold/rgba_N_P_diffuse_direct_specular.exr", "32.0% of the light that is in no layer"),
+        ("cycles-5.0/cycles_viewlayer_zip32.exr", "sums to the beauty (residual 6.5e-08"),
+        ("cycles-5.0/cycles_two_dotted_viewlayers_piz16.exr", "sums to the beauty (residual 0.00025"),
+        ("arnold/rgba_N_P_diffuse_direct_specular.exr", "32.0% of its light, which is in no layer"),
     ],
 )
 def test_sets_of_real_files(file, text):

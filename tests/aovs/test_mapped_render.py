@@ -73,7 +73,7 @@ def test_layers_of_another_view_are_told_apart(tmp_path):
     channels = layer("", 1) | layer("albedo", 2) | layer("right", 3) | layer("albedo.right", 4)
     render = mapped(tmp_path, channels, attributes={"multiView": ["left", "right"]})
     assert (render.view, found(render)["albedo"]) == ("left", "albedo")
-    assert render.unread_layers() == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
+    assert render.unused_layers([], []) == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
 
 
 def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):
@@ -86,7 +86,7 @@ def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):
 def test_layers_that_no_feature_is_read_from_are_named(tmp_path):
     """A layer that is read in part is named by its other channels."""
     channels = layer("", 1) | layer("albedo", 2, "RGBA") | layer("mask", 3) | {"Z": plane(1)}
-    assert mapped(tmp_path, channels).unread_layers() == ["Z", "albedo.A", "mask"]
+    assert mapped(tmp_path, channels).unused_layers([], []) == ["Z", "albedo.A", "mask"]
 
 
 def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):

@@ -76,6 +76,7 @@ def test_help_shows_everyday_options_in_groups_and_help_all_shows_all(program):
 
 
 def test_help_all_of_submit_lists_the_options_of_msspl_fuse():
-    done = run("msspl", "submit", "--bundle", "x", "--help-all")
-    assert done.returncode == 0
-    assert {"--scheduler", "--half", "--layout"} <= options_in(done.stdout)
+    for arguments in ((), ("--bundle", "x")):
+        done = run("msspl", "submit", *arguments, "--help-all")
+        assert done.returncode == 0
+        assert {"--scheduler", "--half", "--layout"} <= options_in(done.stdout)

@@ -16,7 +16,7 @@ def test_inspect_tells_a_person_and_a_machine(files):
     done = run("msspl", "inspect", files / "hr.exr")
     assert done.returncode == 0
     assert "display window 128x96+0+0" in done.stdout
-    assert "passed through: Z, mask" in done.stdout
+    assert "neither read nor fused: Z, mask" in done.stdout
     data = json.loads(run("msspl", "inspect", files / "hr.exr", "--json").stdout)
     assert data["usable"]
     assert data["parts"][0]["channels"]["mask.X"] == "half"
@@ -29,7 +29,7 @@ def test_inspect_tells_of_a_pair_whether_its_noise_is_spread(tmp_path, sigma, no
         image = rng.gamma(spp, 0.5 / spp, (side, side, 3)).astype(np.float32)
         write_exr(tmp_path / f"{name}.exr", rgb(spread(image, sigma) if sigma else image))
     done = run("msspl", "inspect", tmp_path / "hr.exr", tmp_path / "lr.exr")
-    assert f"  noise, by lr.exr: {'the pixel filter' if sigma else 'independent'}" in done.stdout
+    assert f"  noise, compared with lr.exr: {'the pixel filter' if sigma else 'independent'}" in done.stdout
     high, low = json.loads(run("msspl", "inspect", tmp_path / "hr.exr", tmp_path / "lr.exr", "--json").stdout)
     assert (high["noise"], low["noise"]) == (noise, None)
 
@@ -94,7 +94,7 @@ def test_inspect_verifies_motion_vectors_with_the_next_frame(tmp_path):
         frame(tmp_path, t, layer("velocity", encode(vectors(truck_and_dolly, t, 1), MotionFormat(y="up"))))
     first, last = (tmp_path / f"plane.{number}.exr" for number in (1001, 1002))
     assert (
-        "motion, by plane.1002.exr: motion vectors of velocity.XY (to=next,x=right,y=up,unit=pixels)"
+        "motion, checked with plane.1002.exr: motion vectors of velocity.XY (to=next,x=right,y=up,unit=pixels)"
         in run("msspl", "inspect", first).stdout
     )
     data = json.loads(run("msspl", "inspect", first, "--json").stdout)

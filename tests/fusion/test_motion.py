@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.aovs.motion import MotionFormat
+from oiio_msspl.aovs.motion import MotionFormat, user_fields
 from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
@@ -422,6 +422,28 @@ def test_a_format_may_describe_two_layers(tmp_path):
     source = find_motion(frames[0], frames[1], "layer=there+layer=back,to=previous")
     assert [each.layer for each in source.fields] == ["there", "back"]
     assert [right_share(source, frames, 1, step) for step in (1, -1)] == [1, 1]
+
+
+def test_a_format_takes_the_channels_that_lead_to_its_frame(tmp_path):
+    """Cycles' layer has vectors to the previous frame in XY, and to the next one in ZW."""
+    names = [f"ViewLayer.{name}" for name in ("Combined.R", "Combined.G", "Combined.B", *(f"Vector.{c}" for c in "XYZW"))]
+    blank = np.zeros((8, 8), np.float32)
+    path = write_exr(tmp_path / "hr.exr", dict.fromkeys(names, blank), **{"cycles.ViewLayer.samples": "1"})
+    layers = map_render(open_exr(path)).motion
+    for words, channels in (("to=next", ["ZW"]), ("to=previous,y=down", ["XY"]), ("unit=pixels", ["XY", "ZW"])):
+        found = user_fields(layers, f"layer=Vector,{words}")
+        assert ["".join(each.components) for each in found] == channels
+
+
+def test_vectors_that_are_zero_where_they_are_tried_explain_nothing(tmp_path):
+    """The first frame of an animation has none; the user's description stands, and nothing verifies it."""
+    frames = []
+    for t in (0, 1):
+        way = vectors(truck_and_dolly, t, 1)
+        frames.append(frame(tmp_path, t, layer("forward", way if t else np.zeros_like(way)), truck_and_dolly))
+    source = find_motion(*frames, "layer=forward,to=next,x=right,y=down,unit=pixels")
+    assert source.kind == "vectors" and source.text.endswith("as --motion-format says, not verified; "
+        "vectors to the previous frame are computed by inverting these")  # fmt: skip
 
 
 @pytest.mark.parametrize("step", [1, -1])

@@ -181,6 +181,28 @@ def test_a_full_name_in_a_mapping_means_its_own_view(tmp_path):
         assert other.hr.features["albedo"].text == "bg.Denoising Albedo"
 
 
+def test_a_full_name_of_a_later_view_leaves_the_others_alone(tmp_path):
+    """The first view and a third one keep the layers that are found for them."""
+    parts = []
+    for name in ("fg", "bg", "sky"):
+        layers = {key.replace("fg.", f"{name}."): pixels for key, pixels in channels_of("fg", 1, 1).items()}
+        parts.append((name, layers | rgb(picture(HEIGHT, WIDTH), f"{name}.paint."), (0, 0)))
+    hr = write_exr(tmp_path / "hr.exr", parts, **CYCLES)
+    lr = write_exr(
+        tmp_path / "lr.exr",
+        [(name, {k.replace("fg.", f"{name}."): v for k, v in channels_of("fg", 16, 4).items()}, (0, 0)) for name, *_ in parts],
+        **CYCLES,
+    )
+    inputs = InputOptions({"albedo": "bg.paint"})
+    low, high = map_pair(lr, hr, inputs)
+    others = [view.hr for view in views.find_other_views(low, high, inputs).views]
+    read = {each.view: each.features["albedo"].text for each in (high, *others)}
+    assert read == {"fg": "fg.Denoising Albedo", "bg": "bg.paint", "sky": "sky.Denoising Albedo"}
+    assert inspect_file(hr, inputs).render.features["albedo"].text == "fg.Denoising Albedo"
+    alone = map_pair(lr, hr, InputOptions({"albedo": "bg.paint"}, view="fg"))
+    assert alone[1].features["albedo"].text == "bg.paint"
+
+
 def test_what_is_broken_in_a_view_is_said_with_its_name(tmp_path, bilinear_models):
     """Broken pixels, light beyond half, and a doubt about one view alone; one sentence about all views."""
     lr, hr = write_layers(tmp_path, dtype=np.float16)
@@ -208,7 +230,7 @@ def test_check_and_inspect_look_at_all_views(tmp_path):
     found = inspect_file(pair[1], InputOptions())
     assert [view.view for view in found.other_views] == ["bg"]
     assert any(fact.startswith("bg: light groups (Combined_fill, Combined_key): sums") for fact in found.facts)
-    assert not any("bg.Combined" in name and "_" not in name for name in found.passed_through)
+    assert found.unused == []
     assert inspect_file(pair[1], InputOptions(view="fg")).other_views == []
 
 

@@ -55,8 +55,8 @@ def inspect(
             if inspection.render is not None:
                 console.say(f"  what {inspection.model} would read:")
                 console.aov_table(inspection.aovs(), inspection.render.notes)
-                if inspection.passed_through:
-                    console.say(f"  passed through: {', '.join(inspection.passed_through)}")
+                if inspection.unused:
+                    console.say(f"  neither read nor fused: {', '.join(inspection.unused)}")
             for problem in inspection.problems:
                 console.say(f"  can't be used: {problem}")
     if any(inspection.problems for inspection in found):

@@ -42,6 +42,15 @@ def submit(
     timeout: Annotated[
         int, typer.Option(metavar="SECONDS", min=1, help="Time limit of a frame. A task gets N times as long.")
     ] = 1800,
+    help_all: Annotated[
+        bool,
+        typer.Option(
+            "--help-all",
+            help="Show the options of msspl-fuse and exit.",
+            is_eager=True,
+            callback=lambda wanted: _parse(["--help-all"]) if wanted else None,
+        ),
+    ] = False,
 ) -> None:
     """Write a shot as a job for a farm: an Open Job Description bundle.
 

@@ -90,7 +90,7 @@ def camera_matrix(animation: Animation, at: float) -> np.ndarray:
 def focus_distance() -> float:
     """Metres from the camera to the block in the middle, along the camera's axis."""
     forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
-    return float((BLOCK + (0, 0, 0.3) - CAMERA) @ forward)
+    return float((BLOCK + np.array([0, 0, 0.3]) - CAMERA) @ forward)
 
 
 def object_matrix(animation: Animation, at: float) -> np.ndarray:

@@ -59,7 +59,7 @@ MapFile = Annotated[
     typer.Option(
         "--map-file",
         metavar="TOML",
-        help="The same in a file, with candidate layers for each feature.",
+        help="Read mappings (see --map) from a file.",
         rich_help_panel=INPUT,
         hidden=True,
     ),
@@ -154,7 +154,7 @@ Passes = Annotated[
     list[str],
     typer.Option(
         metavar="PATTERN",
-        help="Which layers that sum to the beauty are fused, too: auto, none, or names of sets or layers (light*).",
+        help="Passes to fuse with the beauty: auto (all that sum to it), none, or names of sets or layers (light*).",
         rich_help_panel=OUTPUT,
     ),
 ]
@@ -202,7 +202,7 @@ FramesLayer = Annotated[
     bool,
     typer.Option(
         "--frames-layer",
-        help="Add a layer 'frames': of how many frames each pixel is the average.",
+        help="Add a layer 'frames': the number of frames that each pixel is the average of.",
         rich_help_panel=SHOT,
         hidden=True,
     ),

@@ -426,7 +426,9 @@ def test_a_format_may_describe_two_layers(tmp_path):
 
 def test_a_format_takes_the_channels_that_lead_to_its_frame(tmp_path):
     """Cycles' layer has vectors to the previous frame in XY, and to the next one in ZW."""
-    names = [f"ViewLayer.{name}" for name in ("Combined.R", "Combined.G", "Combined.B", *(f"Vector.{c}" for c in "XYZW"))]
+    names = [
+        f"ViewLayer.{name}" for name in ("Combined.R", "Combined.G", "Combined.B", *(f"Vector.{c}" for c in "XYZW"))
+    ]
     blank = np.zeros((8, 8), np.float32)
     path = write_exr(tmp_path / "hr.exr", dict.fromkeys(names, blank), **{"cycles.ViewLayer.samples": "1"})
     layers = map_render(open_exr(path)).motion

@@ -190,7 +190,10 @@ def test_a_full_name_of_a_later_view_leaves_the_others_alone(tmp_path):
     hr = write_exr(tmp_path / "hr.exr", parts, **CYCLES)
     lr = write_exr(
         tmp_path / "lr.exr",
-        [(name, {k.replace("fg.", f"{name}."): v for k, v in channels_of("fg", 16, 4).items()}, (0, 0)) for name, *_ in parts],
+        [
+            (name, {k.replace("fg.", f"{name}."): v for k, v in channels_of("fg", 16, 4).items()}, (0, 0))
+            for name, *_ in parts
+        ],
         **CYCLES,
     )
     inputs = InputOptions({"albedo": "bg.paint"})

@@ -83,8 +83,8 @@ def render(
         typer.Option(
             min=1,
             metavar="N",
-            help="Samples per pixel of the low-resolution render. Without it: a third of the other's samples in total, "
-            "but at least N x N of --scale.",
+            help="Samples per pixel of the low-resolution render. \\[default: a third as many samples in total as the "
+            "full-resolution render has, but at least 4, 16 or 64 at x2, x4 or x8]",
             show_default=False,
             rich_help_panel=RENDER,
         ),

@@ -7,7 +7,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.guards import check_finite, holds_around
+from oiio_msspl.fusion.guards import all_within, check_finite, enlarge
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.session import Session
@@ -16,8 +16,9 @@ from oiio_msspl.model.session import Session
 def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
     """Alpha of a tile, (s*h, s*w, 1) in [0, 1].
 
-    Where both renders agree that a pixel and its surroundings are fully covered or fully empty, it stays exactly 1 or
-    0. A tile that is all of one kind does not reach the network. Without an alpha in the LRHS, the HRLS's is kept.
+    A pixel is exactly 1 or 0 if the LRHS pixel over it is, and the 3 x 3 HRLS pixels around it are. The network would
+    blur edges over several pixels. A tile that is all of one kind does not reach it. Without an alpha in the LRHS, the
+    HRLS's is kept.
 
     Args:
         shares: see :meth:`oiio_msspl.model.session.Session.run`.
@@ -26,8 +27,9 @@ def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
     if "alpha" not in pair.lrhs:
         return hrls_alpha
     lrhs_alpha = np.clip(pair.lrhs["alpha"], 0.0, 1.0)
-    solid = holds_around(lrhs_alpha == 1, hrls_alpha == 1, pair.scale)
-    empty = holds_around(lrhs_alpha == 0, hrls_alpha == 0, pair.scale)
+    solid, empty = (
+        enlarge(lrhs_alpha == value, pair.scale) & all_within(hrls_alpha == value, 1) for value in (1, 0)
+    )
     if (solid | empty).all():
         return solid.astype(np.float32)
     grey = session.run(*alpha_as_colour(pair), 1.0, shares)["fused"]

@@ -208,7 +208,7 @@ class EmptyRegions:
         if not self._black[window].any():
             return None
         empty = holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
-        empty &= _shows_no_surface(pair.hrls) | _enlarge(self._black_far_around[window], pair.scale)
+        empty &= _shows_no_surface(pair.hrls) | enlarge(self._black_far_around[window], pair.scale)
         return empty
 
 
@@ -229,10 +229,10 @@ def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
 
 def holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
     """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
-    return _enlarge(reduce(np.logical_and, _neighbours(lrhs)), scale) & hrls
+    return enlarge(reduce(np.logical_and, _neighbours(lrhs)), scale) & hrls
 
 
-def _enlarge(lrhs: Mask, scale: int) -> Mask:
+def enlarge(lrhs: Mask, scale: int) -> Mask:
     """(h, w, 1) to (s*h, s*w, 1)."""
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 

@@ -371,16 +371,27 @@ def test_alpha_is_fused_and_exact_where_both_agree(session, scale):
     assert alpha.max() <= 1
 
 
-def test_alpha_settles_only_where_the_surroundings_agree(session, scale):
-    """An uncovered HRLS pixel beside partly covered LRHS pixels is a sample that missed, not an edge."""
+def test_a_surface_is_solid_up_to_its_edge(scale):
+    """The network makes the edge soft, as in the LRHS. Inside of the surface, both renders are sure."""
+    session = Session(find_model(scale, "joint"))
+    low, high, _ = pair_of(scale)
+    coverage = np.zeros((96, 128, 1), np.float32)
+    coverage[48:] = 1
+    high.layers["alpha"], low.layers["alpha"] = coverage, downsample(coverage, scale)
+    alpha = fuse(low, high, session).alpha
+    assert (alpha[49:] == 1).all() and (alpha[:47] == 0).all()
+
+
+def test_alpha_settles_only_where_both_renders_agree(session, scale):
+    """An uncovered HRLS pixel under a partly covered LRHS pixel is a sample that missed."""
     low, high, _ = pair_of(scale)
     high.layers["alpha"] = np.zeros((96, 128, 1), np.float32)
     low.layers["alpha"] = np.zeros((96 // scale, 128 // scale, 1), np.float32)
     low.layers["alpha"][3, 3] = 0.5
     alpha = fuse(low, high, session).alpha
-    beside = alpha[3 * scale : 4 * scale, 2 * scale : 3 * scale]
-    assert beside.max() > 0
-    assert alpha[:scale, :scale].max() == 0
+    under = np.zeros((96, 128, 1), bool)
+    under[3 * scale : 4 * scale, 3 * scale : 4 * scale] = True
+    assert (alpha[under] > 0).all() and not alpha[~under].any()
 
 
 def test_alpha_without_a_partner_is_passed_through_and_said(session, scale):

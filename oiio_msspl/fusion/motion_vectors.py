@@ -24,6 +24,9 @@ Mask = NDArray[np.bool_]
 
 #: Shorter vectors are no movement, in pixels.
 NO_MOTION = 1e-3
+#: Vectors that change by more than this from pixel to pixel can't be followed, in pixels: whether the way there and back
+#: ends at its pixel would depend on how places are rounded to pixels.
+UNEVEN = 0.25
 #: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
 ROUNDS, ROUND_TRIP = 3, 0.5
 
@@ -47,7 +50,8 @@ def judged_vectors(
 
     Returns:
         Vectors (h, w, 2), 0 where they can't be believed; and where they can (h, w): they are finite, shorter than the
-        frame, not clamped, alpha is not 0, and they are not zeros of a background, see :func:`_doubtful_zeros`.
+        frame, not clamped, alpha is not 0, they do not change too fast, see :func:`_uneven`, and they are not zeros of
+        a background, see :func:`_doubtful_zeros`.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -61,6 +65,7 @@ def judged_vectors(
         rendered[inside.slices(window)] = True
         known &= rendered
     known &= ~_doubtful_zeros(pixels, vectors, known)
+    known &= ~_uneven(vectors)
     vectors[~known] = 0
     return vectors, known
 
@@ -112,6 +117,21 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
     count = np.count_nonzero(surface)
     camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count
     return np.zeros_like(known) if camera_stands else still
+
+
+def _uneven(vectors: Array) -> Mask:
+    """Where vectors change by more than ``UNEVEN`` on both sides of a pixel, in the same direction: on what turns fast.
+
+    At the border of two surfaces, they change on one side. On a surface as thin as a pixel, they change and change back.
+    """
+    motion = np.ascontiguousarray(vectors).view(np.complex64)[..., 0]
+    result = np.zeros(motion.shape, np.bool_)
+    for turned, found in ((motion, result), (motion.T, result.T)):
+        with np.errstate(invalid="ignore"):
+            steps = np.diff(turned, axis=0)
+            fast = np.abs(steps) > UNEVEN
+            found[1:-1] |= fast[1:] & fast[:-1] & ((steps[1:] * steps[:-1].conj()).real > 0)
+    return result
 
 
 def _all_planes(mask: Mask) -> Mask:

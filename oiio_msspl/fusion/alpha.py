@@ -27,9 +27,7 @@ def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
     if "alpha" not in pair.lrhs:
         return hrls_alpha
     lrhs_alpha = np.clip(pair.lrhs["alpha"], 0.0, 1.0)
-    solid, empty = (
-        enlarge(lrhs_alpha == value, pair.scale) & all_within(hrls_alpha == value, 1) for value in (1, 0)
-    )
+    solid, empty = (enlarge(lrhs_alpha == value, pair.scale) & all_within(hrls_alpha == value, 1) for value in (1, 0))
     if (solid | empty).all():
         return solid.astype(np.float32)
     grey = session.run(*alpha_as_colour(pair), 1.0, shares)["fused"]

@@ -28,7 +28,7 @@ from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid, wide_mean
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
-from oiio_msspl.fusion.warp import Mask, Path, Step, nearest_indices, sample_cubic
+from oiio_msspl.fusion.warp import Mask, Path, Step, grown, nearest_indices, sample_cubic
 from oiio_msspl.fusion.weighted_sum import Rows, WeightedSum, rows_of
 from oiio_msspl.parallel import for_row_blocks
 
@@ -37,6 +37,9 @@ COVERED = 0.9
 #: A neighbour counts less near objects that move and are not followed: less the more of the HRLS pixels up to so many
 #: away on each side show them, and not at all from this share on.
 NEAR_OBJECTS, FEW = 8, 0.125
+#: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided by
+#: the root of the product. That is a factor of 3.
+OTHER_LIGHT = np.float32(2 / np.sqrt(3))
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
 #: With more channels, as passes have, bands have fewer rows.
@@ -231,6 +234,8 @@ class _Band:
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = trust if trusted is None else np.minimum(trusted, trust)
             counted = trusted if path.moved_objects is None else trusted * self._far_from(path.moved_objects)
+            hidden = grown(grown(share < 1))
+            counted = counted * np.where(hidden, self._as_bright(lrhs), np.float32(1))
             weight = from_grid(self._alignment, counted, self._area) * valid
             self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)
@@ -246,6 +251,12 @@ class _Band:
         share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
         near = wide_mean(share, max(1, round(NEAR_OBJECTS / self._alignment.scale)))
         return np.maximum(1 - near / np.float32(FEW), 0)
+
+    def _as_bright(self, lrhs: Array) -> Array:
+        """How much a neighbour counts by the luminance of its LRHS (h, w), where it may show another surface as well."""
+        own, other = (np.maximum(each, self._light.darkest) for each in (self._low_luminance, lrhs))
+        difference = (own - other) / np.sqrt(own * other)
+        return np.asarray(1 / (1 + np.square(np.square(difference / OTHER_LIGHT))), np.float32)
 
     def finish(self) -> Array:
         """Turn the sums into means. Returns the number of frames of each pixel, as :attr:`AveragedPair.frames`."""

@@ -110,8 +110,11 @@ def _add_side(
         # A light that has changed in the nearer frame has changed in the farther one.
         trusted = weight if trusted is None else np.minimum(trusted, weight)
         weight = from_grid(alignment, trusted, area) * path.valid
+        mixed = _borders_there(step, path)
         if borders is not None:
-            weight[borders] *= _likeness(here[borders], there[borders], light.darkest)
+            mixed = borders if mixed is None else borders | mixed
+        if mixed is not None:
+            weight[mixed] *= _likeness(here[mixed], there[mixed], light.darkest)
         # A neighbour may have no alpha.
         total.add(rows_of({name: warped.get(name, image)[inside] for name, image in own.items()}), weight[inside])
 
@@ -128,6 +131,18 @@ def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) ->
     return moved_objects if borders is None else borders | moved_objects
 
 
+def _borders_there(step: Step[FusedFrame], path: Path) -> Mask | None:
+    """Pixels (h, w) of a path that lead to pixels of a neighbour that may show two surfaces; None if nothing moves."""
+    if step.back is None:
+        return None
+    window = step.frame.alignment.hr_data_window
+    place = path.place_in(window)
+    borders = near_borders(step.back[place.slices(window)], step.tolerance)
+    if path.nearest is None:
+        return borders
+    return borders.reshape(-1).take(path.nearest - (place.y0 - window.y0) * window.width, mode="clip")
+
+
 def _likeness(own: Array, other: Array, darkest: float) -> Array:
     """How much pixels count whose brightness may differ because they show other shares of two surfaces, from 0 to 1.
 
@@ -135,7 +150,8 @@ def _likeness(own: Array, other: Array, darkest: float) -> Array:
         own, other: luminance.
         darkest: differences are relative to at least this luminance.
     """
-    difference = (own - other) / np.maximum(np.maximum(own, other), np.float32(darkest))
+    own, other = (np.maximum(each, np.float32(darkest)) for each in (own, other))
+    difference = (own - other) / np.sqrt(own * other)
     return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
 
 

@@ -12,7 +12,7 @@ from oiio_msspl.aovs.motion import MotionFormat, user_fields
 from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion import motion
+from oiio_msspl.fusion import motion, motion_vectors
 from oiio_msspl.fusion.motion import MotionFrame, MotionSource, find_motion
 from tests.conftest import rgb, write_exr
 from tests.moving_plane import (
@@ -446,6 +446,19 @@ def test_vectors_that_are_zero_where_they_are_tried_explain_nothing(tmp_path):
     source = find_motion(*frames, "layer=forward,to=next,x=right,y=down,unit=pixels")
     assert source.kind == "vectors" and source.text.endswith("as --motion-format says, not verified; "
         "vectors to the previous frame are computed by inverting these")  # fmt: skip
+
+
+@pytest.mark.parametrize(("turn", "followed"), [(0.2, True), (0.5, False)])
+def test_what_turns_fast_is_not_followed(turn, followed):
+    """A disc turns in front of a wall that moves. Its rim, and a line of a pixel, are borders of surfaces."""
+    y, x = np.mgrid[-32:32, -32:32].astype(np.float32)
+    disc = x**2 + y**2 < 24**2
+    vectors = np.full((64, 64, 2), 3, np.float32)
+    vectors[disc] = np.stack([-turn * y, turn * x], axis=-1)[disc]
+    vectors[:, 2] = -3
+    uneven = motion_vectors._uneven(vectors)
+    assert not uneven[~disc].any()
+    assert uneven[x**2 + y**2 < 22**2].all() != followed
 
 
 @pytest.mark.parametrize("step", [1, -1])

@@ -92,6 +92,24 @@ def test_light_that_changes_is_not_averaged(change):
     assert rms(made, truth, same) < 0.75 * rms(own, truth, same)
 
 
+def test_a_lamp_that_is_wider_in_the_lrhs_leaves_no_ghost():
+    """Its light reaches further than its vectors: the filter of the LRHS is as wide as the LRHS's pixels."""
+    places = (slice(40, 52), slice(48, 60)), (slice(40, 52), slice(32, 44))
+    ways, pairs = [], []
+    for seed, (place, distance) in enumerate(zip(places, (-16, 16), strict=True)):
+        truth = np.full((HEIGHT, WIDTH, 3), 0.05, np.float32)
+        truth[place] = 50
+        pairs.append(pair_of(truth, seed))
+        ways.append(np.zeros((HEIGHT, WIDTH, 2), np.float32))
+        ways[-1][place] = (distance, 0)
+        low = pairs[-1].lr.layers["rgb"]
+        y, x = (slice(part.start // SCALE - 1, part.stop // SCALE + 1) for part in place)
+        low[y, x] = np.maximum(low[y, x], 5)
+    result = average_renders(pairs[0], [Step(pairs[1], ways[0], None, ways[1], None)], [])
+    ghost = np.s_[9:14, 7:11]
+    assert result.lr.layers["rgb"][ghost].max() < 1.5 * pairs[0].lr.layers["rgb"][ghost].max()
+
+
 def test_values_that_are_not_finite_do_not_count():
     pairs = [pair_of(texture(), seed) for seed in range(2)]
     pairs[1].hr.layers["rgb"][40:44, 60:64] = np.nan

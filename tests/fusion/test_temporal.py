@@ -65,6 +65,20 @@ def test_another_mix_of_two_surfaces_hardly_counts():
     assert 0 < 3 * with_borders.mean() < without.mean()
 
 
+def test_the_rim_of_a_lamp_in_the_neighbour_leaves_no_ghost():
+    """The rim has light of the lamp, and the vectors of the wall, which stands still."""
+    wall = np.full((HEIGHT, WIDTH, 3), 0.05, np.float32)
+    frame, neighbour = frame_of(wall, 1), frame_of(wall, 2)
+    lamp, rim = np.s_[20:40, 30:60], np.s_[40, 30:60]
+    neighbour.rgb[lamp], neighbour.rgb[rim] = 50, 5
+    none = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    back = none.copy()
+    back[lamp] = (-40, 0)
+    for vectors in (None, none):
+        result = accumulate(frame, [Step(neighbour, vectors, None, back, None)], [])
+        assert (result.rgb[rim] < 1.1 * frame.rgb[rim]).all()
+
+
 def test_borders_reach_one_pixel_to_each_side():
     vectors = np.zeros((7, 9, 2), np.float32)
     vectors[:, 5:] = (0.3, 0)

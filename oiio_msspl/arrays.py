@@ -104,9 +104,13 @@ def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
 
 
 def unload(values: NDArray[Any]) -> None:
-    """Give the memory of an image in a temporary file back to the system. Its pixels stay in the file."""
-    if isinstance(values.base, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
-        values.base.madvise(mmap.MADV_DONTNEED)
+    """Give the memory of an image in a temporary file, or of a part of it, back to the system. Its pixels stay in the
+    file."""
+    owner = values.base
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    if isinstance(owner, mmap.mmap) and hasattr(mmap, "MADV_DONTNEED"):  # not on Windows
+        owner.madvise(mmap.MADV_DONTNEED)
 
 
 def map_rows(function: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:

@@ -18,11 +18,11 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, unload
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_encodable
 from oiio_msspl.exr.render import Window
-from oiio_msspl.exr.strips import ROWS_PER_STRIP, StripCache, StripKey, strip_rows
+from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, StripCache, StripKey, strip_rows
 
 # OpenImageIO's own limits protect programs that read whole files: 1024 channels, and an image as large as the memory.
 # Files with thousands of light groups are larger. This module reads by rectangle, so it needs no limit to the image.
@@ -76,9 +76,10 @@ class Part:
 
     @property
     def strip_height(self) -> int:
-        """Rows that are decoded together: whole tiles, or whole chunks of scan lines."""
+        """Rows that are decoded together: whole tiles, or whole chunks of scan lines; fewer if there are many channels."""
         unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)
-        return unit * max(1, ROWS_PER_STRIP // unit)
+        row_bytes = self.nbytes // max(1, self.data_window.height)
+        return unit * max(1, min(ROWS_PER_STRIP, LARGEST_STRIP // max(1, row_bytes)) // unit)
 
 
 @dataclass(frozen=True)
@@ -155,17 +156,19 @@ class ExrFile:
 
         Args:
             first, last: indices of the first channel and of the one after the last. All have one pixel type.
-            later: more such ranges, which are read by later calls. Inside :meth:`cache_strips`, those of the same pixel
-                type are decoded together with this one, and kept until they are read.
+            later: more such ranges, which are read by later calls inside of the same :meth:`cache_strips`. Those of the
+                same pixel type are decoded together with this one, and kept until they are read: in a temporary file
+                what does not fit into the cache.
 
         Yields:
             First row, last row (exclusive), and the strip (rows, width, channels).
 
         Raises:
             InputError: pixels can't be decoded.
+            MssplError: the disk has no room for the temporary file.
         """
         window, kind = part.data_window, part.channels[first].type
-        later = [(a, b) for a, b in later if self._cache.max_bytes and part.channels[a].type == kind]
+        later = [(a, b) for a, b in later if part.channels[a].type == kind]
         start = min(first, *(a for a, _ in later)) if later else first
         stop = max(last, *(b for _, b in later)) if later else last
         for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
@@ -173,10 +176,12 @@ class ExrFile:
             if strip is None:
                 decoded = self._decode(part, y0, y1, start, stop, kind)
                 strip = decoded[..., first - start : last - start]
-                for a, b in later:
-                    key = StripKey(self.path, part.index, tuple(range(a, b)), y0, y1)
-                    self._cache.keep(key, decoded[..., a - start : b - start].copy())
+                self._cache.keep_all({
+                    StripKey(self.path, part.index, tuple(range(a, b)), y0, y1): decoded[..., a - start : b - start]
+                    for a, b in later
+                })  # fmt: skip
             yield y0, y1, strip
+            unload(strip)
 
     def _read_part(
         self,

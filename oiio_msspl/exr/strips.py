@@ -7,16 +7,21 @@ tiles share strips. A cache keeps them from one tile to the next.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import numpy as np
 from numpy.typing import NDArray
+
+from oiio_msspl.arrays import blank, unload
 
 #: Rows of a strip, which is at least one chunk. OpenImageIO decodes chunks in parallel; one chunk has 16 rows for ZIP,
 #: 32 for PIZ and DWAA, 256 for DWAB.
 ROWS_PER_STRIP = 64
+#: Bytes of a strip with all channels of its part, unless a single chunk has more.
+LARGEST_STRIP = 64 << 20
 
 
 class StripKey(NamedTuple):
@@ -44,10 +49,10 @@ class StripCache:
     """Bytes that the strips may take together. With 0, nothing is kept."""
     _strips: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
 
-    @property
-    def bytes(self) -> int:
-        """Bytes that the strips take at the moment."""
-        return sum(strip.nbytes for strip in self._strips.values())
+    bytes: int = field(default=0, init=False)
+    """Bytes that the strips take in memory at the moment."""
+    _in_memory: set[StripKey] = field(default_factory=set, repr=False)
+    """Of the strips that are not in a temporary file."""
 
     def get(self, key: StripKey) -> NDArray[Any] | None:
         """The strip, if it is kept."""
@@ -55,21 +60,53 @@ class StripCache:
 
     def pop(self, key: StripKey) -> NDArray[Any] | None:
         """The strip, if it is kept, and forget it."""
-        return self._strips.pop(key, None)
+        strip = self._strips.pop(key, None)
+        if strip is not None and key in self._in_memory:
+            self._in_memory.remove(key)
+            self.bytes -= strip.nbytes
+        return strip
 
     def keep(self, key: StripKey, strip: NDArray[Any]) -> None:
         """Keep a strip if there is room."""
-        if self.bytes + strip.nbytes <= self.max_bytes:
+        if self._has_room(strip):
             self._strips[key] = strip
+            self._in_memory.add(key)
+            self.bytes += strip.nbytes
+
+    def _has_room(self, strip: NDArray[Any]) -> bool:
+        return self.bytes + strip.nbytes <= self.max_bytes
+
+    def keep_all(self, parts: Mapping[StripKey, NDArray[Any]]) -> None:
+        """Keep copies of parts of a strip, in one temporary file those for which there is no room.
+
+        Raises:
+            MssplError: the disk has no room.
+        """
+        left = {}
+        for key, part in parts.items():
+            if self._has_room(part):
+                self.keep(key, part.copy())
+            else:
+                left[key] = part
+        if not left:
+            return
+        ends = np.cumsum([part.size for part in left.values()])
+        block = blank((int(ends[-1]),), next(iter(left.values())).dtype, on_disk=True)
+        for (key, part), flat in zip(left.items(), np.split(block, ends[:-1]), strict=True):
+            self._strips[key] = flat.reshape(part.shape)
+            self._strips[key][:] = part
+        unload(block)
 
     def drop_outside(self, first: int, last: int) -> None:
         """Forget the strips that have none of the rows from ``first`` to ``last`` (exclusive)."""
         for key in [key for key in self._strips if key.last <= first or key.first >= last]:
-            del self._strips[key]
+            self.pop(key)
 
     def clear(self) -> None:
         """Forget all strips."""
         self._strips.clear()
+        self._in_memory.clear()
+        self.bytes = 0
 
 
 def strip_rows(start: int, stop: int, origin: int, height: int, end: int) -> Iterator[tuple[int, int]]:

@@ -58,8 +58,8 @@ def write_fused(
         extra: further layers, such as ``error``, see :attr:`FusedPixels.extra`.
         replaced: new pixels for some of the other channels, each over the data window of its part.
         overwrite: replace an existing file.
-        cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit is decoded once for
-            each layer.
+        cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
+            files.
         stale: a file that is deleted just before the EXR gets its name: the preview of the EXR that it replaces.
 
     Returns:

@@ -1,10 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decoded rows are shared by neighbouring windows, within a number of bytes."""
 
+import mmap
+
 import numpy as np
 import OpenEXR
 import pytest
 
+from oiio_msspl.exr import reader
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
@@ -183,17 +186,28 @@ def test_only_what_is_still_to_be_written_is_kept(tmp_path, decoded):
     assert len(decoded) == len(set(decoded))
 
 
-def test_layers_that_do_not_fit_are_decoded_again(tmp_path, decoded):
+@pytest.mark.parametrize("room", [0, 1])
+def test_layers_that_do_not_fit_wait_in_a_file(tmp_path, decoded, room):
+    """The cache has room for no strip, or for one. No row is decoded twice, and no more memory is taken."""
     values = {name: picture(HEIGHT, WIDTH, seed).astype(np.float16) for seed, name in enumerate("abc")}
     channels = {key: plane for name, image in values.items() for key, plane in rgb(image, f"{name}.").items()}
     file = open_exr(write_exr(tmp_path / "a.exr", channels))
     (part,) = file.parts
     ranges = [(0, 3), (3, 6), (6, 9)]
-    with file.cache_strips(strip_bytes(ROWS_PER_STRIP)):
+    with file.cache_strips(room * strip_bytes(ROWS_PER_STRIP)):
         for i, name in enumerate("abc"):
             rows = np.concatenate([s for _, _, s in file.native_strips(part, *ranges[i], ranges[i + 1 :])])
             order = [part.channels[j].name[-1] for j in range(*ranges[i])]
             assert same_bits(np.ascontiguousarray(rows), values[name][..., ["RGB".index(c) for c in order]])
-            assert file._cache.bytes <= strip_bytes(ROWS_PER_STRIP)
-    assert decoded.count((0, 64)) == 2
-    assert decoded.count((256, 300)) > 1
+            assert file._cache.bytes <= room * strip_bytes(ROWS_PER_STRIP)
+            waiting = [strip for key, strip in file._cache._strips.items() if key not in file._cache._in_memory]
+            assert all(isinstance(strip.base.base, mmap.mmap) for strip in waiting)
+    assert len(decoded) == len(set(decoded)) == 5
+
+
+def test_strips_of_many_channels_have_fewer_rows(tmp_path, monkeypatch):
+    file = open_exr(write_exr(tmp_path / "a.exr", rgb(picture(300, 8)), compression=OpenEXR.ZIP_COMPRESSION))
+    row = file.parts[0].nbytes // 300
+    for largest, rows in ((1, 16), (40 * row, 32), (1000 * row, 64)):
+        monkeypatch.setattr(reader, "LARGEST_STRIP", largest)
+        assert file.parts[0].strip_height == rows

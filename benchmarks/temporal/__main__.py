@@ -29,7 +29,7 @@ from benchmarks.results import Row
 from benchmarks.scenes import beauty
 from benchmarks.temporal.measures import flicker, jod, psnr, relmse, warp_error
 from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
-from benchmarks.temporal.report import REFERENCE, film, layout, strip, summary
+from benchmarks.temporal.report import REFERENCE, details, film, layout, strip, summary
 from benchmarks.temporal.sequence import Sequence, load, without_vectors
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.colour import srgb
@@ -70,6 +70,7 @@ def main() -> int:
         "--without-vectors", action="store_true", help="leave the motion vectors of Mitsuba's sequences out"
     )
     parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
+    parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated WebP")
@@ -84,7 +85,7 @@ def main() -> int:
 
 
 def run(args: argparse.Namespace) -> None:
-    """Measure sequences. Their rows replace those of the same sequences in the table.
+    """Measure sequences. Their rows replace those of the same sequences and methods in the table.
 
     Raises:
         InputError: there are none, one is not complete, or a picture can't be written.
@@ -103,15 +104,16 @@ def run(args: argparse.Namespace) -> None:
         options = TemporalOptions(args.temporal, args.motion_format)
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
-            made = list(all_methods(judged, options))
+            made = list(all_methods(judged, options, args.methods))
         of_sequence = list(measure(sequence, made, with_jod=args.jod))
-        print(layout(of_sequence), flush=True)
+        print(layout(of_sequence) if args.methods == "*" else details(of_sequence), flush=True)
         rows += of_sequence
         if args.table:
             results.merge(args.table, of_sequence, KEYS)
         if index == 0 and (args.picture or args.film):
             draw(args, sequence, made)
-    print(summary(rows))
+    if args.methods == "*":
+        print(summary(rows))
 
 
 def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None:

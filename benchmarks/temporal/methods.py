@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
 from functools import partial
 
 import numpy as np
@@ -42,22 +43,29 @@ class Made:
     """How the motion is known; empty for single frames."""
 
 
-def all_methods(sequence: Sequence, options: TemporalOptions = TemporalOptions()) -> Iterator[Made]:
-    """Each method on a sequence.
+def all_methods(
+    sequence: Sequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*"
+) -> Iterator[Made]:
+    """Each method on a sequence whose name matches the pattern.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
     are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``options`` say which
     neighbours are averaged.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
-    yield Made(OIDN, 1, np.stack([oidn(render) for render in full]))
-    yield Made(OIDN_BEST, 1, np.stack([oidn_prefiltered(render) for render in full]))
+    for name, denoised in ((OIDN, oidn), (OIDN_BEST, oidn_prefiltered)):
+        if fnmatchcase(name, pattern):
+            yield Made(name, 1, np.stack([denoised(render) for render in full]))
     for scale in SCALES:
-        yield from _by_scale(sequence, scale, options)
+        for name, temporal, frames in _by_scale(sequence, scale, options):
+            if fnmatchcase(name, pattern):
+                yield Made(name, scale, frames(), _motion(temporal) if temporal.count else "")
 
 
-def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Iterator[Made]:
-    """Our frames alone and with neighbours, and OIDN's with neighbours."""
+def _by_scale(
+    sequence: Sequence, scale: int, options: TemporalOptions
+) -> Iterator[tuple[str, Temporal, Callable[[], Array]]]:
+    """Our frames alone and with neighbours, and OIDN's with neighbours: the method, and how to compute its frames."""
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     # More threads only wait for each other: the pictures are small.
@@ -83,12 +91,9 @@ def _by_scale(sequence: Sequence, scale: int, options: TemporalOptions) -> Itera
 
     for quality, prefix in QUALITIES.items():
         own = by_quality[quality]
-        fuse = partial(ours, own)
-        yield Made(prefix + ALONE, scale, _frames(own.read, Temporal(), shot.frames, fuse))
-        averaged = _frames(own.read, own.temporal, shot.frames, fuse)
-        yield Made(prefix + NEIGHBOURS, scale, averaged, _motion(own.temporal))
-    averaged = _frames(with_full, stages.temporal, shot.frames, theirs)
-    yield Made(OIDN_NEIGHBOURS, scale, averaged, _motion(stages.temporal))
+        for name, temporal in ((ALONE, Temporal()), (NEIGHBOURS, own.temporal)):
+            yield prefix + name, temporal, partial(_frames, own.read, temporal, shot.frames, partial(ours, own))
+    yield OIDN_NEIGHBOURS, stages.temporal, partial(_frames, with_full, stages.temporal, shot.frames, theirs)
 
 
 def _motion(temporal: Temporal) -> str:

@@ -38,8 +38,8 @@ COVERED = 0.9
 #: away on each side show them, and not at all from this share on.
 NEAR_OBJECTS, FEW = 8, 0.125
 #: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided by
-#: the root of the product. That is a factor of 3.
-OTHER_LIGHT = np.float32(2 / np.sqrt(3))
+#: the root of the product. That is a factor of 5.
+OTHER_LIGHT = np.float32(4 / np.sqrt(5))
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
 #: With more channels, as passes have, bands have fewer rows.

@@ -104,13 +104,11 @@ class Stages:
     """Models that are loaded, by scale and ``model``."""
 
     def skips(self, frame: Frame) -> bool:
-        """Whether a frame counts as done: its EXR exists, and with ``update`` none of its inputs is newer."""
-        if not (self.skip_existing and frame.output.exists()):
-            return False
-        return not (self.update and self.newer_inputs(frame.lr, frame.hr, frame.output))
+        """Whether a frame counts as done: its EXR exists and is not to be replaced."""
+        return self.skip_existing and frame.output.exists() and not self.replaces(frame.lr, frame.hr, frame.output)
 
     def replaces(self, lr: Path | None, hr: Path | None, output: Path) -> bool:
-        """Whether an EXR that exists is replaced."""
+        """Whether an EXR that exists is replaced: with ``overwrite`` always, with ``update`` if an input is newer."""
         return self.overwrite or (self.update and bool(self.newer_inputs(lr, hr, output)))
 
     def newer_inputs(self, lr: Path | None, hr: Path | None, output: Path) -> list[Path]:

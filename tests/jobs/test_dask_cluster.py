@@ -133,6 +133,24 @@ def test_the_program_says_of_a_cluster_what_it_says_of_a_local_run(tmp_path, bil
     assert all(after - known[address] <= 1 for address, after in client.run(loaded_models).items())
 
 
+def test_overwrite_replaces_frames_on_a_cluster(tmp_path, bilinear_models, client):
+    """Also the second time. A frame that fails is not taken for one that another run has fused."""
+    make_shot(tmp_path, 3)
+    (tmp_path / "hr/beauty.1003.exr").write_text("no EXR")
+    settings = {"model": str(bilinear_models[4]), "previews": True}
+    fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "local", **settings)
+    (tmp_path / "out").mkdir()
+    old = {f"beauty.{number}.{suffix}": b"old" for number in (1001, 1002, 1003) for suffix in ("exr", "png")}
+    for name, content in old.items():
+        (tmp_path / "out" / name).write_bytes(content)
+    for _ in range(2):
+        report = fuse_shot(
+            tmp_path / "lr", tmp_path / "hr", tmp_path / "out", client=client, overwrite=True, **settings
+        )
+        assert [result.status for result in report.results.values()] == ["fused", "fused", "failed"]
+        assert contents(tmp_path / "out") == old | contents(tmp_path / "local")
+
+
 def test_a_frame_that_kills_its_workers_is_given_up(tmp_path, bilinear_models, two_workers, client):
     make_shot(tmp_path, 1)
     two_workers.scheduler.allowed_failures, usual = 0, two_workers.scheduler.allowed_failures

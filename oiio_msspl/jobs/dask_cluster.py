@@ -88,7 +88,7 @@ def fuse_frames(
     run = uuid.uuid4().hex
     #: What is under way, and how often a frame of it may still be tried again.
     futures: dict[Future, tuple[list[Frame], int]] = {}
-    stages = replace(stages, temporal=stages.temporal.absolute())
+    stages = replace(stages, inputs=stages.inputs.absolute(), temporal=stages.temporal.absolute())
 
     def submit(chunk: list[Frame], tries: int) -> Future:
         key = f"msspl-fuse-{chunk[0].number}-{tries}-{run}"

@@ -43,6 +43,10 @@ class InputOptions:
     map_file: Path | None = None
     """The file that ``mapping`` was read from, if any."""
 
+    def absolute(self) -> InputOptions:
+        """The same with an absolute path, for workers with other working directories. Paths in ``mapping`` are full."""
+        return replace(self, map_file=None if self.map_file is None else self.map_file.absolute())
+
     def files(self, hr_path: Path, model: str | None) -> set[Path]:
         """The files that a frame is made from beside the pair: of the mapping, and a model that is no shipped one."""
         named = [self.map_file, None if model is None else Path(model)]

@@ -17,6 +17,7 @@ from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs import dask_cluster
 from oiio_msspl.jobs.dask_cluster import _sessions, fuse_frames
+from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions
@@ -149,6 +150,19 @@ def test_overwrite_replaces_frames_on_a_cluster(tmp_path, bilinear_models, clien
         )
         assert [result.status for result in report.results.values()] == ["fused", "fused", "failed"]
         assert contents(tmp_path / "out") == old | contents(tmp_path / "local")
+
+
+def test_workers_in_another_folder_see_that_the_file_of_a_mapping_is_newer(
+    tmp_path, bilinear_models, monkeypatch, client
+):
+    make_shot(tmp_path, 1)
+    (tmp_path / "map.toml").write_text('albedo = "albedo"')
+    monkeypatch.chdir(tmp_path)
+    settings = {"model": str(bilinear_models[4]), "inputs": InputOptions(map_file=Path("map.toml"))}
+    assert fuse_shot("lr", "hr", "out", **settings).exit_code == 0
+    later = Path("out/beauty.1001.exr").stat().st_mtime + 9
+    os.utime("map.toml", (later, later))
+    assert fuse_shot("lr", "hr", "out", client=client, update=True, **settings).results[1001].status == "fused"
 
 
 def test_a_frame_that_kills_its_workers_is_given_up(tmp_path, bilinear_models, two_workers, client):

@@ -16,7 +16,7 @@ from typing import Any
 from oiio_msspl.aovs.features import RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapping import split_exr
-from oiio_msspl.aovs.renderers import detect_renderer, layer_of_source, siblings_of, view_layer_of
+from oiio_msspl.aovs.renderers import detect_renderer, layer_of_source, sibling_of, siblings_of, view_layer_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr
@@ -128,7 +128,7 @@ class LayerFinder:
         file = self._file
         named, wanted = split_exr(name)
         if not named:
-            sibling = next((p for p in siblings_of(file.path, name) if p != file.path and p.is_file()), None)
+            sibling = sibling_of(file.path, name)
             if sibling is None:
                 return None
             layers = layers_of(self._open(sibling))

@@ -88,12 +88,41 @@ def _holds(condition: dict[str, Any], file: ExrFile, layers: list[Layer]) -> boo
     for key, value in condition.get("attributes", {}).items():
         if not any(re.search(key, k) and re.search(value, str(v)) for k, v in file.metadata.items()):
             return False
-    if "sibling" in condition and not siblings_of(file.path, condition["sibling"])[0].is_file():
+    return _holds_by_name(condition, file.path)
+
+
+def _holds_by_name(condition: dict[str, Any], path: Path) -> bool:
+    """Whether all is true that an entry of ``detect`` asks for of a file's name and of what lies beside it."""
+    if "sibling" in condition and not siblings_of(path, condition["sibling"])[0].is_file():
         return False
-    return bool(re.search(condition.get("file", ""), file.path.stem))
+    return bool(re.search(condition.get("file", ""), path.stem))
 
 
 def siblings_of(path: Path, name: str) -> list[Path]:
     """Where a renderer that writes a file for each AOV may have put one, beside the beauty ``path``: the file that
     belongs to this beauty by its name first."""
     return [path.with_name(f"{stem}.exr") for stem in (f"{path.stem}.{name}", name)]
+
+
+def sibling_of(path: Path, name: str) -> Path | None:
+    """The file of an AOV beside the beauty ``path``, see :func:`siblings_of`; None if there is none."""
+    return next((each for each in siblings_of(path, name) if each != path and each.is_file()), None)
+
+
+def aov_files(path: Path) -> set[Path]:
+    """The files of AOVs beside the beauty ``path``, as far as names tell: the beauty is not opened."""
+    found = (
+        sibling_of(path, name)
+        for renderer in renderers()
+        if (names := _file_names(renderer)) and any(_holds_by_name(each, path) for each in renderer["detect"])
+        for name in names
+    )
+    return {each for each in found if each is not None}
+
+
+def _file_names(entry: object) -> set[str]:
+    """The AOVs that an entry of the table, or a part of one, reads from files of their own: ``file:AOV``."""
+    if isinstance(entry, str):
+        return {entry.removeprefix("file:")} if entry.startswith("file:") else set()
+    parts = entry.values() if isinstance(entry, dict) else entry if isinstance(entry, list) else ()
+    return set().union(*map(_file_names, parts))

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -13,6 +13,7 @@ from oiio_msspl.aovs.candidates import mapped_files
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.aovs.renderers import aov_files
 from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, space_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layers_of
@@ -198,7 +199,22 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     return family + SPREAD
 
 
+def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:
+    """The files that a frame is made from, as far as names tell: :func:`files_read` without opening any.
+
+    Args:
+        renders: its pair, and the pairs of neighbours that it depends on.
+        hr_path: its own HRLS.
+        inputs, model: what else it is made from.
+
+    Returns:
+        The renders, in their order, and then the others. Those of the mapping need not exist.
+    """
+    others = inputs.files(hr_path, model).union(*map(aov_files, renders))
+    return [*renders, *sorted(others)]
+
+
 def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
     """All files that a frame is made from: the pair, what lies beside it, the mapping's files and the model."""
-    siblings = {*lr.file.siblings, *hr.file.siblings}
-    return {lr.file.path, hr.file.path} | siblings | inputs.files(hr.file.path, model)
+    named = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
+    return {*named, *lr.file.siblings, *hr.file.siblings}

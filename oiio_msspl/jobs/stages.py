@@ -30,7 +30,7 @@ from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.fusion.warp import Mask
 from oiio_msspl.jobs.frame import check_frame_memory, require_outputs, write_frame, write_frame_preview
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
-from oiio_msspl.jobs.inputs import InputOptions, files_read, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, files_by_name, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, add_other_views, name_of, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
@@ -116,7 +116,7 @@ class Stages:
         if lr is None or hr is None or not output.exists():
             return []
         written = output.stat().st_mtime
-        files = [lr, hr, *sorted(self.inputs.files(hr, self.model)), *self.temporal.files_beside(hr)]
+        files = files_by_name([lr, hr, *self.temporal.files_beside(hr)], hr, self.inputs, self.model)
         return [path for path in files if path.is_file() and path.stat().st_mtime > written]
 
     def read(self, frame: Frame) -> LoadedFrame:

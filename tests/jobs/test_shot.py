@@ -5,6 +5,7 @@ import json
 import os
 import threading
 from concurrent.futures import ThreadPoolExecutor
+from functools import partial
 from types import SimpleNamespace
 
 import numpy as np
@@ -22,7 +23,7 @@ from oiio_msspl.jobs.shot_report import fused_result, read_earlier
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.session import Session
-from tests.conftest import picture, rgb, write_exr
+from tests.conftest import downsample, picture, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
 
 
@@ -547,6 +548,30 @@ def test_frames_that_are_older_than_an_input_are_named_and_with_update_fused_aga
     assert changed == [1002, 1003, 1004]
     os.utime(albedo, (now + 99, now + 99))
     assert {r.status for r in run(folder, bilinear_models[4], update=True, **more).results.values()} == {"fused"}
+
+
+@pytest.mark.parametrize("newer", ["lr/lr.1001.ALBEDO.exr", "hr/beauty.1001.AVG_SHADING_NORMAL.exr", "hr/ALBEDO.exr"])
+def test_files_of_layers_beside_a_render_are_inputs(tmp_path, bilinear_models, newer):
+    """LuxCore writes one file a layer. A file of another frame, or one that is not read, does not count."""
+    folder = make_shot(tmp_path, 2)
+    clean = picture(HEIGHT, WIDTH)
+    write_exr(folder / "lr/lr.1001.ALBEDO.exr", rgb(downsample(clean, 4)))
+    for name in ("beauty.1001.AVG_SHADING_NORMAL", "ALBEDO"):
+        write_exr(folder / f"hr/{name}.exr", rgb(clean))
+    (folder / "hr/beauty.1001.DEPTH.exr").touch()
+    sequences = folder / "lr/lr.####.exr", folder / "hr/beauty.####.exr", folder / "out"
+    fuse = partial(fuse_shot, *sequences, model=str(bilinear_models[4]), temporal=TemporalOptions("off"))
+    assert fuse().exit_code == 0
+    later = (folder / "out/beauty.1002.exr").stat().st_mtime + 9
+    os.utime(folder / "hr/beauty.1001.DEPTH.exr", (later, later))
+    report = fuse(skip_existing=True)
+    assert [result.warnings for result in report.results.values()] == [[], []]
+    os.utime(folder / newer, (later, later))
+    report = fuse(skip_existing=True)
+    (warning,) = report.results[1001].warnings
+    assert warning.startswith(f"is older than {folder / newer}")
+    report = fuse(update=True)
+    assert [report.results[number].status for number in (1001, 1002)] == ["fused", "skipped"]
 
 
 def test_write_protected_frames_are_not_replaced(tmp_path, bilinear_models):

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import errno
+import os
 import unicodedata
 
 
@@ -39,10 +41,18 @@ def printable(text: str) -> str:
     )
 
 
+#: Why the file system refuses a path that the caller can change.
+_REFUSED = {errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT, errno.ENOTDIR}
+
+
 def explain(error: Exception) -> tuple[str, int]:
     """One sentence and an exit code for anything that can go wrong."""
     if isinstance(error, MssplError):
         return str(error), error.exit_code
     if isinstance(error, MemoryError):
         return "out of memory; try a smaller --max-memory", 1
+    if isinstance(error, OSError) and error.errno in _REFUSED:
+        path = error.filename2 or error.filename
+        if isinstance(path, str | bytes | os.PathLike):
+            return f"{os.fsdecode(path)}: can't be used ({error.strerror})", InputError.exit_code
     return f"unexpected {type(error).__name__}: {error} (--debug shows where)", 1

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import signal
 import sys
+import traceback
 
 import typer
 
@@ -19,7 +20,7 @@ def run(app: typer.Typer) -> None:
         app()
     except Exception as error:
         if "--debug" in sys.argv:
-            raise
+            traceback.print_exc()
         message, code = explain(error)
         print(f"error: {printable(message)}", file=sys.stderr)
         sys.exit(code)

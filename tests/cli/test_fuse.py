@@ -152,9 +152,21 @@ def test_the_callers_mistakes_are_one_sentence_and_exit_code_2(files, bilinear_m
     assert not (files / "out.exr").exists()
 
 
-def test_debug_shows_the_traceback(files):
+def test_debug_shows_the_traceback_and_leaves_the_exit_code(files):
     done = fuse(files / "hr.exr", files / "lr.exr", "-o", files / "out.exr", "--debug")
     assert "Traceback" in done.stderr
+    assert done.stderr.splitlines()[-1].startswith("error: ")
+    assert done.returncode == 2
+
+
+@pytest.mark.parametrize("option", ["lr", "output"])
+def test_a_name_that_is_too_long_is_a_mistake(files, option):
+    name = files / f"{'x' * 300}.exr"
+    lr, output = (name, files / "out.exr") if option == "lr" else (files / "lr.exr", name)
+    done = fuse(lr, files / "hr.exr", "-o", output)
+    assert done.returncode == 2
+    assert done.stderr.startswith(f"error: {name}: can't be used (")
+    assert done.stderr.count("\n") == 1
 
 
 def test_wrong_usage_is_exit_code_2(files):

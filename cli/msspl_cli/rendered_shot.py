@@ -131,13 +131,16 @@ class RenderedShot:
         return self._warnings.get(output, [])
 
     def _read(self, frame: Frame) -> LoadedFrame:
+        if self._temporal.count and self._temporal.motion is None:
+            assert frame.lr is not None and frame.hr is not None
+            _, hr = map_pair(frame.lr, frame.hr, self._stages.inputs)
+            # The format need not be verified: Blender is known, and motion blur is off.
+            motion = MotionSource(VECTORS, self.text, hr.motion.fields)
+            self._temporal = replace(self._temporal, motion=motion)
+            self._stages = replace(self._stages, temporal=self._temporal)  # it reads the vectors with the pixels
+            self._window = FrameWindow(self._temporal, self._wanted, self._fuse_frame)
         loaded = self._stages.read(frame)
         self._renders[frame.number] = frame
-        if self._temporal.count and self._temporal.motion is None:
-            # The format need not be verified: Blender is known, and motion blur is off.
-            motion = MotionSource(VECTORS, self.text, loaded.hr.motion.fields)
-            self._temporal = replace(self._temporal, motion=motion)
-            self._window = FrameWindow(self._temporal, self._wanted, self._fuse_frame)
         return loaded
 
     def _fuse_frame(self, loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:

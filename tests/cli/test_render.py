@@ -15,10 +15,13 @@ import pytest
 from msspl_cli.blender_process import command, find_blender
 from msspl_cli.commands.render import name_targets
 from msspl_cli.installed import shipped_folder
+from msspl_cli.rendered_shot import RenderedShot
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.shot import fuse_shot
+from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from tests.conftest import EXAMPLES
 from tests.jobs.test_temporal import make_moving_shot
@@ -221,6 +224,24 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
     written = pixels(folder / "out")
     assert written.pop("hr.1003.exr") == pixels(moving / "hr")["hr.1003.exr"]
     assert written.items() < pixels(moving / "whole").items()
+
+
+def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, bilinear_models, moving, monkeypatch):
+    """And their memory is counted."""
+    loaded, counted = [], []
+    load, held = Stages._load, Stages._held_bytes
+    monkeypatch.setattr(Stages, "_load", lambda *given: loaded.append(load(*given)) or loaded[-1])
+    monkeypatch.setattr(
+        Stages, "_held_bytes", lambda self, each: counted.append(self._motion_channels(each.hr)) or held(self, each)
+    )
+    frames = [Frame(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
+    shot = RenderedShot(Stages(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
+    for frame in shot.order:
+        pair = [moving / f"{each}/{each}.{frame.number}.exr" for each in ("lr", "hr")]
+        shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
+    assert [list(each.vectors) for each in loaded] == [[1]] * 3
+    assert counted and all(counted)
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["1001.exr", "1002.exr", "1003.exr"]
 
 
 @posix

@@ -11,7 +11,6 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -19,6 +18,7 @@ from typing import Any
 
 from msspl_cli.installed import shipped_folder
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.atomic import temporary_folder
 
 #: What Blender prints while it renders.
 _SAMPLES = re.compile(r"Sample (\d+)/(\d+)")
@@ -79,7 +79,7 @@ def render_frames(
         number = None
         fuse(lr, hr)
 
-    with tempfile.TemporaryDirectory(prefix=".msspl-", dir=folder.absolute()) as work:
+    with temporary_folder(folder) as work:
         path = Path(work, "job.json")
         path.write_text(json.dumps({**job, "work": work}), encoding="utf-8")
         try:

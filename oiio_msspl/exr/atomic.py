@@ -11,8 +11,10 @@ from __future__ import annotations
 import os
 import re
 import secrets
+import shutil
 import socket
 import sys
+import tempfile
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
@@ -24,8 +26,8 @@ from oiio_msspl.errors import InputError, MssplError
 
 #: Bytes of the target's stem in the name of its temporary file. Names may have 143 bytes on encrypted file systems.
 _STEM_BYTES = 60
-#: Seconds after which the temporary file of a process that can't be looked up counts as left over. A file that is
-#: being written is touched every few seconds.
+#: Seconds after which what a process that can't be looked up has left counts as left over. A file that is being written
+#: is touched every few seconds, a folder with each frame that is rendered.
 _ABANDONED = 24 * 3600
 
 
@@ -174,6 +176,26 @@ def remove_leftovers(targets: Iterable[Path]) -> None:
                         (folder / name).unlink()
 
 
+def temporary_folder(folder: Path) -> tempfile.TemporaryDirectory[str]:
+    """Make a hidden folder in ``folder``, which is deleted when its ``with`` block ends.
+
+    Its name is ``.msspl-MACHINE-PROCESS-RANDOM``, as in the names of temporary files.
+
+    Raises:
+        OSError: it can't be made.
+    """
+    return tempfile.TemporaryDirectory(prefix=f".msspl-{_machine()}-{os.getpid()}-", dir=folder.absolute())
+
+
+def remove_left_folders(folder: Path) -> None:
+    """Delete what killed processes left of :func:`temporary_folder` in ``folder``, by the rule for temporary files."""
+    with suppress(OSError):
+        for name in os.listdir(folder):
+            match = re.fullmatch(r"\.msspl-([0-9a-f]{8})-(\d+)-[^.]+", name)
+            if match and _is_abandoned(folder / name, match[1], int(match[2])):
+                shutil.rmtree(folder / name, ignore_errors=True)
+
+
 def _prefix(target: Path) -> str:
     """The beginning of the names of a target's temporary files."""
     stem = os.fsencode(target.stem)[:_STEM_BYTES].decode("utf-8", "ignore")
@@ -197,7 +219,7 @@ def _hash(text: str) -> str:
 
 
 def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:
-    """Whether nobody writes a temporary file any more."""
+    """Whether nobody uses a temporary file or folder any more."""
     # On Windows, os.kill would end the process.
     if machine == _machine() and sys.platform != "win32":
         try:

@@ -18,6 +18,7 @@ from msspl_cli.installed import shipped_folder
 from msspl_cli.rendered_shot import RenderedShot
 
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import temporary_folder
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.shot import fuse_shot
@@ -25,6 +26,7 @@ from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from tests.conftest import EXAMPLES
 from tests.jobs.test_temporal import make_moving_shot
+from tests.programs import leave_temporary
 from tests.shots import pixels
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
@@ -382,6 +384,27 @@ def test_cancelling_ends_blender_and_what_it_started(farm, how):
                 os.kill(int(pid), 0)
                 time.sleep(0.02)
     assert sorted(p.name for p in folder.iterdir()) == ["blender", "pids", "scene.blend"]
+
+
+@posix
+def test_what_a_killed_run_left_is_deleted_by_the_next_one(farm):
+    """And nothing of a run that is alive, nor what only looks like it."""
+    start, run, folder = farm
+    process = start(
+        code="Path('pid').write_text(str(os.getpid())); Path(job['work'], 'lr.exr').touch(); time.sleep(60)"
+    )
+    while not (folder / "pid").exists() or not (folder / "pid").read_text():
+        time.sleep(0.02)
+        assert process.poll() is None
+    process.kill()
+    process.communicate()
+    os.kill(int((folder / "pid").read_text()), signal.SIGKILL)
+    leave_temporary(folder / "out.exr")
+    (folder / ".msspl-notes").mkdir()
+    with temporary_folder(folder) as alive:
+        code, _, err, left = run()
+        assert code == 0, err
+        assert left == sorted([".msspl-notes", Path(alive).name, "out.exr", "pid"])
 
 
 @posix

@@ -12,7 +12,14 @@ import typer
 from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
+from oiio_msspl.exr.atomic import (
+    check_folder,
+    check_separate,
+    check_target,
+    make_folder,
+    remove_left_folders,
+    remove_leftovers,
+)
 
 if TYPE_CHECKING:
     from msspl_cli.rendered_shot import RenderedShot
@@ -243,6 +250,8 @@ def render(
     }
     if makes_folder:
         make_folder(folder)
+    remove_leftovers(target for _, target in shot)
+    remove_left_folders(folder)
     reports: list[dict[str, Any]] = []
     waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
     warnings: list[str] = []  # about all frames

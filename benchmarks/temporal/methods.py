@@ -43,9 +43,7 @@ class Made:
     """How the motion is known; empty for single frames."""
 
 
-def all_methods(
-    sequence: Sequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*"
-) -> Iterator[Made]:
+def all_methods(sequence: Sequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*") -> Iterator[Made]:
     """Each method on a sequence whose name matches the pattern.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames

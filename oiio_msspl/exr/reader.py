@@ -76,7 +76,7 @@ class Part:
 
     @property
     def strip_height(self) -> int:
-        """Rows that are decoded together: whole tiles, or whole chunks of scan lines; fewer if there are many channels."""
+        """Rows that are decoded together: whole tiles, or whole chunks of scan lines. Many channels make it fewer."""
         unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)
         row_bytes = self.nbytes // max(1, self.data_window.height)
         return unit * max(1, min(ROWS_PER_STRIP, LARGEST_STRIP // max(1, row_bytes)) // unit)

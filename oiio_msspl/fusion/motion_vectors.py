@@ -24,8 +24,8 @@ Mask = NDArray[np.bool_]
 
 #: Shorter vectors are no movement, in pixels.
 NO_MOTION = 1e-3
-#: Vectors that change by more than this from pixel to pixel can't be followed, in pixels: whether the way there and back
-#: ends at its pixel would depend on how places are rounded to pixels.
+#: Vectors that change by more than this from pixel to pixel can't be followed, in pixels. Whether the way there and
+#: back ends at its pixel would depend on how places are rounded to pixels.
 UNEVEN = 0.25
 #: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
 ROUNDS, ROUND_TRIP = 3, 0.5
@@ -122,7 +122,8 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
 def _uneven(vectors: Array) -> Mask:
     """Where vectors change by more than ``UNEVEN`` on both sides of a pixel, in the same direction: on what turns fast.
 
-    At the border of two surfaces, they change on one side. On a surface as thin as a pixel, they change and change back.
+    At the border of two surfaces, they change on one side. On a surface as thin as a pixel, they change and change
+    back.
     """
     motion = np.ascontiguousarray(vectors).view(np.complex64)[..., 0]
     result = np.zeros(motion.shape, np.bool_)

@@ -37,8 +37,8 @@ COVERED = 0.9
 #: A neighbour counts less near objects that move and are not followed: less the more of the HRLS pixels up to so many
 #: away on each side show them, and not at all from this share on.
 NEAR_OBJECTS, FEW = 8, 0.125
-#: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided by
-#: the root of the product. That is a factor of 5.
+#: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided
+#: by the root of the product. That is a factor of 5.
 OTHER_LIGHT = np.float32(4 / np.sqrt(5))
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
@@ -253,7 +253,7 @@ class _Band:
         return np.maximum(1 - near / np.float32(FEW), 0)
 
     def _as_bright(self, lrhs: Array) -> Array:
-        """How much a neighbour counts by the luminance of its LRHS (h, w), where it may show another surface as well."""
+        """How much a neighbour counts by the luminance (h, w) of its LRHS, where it may show another surface, too."""
         own, other = (np.maximum(each, self._light.darkest) for each in (self._low_luminance, lrhs))
         difference = (own - other) / np.sqrt(own * other)
         return np.asarray(1 / (1 + np.square(np.square(difference / OTHER_LIGHT))), np.float32)

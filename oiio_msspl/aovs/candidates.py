@@ -48,17 +48,23 @@ class LayerFinder:
                 exactly one layer for the feature.
         """
         entry: dict[str, Any] = {"layer": candidate} if isinstance(candidate, str) else dict(candidate)
-        if "channels" in entry:
-            return self._formula_of_channels(entry)
         path, named = split_exr(str(entry.get("layer", "")).removeprefix("file:"))
         if str(entry.get("layer", "")).startswith("file:") and path and not named and "times" not in entry:
             extras = {key: entry[key] for key in ("kind", "encoding", "note") if key in entry}
             return replace(self._formula_of_file(feature, Path(path)), **extras)
-        aliases = entry.get("sum") or entry.get("halves") or [entry.get("layer")]
-        if "times" in entry:
-            aliases = [*aliases, entry["times"]]
         groups: list[tuple[Channel, ...]] = []
         names: list[str] = []
+        if "channels" in entry:
+            stored = self._channels()
+            if not all(name in stored for name in entry["channels"]):
+                return None
+            groups.append(tuple(stored[name] for name in entry["channels"]))
+            names.append(" ".join(entry["channels"]))
+            aliases = []
+        else:
+            aliases = [*(entry.get("sum") or entry.get("halves") or [entry.get("layer")])]
+        if "times" in entry:
+            aliases.append(entry["times"])
         for alias in aliases:
             layer = self._layer(feature, str(alias))
             if layer is None:
@@ -74,15 +80,9 @@ class LayerFinder:
         encoding, note = entry.get("encoding", "signed"), entry.get("note", "")
         return FeatureFormula(tuple(groups), factor, kind, encoding, _text(names, factor is not None), note)
 
-    def _formula_of_channels(self, entry: dict[str, Any]) -> FeatureFormula | None:
-        """The formula of a candidate that lists channels by their stored names."""
-        stored = {c.name: c for part in self._file.parts for c in part.channels}
-        names = entry["channels"]
-        if not all(n in stored for n in names):
-            return None
-        group = tuple(stored[n] for n in names)
-        encoding, note = entry.get("encoding", "signed"), entry.get("note", "")
-        return FeatureFormula((group,), encoding=encoding, text=" ".join(names), note=note)
+    def _channels(self) -> dict[str, Channel]:
+        """The file's channels by their stored names."""
+        return {c.name: c for part in self._file.parts for c in part.channels}
 
     def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
         """The feature of another render, found by the table of renderers; or its only layer, for a file of one AOV."""

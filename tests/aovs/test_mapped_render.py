@@ -19,10 +19,11 @@ from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_e
         ({"layer": "v", "kind": "second_moment"}, (0.64 - 0.25) / 4),
         ({"layer": "v", "kind": "deviation"}, 0.64**2),
         ({"halves": ["a", "b"]}, (0.6 - 0.2) ** 2 / 4),
+        ({"channels": ["v.R", "v.G", "v.B"], "kind": "deviation"}, 0.64**2),
     ],
 )
 def test_every_kind_of_variance_becomes_that_of_the_mean(tmp_path, entry, expected):
-    """A grey pixel of 0.5 with 4 spp: all six descriptions give the variance of the mean luminance."""
+    """A grey pixel of 0.5 with 4 spp: all descriptions give the variance of the mean luminance."""
     channels = {c: plane(0.5) for c in "RGB"}
     channels |= {f"{n}.{c}": plane(v) for n, v in (("v", 0.64), ("a", 0.6), ("b", 0.2)) for c in "RGB"}
     render = mapped(tmp_path, channels, {"variance": entry}, spp=4)

@@ -197,6 +197,13 @@ def test_a_mapping_file_takes_what_the_table_takes(tmp_path):
     assert render.read(render.data_window)["diffuse"][0, 0, 0] == 20
 
 
+def test_listed_channels_can_be_multiplied_by_a_layer(tmp_path):
+    channels = layer("", 1) | {name: plane(4) for name in "uvw"} | layer("colour", 5)
+    render = mapped(tmp_path, channels, {"diffuse": {"channels": ["u", "v", "w"], "times": "colour"}})
+    assert render.read(render.data_window)["diffuse"][0, 0, 0] == 20
+    assert found(render)["diffuse"] == "u v w * colour"
+
+
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
     channels = layer("", 1) | {"mask.A": plane(1)}
     with pytest.raises(InputError, match="albedo is mapped to nothing, which is not there"):

@@ -81,8 +81,12 @@ class LayerFinder:
         return FeatureFormula(tuple(groups), factor, kind, encoding, _text(names, factor is not None), note)
 
     def _channels(self) -> dict[str, Channel]:
-        """The file's channels by their stored names."""
-        return {c.name: c for part in self._file.parts for c in part.channels}
+        """The channels of the view's layers by their stored names; of equal names the view's first one."""
+        stored: dict[str, Channel] = {}
+        for layer in sorted(self._layers, key=lambda each: each.view != self._view):
+            for channel in layer.channels.values():
+                stored.setdefault(channel.name, channel)
+        return stored
 
     def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
         """The feature of another render, found by the table of renderers; or its only layer, for a file of one AOV."""
@@ -213,8 +217,14 @@ def mapped_files(mapping: Mapping[str, Any], path: Path) -> set[Path]:
 
 def missing(feature: str, candidate: Any) -> str:
     """The sentence for a candidate of the user whose layers are not in the file."""
-    names = [candidate] if isinstance(candidate, str) else [str(v) for v in candidate.values()]
-    return f"{feature} is mapped to {' * '.join(names).removeprefix('file:')}, which is not there"
+    entry = {"layer": candidate} if isinstance(candidate, str) else candidate
+    if "channels" in entry:
+        names = [" ".join(entry["channels"])]
+    else:
+        names = [*(entry.get("sum") or entry.get("halves") or [entry["layer"]])]
+    names += [entry["times"]] if "times" in entry else []
+    text = _text([name.removeprefix("file:") for name in names], "times" in entry)
+    return f"{feature} is mapped to {text}, which is not there"
 
 
 def _wrong_channels(feature: str, layer: Layer) -> str:

@@ -72,7 +72,7 @@ def map_render(
             formula = _first_formula(finder, feature, renderer.get(feature, []), notes)
         if formula is not None:
             found[feature] = formula
-    _check_no_integers(file, found)
+    _check_no_integers(found)
     labels = dict.fromkeys(each.label for each in beauties)
     render = MappedRender(
         file=file,
@@ -145,12 +145,14 @@ def _first_formula(
     return None
 
 
-def _check_no_integers(file: ExrFile, formulas: dict[str, FeatureFormula]) -> None:
+def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:
     for feature, formula in formulas.items():
-        integers = [c.name for c in formula.channels if c.type == "uint"]
+        integers = [c for c in formula.channels if c.type == "uint"]
         if integers:
+            path = integers[0].path
+            names = ", ".join(c.name for c in integers if c.path == path)
             raise InputError(
-                f"{file.path}: {feature}: {', '.join(integers)} hold integers (ids, not light); "
+                f"{path}: {feature}: {names} hold integers (ids, not light); "
                 f"choose another layer with --map {feature}=LAYER"
             )
 

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
@@ -14,6 +15,12 @@ def test_integers_are_no_light(tmp_path):
     ids = {c: np.full((H, W), 4000, np.uint32) for c in "RGB"}
     with pytest.raises(InputError, match="rgb: R, G, B hold integers"):
         mapped(tmp_path, ids)
+
+
+def test_integers_are_said_of_the_file_that_holds_them(tmp_path):
+    ids = {f"ids.{c}": np.full((H, W), 4000, np.uint32) for c in "RGB"}
+    with pytest.raises(InputError, match=r"other\.exr: albedo: ids\.R, ids\.G, ids\.B hold integers"):
+        beside(tmp_path, ids, ["albedo={}:ids"])
 
 
 def test_a_single_unnamed_view_is_the_one_that_is_meant(tmp_path):
@@ -202,6 +209,36 @@ def test_listed_channels_can_be_multiplied_by_a_layer(tmp_path):
     render = mapped(tmp_path, channels, {"diffuse": {"channels": ["u", "v", "w"], "times": "colour"}})
     assert render.read(render.data_window)["diffuse"][0, 0, 0] == 20
     assert found(render)["diffuse"] == "u v w * colour"
+
+
+def test_listed_channels_are_those_of_the_view(tmp_path):
+    """Each eye has its own part, and both name the channels alike."""
+    names = ["albedo.u", "albedo.v", "albedo.w"]
+
+    def part(view, light, albedo):
+        channels = layer("", light) | {name: plane(albedo) for name in names}
+        header = {"type": OpenEXR.scanlineimage, "view": view}
+        return OpenEXR.Part(header, channels, view)
+
+    path = tmp_path / "stereo.exr"
+    with OpenEXR.File([part("left", 1, 2), part("right", 3, 4)]) as file:
+        file.write(str(path))
+    for view, albedo in (("left", 2), ("right", 4)):
+        render = map_render(open_exr(path), {"albedo": {"channels": names}}, view=view)
+        assert render.read(render.data_window)["albedo"][0, 0, 0] == albedo
+
+
+@pytest.mark.parametrize(
+    ("feature", "candidate", "text"),
+    [
+        ("variance", {"layer": "v", "kind": "deviation", "note": "of the mean"}, "v"),
+        ("diffuse", {"sum": ["a", "b"], "times": "c"}, r"\(a \+ b\) \* c"),
+        ("normal", {"channels": ["n.u", "n.v", "n.w"], "encoding": "auto"}, "n.u n.v n.w"),
+    ],
+)
+def test_of_a_candidate_that_is_missing_the_layers_are_named(tmp_path, feature, candidate, text):
+    with pytest.raises(InputError, match=f"{feature} is mapped to {text}, which is not there"):
+        mapped(tmp_path, layer("", 1), {feature: candidate})
 
 
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):

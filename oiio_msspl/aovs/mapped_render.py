@@ -67,8 +67,9 @@ class MappedRender:
 
     @property
     def metadata(self) -> dict[str, Any]:
-        """Header attributes by their OpenImageIO names."""
-        return self.file.metadata
+        """Header attributes by their OpenImageIO names. Those of the beauty's part count more than those of others,
+        which may belong to another view."""
+        return self.file.metadata | self.file.parts[self.features[RGB].terms[0][0].part].metadata
 
     @property
     def beauty_channels(self) -> tuple[Channel, ...]:

@@ -65,6 +65,11 @@ class Part:
     spec: Any = field(repr=False, compare=False)
     """OpenImageIO's ``ImageSpec``, from which a copy of the part can be written."""
 
+    @cached_property
+    def metadata(self) -> dict[str, Any]:
+        """Header attributes by their OpenImageIO names."""
+        return {_text(attribute.name): _text(attribute.value) for attribute in self.spec.extra_attribs}
+
     @property
     def nbytes(self) -> int:
         """Bytes of all pixels in their stored types."""
@@ -257,10 +262,9 @@ def open_exr(path: str | Path) -> ExrFile:
     parts: list[Part] = []
     metadata: dict[str, Any] = {}
     while handle.seek_subimage(len(parts), 0):
-        spec = handle.spec()
-        parts.append(_part(path, len(parts), spec))
-        for attribute in spec.extra_attribs:
-            metadata.setdefault(_text(attribute.name), _text(attribute.value))
+        parts.append(_part(path, len(parts), handle.spec()))
+        for name, value in parts[-1].metadata.items():
+            metadata.setdefault(name, value)
     if not parts:
         raise InputError(f"{path}: holds no image ({reason_of(handle)})")
     first = parts[0].spec

@@ -1,5 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
@@ -75,6 +76,21 @@ def test_layers_of_another_view_are_told_apart(tmp_path):
     render = mapped(tmp_path, channels, attributes={"multiView": ["left", "right"]})
     assert (render.view, found(render)["albedo"]) == ("left", "albedo")
     assert render.unused_layers([], []) == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
+
+
+def test_each_view_has_the_attributes_of_its_own_part(tmp_path):
+    """Such as its camera's matrix; what only another part says holds for all."""
+
+    def part(view, **attributes):
+        header = {"type": OpenEXR.scanlineimage, "view": view, "eye": view, **attributes}
+        return OpenEXR.Part(header, layer("", 1), view)
+
+    path = tmp_path / "stereo.exr"
+    with OpenEXR.File([part("left", scene="shared"), part("right")]) as file:
+        file.write(str(path))
+    for view in ("left", "right"):
+        metadata = map_render(open_exr(path), view=view).metadata
+        assert (metadata["eye"], metadata["scene"]) == (view, "shared")
 
 
 def test_the_beauty_channels_are_those_that_a_fused_frame_replaces(tmp_path):

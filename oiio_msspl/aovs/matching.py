@@ -28,8 +28,8 @@ from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Window
 
-#: Rows in the middle of the frame that tell whether normals are signed.
-_ROWS_OF_NORMALS = 64
+#: Bands of rows that tell whether normals are signed, and rows in each.
+_BANDS_OF_NORMALS, _ROWS_PER_BAND = 8, 8
 
 
 def map_render(
@@ -173,14 +173,20 @@ def _decide_normal_encoding(render: MappedRender) -> None:
     formula = render.features.get(NORMAL)
     if formula is None or formula.encoding != "auto":
         return
-    window = render.data_window
-    middle = window.y0 + window.height // 2
-    half = _ROWS_OF_NORMALS // 2
-    rows = Window(window.x0, max(window.y0, middle - half), window.x1, min(window.y1, middle + half))
-    normal = render.file.read(formula.terms[0], rows).reshape(-1, 3)
+    bands = [render.file.read(formula.terms[0], rows) for rows in _bands(render.data_window)]
+    normal = np.concatenate([band.reshape(-1, 3) for band in bands])
     normal = normal[np.isfinite(normal).all(axis=1) & (np.abs(normal).max(axis=1) > 0)]
     unsigned = len(normal) > 0 and normal.min() >= 0 and _unit_share(normal * 2 - 1) > _unit_share(normal)
     render.features[NORMAL] = replace(formula, encoding="unsigned" if unsigned else "signed")
+
+
+def _bands(window: Window) -> list[Window]:
+    """Bands of rows, evenly spread over a window; the whole window if it is small."""
+    if window.height <= _BANDS_OF_NORMALS * _ROWS_PER_BAND:
+        return [window]
+    last = window.y1 - _ROWS_PER_BAND
+    tops = [window.y0 + (last - window.y0) * i // (_BANDS_OF_NORMALS - 1) for i in range(_BANDS_OF_NORMALS)]
+    return [Window(window.x0, top, window.x1, top + _ROWS_PER_BAND) for top in tops]
 
 
 def _unit_share(vectors: Array) -> float:

@@ -129,6 +129,15 @@ def test_encoded_normals_are_recognised_by_their_pixels(tmp_path):
         np.testing.assert_allclose(render.read(render.data_window)["normal"], normal, atol=1e-6)
 
 
+def test_encoded_normals_are_recognised_wherever_there_is_a_surface(tmp_path):
+    """The sky fills the middle of the frame, where the normal is black."""
+    stored = np.zeros((400, W, 3), np.float32)
+    stored[300:] = 0.5, 0.5, 1
+    light = {c: np.ones((400, W), np.float32) for c in "RGB"}
+    render = mapped(tmp_path, light | rgb(stored, "normal."))
+    np.testing.assert_array_equal(render.read(render.data_window)["normal"][-1, 0], [0, 0, 1])
+
+
 def test_the_users_mapping_wins(tmp_path):
     channels = layer("", 1) | layer("albedo", 2) | layer("my_albedo", 3)
     render = mapped(tmp_path, channels, parse_map_options(["albedo=my_albedo"]))

@@ -280,7 +280,8 @@ class _Band:
             )
         usable = (x > data.x0 - 0.5) & (x < data.x1 - 0.5) & (y > data.y0 - 0.5) & (y < data.y1 - 0.5)
         x, y = np.clip(x, data.x0, data.x1 - 1), np.clip(y, data.y0, data.y1 - 1)
-        top, bottom = max(int(y.min()) - 1, data.y0), min(int(y.max()) + 3, data.y1)
+        top = max(int(np.floor(y.min())) - 1, data.y0)
+        bottom = min(int(np.floor(y.max())) + 3, data.y1)
         place = Window(data.x0, top, data.x1, bottom)
         stored = _with_finite_passes(_read(frame.lr, place, self._low_features))
         x, y = x - place.x0, y - place.y0

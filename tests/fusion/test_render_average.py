@@ -187,6 +187,26 @@ def test_bands_of_rows_agree(monkeypatch):
     assert np.allclose(whole.frames, parts.frames, rtol=1e-5)
 
 
+def test_rows_above_the_frame_are_averaged_like_others(monkeypatch):
+    """The same pixels, once all inside the display window and once all above it. Some surfaces move further than the
+    others, so that the first row that is read belongs to them."""
+    monkeypatch.setattr(light, "BAND_ROWS", 16)
+    monkeypatch.setattr(light, "BAND_PIXELS", 1)
+    pairs = [pair_of(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32), seed) for seed in range(2)]
+    way, back = np.zeros((2, HEIGHT, WIDTH, 2), np.float32)
+    way[40:48, 32:64, 1], back[10:18, 32:64, 1] = -30, 30
+
+    def raised(render, rows):
+        width, height = render.data_window.width, render.data_window.height
+        return Render(render.layers, Window(0, -rows, width, height - rows), Window(0, 0, width, height))
+
+    def result(rows):
+        own, other = (RenderPair(raised(pair.lr, rows // SCALE), raised(pair.hr, rows)) for pair in pairs)
+        return average_renders(own, [], [Step(other, way, None, back, None)]).lr.layers["rgb"]
+
+    assert np.allclose(result(0), result(HEIGHT), atol=1e-5)
+
+
 def test_bands_read_a_file_at_the_same_time(monkeypatch, tmp_path):
     """As for frames that don't fit into memory."""
     monkeypatch.setattr(light, "BAND_ROWS", 16)

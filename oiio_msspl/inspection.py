@@ -15,6 +15,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
@@ -185,16 +186,23 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
     """Find the layers of motion vectors, and verify them with the next frame if there is one.
 
     Raises:
-        InputError: a frame can't be read, or ``wanted`` does not fit.
+        InputError: this frame can't be read, or ``wanted`` does not fit.
     """
     path = _next_frame(result.path)
     if path is not None:
+        if wanted:
+            user_fields(render.motion, wanted, render.name)
+        following = None
         try:
             following = map_render(open_exr(path), inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
-        except InputError as error:  # it may still be rendered
+            result.motion = find_motion(render, following, wanted)
+        except InputError as error:
+            files = (path, *following.file.siblings) if following else ()
+            if following and not str(error).startswith(tuple(f"{each}: " for each in files)):
+                raise  # it is about this frame, or about ``wanted``
+            # The next frame may still be rendered.
             result.facts.append(f"motion: not verified, because the next frame can't be read: {error}")
             return
-        result.motion = find_motion(render, following, wanted)
         result.facts.append(f"motion, checked with {path.name}: {result.motion.text}")
     elif render.motion.fields:
         layers = " and ".join(f"{each.name} ({each.format})" for each in render.motion.fields)

@@ -7,7 +7,7 @@ needs the whole file in memory.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -17,12 +17,21 @@ from numpy.typing import NDArray
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.part_specs import runs
-from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.reader import Channel, Part
 from oiio_msspl.exr.replaced import DTYPES
 from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Header entries that say how the source was stored. The ACES flag is forbidden in a file with AOVs (ST 2065-4).
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
+
+
+def check_single_part(contents: FileContents) -> None:
+    """Check by the headers that one part can hold all channels. The fused pixels are not looked at.
+
+    Raises:
+        InputError: parts have different data windows or equal channel names.
+    """
+    _names(contents)
 
 
 def write_single_part(path: Path, contents: FileContents) -> None:
@@ -61,19 +70,12 @@ def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
 
 def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[Any]]) -> None:
     """Add the channels of the HRLS that are neither fused nor dropped."""
-    file, home = contents.source, contents.home
-    for part in file.parts:
-        if part.deep or contents.dropped.issuperset(part.channels):
-            continue
-        if part.data_window != home.data_window:
-            raise InputError(
-                f"--layout multilayer: part '{part.name}' of {file.path} has the data window {part.data_window}, "
-                f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
-            )
-        passed_on = [c for c in part.channels if c not in contents.beauty and c not in contents.dropped]
+    file, names = contents.source, _names(contents)
+    for part, passed_on in _passed_on(contents):
         for kind in sorted({channel.type for channel in passed_on}):
             for run in runs([channel for channel in passed_on if channel.type == kind]):
-                planes = _planes(contents, run, channels)
+                planes = [np.empty((part.data_window.height, part.data_window.width), DTYPES[kind]) for _ in run]
+                channels |= {names[c]: plane for c, plane in zip(run, planes, strict=True)}
                 for y0, y1, strip in file.native_strips(part, run[0].index, run[-1].index + 1):
                     if contents.replaced is not None:
                         strip = contents.replaced.apply(run, y0 - part.data_window.y0, strip)
@@ -81,19 +83,37 @@ def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[
                         plane[y0 - part.data_window.y0 : y1 - part.data_window.y0] = strip[..., position]
 
 
-def _planes(contents: FileContents, run: Sequence[Channel], channels: dict[str, NDArray[Any]]) -> list[NDArray[Any]]:
-    """Empty planes for some channels of one pixel type, which are added to ``channels``."""
-    window = contents.home.data_window
-    planes = []
-    for channel in run:
-        name = _name(contents, channel)
-        if name in channels:
+def _passed_on(contents: FileContents) -> Iterator[tuple[Part, list[Channel]]]:
+    """The parts of the HRLS with their channels that are neither fused nor dropped."""
+    for part in contents.source.parts:
+        if not part.deep and not contents.dropped.issuperset(part.channels):
+            yield part, [c for c in part.channels if c not in contents.beauty and c not in contents.dropped]
+
+
+def _names(contents: FileContents) -> dict[Channel, str]:
+    """What the channels that are passed on are called in the file that is written.
+
+    Raises:
+        InputError: parts have different data windows, or two channels would have one name.
+    """
+    path, home = contents.source.path, contents.home
+    added = {f"{name}.{c}" for name in contents.pixels.extra for c in COMPONENTS[name]}
+    taken = {channel.name for channel in contents.beauty} | added
+    names: dict[Channel, str] = {}
+    for part, passed_on in _passed_on(contents):
+        if part.data_window != home.data_window:
             raise InputError(
-                f"--layout multilayer: two parts of {contents.source.path} hold a channel '{name}'; use --layout spec"
+                f"--layout multilayer: part '{part.name}' of {path} has the data window {part.data_window}, "
+                f"the beauty has {home.data_window}; one part can hold only one, use --layout spec"
             )
-        channels[name] = np.empty((window.height, window.width), dtype=DTYPES[channel.type])
-        planes.append(channels[name])
-    return planes
+        for channel in passed_on:
+            name = names[channel] = _name(contents, channel)
+            if name in taken:
+                whose = f"{path} holds a channel" if name in added else f"two parts of {path} hold a channel"
+                also = ", as does a layer that is added" if name in added else ""
+                raise InputError(f"--layout multilayer: {whose} '{name}'{also}; use --layout spec")
+            taken.add(name)
+    return names
 
 
 def _name(contents: FileContents, channel: Channel) -> str:

@@ -7,7 +7,7 @@ are copied strip by strip in their own type.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -24,7 +24,7 @@ from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels,
 from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, extra_spec, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.exr.single_part import write_single_part
+from oiio_msspl.exr.single_part import check_single_part, write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.parallel import one_ahead
@@ -82,6 +82,23 @@ def write_fused(
         for part in source.parts
         if part.deep
     ]
+
+
+def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
+    """Check by the headers alone that the layout can hold what :func:`write_fused` would write.
+
+    Args:
+        source, beauty, options: as for :func:`write_fused`.
+        extra: names of further layers.
+
+    Raises:
+        InputError: it can't, or a pattern of ``options`` matches nothing.
+    """
+    dropped = dropped_channels(source, beauty, options.layers)
+    if options.layout == "multilayer":
+        nothing = np.empty((0, 0, 3), np.float32)
+        pixels = FusedPixels(nothing, None, dict.fromkeys(extra, nothing), stored_type(beauty, options))
+        check_single_part(FileContents(source, tuple(beauty), dropped, pixels, {}, options))
 
 
 def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:

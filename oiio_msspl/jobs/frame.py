@@ -17,10 +17,10 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target, remove_leftovers
-from oiio_msspl.exr.contents import dropped_channels, stored_type
+from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.preview import check_view, old_preview, write_preview
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
-from oiio_msspl.exr.writer import bytes_held, write_fused
+from oiio_msspl.exr.writer import bytes_held, check_layout, write_fused
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse, result_bytes
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, require_memory
@@ -53,6 +53,21 @@ def require_outputs(session: Session, write: WriteOptions) -> None:
         session.require_error()
     if write.data_passes:
         session.require_clean_aovs()
+
+
+def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
+    """Check by the headers that the layers that are asked for are there, and that one file can hold them all.
+
+    Raises:
+        InputError: a pattern of ``write`` matches nothing, or the layout can't hold the layers.
+    """
+    wanted = {
+        ERROR_LAYER: write.error_layer,
+        FRAMES_LAYER: write.frames_layer,
+        ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
+        NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
+    }
+    check_layout(hr.file, hr.beauty_channels, write, [name for name, is_added in wanted.items() if is_added])
 
 
 def check_frame_memory(
@@ -129,7 +144,7 @@ def fuse_files(
     targets = [output] if preview_path is None else [output, preview_path]
     check_separate(files_read(lr, hr, inputs, model), targets)
     remove_leftovers(targets)
-    dropped_channels(hr.file, hr.beauty_channels, write.layers)  # a missing layer is an error before the work
+    check_written_layers(hr, write)  # a missing layer is an error before the work
     check_passes(hr, others, write)  # and so is a set
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     fits = memory_to_write(align(lr, hr), hr, write) <= max_memory

@@ -10,10 +10,9 @@ from pathlib import Path
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
-from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.jobs.frame import require_outputs
+from oiio_msspl.jobs.frame import check_written_layers, require_outputs
 from oiio_msspl.jobs.inputs import InputOptions, map_pair, resolve_auto
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
@@ -97,7 +96,8 @@ def check_wanted_outputs(frames: Sequence[Frame], inputs: InputOptions, write: W
     """Check on the first pair that can be read whether what is to be written can be, before a farm is asked for it.
 
     Raises:
-        InputError: a layer or a set of passes that an option names is not there, or the model does not make a layer.
+        InputError: a layer or a set of passes that an option names is not there, the layout can't hold the layers, or
+            the model does not make a layer.
     """
     for frame in frames:
         if frame.lr is None or frame.hr is None:
@@ -107,7 +107,7 @@ def check_wanted_outputs(frames: Sequence[Frame], inputs: InputOptions, write: W
             others = find_other_views(lr, hr, inputs, write)
         except InputError:  # files that an option names may exist on the workers only
             continue
-        dropped_channels(hr.file, hr.beauty_channels, write.layers)
+        check_written_layers(hr, write)
         check_passes(hr, others, write)
         if write.error_layer or write.data_passes:
             require_outputs(load_model(align(lr, hr).scale, model), write)

@@ -28,7 +28,13 @@ from oiio_msspl.fusion.passes import pass_features
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, lacking_passes
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.fusion.warp import Mask
-from oiio_msspl.jobs.frame import check_frame_memory, require_outputs, write_frame, write_frame_preview
+from oiio_msspl.jobs.frame import (
+    check_frame_memory,
+    check_written_layers,
+    require_outputs,
+    write_frame,
+    write_frame_preview,
+)
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions, files_by_name, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, add_other_views, name_of, report_on
@@ -147,6 +153,7 @@ class Stages:
         targets = [frame.output, frame.output.with_suffix(".png")] if self.previews else [frame.output]
         check_separate(files_read(lr, hr, self.inputs, self.model), targets)
         align(lr, hr)  # refuses the pair before its pixels are read
+        check_written_layers(hr, self.write_options)
         check_passes(hr, others, self.write_options)
         over_time = [view for view in others.views if view.hr.view in self.temporal.views]
         alone = replace(others, views=tuple(view for view in others.views if view not in over_time))

@@ -1,9 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 import pytest
 
+from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from tests.conftest import picture, rgb
+from oiio_msspl.exr.writer import check_layout
+from tests.conftest import picture, rgb, write_exr
 from tests.exr.sources import H, W, everything, written
 
 
@@ -18,3 +21,17 @@ def test_multilayer_refuses_parts_of_different_windows(tmp_path):
     with pytest.raises(InputError, match=r"part 'mist' of .* one part can hold only one, use --layout spec"):
         written(tmp_path, source, WriteOptions(layout="multilayer"))
     assert not (tmp_path / "out.exr").exists()
+
+
+def test_a_channel_of_an_added_layer_and_one_of_two_parts_are_told_apart(tmp_path):
+    """By the headers alone."""
+    multilayer = WriteOptions(layout="multilayer")
+    plane = picture(H, W)[..., 0]
+    one = map_render(open_exr(write_exr(tmp_path / "one.exr", rgb(picture(H, W)) | {"error.Y": plane})))
+    check_layout(one.file, one.beauty_channels, multilayer, [])
+    with pytest.raises(InputError, match=r"one\.exr holds a channel 'error\.Y', as does a layer that is added"):
+        check_layout(one.file, one.beauty_channels, multilayer, ["error"])
+    parts = [("rgba", rgb(picture(H, W)) | {"a.Y": plane}, (0, 0)), ("more", {"a.Y": plane}, (0, 0))]
+    two = map_render(open_exr(write_exr(tmp_path / "two.exr", parts)))
+    with pytest.raises(InputError, match=r"two parts of .*two\.exr hold a channel 'a\.Y'; use --layout spec"):
+        check_layout(two.file, two.beauty_channels, multilayer, [])

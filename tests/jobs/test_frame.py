@@ -14,6 +14,9 @@ from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.jobs import frame
 from oiio_msspl.jobs.inputs import map_pair
+from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.shot_checks import check_wanted_outputs
+from oiio_msspl.jobs.stages import Stages
 from tests.conftest import downsample, picture, read_bits, rgb, write_exr
 from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
@@ -49,6 +52,25 @@ def test_what_is_wrong_is_said_before_the_work(pair, tmp_path, monkeypatch, outp
     with pytest.raises(InputError, match=message):
         fuse_files(*pair, tmp_path / output, **more)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr"]
+
+
+def test_a_layout_that_can_not_hold_the_layers_is_refused_by_the_headers(tmp_path, monkeypatch):
+    """Of one frame, of a frame of a shot, and of a shot that a farm is to fuse."""
+    lr, hr, out = (tmp_path / name for name in ("lr.exr", "hr.exr", "out.exr"))
+    write_exr(lr, low_layers(1))
+    display = (np.array([0, 0], np.int32), np.array([WIDTH - 1, HEIGHT - 1], np.int32))
+    mist = {"mist.Z": np.ones((8, 8), np.float32)}
+    write_exr(hr, [("rgba", layers(1), (0, 0)), ("mist", mist, (5, 3))], display=display)
+    write = WriteOptions(layout="multilayer")
+    of_shot = Frame(1, lr, hr, out)
+    monkeypatch.setattr(ExrFile, "read", pytest.fail)
+    for check in (
+        lambda: fuse_files(lr, hr, out, write=write),
+        lambda: Stages(write_options=write).read_views(of_shot),
+        lambda: check_wanted_outputs([of_shot], InputOptions(), write, None),
+    ):
+        with pytest.raises(InputError, match=r"part 'mist' of .* one part can hold only one, use --layout spec"):
+            check()
 
 
 def test_a_frame_without_its_preview_is_a_warning(pair, tmp_path, bilinear_models, monkeypatch):

@@ -33,14 +33,21 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import HALF_MAX, Array, repair
 from oiio_msspl.colour import REC709, conversion, space_of
-from oiio_msspl.compare import check_size, error_colours, error_levels, upsample_bicubic
+from oiio_msspl.compare import (
+    common_windows,
+    error_colours,
+    error_levels,
+    largest_of,
+    open_beauty,
+    upsample_bicubic,
+)
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate, check_target, replacing
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
-from oiio_msspl.exr.reader import Channel, open_exr
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import Window
 from oiio_msspl.metrics import psnr, relmse
 
 TEMPLATE = "compare_page.html"
@@ -98,18 +105,19 @@ class _Picture:
     render: MappedRender
     layers: dict[str, _Layer]
     """All that the file holds, by their names without what programs spell differently."""
+    window: Window
+    """The part that is shown, inside the data window."""
 
     @property
     def size(self) -> tuple[int, int]:
-        """Height and width."""
-        window = self.render.data_window
-        return window.height, window.width
+        """Height and width of what is shown."""
+        return self.window.height, self.window.width
 
     def read(self, key: str) -> Array:
         """A layer, (height, width, 3 or 1). Light has no NaN, infinities and negative values."""
         layer = self.layers[key]
         features = {RGB: self.render.features[RGB], key: layer.formula}
-        values = replace(self.render, features=features, alpha=None).read(self.render.data_window, [key])[key]
+        values = replace(self.render, features=features, alpha=None).read(self.window, [key])[key]
         return repair(values)[0] if layer.is_colour else values
 
 
@@ -147,14 +155,17 @@ def write_page(
         progress: called with the number of layers done and of all.
 
     Raises:
-        InputError: a file can't be read, sizes do not fit, no file has a layer of a pattern, or ``path`` exists.
+        InputError: a file can't be read, sizes or data windows do not fit, no file has a layer of a pattern, or
+            ``path`` exists.
         MssplError: the page can't be written.
     """
     paths = [*images, *([reference] if reference else [])]
     pictures = [_open(each) for each in paths]
-    largest = pictures[-1] if reference else max(pictures, key=lambda each: each.size[0] * each.size[1])
-    for picture in pictures:
-        check_size(picture.path, picture.size, largest.path, largest.size)
+    renders = [each.render for each in pictures]
+    at_size_of = largest_of(renders, has_reference=reference is not None)
+    windows = common_windows(renders, at_size_of)
+    pictures = [replace(each, window=window) for each, window in zip(pictures, windows, strict=True)]
+    largest = next(each for each in pictures if each.render is at_size_of)
     keys = _chosen(pictures, layers)
     head, tail = resources.files("oiio_msspl").joinpath(TEMPLATE).read_text(encoding="utf-8").split(DATA)
     with replacing(path, overwrite=overwrite) as temporary:
@@ -175,7 +186,7 @@ def write_page(
 
 def _open(path: Path) -> _Picture:
     """Read the headers of a file, and find its layers."""
-    render = map_render(open_exr(path), features=())
+    render = open_beauty(path)
     beauty = render.features[RGB]
     found = {BEAUTY: _Layer(BEAUTY, beauty, True, stored=beauty.text)}
     in_sets = set()
@@ -198,7 +209,7 @@ def _open(path: Path) -> _Picture:
                 is_colour = len(channels) == 3 and channels[0] is stored.channels.get("R")
                 layer = _Layer(label, FeatureFormula((channels,), text=label), is_colour, stored=stored.name)
                 found.setdefault(same_spelling(label), layer)
-    return _Picture(path, render, found)
+    return _Picture(path, render, found, render.data_window)
 
 
 def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:

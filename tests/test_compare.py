@@ -5,9 +5,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.compare import error_map, scores, upsample_bicubic
+from oiio_msspl.compare import compare_files, error_map, note_on_windows, scores, upsample_bicubic
+from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import RELMSE_GHARBI, relmse
-from tests.conftest import picture
+from tests.conftest import downsample, picture, rgb, write_exr
 
 
 def test_scores_follow_the_conventions_that_they_are_named_after():
@@ -15,6 +16,34 @@ def test_scores_follow_the_conventions_that_they_are_named_after():
     found = scores(image, truth)
     assert found["relmse"] == relmse(image, truth, (0.5, 0.01))
     assert found["relmse_gharbi"] == relmse(image, truth, RELMSE_GHARBI) != found["relmse"]
+
+
+def part_of(path, truth, x0, y0, width, height):
+    """A file of the frame ``truth`` that holds only a part of its pixels."""
+    display = tuple(np.array(each, np.int32) for each in ((0, 0), (truth.shape[1] - 1, truth.shape[0] - 1)))
+    pixels = truth[y0 : y0 + height, x0 : x0 + width]
+    return write_exr(path, [("rgba", rgb(pixels), (x0, y0))], display=display)
+
+
+def test_pictures_are_compared_where_they_lie(tmp_path):
+    truth = picture(48, 64)
+    reference = part_of(tmp_path / "ref.exr", truth, 0, 4, 64, 44)
+    image = part_of(tmp_path / "image.exr", truth, 6, 0, 58, 48)
+    moved = part_of(tmp_path / "moved.exr", truth, 0, 0, 64, 44)  # of the reference's size
+    low = write_exr(tmp_path / "low.exr", rgb(downsample(truth[4:], 4)))
+    found = compare_files([image, moved, low], reference)
+    assert [each["relmse"] for each in found[:2]] == [0, 0]
+    shown = upsample_bicubic(downsample(truth[4:], 4)[:10, 2:], 56, 40)
+    assert found[2]["relmse"] == pytest.approx(relmse(shown, truth[4:44, 8:]), rel=1e-4)
+    assert note_on_windows([image, moved, low], reference).endswith(" is compared: 56x40+8+4")
+    assert note_on_windows([low], reference) == ""
+
+
+def test_pictures_of_two_parts_of_the_frame_are_refused(tmp_path):
+    truth = picture(48, 64)
+    left, right = (part_of(tmp_path / f"{x}.exr", truth, x, 0, 32, 48) for x in (0, 32))
+    with pytest.raises(InputError, match=r"no part of the frame in common: .*0\.exr \(32x48\+0\+0\), .*32\.exr \("):
+        compare_files([left], right)
 
 
 def test_an_enlarged_picture_has_no_negative_light():

@@ -114,6 +114,17 @@ def test_the_page_holds_layers_and_scores(page):
     assert depth["range"] == pytest.approx([1, 6.9], abs=0.1)  # without the sky
 
 
+def test_the_page_shows_the_part_that_all_pictures_hold(tmp_path):
+    display = (np.array([0, 0], np.int32), np.array([63, 47], np.int32))
+    for name, top in (("image", 0), ("ref", 4)):
+        part = ("rgba", rgb(LIGHT_1[top : top + 44]), (0, top))
+        write_exr(tmp_path / f"{name}.exr", [part], display=display)
+    write_page(tmp_path / "page.html", [tmp_path / "image.exr"], tmp_path / "ref.exr")
+    made = manifest(tmp_path / "page.html")
+    image = made["layers"][0]["images"]["0"]
+    assert (made["height"], image["height"], image["relmse"]) == (40, 40, 0)
+
+
 def test_the_page_needs_nothing_from_outside(page):
     text = page.read_text(encoding="utf-8")
     assert not re.search(r"""https?://|\bsrc=|<link|@import|\burl\(""", text)

@@ -4,6 +4,7 @@
 import json
 import re
 
+import numpy as np
 import OpenImageIO as oiio
 import pytest
 
@@ -50,6 +51,16 @@ def test_compare_refuses_other_sizes(files):
     done = run("msspl", "compare", files / "small.exr", "-r", files / "ref.exr")
     assert done.returncode == 2
     assert "is 50x50, but" in done.stderr
+
+
+def test_compare_says_that_only_a_part_is_compared(tmp_path):
+    display = (np.array([0, 0], np.int32), np.array([63, 47], np.int32))
+    for name, top in (("image", 0), ("ref", 4)):
+        part = ("rgba", rgb(picture(48, 64)[top : top + 44]), (0, top))
+        write_exr(tmp_path / f"{name}.exr", [part], display=display)
+    done = run("msspl", "compare", tmp_path / "image.exr", "-r", tmp_path / "ref.exr", "--json")
+    assert json.loads(done.stdout)[0]["relmse"] == 0
+    assert done.stderr == "The data windows differ; only the part that all pictures show is compared: 64x40+0+4\n"
 
 
 def test_compare_writes_a_page(files):

@@ -64,7 +64,7 @@ def compare(
     RelMSE has two columns, one for each convention in the paper. Images smaller
     than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
-    from oiio_msspl.compare import check_error_map, compare_files, write_error_map
+    from oiio_msspl.compare import check_error_map, compare_files, note_on_windows, write_error_map
     from oiio_msspl.compare_page import check_page
 
     if reference is None and (html is None or error_map is not None):
@@ -76,6 +76,8 @@ def compare(
         check_error_map(error_map, compared, overwrite=overwrite)
     if html is not None:
         check_page(html, compared, overwrite=overwrite)
+    if note := note_on_windows(images, reference):
+        console.say(note, error=True)
     results = compare_files(images, reference) if reference else [{} for _ in images]
     if error_map is not None and reference is not None:
         write_error_map(error_map, images[0], reference, overwrite=overwrite)

@@ -169,7 +169,7 @@ class Stages:
         """Views of a frame with their stages: the first one, and those that are averaged with their neighbours."""
         plans = self.temporal.views
         # Layers about the fused picture are those of the first view.
-        options = replace(self.write_options, error_layer=False, data_passes=False)
+        options = replace(self.write_options, error_layer=False, data_passes=False, pixel_type=None)
         others = [replace(self, temporal=plans[view.hr.view], write_options=options) for view in views[1:]]
         stages = [self, *others]
         if not plans:

@@ -9,7 +9,7 @@ neighbours instead (:mod:`oiio_msspl.jobs.view_windows`), and memory holds frame
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -18,7 +18,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.contents import dropped_channels, widest_type
+from oiio_msspl.exr.contents import dropped_channels, stored_type, widest_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
@@ -135,7 +135,9 @@ def fuse_other_views(
         clean = bool(sets_to_fuse(view.hr, write))
         fused = fuse(view.lr, view.hr, session, clean_aovs=clean, max_memory=max_memory, held=held, progress=progress)
         fused.replaced = replaced
-        fuse_frame_passes(view.lr, view.hr, fused, session, write, max_memory - held, progress)
+        # The pixel type that is asked for is that of the first view.
+        own = replace(write, pixel_type=None)
+        fuse_frame_passes(view.lr, view.hr, fused, session, own, max_memory - held, progress)
         reports.append(store_view(view, fused, session))
     return replaced, reports
 
@@ -209,7 +211,7 @@ def fuse_frame_passes(
         lr, hr: the pair, as files.
         fused: its fused beauty.
         session: the model of the beauty. Its memory is used for the passes.
-        write: ``passes`` says which.
+        write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
         max_memory: bytes that the process should stay below.
         progress: called with (steps done, steps in all) of this part of the work.
         averaged: see :func:`oiio_msspl.fusion.passes.fuse_passes`.
@@ -220,11 +222,15 @@ def fuse_frame_passes(
     sets = sets_to_fuse(hr, write)
     if sets:
         session.release_memory()
+        beauty = fused.rgb
+        if stored_type(hr.beauty_channels, write) == "half" and beauty.dtype != np.float16:
+            # The passes sum to the beauty that is written.
+            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
         with limit_threads(session.threads):
             fused.passes = fuse_passes(
                 lr,
                 hr,
-                fused.rgb,
+                beauty,
                 fused.alignment,
                 sets,
                 cache_bytes=strips_memory(max_memory, fused.nbytes),

@@ -264,10 +264,12 @@ def test_memory_holds_one_view_at_a_time(tmp_path, bilinear_models, monkeypatch)
     assert len(alive) == 2
 
 
-def test_shots_fuse_all_views(tmp_path, bilinear_models):
+@pytest.mark.parametrize("dtype", [np.float32, np.float16])
+def test_shots_fuse_all_views(tmp_path, bilinear_models, dtype):
+    """As a single frame: passes of half floats sum to the beauty as it is stored."""
     for folder in ("lr", "hr"):
         (tmp_path / folder).mkdir()
-    write_layers(tmp_path, name="{}/a.0001.exr")
+    write_layers(tmp_path, dtype=dtype, name="{}/a.0001.exr")
     shot = fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", model=str(bilinear_models[4]))
     assert [each["view"] for each in shot.first["fused_views"]] == ["fg", "bg"]
     pair = tmp_path / "lr" / "a.0001.exr", tmp_path / "hr" / "a.0001.exr"

@@ -3,7 +3,7 @@
 
 import bpy
 
-from .render_settings import BLENDER_5
+from .render_settings import BLENDER_5, linear_override
 
 NODE = "MSSPL Fused"
 
@@ -34,8 +34,11 @@ def show(scene, path, connect, frames=None):
     if frames:  # The file of frame n is shown at frame n.
         node.frame_duration, node.frame_start = frames[-1] - frames[0] + 1, frames[0]
         node.frame_offset, node.use_auto_refresh = frames[0] - 1, True
-    # The file holds scene-linear values, as the scene's own render does, so no colour conversion is wanted.
-    node.image.colorspace_settings.is_data = True
+    space = linear_override(scene)
+    if space:
+        node.image.colorspace_settings.name = space
+    else:  # The file holds scene-linear values, as the scene's own render does, so no colour conversion is wanted.
+        node.image.colorspace_settings.is_data = True
     output = _output(tree)
     if connect or fresh or not output.inputs[0].is_linked:
         tree.links.new(node.outputs["Combined"], output.inputs[0])

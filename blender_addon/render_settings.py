@@ -4,6 +4,8 @@
 Dictionaries of data paths can be merged, read back and restored by code that knows none of the settings.
 """
 
+import re
+
 import bpy
 
 from .options import find_view_layer, hrls_size, lrhs_size, view_layer_path
@@ -33,6 +35,8 @@ _COMPONENTS = (
     "cycles.use_pass_volume_direct",
     "cycles.use_pass_volume_indirect",
 )
+#: Names of linear colour spaces: Linear Rec.2020, lin_ap1, scene_linear, ACEScg, ACES2065-1. Blender does not tell.
+_LINEAR = re.compile(r"(?<![a-z])lin(ear)?(?![a-z])|acescg|aces2065", re.IGNORECASE)
 #: Added to the scene's seed for the LRHS. With one seed, both renders would share samples and their noise.
 _LRHS_SEED = 1009
 
@@ -121,8 +125,25 @@ def _common(scene, options):
         "render.image_settings.color_mode": "RGBA",
         "render.image_settings.color_depth": image.color_depth if image.file_format.startswith("OPEN_EXR") else "16",
         "render.image_settings.exr_codec": "ZIP",
-        "render.image_settings.color_management": "FOLLOW_SCENE",
+        **_colour_space(scene),
     }
     if BLENDER_5:  # Blender 5.0 cannot write several parts if the pixels are not square.
         values["render.image_settings.use_exr_interleave"] = True
+    return values
+
+
+def linear_override(scene):
+    """The colour space that the scene's output is overridden with, if it is linear; otherwise an empty text."""
+    image = scene.render.image_settings
+    name = image.linear_colorspace_settings.name
+    overridden = image.color_management == "OVERRIDE" and image.has_linear_colorspace
+    return name if overridden and _LINEAR.search(name) else ""
+
+
+def _colour_space(scene):
+    """The colour space of the file. Without an override it is that in which the scene is rendered."""
+    values = {"render.image_settings.color_management": "OVERRIDE" if linear_override(scene) else "FOLLOW_SCENE"}
+    name = scene.render.image_settings.linear_colorspace_settings.name
+    if name:  # Blender can change it when the file format is set. It is empty if the configuration lacks it.
+        values["render.image_settings.linear_colorspace_settings.name"] = name
     return values

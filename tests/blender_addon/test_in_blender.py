@@ -14,6 +14,7 @@ import pytest
 from msspl_cli.installed import find_msspl_fuse
 
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion import motion
 from oiio_msspl.fusion.alignment import align
@@ -75,6 +76,17 @@ def test_each_frame_of_the_composited_animation_equals_its_fused_file(results):
     fused = layer(results / "shot_13.exr", "ViewLayer.Combined.", "RGBA")
     np.testing.assert_array_equal(layer(results / "composited_shot.exr", "", "RGBA"), fused)
     assert fused.std() > 0.01
+
+
+def test_frames_have_the_linear_space_of_the_output_and_the_compositor_converts_it_back(results):
+    """ACEScg is linear and kept. sRGB is not, so the frame is in the space in which the scene is rendered."""
+    kept, own = (layer(results / f"space_{name}.exr", "ViewLayer.Combined.", "RGB") for name in ("ACEScg", "sRGB"))
+    converted = kept @ conversion(ACESCG, REC709).astype(np.float32).T
+    assert np.abs(converted - own).mean() < 0.1 * np.abs(kept - own).mean()
+    for name, wanted in (("ACEScg", converted), ("sRGB", own)):
+        np.testing.assert_allclose(layer(results / f"space_{name}_Combined.exr", "", "RGB"), wanted, atol=2e-3)
+        normal = layer(results / f"space_{name}.exr", "ViewLayer.Normal.", "XYZ")
+        np.testing.assert_array_equal(layer(results / f"space_{name}_Normal.exr", "", "RGB"), normal)
 
 
 def test_the_animation_button_renders_what_averaging_needs(results):

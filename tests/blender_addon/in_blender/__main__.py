@@ -14,7 +14,14 @@ import sys
 from pathlib import Path
 
 import bpy
-from check_button import check_animation_button, check_button, check_cancel, check_modes, check_panel
+from check_button import (
+    check_animation_button,
+    check_button,
+    check_cancel,
+    check_colour_space,
+    check_modes,
+    check_panel,
+)
 from check_motion import render_motion
 from check_passes import check_passes
 from check_scene import check_animated, check_changes, check_samples, check_sentences, render_ramps
@@ -38,6 +45,7 @@ if __name__ == "__main__":
     scene = build_scene()
     check_panel()
     check_button(scene)
+    check_colour_space(build_scene())
     scene = build_scene()
     check_sentences(scene)
     check_samples()

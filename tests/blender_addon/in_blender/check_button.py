@@ -2,6 +2,7 @@
 """Checks of the button, the panel and the compositor."""
 
 import os
+import shutil
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -44,6 +45,41 @@ def check_button(scene):
     for name in ("Combined", "Mist", "Normal"):
         tree.links.new(node.outputs[name], output.inputs[0])
         composite(scene, WORK / f"composited_{name}.exr")
+
+
+def check_colour_space(scene):
+    """Both renders are written in the linear space that the scene's output has. The compositor converts it back.
+
+    test_in_blender.py compares the files that are left here.
+    """
+    settings, override = module("render_settings"), module("overrides").override
+    options, image = module("options").Options(view_layer="ViewLayer"), "render.image_settings"
+    scene.msspl.connect = True
+    scene.world.node_tree.nodes["Background"].inputs[0].default_value = (0.9, 0.2, 0.1, 1)
+    for name, kept in (("ACEScg", True), ("sRGB", False)):
+        output = {
+            **({f"{image}.media_type": "MULTI_LAYER_IMAGE"} if BLENDER_5 else {}),
+            f"{image}.file_format": "OPEN_EXR_MULTILAYER",
+            f"{image}.color_depth": "32",
+            f"{image}.color_management": "OVERRIDE",
+            f"{image}.linear_colorspace_settings.name": name,
+        }
+        with override(scene, output):
+            before = snapshot(scene)
+            for values in (settings.lrhs(scene, options), settings.hrls(scene, options)):
+                with override(scene, values):
+                    found = scene.render.image_settings.color_management
+                    assert found == ("OVERRIDE" if kept else "FOLLOW_SCENE"), name
+            assert bpy.ops.msspl.fuse() == {"FINISHED"}
+            assert snapshot(scene) == before
+            assert scene.render.image_settings.linear_colorspace_settings.name == name
+        shutil.move(WORK / "fused_001.exr", WORK / f"space_{name}.exr")
+        tree = scene.compositing_node_group if BLENDER_5 else scene.node_tree
+        node = tree.nodes["MSSPL Fused"]
+        node.image.filepath = f"//space_{name}.exr"
+        for wanted in ("Combined", "Normal"):
+            tree.links.new(node.outputs[wanted], module("compositor")._output(tree).inputs[0])
+            composite(scene, WORK / f"space_{name}_{wanted}.exr")
 
 
 def check_animation_button(scene):

@@ -73,7 +73,7 @@ def check_colour_space(scene):
             assert bpy.ops.msspl.fuse() == {"FINISHED"}
             assert snapshot(scene) == before
             assert scene.render.image_settings.linear_colorspace_settings.name == name
-        shutil.move(WORK / "fused_001.exr", WORK / f"space_{name}.exr")
+        shutil.copy(WORK / "fused_001.exr", WORK / f"space_{name}.exr")
         tree = scene.compositing_node_group if BLENDER_5 else scene.node_tree
         node = tree.nodes["MSSPL Fused"]
         node.image.filepath = f"//space_{name}.exr"

@@ -26,7 +26,7 @@ from oiio_msspl.jobs.sequence import Frame, find_shot
 from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of_shot, prepare_output
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
+from oiio_msspl.jobs.temporal import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.parallel import limit_threads
 
 if TYPE_CHECKING:
@@ -44,7 +44,7 @@ def fuse_shot(
     frames: str | Iterable[int] | None = None,
     inputs: InputOptions = InputOptions(),
     write: WriteOptions = WriteOptions(),
-    temporal: TemporalOptions = TemporalOptions(),
+    temporal: str | int | TemporalOptions = AUTO,
     model: str | None = None,
     device: str = "cpu",
     threads: int = 0,
@@ -65,7 +65,8 @@ def fuse_shot(
         output: a pattern, or a folder, which is created if its parent exists.
         frames: numbers, or a range such as ``1001-1100x2``; None for all frames that exist.
         inputs, write, model, device, threads, max_memory, view_transform: as in :func:`oiio_msspl.fuse_files`.
-        temporal: which neighbours each frame is averaged with, and how motion is stored.
+        temporal: ``auto``, ``off``, or the number of frames before and after each frame that it is averaged with;
+            :class:`oiio_msspl.jobs.temporal.TemporalOptions` also say how motion is stored.
         previews: write a PNG beside each EXR.
         overwrite: replace existing files.
         skip_existing: skip frames whose EXR exists. This resumes a run that was ended.
@@ -89,6 +90,8 @@ def fuse_shot(
     if overwrite and (skip_existing or update):
         option = "--update" if update else "--skip-existing"
         raise InputError(f"--overwrite and {option} exclude each other: replace all frames, or leave some")
+    if not isinstance(temporal, TemporalOptions):
+        temporal = TemporalOptions(temporal)
     shot = find_shot(lr, hr, output, frames)
     if previews and view_transform is not None:
         check_view(view_transform)

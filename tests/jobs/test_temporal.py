@@ -470,3 +470,10 @@ def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):
         counts[name] = file.read(list(layer.channels.values()), map_render(file, features=()).data_window)
     assert (counts["ones/hr.1001"] == 1).all()
     assert 1 < np.median(counts["counted/hr.1001"]) <= 5 < np.median(counts["counted/hr.1003"]) <= 9
+
+
+@pytest.mark.parametrize(("temporal", "text"), [("auto", "with 4"), (1, "with one frame before"), ("2", "with 2")])
+def test_a_number_of_neighbours_is_enough(shot, bilinear_models, tmp_path, temporal, text):
+    options = {"model": str(bilinear_models[4]), "frames": [FIRST]}
+    report = fuse_shot(shot / "lr", shot / "hr", tmp_path / "out", temporal=temporal, **options)
+    assert report.exit_code == 0 and report.temporal.startswith(text)

@@ -183,6 +183,11 @@ def check_passes(hr: MappedRender, others: OtherViews, write: WriteOptions) -> N
         raise InputError("--sum and --passes none exclude each other: fuse the layers of the sum, or leave it out")
     views = [hr, *(view.hr for view in others.views)]
     if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
+        if any(each.matches(p) for view in views for each in view.additive_sets for p in write.passes):
+            raise InputError(
+                f"--passes {', '.join(write.passes)}: --layers {', '.join(write.layers)} leaves these layers out; "
+                "name them there, too"
+            )
         names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))
         known = ", ".join(names) or "none"
         raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")

@@ -200,7 +200,7 @@ def test_a_stereo_pair_says_whose_layers_are_read(tmp_path, bilinear_models):
     options = ("--model", bilinear_models[4], "--no-preview", "-o", tmp_path / "out.exr")
     done = fuse(tmp_path / "lr.exr", tmp_path / "hr.exr", *options)
     assert done.stdout.startswith("Pair at x4, views left, right\n"), done.stderr
-    assert "\n  view right: rgb " in done.stdout
+    assert re.search(r"\n  view right: rgb .*, albedo none: expect blur\n", done.stdout)
     assert "Repaired values that were NaN or infinite: 1 in lrhs.rgb, 1 in hrls.rgb\n" in done.stdout
     assert "Set negative values to 0 (colours out of gamut): 3 in lrhs.rgb, 3 in hrls.rgb\n" in done.stdout
     assert open_exr(tmp_path / "out.exr").metadata["msspl/aovs"].endswith("variance: none (optional); alpha: none")

@@ -109,7 +109,8 @@ def fuse(
         list[str],
         typer.Option(
             metavar="PATTERN",
-            help="Copy only these layers of HR (crypto*), or none. May be repeated. \\[default: all]",
+            help="Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is "
+            "left out, too. May be repeated. \\[default: all]",
             rich_help_panel=options.OUTPUT,
         ),
     ] = [],  # noqa: B006
@@ -303,7 +304,10 @@ def _print(report: FrameReport, seconds: float) -> None:
     console.say(f"{renderer} at x{report.scale}{average}{view}{others}")
     console.aov_table(report.aovs(), report.hr.notes)
     for other in report.other_views:
-        read = (f"{row['feature']} {row['source']}" for row in other.aovs() if row["status"] in ("found", "computed"))
+        rows = other.aovs()
+        read = [f"{row['feature']} {row['source']}" for row in rows if row["status"] in ("found", "computed")]
+        if any((row["feature"], row["status"]) == ("albedo", "default") for row in rows):
+            read.append("albedo none: expect blur")
         console.say(f"  view {other.hr.view or '(unnamed)'}: {', '.join(read)}")
     if lrhs_aovs := report.found_lrhs_aovs():
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))

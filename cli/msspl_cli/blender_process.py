@@ -22,6 +22,10 @@ from oiio_msspl.exr.atomic import temporary_folder
 
 #: What Blender prints while it renders.
 _SAMPLES = re.compile(r"Sample (\d+)/(\d+)")
+#: What a Python without bpy prints: one that is too old for bpy, or one that lacks the module.
+_NO_BPY = re.compile(r"unknown option:? -P|No module named 'bpy'", re.IGNORECASE)
+#: What to do about a program that is no Blender.
+_NAME_ANOTHER = "name Blender, or a Python that has bpy, with --blender or MSSPL_BLENDER"
 #: Seconds that Blender gets to end.
 _GRACE = 15
 
@@ -134,10 +138,7 @@ def run_blender(
             start_new_session=posix,  # a process group, which can be ended as a whole
         )
     except OSError as refused:
-        raise InputError(
-            f"{arguments[0]}: can't be started ({refused.strerror}); name Blender, or a Python that has bpy, with "
-            "--blender or MSSPL_BLENDER"
-        ) from refused
+        raise InputError(f"{arguments[0]}: can't be started ({refused.strerror}); {_NAME_ANOTHER}") from refused
     with started as process:
         assert process.stdin is not None and process.stdout is not None
         last: deque[str] = deque(maxlen=5)
@@ -178,6 +179,8 @@ def run_blender(
         raise (InputError if error["code"] == 2 else MssplError)(error["error"])
     if process.returncode:
         said = " | ".join(last)
+        if _NO_BPY.search(said):
+            raise InputError(f"{arguments[0]}: this Python has no module bpy; {_NAME_ANOTHER}")
         raise MssplError(f"{arguments[0]}: ended with code {process.returncode}" + (f": {said}" if said else ""))
 
 

@@ -354,6 +354,19 @@ def test_a_program_that_cannot_be_started(farm):
 
 
 @posix
+@pytest.mark.parametrize("said", ["", "Unknown option: -P\nusage: python [option] ..."])
+def test_a_python_without_bpy_is_the_callers_mistake(farm, said):
+    """It lacks the module, or is so old that it does not know an option."""
+    _, run, folder = farm
+    program = folder / "python3"
+    program.write_text(f'#!/bin/sh\necho "{said}"; exit 2\n' if said else f'#!/bin/sh\nexec {sys.executable} -S "$@"\n')
+    program.chmod(0o755)
+    code, out, err, _ = run("--blender", str(program))
+    assert (code, out, err.count("\n")) == (2, "", 1)
+    assert "python3: this Python has no module bpy; name Blender" in err
+
+
+@posix
 def test_nothing_is_overwritten_unasked(farm):
     _, run, folder = farm
     (folder / "out_oidn.exr").write_text("old")

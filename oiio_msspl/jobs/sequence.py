@@ -22,6 +22,10 @@ from oiio_msspl.errors import InputError
 #: number in ``a.####_v2.exr``, it takes ``a.#.##.exr`` for subframes, and it refuses a folder named ``lr#1``.
 _NUMBER_FIELD = re.compile(r"#+|@+|%\d*d|\$F\d*")
 
+#: A name whose number is not at its end, such as ``anim.0001_lr.exr``: head, number, tail. A number that follows a
+#: letter is none: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
+_NUMBER_INSIDE = re.compile(r"(|.*[._ -])(\d+)([_ -]\D*\.exr)", re.IGNORECASE)
+
 #: One digit for each ``#``, as in Nuke, Katana and RV. fileseq's default is four digits for each.
 _PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
 
@@ -166,7 +170,9 @@ def _sequences(path: Path) -> list[Sequence]:
     if path.is_dir():
         found = _sequences_in(path)
         if not found:
-            raise InputError(f"{path}: no numbered EXRs in this folder")
+            raise InputError(
+                f"{path}: no numbered EXRs in this folder (a pattern such as name####_lr.exr finds others)"
+            )
         return found
     if not is_sequence(path):
         raise InputError(f"{path}: is a single file, the other one is a folder or a pattern; give two of a kind")
@@ -195,8 +201,14 @@ def _files_of(pattern: Pattern) -> dict[int, Path]:
 
 
 def _sequences_in(folder: Path) -> list[Sequence]:
-    """The sequences of EXRs in a folder, by name. Hidden files are left out because they may be half written."""
-    names = [n for n in os.listdir(folder) if n.lower().endswith(".exr") and not n.startswith(".")]
+    """The sequences of EXRs in a folder, by name. Hidden files are left out because they may be half written.
+
+    Numbers inside of names (``anim.0001_lr.exr``) count only if no name ends with its number: such files may lie beside
+    the frames that they belong to.
+    """
+    every = [n for n in os.listdir(folder) if n.lower().endswith(".exr") and not n.startswith(".")]
+    inside = [match for match in map(_NUMBER_INSIDE.fullmatch, every) if match]
+    names = sorted({*every}.difference(match[0] for match in inside))
     by_name: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
     for found in fileseq.FileSequence.findSequencesInList(names, pad_style=_PAD_STYLE):
         if found.frameSet() is None:
@@ -208,6 +220,9 @@ def _sequences_in(folder: Path) -> list[Sequence]:
                 head, number, width = f"{head}-", -number, width - 1
             # fileseq gives a sequence for each padding. One name with two paddings is refused below.
             by_name.setdefault((head, found.extension()), []).append((number, width, name))
+    for match in [] if by_name else inside:
+        head, digits, tail = match.groups()
+        by_name.setdefault((head, tail), []).append((int(digits), len(digits), match[0]))
     sequences = []
     for (head, tail), members in sorted(by_name.items()):
         pattern = Pattern.padded(folder, head, min(width for _, width, _ in members), tail)

@@ -44,6 +44,24 @@ def test_of_several_sequences_those_of_one_name_are_paired(tmp_path):
     assert (found.lr.pattern.name, found.hr.pattern.name) == ("beauty_####.exr", "beauty.####.exr")
 
 
+def test_a_folder_knows_the_names_of_renders_that_msspl_render_keeps(tmp_path):
+    """A number in front of a suffix is that of the frame if it follows a separator: versions and sizes are none."""
+    touch(tmp_path / "lr", *(f"a_v2.{n:04d}_lr.exr" for n in (9, 10000)), "a_v2_lr.exr", "a_x2_lr.exr", "single.exr")
+    touch(tmp_path / "hr", *(f"a_v2.{n:04d}_hr.exr" for n in (9, 10000)))
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert [(f.number, f.lr and f.lr.name, f.output.name) for f in found.frames] == [
+        (9, "a_v2.0009_lr.exr", "a_v2.0009_hr.exr"),
+        (10000, "a_v2.10000_lr.exr", "a_v2.10000_hr.exr"),
+    ]
+
+
+def test_a_number_at_the_end_of_a_name_wins_over_one_in_front_of_a_suffix(tmp_path):
+    """The fused frames, beside the renders that msspl-render keeps."""
+    touch(tmp_path / "a", *(f"shot01_v002.{n}{suffix}.exr" for n in (1001, 1002) for suffix in ("", "_lr", "_hr")))
+    found = find_shot(tmp_path / "a", tmp_path / "a", tmp_path / "out")
+    assert found.lr.pattern.name == found.hr.pattern.name == "shot01_v002.####.exr"
+
+
 def test_results_are_named_exr_whatever_the_hrls_is_named(tmp_path):
     touch(tmp_path, "hr.exr.0001", "hr.exr.0002")
     found = find_shot(tmp_path / "hr.exr.####", tmp_path / "hr.exr.####", tmp_path / "out")

@@ -9,10 +9,10 @@ from pathlib import Path
 import bpy
 
 from . import render_settings
-from .checks import check_animation
+from .checks import check_animation, check_scene
 from .errors import Failure
 from .frame import render_and_fuse, run_to_end
-from .options import Options
+from .options import Options, find_view_layer, hrls_size
 from .overrides import override
 from .render import escape_path, render
 
@@ -50,13 +50,33 @@ def run_job(job, send, receive):
     if options.vectors and scene.render.use_motion_blur:
         send(no_vectors="motion blur is on, and Cycles then writes no motion vectors; turn it off")
         options = replace(options, vectors=False)
-    for number, output in job["frames"]:
+    for index, (number, output) in enumerate(job["frames"]):
         if number is not None:
             scene.frame_set(number)
+        if index == 0:
+            check_scene(scene, options)
+            send(size=hrls_size(scene), layers=_color_passes(scene, options))
         if output is not None:
             send(report=_run_frame(scene, options, job, Path(output), send, receive))
         elif options.vectors:
             _run_frame(scene, options, job, None, send, receive)
+
+
+def _color_passes(scene, options):
+    """The names of the passes with colours that both renders will have; None if Cycles does not tell."""
+    try:
+        from cycles.engine import list_render_passes
+
+        with override(scene, render_settings.hrls(scene, options)):
+            passes = list(list_render_passes(scene, find_view_layer(scene, options)))
+        return [name for name, _, kind in passes if kind == "COLOR"]
+    except (
+        ImportError,
+        AttributeError,
+        TypeError,
+        ValueError,
+    ):  # Cycles lists them for Blender, and may do so in another way one day.
+        return None
 
 
 def _run_frame(scene, options, job, output, send, receive):

@@ -19,6 +19,9 @@ Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON
 ``MSSPL {"fuse": {"lrhs": file, "hrls": file}}``, msspl-render fuses these files, and deletes them when no frame needs
 them any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
 
+The line ``MSSPL {"size": [width, height], "layers": names or null}`` comes before the first frame is rendered: the size
+of the HRLS and the passes that it will have. If they can't be fused, msspl-render ends this process.
+
 The line ``MSSPL {"no_vectors": reason}`` says that frames can't be fused with their neighbours, ``MSSPL {"warning":
 sentence}`` that all frames may be wrong.
 """

@@ -8,8 +8,17 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+from oiio_msspl.aovs.additive_sets import AdditiveSet, find_additive_sets
+from oiio_msspl.aovs.renderers import renderers
+from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.layers import Layer
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.fuse import memory_to_fuse
 from oiio_msspl.fusion.motion import VECTORS, MotionSource
+from oiio_msspl.fusion.tiling import require_memory
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import map_pair, resolve_auto
 from oiio_msspl.jobs.sequence import Frame
@@ -22,6 +31,16 @@ from oiio_msspl.parallel import limit_threads
 def beside(output: Path, suffix: str) -> Path:
     """``frame.exr`` -> ``frame_suffix.exr``."""
     return output.with_name(f"{output.stem}_{suffix}.exr")
+
+
+def _cycles_sets(names: Sequence[str]) -> list[AdditiveSet]:
+    """The additive sets that a file of Cycles with these passes has."""
+    layers = [
+        Layer(name, "", {c: Channel(Path(), 0, 3 * i + j, f"{name}.{c}", "float") for j, c in enumerate("RGB")})
+        for i, name in enumerate(names)
+    ]
+    cycles = next(each for each in renderers() if each["name"] == "Cycles")
+    return find_additive_sets(cycles, layers, Beauty("", "", Layer("Combined", "")))
 
 
 class RenderedShot:
@@ -95,11 +114,40 @@ class RenderedShot:
             raise InputError(f"--temporal {self._temporal.count}: {reason}")
         self._plan(Temporal(text=f"frame by frame: {reason}"))
 
+    def check(self, size: tuple[int, int], layers: Sequence[str] | None) -> None:
+        """Refuse a frame that could not be fused, before it is rendered.
+
+        Args:
+            size: width and height of the HRLS.
+            layers: names of the passes that Cycles will render; None if they are not known.
+
+        Raises:
+            InputError: the frame needs more memory than it may take, or a pattern of ``--passes`` matches no pass.
+        """
+        write = self._stages.write_options
+        (session,) = self._stages.sessions.values()
+        width, height = size
+        scale = session.contract.scale
+        grid = Window(0, 0, -(-width // scale), -(-height // scale))
+        needed = memory_to_fuse(
+            Alignment(scale, grid, grid, Window(0, 0, width, height)), session, error=write.error_layer
+        )
+        require_memory(needed, session.contract, self._stages.max_memory)
+        if layers is None or write.passes in ((), ("none",)):
+            return
+        sets = _cycles_sets(layers)
+        if not any(each.matches(pattern) for each in sets for pattern in write.passes):
+            known = ", ".join(f"'{each.name}'" for each in sets) or "none (turn on light groups, or pass --components)"
+            raise InputError(
+                f"--passes {', '.join(write.passes)}: the scene renders no such set of layers; it has {known}"
+            )
+
     def fuse(self, lr: Path, hr: Path) -> None:
         """Fuse the next frame of ``order``, and write each frame that has all its neighbours now.
 
         Args:
-            lr, hr: the renders, which are deleted or renamed when no frame needs them any more.
+            lr, hr: the renders, which are deleted or renamed when no frame needs them any more. Those of a frame that
+                can't be fused are kept beside its result.
 
         Raises:
             InputError, MssplError: a frame can't be fused. The message names it if there are several.
@@ -117,10 +165,35 @@ class RenderedShot:
                     assert isinstance(outcome, FusedAlone)
                     self._write(ready, outcome)
         except MssplError as error:
-            if len(self._shot) == 1:
-                raise
-            raise type(error)(f"frame {self._at_work}: {error}") from error
+            said = self._keep_failed(self._renders.get(self._at_work, frame), str(error))
+            if len(self._shot) > 1:
+                said = f"frame {self._at_work}: {said}"
+            raise type(error)(said) from error
         self._release()
+
+    def _keep_failed(self, frame: Frame, said: str) -> str:
+        """Keep the renders of a frame that can't be fused. The rest of the temporary files is deleted.
+
+        Args:
+            said: the error. It may name the renders.
+
+        Returns:
+            The error, with the names of the files that are kept.
+        """
+        assert frame.lr is not None and frame.hr is not None
+        renders = ((frame.lr, "lr", "the LRHS"), (frame.hr, "hr", "the HRLS"))
+        if not all(path.exists() for path, _, _ in renders):  # Blender wrote none, and the error says so
+            return said
+        kept = {path: beside(frame.output, suffix) for path, suffix, _ in renders}
+        wanted = any(frame.output == each.output for each in self._wanted)
+        if not wanted or (not self._keep and any(target.exists() for target in kept.values())):
+            for path, _, name in renders:
+                said = said.replace(str(path), name)
+            return said
+        for path, target in kept.items():
+            os.replace(path, target)
+            said = said.replace(str(path), str(target))
+        return f"{said}; both renders are kept for msspl-fuse: {', '.join(map(str, kept.values()))}"
 
     def waits(self, output: Path) -> bool:
         """Whether a frame is rendered, and waits for its neighbours."""

@@ -309,6 +309,7 @@ def test_neighbouring_frames_have_different_noise_if_they_are_averaged(python, r
     [
         (["-s", "2"], "2 view layers are on (ViewLayer, Other.1); choose one with --view-layer NAME"),
         (["--view-layer", "Third"], "has no view layer 'Third'; it has ViewLayer, Other.1"),
+        (["--view-layer", "ViewLayer", "--passes", "light*"], "no such set of layers; it has 'components'"),
     ],
 )
 def test_a_scene_that_cannot_be_fused_is_refused_in_one_sentence(python, results, tmp_path, options, message):

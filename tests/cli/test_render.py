@@ -264,6 +264,38 @@ def test_without_vectors_frames_are_fused_one_by_one(farm, model, moving, monkey
 
 
 @posix
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--passes", "foo*"], "--passes foo*: the scene renders no such set of layers; it has 'light groups'"),
+        (["--passes", "light*", "--max-memory", "400M"], "--max-memory: this frame needs more with model bilinear-x4"),
+    ],
+)
+def test_wrong_options_are_refused_before_anything_is_rendered(farm, model, options, message):
+    _, run, _ = farm
+    told = "tell(size=[8192, 8192], layers=['Combined', 'Combined_key', 'Combined_rest', 'Diffuse Direct'])"
+    code, _, err, left = run("--model", model, *options, code=f"{told}; time.sleep(300)")
+    assert (code, left, err.count("\n")) == (2, [], 1)
+    assert message in err
+
+
+@posix
+def test_renders_that_cannot_be_fused_are_kept_and_named(farm, model):
+    _, run, folder = farm
+    arguments = ["-o", "out.##.exr", "--frames", "1-2", "--model", model, "--passes", "foo*"]
+    code, _, err, left = run(*arguments, code=ASKS)
+    assert (code, left) == (2, ["out.01_hr.exr", "out.01_lr.exr"])
+    kept = folder / "out.01_lr.exr", folder / "out.01_hr.exr"
+    assert f"frame 1: --passes foo*: {kept[1]} has no such set of layers" in err
+    assert err.endswith(f"; both renders are kept for msspl-fuse: {kept[0]}, {kept[1]}\n")
+    assert kept[0].read_bytes() == (EXAMPLES / "lr.exr").read_bytes()
+    for path in kept:
+        path.write_text("the user's")
+    assert "frame 1: --passes foo*: the HRLS has no such set of layers" in run(*arguments, code=ASKS)[2]
+    assert [path.read_text() for path in kept] == 2 * ["the user's"]
+
+
+@posix
 def test_renders_are_kept_beside_each_frame(farm, model):
     _, run, folder = farm
     code, out, err, left = run("-o", "out.##.exr", "--frames", "1-2", "--model", model, "--keep", "--json", code=ASKS)

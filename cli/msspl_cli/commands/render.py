@@ -275,6 +275,8 @@ def render(
         nonlocal label
         if "no_vectors" in event:
             fuser.fuse_alone(event["no_vectors"])
+        if "size" in event:
+            fuser.check(event["size"], event["layers"])
         if "warning" in event:
             warnings.append(event["warning"])
         if "report" in event:

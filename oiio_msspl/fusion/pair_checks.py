@@ -59,6 +59,9 @@ NOISY = 0.01
 MIN_NOISY_BLOCKS = 64
 #: The LRHS is the HRLS's nearest pixels if this share of its noisy pixels equal an HRLS pixel.
 EQUAL_PIXELS = 0.5
+#: A render is black around a rectangle by chance if no more pixels of the other one are lit there: so many, or this
+#: share of them.
+MOST_BY_CHANCE, REGION = 64, 0.05
 #: The warning for a pair that fits, and shows nothing.
 BOTH_BLACK = "both renders are black (or NaN) everywhere: the result is black"
 #: Pixels of the HRLS that :func:`check_renders` reads at a time.
@@ -198,6 +201,11 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
                 "check which layer it is (--map rgb=LAYER)"
             )
     warnings = []
+    for name, values, other, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
+        if _is_region(values, lit):
+            warnings.append(
+                f"the {name} is black outside of a rectangle, where the {other} is lit: was a render region on?"
+            )
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges))
     if _shares_noise(hrls):
@@ -241,6 +249,16 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
             "the same frame, with the same lights and objects?"
         )
     return warnings
+
+
+def _is_region(values: Array, other: Array) -> bool:
+    """Whether a picture (h, w) is black around a rectangle, though the other one is not."""
+    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
+    outside = np.ones(values.shape, np.bool_)
+    # The other render's filter may reach further.
+    outside[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3] = False
+    lit = np.count_nonzero(other[outside])
+    return bool(lit > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
 
 
 def _shares_noise(hrls: HrlsAverages) -> bool:

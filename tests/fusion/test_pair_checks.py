@@ -186,6 +186,24 @@ def test_rare_light_is_not_shared_noise(scale):
     assert check_renders(low, Render.from_arrays("hr", rgb=second)) == []
 
 
+@pytest.mark.parametrize("which", ["HRLS", "LRHS"])
+@pytest.mark.parametrize("lit", [1, 0.1])
+def test_a_render_region_in_one_render_is_noticed(scale, which, lit):
+    """Around it, that render is black. Rare light has black pixels too, but not around a rectangle."""
+    rng = np.random.default_rng(0)
+    colour = scene(scale)[0] + np.float32(0.01)
+    first, second = (colour / lit * (rng.random(colour.shape[:2]) < lit)[..., None] for _ in range(2))
+    height, width = colour.shape[:2]
+    region = np.zeros_like(colour)
+    region[height // 4 : -height // 8, width // 8 : -width // 4] = 1
+    sentence = f"the {which} is black outside of a rectangle"
+    for mask, noticed in ((1, False), (region, True)):
+        low, high = (first * mask, second) if which == "LRHS" else (first, second * mask)
+        low = Render.from_arrays("lr", rgb=downsample(low, scale).astype(np.float32))
+        said = check_renders(low, Render.from_arrays("hr", rgb=high.astype(np.float32)))
+        assert any(text.startswith(sentence) for text in said) == noticed
+
+
 def test_a_shift_under_noise_is_noticed():
     """By one LRHS pixel, in a large and pale picture: noise is most of the difference, yet the shift is certain."""
     colour = 0.4 + 0.6 * scene(2, size=(180, 320))[0]

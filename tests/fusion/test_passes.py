@@ -10,7 +10,8 @@ from numpy.lib.stride_tricks import sliding_window_view
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.fusion import tiling
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import _Pair, fuse, layer_fuser
 from oiio_msspl.fusion.passes import _make_sum, fuse_passes, pass_steps
@@ -389,7 +390,7 @@ def test_light_in_no_layer_is_left_out(tmp_path, model):
     pair = write_pair(tmp_path, clean, beauty=lambda layers: sum(v.astype(np.float64) for v in layers.values()))
     sums = ("some=light_key+light_spot",)
     report, out = fused(pair, tmp_path / "out.exr", model, ("some",), sums)
-    assert report.passes == {"some": "fused: light_key, light_spot"}
+    assert report.passes == {"some": "fused: light_key, light_spot; 17.6% of the beauty's light is in none of them"}
     rest = layer(out) - layer(out, "light_key") - layer(out, "light_spot")
     assert rest.min() >= -1e-5 * layer(out).max()
     assert np.mean((rest - clean["light_rest"]) ** 2) < 0.02
@@ -554,12 +555,19 @@ def test_passes_that_layers_leaves_out_are_said_to_be_left_out(tmp_path, bilinea
         fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), write=write)
 
 
-def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models):
+def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeypatch):
+    """Decoded rows are kept, or decoded again for each band that needs them."""
     pair = write_pair(tmp_path, lights())
-    results = []
-    for memory in (1 << 30, 4 << 30):
-        fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), max_memory=memory, overwrite=True)
-        results.append(read_bits(tmp_path / "out.exr"))
+    monkeypatch.setattr("oiio_msspl.fusion.passes.BAND_ROWS", 16)
+    decode, decoded, results = ExrFile._decode, [], []
+    monkeypatch.setattr(ExrFile, "_decode", lambda *given: decoded.append(given) or decode(*given))
+    for share in (tiling.STRIPS_SHARE, 0):
+        monkeypatch.setattr(tiling, "STRIPS_SHARE", share)
+        fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), overwrite=True)
+        results.append((read_bits(tmp_path / "out.exr"), len(decoded)))
+        decoded.clear()
+    (results, times) = zip(*results, strict=True)
+    assert times[1] > 1.5 * times[0]
     for (_, first), (_, second) in zip(*results, strict=True):
         assert all(same_bits(first[name], second[name]) for name in first)
 

@@ -242,6 +242,12 @@ class ExrFile:
         return np.asarray(strip)
 
 
+def use_threads(count: int) -> None:
+    """Let OpenImageIO and OpenEXR decode and compress with so many threads, in the whole process; 0 changes nothing."""
+    for library in ("threads", "exr_threads") if count else ():
+        oiio.attribute(library, count)
+
+
 def unreadable(path: Path, part: Part, reason: str, where: str = "") -> InputError:
     """The error for pixels that can't be decoded; ``where`` follows the part's name."""
     return InputError(

@@ -17,6 +17,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.reader import use_threads
 from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
@@ -183,6 +184,7 @@ def _fuse_chunk(
             outcomes[frame.number] = None
     threads = stages.threads or (max(1, CPU_COUNT // neighbours) if neighbours > 1 else 0)
     # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
+    use_threads(threads)
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
     if missing:
         run_pipeline(stages, missing, lambda frame, outcome: outcomes.update({frame.number: outcome}), lambda: None)

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 import numpy as np
 import OpenEXR
+import OpenImageIO as oiio
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.reader import open_exr, use_threads
 from oiio_msspl.exr.render import Window
 from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
 
@@ -99,3 +100,15 @@ def test_real_headers_are_read(path):
             assert {c.name for c in part.channels} == {c.name for c in other.header["channels"]}
             low, high = other.header["dataWindow"]
             assert part.data_window == Window(low[0], low[1], high[0] + 1, high[1] + 1)
+
+
+def test_files_are_decoded_with_as_many_threads_as_are_allowed():
+    names = ("threads", "exr_threads")
+    before = [oiio.get_int_attribute(name) for name in names]
+    try:
+        for count in (1, 0):  # 0 changes nothing
+            use_threads(count)
+            assert [oiio.get_int_attribute(name) for name in names] == [1, 1]
+    finally:
+        for name, count in zip(names, before, strict=True):
+            oiio.attribute(name, count)

@@ -204,6 +204,7 @@ def fuse(
     bad frame does not stop the others.
     """
     options.set_up_logging(verbose, quiet)
+    from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.frame import fuse_files
     from oiio_msspl.jobs.sequence import is_sequence
 
@@ -220,6 +221,7 @@ def fuse(
         "overwrite": overwrite,
     }
     over_time = options.make_temporal_options(temporal, motion_format)
+    use_threads(threads)
     if is_sequence(lr) or is_sequence(hr):
         from oiio_msspl.jobs.shot import fuse_shot
 

@@ -324,11 +324,13 @@ def _make_fuser(
         InputError: the model, the device or the neighbours can't be had. No frame was rendered for nothing.
     """
     from msspl_cli.rendered_shot import RenderedShot
+    from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.frame import require_outputs
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
     from oiio_msspl.model.catalogue import family_of, load_model
 
+    use_threads(threads)
     session = load_model(scale, model, device, threads)
     require_outputs(session, write)
     stages = Stages(

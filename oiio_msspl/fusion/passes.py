@@ -3,10 +3,9 @@
 
 A layer is estimated in one of two ways:
 
-- It is fitted, around every LRHS pixel, as a linear function of the fused beauty, which has little noise. Pixels count
-  by how much they look alike in albedo and normal (first-order regression with cross-bilateral weights: Bitterli et al.
-  2016; the fit at low resolution: fast guided filter, He and Sun 2015). The function is then applied at full
-  resolution. A fit needs averages of noisy layers only, so it is fast.
+- It is fitted, around every LRHS pixel, as a line of the fused beauty, which has little noise
+  (:mod:`oiio_msspl.fusion.line_fit`). Pixels count by how much they look alike in albedo and normal. A fit needs
+  averages of noisy layers only, so it is fast.
 - A network fuses it, as if it were a beauty. That is more accurate, and takes a run of the network for each layer. Both
   renders must have the layer.
 
@@ -22,11 +21,10 @@ from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
-from numpy.lib.stride_tricks import sliding_window_view
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
-from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload, upsample_linear
@@ -35,7 +33,8 @@ from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
-from oiio_msspl.fusion.sums import check_sum, is_sum_of
+from oiio_msspl.fusion.line_fit import STEPS, LineFit, LinesNearby, blurred, downsampled, smoothed
+from oiio_msspl.fusion.pass_plan import PassJob, plan_passes
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks, half_of_the_threads, in_parallel, one_ahead
 
@@ -43,19 +42,8 @@ T = TypeVar("T", bound=np.generic)
 
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
-#: Rows of a band whose weights stay in a core's cache while several planes are averaged.
-CACHED_ROWS = 16
-#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. At x2 a pixel has fewer samples, so
-#: more of them are needed.
-STEPS = {2: (1, 3), 4: (1, 2), 8: (1, 2)}
 #: Pixels that differ by this much have 1/e of the weight in an average: albedo, normal, logarithm of the fused beauty.
 SPREAD = {ALBEDO: 0.2, NORMAL: 0.4, RGB: 0.5}
-#: Pixels of the HRLS choose among fits around them with the spread divided by this.
-SHARPER = 1.4
-#: Keeps a fit from following noise: variance that is added to the guide, relative to its mean square.
-RIDGE = 0.03
-#: Variance of the logarithm of the fused beauty that counts as flat where albedo and normal are smoothed.
-FLAT = 0.001
 #: Light below this share of the frame's median counts as equal.
 DARK = 0.3
 #: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
@@ -98,7 +86,7 @@ class FusedPasses:
     refused: dict[str, str] = field(default_factory=dict)
     """Why other sets were not fused, by name."""
     hrls_alone: dict[str, str] = field(default_factory=dict)
-    """By name of a fused set: the layers that were read from the HRLS alone, see :attr:`_Job.hrls_alone`."""
+    """By name of a fused set: the layers that were read from the HRLS alone, see :attr:`PassJob.hrls_alone`."""
     lacking: dict[str, float] = field(default_factory=dict)
     """By name of a fused set: the share of the beauty's light that is in no layer, for those that lack some."""
     warnings: list[str] = field(default_factory=list)
@@ -137,7 +125,7 @@ def fuse_passes(
     Raises:
         InputError: pixels can't be decoded.
     """
-    jobs, refused, warnings = _checked(lr, hr, sets)
+    jobs, refused, warnings = plan_passes(lr, hr, sets)
     window = alignment.hr_data_window
     pixels = ReplacedChannels() if pixels is None else pixels
     pixels.add([channel for job in jobs for channel in job.channels], window.width, window.height)
@@ -212,27 +200,7 @@ def _bands(alignment: Alignment) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
 
 
-def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
-    """LRHS and HRLS, with the light of layers of additive sets as further features. The LRHS may lack some of them."""
-    names = _layer_names(sets)
-    low = {layer: each for additive_set in sets for layer, each in _same_layers(lr, additive_set).items()}
-    low_light = {names[layer]: each.formula for layer, each in low.items()}
-    high_light = {name: layer.formula for layer, name in names.items()}
-    return replace(lr, features=lr.features | low_light), replace(hr, features=hr.features | high_light)
-
-
-def _layer_names(sets: Sequence[AdditiveSet]) -> dict[AdditiveLayer, str]:
-    """Names, as features, of the light of all layers. Frames of a shot have the same names."""
-    names: dict[AdditiveLayer, str] = {}
-    for layer in dict.fromkeys(layer for each in sets for layer in each.layers):
-        name = f"{LIGHT_OF}{layer.name}{' x colour' if layer.factor else ''}"
-        while name in names.values():
-            name += " again"
-        names[layer] = name
-    return names
-
-
-def _colour_names(jobs: Iterable[_Job]) -> dict[Factor, str]:
+def _colour_names(jobs: Iterable[PassJob]) -> dict[Factor, str]:
     """Names, as features, of the colours by which layers that are fitted are multiplied."""
     factors = dict.fromkeys(each.factor for job in jobs for each in job.fitted if each.factor is not None)
     return {factor: f"colour {i}" for i, factor in enumerate(factors)}
@@ -249,7 +217,7 @@ def _with_layers_of(
 
 
 def _fused_layers(
-    low: Render, high: Render, job: _Job, low_lit: set[str], high_lit: set[str], fuse_layers: LayerFuser
+    low: Render, high: Render, job: PassJob, low_lit: set[str], high_lit: set[str], fuse_layers: LayerFuser
 ) -> Iterator[tuple[AdditiveLayer, Array | None]]:
     """Each layer of a set that is to be fitted, and its light as a network fuses it; None if that can't be done.
 
@@ -325,130 +293,6 @@ def _range_around(samples: Array) -> tuple[Array, Array]:
     return -max_3x3(-samples), max_3x3(samples)
 
 
-#: Layers, each with the layers that it is the sum of.
-_Sums = dict[AdditiveLayer, tuple[AdditiveLayer, ...]]
-
-
-@dataclass(frozen=True)
-class _Job:
-    """A set that sums to the beauty."""
-
-    layers: AdditiveSet
-    keys: dict[AdditiveLayer, str]
-    """Names, as features, of the light of the layers."""
-    lrhs: dict[str, AdditiveLayer]
-    """The same layers in the LRHS, as far as it has them, by these names."""
-    lacking: float
-    """Share of the beauty's light that is in no layer; 0 if only rounding is lacking."""
-    known: _Sums
-    """Layers of this set that are sums of layers of an earlier set, or that both sets have. The other layers are
-    fitted, and share what these leave of the beauty."""
-    noise_free: frozenset[AdditiveLayer] = frozenset()
-    """See :attr:`oiio_msspl.fusion.sums.SumCheck.noise_free`."""
-    coarser: _Sums = field(default_factory=dict)
-    """Layers outside of all sets that are sums of layers of this one."""
-
-    @property
-    def remainder(self) -> bool:
-        """Some light is in no layer."""
-        return self.lacking > 0
-
-    @property
-    def fitted(self) -> list[AdditiveLayer]:
-        return [layer for layer in self.layers.layers if layer not in self.known]
-
-    @property
-    def hrls_alone(self) -> str:
-        """Names of fitted layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
-        missing = [layer.name for layer in self.fitted if self.keys[layer] not in self.lrhs]
-        return "all layers" if missing and not self.lrhs else ", ".join(missing)
-
-    @property
-    def channels(self) -> list[Channel]:
-        """What is written."""
-        return [channel for layer in (*self.layers.layers, *self.coarser) for channel in layer.channels]
-
-
-def _checked(
-    lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]
-) -> tuple[list[_Job], dict[str, str], list[str]]:
-    """The sets that sum to the beauty; why each of the others does not, by name; and warnings of layers of the LRHS.
-
-    Sets with more layers come first, because layers of the others may be sums of theirs.
-    """
-    jobs: list[_Job] = []
-    refused: dict[str, str] = {}
-    warnings: list[str] = []
-    names = _layer_names(sets)
-    for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        check, (lrhs, problem) = in_parallel(partial(check_sum, hr, layers), partial(_usable_layers, lr, layers))
-        if check.problem:
-            refused[layers.name] = check.text
-            continue
-        # All known layers come from one set. Those of two sets could have more light than the beauty.
-        known = max((_sums_of(hr, layers.layers, job.layers) for job in jobs), key=len, default={})
-        taken = {channel for job in jobs for channel in job.channels}
-        shared = [each.name for each in layers.layers if each not in known and not taken.isdisjoint(each.channels)]
-        if shared:
-            refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
-            continue
-        keys = {layer: names[layer] for layer in layers.layers}
-        theirs = {key: lrhs[layer] for layer, key in keys.items() if layer in lrhs}
-        job = _Job(layers, keys, theirs, check.residual if check.remainder else 0.0, known, check.noise_free)
-        jobs.append(job)
-        if problem:
-            warnings.append(
-                f"{layers.name}: the LRHS's layers do not sum to its beauty, so they are not read: {problem}"
-            )
-        elif theirs and job.hrls_alone:
-            warnings.append(f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there")
-    taken = {channel for job in jobs for channel in job.channels}
-    for job in jobs:
-        for layer in job.layers.coarser:
-            if taken.isdisjoint(layer.channels):
-                job.coarser.update(_sums_of(hr, [layer], job.layers))
-    return jobs, refused, warnings
-
-
-def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> _Sums:
-    """Those of some layers that a set has, or that by name and pixels are sums of its layers.
-
-    No layer of the set belongs to two sums.
-    """
-    sums: _Sums = {}
-    used: set[AdditiveLayer] = set()
-    for layer in layers:
-        parts = tuple(each for each in finer.layers if layer.words < each.words) if layer.words else ()
-        if layer in finer.layers:
-            parts = (layer,)
-        elif layer.factor is not None or len(parts) < 2 or not is_sum_of(hr, layer, parts):
-            continue
-        if used.isdisjoint(parts):
-            sums[layer] = parts
-            used.update(parts)
-    return sums
-
-
-def _usable_layers(lr: MappedRender, layers: AdditiveSet) -> tuple[dict[AdditiveLayer, AdditiveLayer], str]:
-    """The layers of :func:`_same_layers`; and why they can't be used, if they do not sum to the LRHS's beauty.
-
-    They may lack some of its light.
-    """
-    found = _same_layers(lr, layers)
-    problem = check_sum(lr, AdditiveSet(layers.name, tuple(found.values()))).problem if found else ""
-    return ({}, problem) if problem else (found, "")
-
-
-def _same_layers(render: MappedRender, layers: AdditiveSet) -> dict[AdditiveLayer, AdditiveLayer]:
-    """Layers of a set, each with the layer of the same name in another render: in the set that has most of them."""
-    by_name = {(layer.name, layer.factor is None): layer for layer in layers.layers}
-    found = (
-        {by_name[key]: each for each in candidate.layers if (key := (each.name, each.factor is None)) in by_name}
-        for candidate in render.additive_sets
-    )
-    return max(found, key=len, default={})
-
-
 class _Band:
     """Some rows of the frame, with what their layers are fitted to."""
 
@@ -461,7 +305,7 @@ class _Band:
         alignment: Alignment,
         core: Window,
         dark: float,
-        jobs: Sequence[_Job],
+        jobs: Sequence[PassJob],
         guides: Guides,
         fused_light: Mapping[AdditiveLayer, Array],
     ) -> None:
@@ -484,13 +328,13 @@ class _Band:
         window = alignment.hr_data_window
         # A frame that is stored as half is fused as half. Variances would be lost in its rounding.
         self._beauty = planes_of(mirrored(rgb, window, self._hrls_area)).astype(np.float32)
-        self._low_beauty = _downsampled(self._beauty, self._scale)
+        self._low_beauty = downsampled(self._beauty, self._scale)
         self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job, low, high)]
         read = self._read(low, high, colours, [job for job in jobs if job.lrhs or job in self._to_fit])
         if self._to_fit:
             self._prepare_fit(read, guides)
 
-    def _has_light_to_fit(self, job: _Job, low: ReadableRender, high: ReadableRender) -> bool:
+    def _has_light_to_fit(self, job: PassJob, low: ReadableRender, high: ReadableRender) -> bool:
         """Whether the band has light of a layer that no network has fused."""
         keys = [job.keys[layer] for layer in job.fitted if layer not in self._fused_light]
         area = self._area
@@ -505,21 +349,21 @@ class _Band:
         planes = [log[None] / SPREAD[RGB]]
         for name, image in read.items():
             noisy = planes_of(image)
-            guide = _smoothed(noisy, log)
+            guide = smoothed(noisy, log)
             if name in guides:
                 clean = planes_of(mirrored(guides[name], self._alignment.hr_data_window, self._hrls_area))
                 # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
                 guide = np.where((noisy > 1).any(axis=0), guide, clean)
             planes.append(guide / SPREAD[name])
         full = np.concatenate(planes, dtype=np.float32)
-        low = _downsampled(full, self._scale)
+        low = downsampled(full, self._scale)
         with np.errstate(over="ignore", invalid="ignore"):
-            self._fit = _Fit(self._low_beauty, low, STEPS[self._scale])
-        self._nearby = _Nearby(low, full, self._scale, self._core_rows)
+            self._fit = LineFit(self._low_beauty, low, STEPS[self._scale])
+        self._nearby = LinesNearby(low, full, self._scale, self._core_rows)
         self._beauty_core = self._nearby.phases(self._beauty[:, self._hrls_rows])
 
     def _read(
-        self, low: ReadableRender, high: ReadableRender, colours: Mapping[Factor, str], jobs: Sequence[_Job]
+        self, low: ReadableRender, high: ReadableRender, colours: Mapping[Factor, str], jobs: Sequence[PassJob]
     ) -> dict[str, Array]:
         """Read all that the band needs, at once, because a file decodes all layers together.
 
@@ -554,7 +398,7 @@ class _Band:
 
     def fuse(
         self,
-        job: _Job,
+        job: PassJob,
         pixels: ReplacedChannels,
         earlier: Mapping[AdditiveLayer, Array],
     ) -> dict[AdditiveLayer, Array]:
@@ -590,7 +434,7 @@ class _Band:
                 pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
         return lights
 
-    def _fitted(self, job: _Job, light: Array, colours: Mapping[AdditiveLayer, Array]) -> dict[AdditiveLayer, Array]:
+    def _fitted(self, job: PassJob, light: Array, colours: Mapping[AdditiveLayer, Array]) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that earlier sets do not know."""
         layers = job.fitted
         fitted = np.zeros((len(layers) + job.remainder, *light.shape), np.float32)
@@ -654,25 +498,25 @@ class _Band:
         if lit:
             for_row_blocks(fit, len(lit), self._beauty_core.size)
 
-    def _renders_of(self, job: _Job) -> list[Array]:
+    def _renders_of(self, job: PassJob) -> list[Array]:
         """The layers of the HRLS, and of the LRHS if it has some, see :meth:`_dimmed`. Empty if they were not read."""
         renders = [self._dimmed(job, self._low_layers)] if job.lrhs or job in self._to_fit else []
         return [*renders, self._dimmed(job, self._lrhs_layers)] if job.lrhs else renders
 
-    def _doubts(self, job: _Job, hrls: Array, lrhs: Array) -> Array:
+    def _doubts(self, job: PassJob, hrls: Array, lrhs: Array) -> Array:
         """How uncertain each layer is, (layers, h, w) over the core, at most 1: the root of the mean difference between
         the two renders, relative to the layer where that is largest. A layer that the LRHS lacks is most uncertain."""
         both = _in_both(job, len(hrls))
         differences = np.abs(hrls - lrhs[: len(hrls)]).mean(axis=1)
         differences[~both] = 0
-        doubts = np.sqrt([_blurred(plane) for plane in _to_be_fitted(job, differences)])
+        doubts = np.sqrt([blurred(plane) for plane in _to_be_fitted(job, differences)])
         most = doubts.max(axis=0)
         doubts = np.divide(doubts, most, out=np.ones_like(doubts), where=(most > 0) & np.isfinite(most))
         np.maximum(doubts, LEAST_DOUBT, out=doubts)
         doubts[~_to_be_fitted(job, both)] = 1
         return np.stack([upsample_linear(plane, self._scale, self._core_rows) for plane in doubts])
 
-    def _average(self, job: _Job, hrls: Array, lrhs: Array | None = None) -> Array:
+    def _average(self, job: PassJob, hrls: Array, lrhs: Array | None = None) -> Array:
         """The mean of both renders' layers (layers, 3, h, w), of those that are fitted. It may be written over
         ``hrls``."""
         if lrhs is not None:
@@ -682,7 +526,7 @@ class _Band:
                 hrls[i] /= 1 + weight
         return _to_be_fitted(job, hrls)
 
-    def _dimmed(self, job: _Job, pixels: Mapping[str, Array]) -> Array:
+    def _dimmed(self, job: PassJob, pixels: Mapping[str, Array]) -> Array:
         """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Layers that it lacks are
         black. The rest of its beauty is the last layer, if layers are missing or light is in none."""
         black = np.zeros_like(self._low_beauty)
@@ -706,14 +550,14 @@ class _Band:
         return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
 
 
-def _in_both(job: _Job, count: int) -> NDArray[np.bool_]:
+def _in_both(job: PassJob, count: int) -> NDArray[np.bool_]:
     """Which of the first ``count`` layers of a set both renders have. The remainder comes behind them: both have it if
     they have all layers."""
     both = [key in job.lrhs for key in job.keys.values()]
     return np.array([*both, all(both)])[:count]
 
 
-def _to_be_fitted(job: _Job, layers: NDArray[T]) -> NDArray[T]:
+def _to_be_fitted(job: PassJob, layers: NDArray[T]) -> NDArray[T]:
     """Those layers of a set, on the first axis, that are to be fitted."""
     known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
     return np.delete(layers, known, axis=0) if known else layers
@@ -728,182 +572,6 @@ def _is_black(render: ReadableRender, layer: str, area: Window) -> bool:
         return True
     shifted = area.shift(render.display_window.x0, render.display_window.y0)
     return not render.read(shifted.intersect(render.data_window), [layer])[layer].any()
-
-
-class _Fit:
-    """Lines ``layer = slope beauty + offset`` around every low-resolution pixel, fitted to pixels that look alike."""
-
-    def __init__(self, beauty: Array, guides: Array, steps: Sequence[int]) -> None:
-        """``beauty``: (3, h, w). ``guides``: (guides, h, w), in units of their spread."""
-        self._beauty, self._steps = beauty, steps
-        self._kernels = [_kernel(guides, step) for step in steps]
-        means = self._mean(np.concatenate([beauty, beauty * beauty]))
-        self._means = means[:3]
-        variances = np.maximum(means[3:] - self._means**2, 0)
-        self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
-
-    def lines(self, layer: Array) -> tuple[Array, Array]:
-        """The slopes of a layer (3, h, w) in each channel, and then the offsets, (6, h, w); and the layer's means
-        (3, h, w)."""
-        means = self._mean(np.concatenate([layer, layer * self._beauty]))
-        mean, products = means[:3], means[3:]
-        slopes = (products - mean * self._means) / self._variances
-        return np.concatenate([slopes, mean - slopes * self._means]), mean
-
-    def _mean(self, planes: Array) -> Array:
-        """Means (n, h, w) over pixels around that look alike."""
-        for kernel, step in zip(self._kernels, self._steps, strict=True):
-            planes = _mean_around(planes, kernel, step)
-        return planes
-
-
-def _mean_around(planes: Array, weights: Array, step: int) -> Array:
-    """Means of planes (n, h, w) over 5 x 5 pixels, ``step`` pixels apart, with the weights (5, 5, h, w) of
-    :func:`_kernel`."""
-    count, height, width = planes.shape
-    reach = 2 * step
-    padded = np.zeros((count, height + 2 * reach, width + 2 * reach), np.float32)
-    padded[:, reach : reach + height, reach : reach + width] = planes
-    around = sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1), axis=(1, 2))[..., ::step, ::step]
-    # NumPy would add up adjacent columns pixel by pixel, which takes three times as long as row by row.
-    columns = [slice(0, 5, 2), slice(1, 5, 2)] if step == 1 else [slice(0, 5)]
-    result = np.zeros_like(planes)
-    for start in range(0, height, CACHED_ROWS):
-        rows = slice(start, start + CACHED_ROWS)
-        for part in columns:
-            result[:, rows] += np.einsum("ijhw,nhwij->nhw", weights[:, part, rows], around[:, rows, :, :, part])
-    return result
-
-
-def _kernel(guides: Array, step: int) -> Array:
-    """Weights (5, 5, h, w) of 5 x 5 pixels, ``step`` pixels apart, which sum to 1. Pixels outside weigh nothing."""
-    height, width = guides.shape[1:]
-    offsets = [(y * step, x * step) for y in range(-2, 3) for x in range(-2, 3)]
-    weights = np.zeros((len(offsets), height, width), np.float32)
-    weights[12] = 1
-
-    def weigh(part: slice) -> None:
-        # Two pixels differ by as much, whichever of them is in the centre.
-        for i, (y, x) in list(enumerate(offsets[:12]))[part]:
-            if -y < height and abs(x) < width:
-                here = slice(-y, height), slice(max(-x, 0), width - max(x, 0))
-                there = slice(0, height + y), slice(max(x, 0), width - max(-x, 0))
-                with np.errstate(over="ignore", invalid="ignore"):
-                    distance = np.square(guides[:, here[0], here[1]] - guides[:, there[0], there[1]]).sum(axis=0)
-                distance += np.float32((y * y + x * x) / (8 * step * step))
-                weights[i][here] = weights[24 - i][there] = np.exp(-distance)
-
-    for_row_blocks(weigh, 12, guides.size)
-    weights /= weights.sum(axis=0)
-    return weights.reshape(5, 5, height, width)
-
-
-class _Nearby:
-    """Applies lines at full resolution: those of the four low-resolution pixels around, by how much they look alike.
-
-    All pixels that lie in the same place of a low-resolution pixel, a *phase*, are computed together. They are as many
-    as low-resolution pixels, so all arrays are contiguous.
-    """
-
-    def __init__(self, low: Array, full: Array, scale: int, rows: slice) -> None:
-        """``low``, ``full``: guides (guides, h, w) in units of their spread. ``rows``: of ``low``, to interpolate."""
-        self._rows, self._scale = rows, scale
-        height, width = rows.stop - rows.start, low.shape[2]
-        #: For each phase, the weights of the two rows and two columns of corners.
-        self._weights = np.empty((scale, scale, 2, 2, height, width), np.float32)
-        whole = self.phases(full[:, rows.start * scale : rows.stop * scale])
-        padded = self._padded(low)
-        for y, x in np.ndindex(scale, scale):
-            weights = self._weights[y, x]
-            for i, j in np.ndindex(2, 2):
-                top, left = self._corner(y) + i, self._corner(x) + j
-                there = padded[:, top : top + height, left : left + width]
-                distance = np.square(there - whole[y, x]).sum(axis=0) * np.float32(SHARPER**2)
-                share = self._share(y, i) * self._share(x, j)
-                weights[i, j] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(share)
-            weights /= weights.sum(axis=(0, 1))
-
-    def phases(self, planes: Array) -> Array:
-        """Planes (n, h, w) at full resolution as phases (scale, scale, n, h, w)."""
-        n, height, width = planes.shape
-        parts = planes.reshape(n, height // self._scale, self._scale, width // self._scale, self._scale)
-        return np.ascontiguousarray(parts.transpose(2, 4, 0, 1, 3))
-
-    def apply(self, lines: Array, bounds: Array, guide: Array, out: Array) -> None:
-        """The values of lines at full resolution, within interpolated bounds.
-
-        Args:
-            lines: slopes and offsets (2 n, h, w) at low resolution.
-            bounds: lowest and highest values (2 n, h, w) at low resolution.
-            guide: the values that the lines are functions of, as :meth:`phases` over the chosen rows.
-            out: gets the chosen rows (n, h, w) at full resolution.
-        """
-        n, scale = len(out), self._scale
-        height, width = self._weights.shape[-2:]
-        lines, bounds = self._padded(lines), self._padded(bounds)
-        for start in range(0, height, CACHED_ROWS):
-            stop = min(start + CACHED_ROWS, height)
-            target = out[:, start * scale : stop * scale]
-            for y in range(scale):
-                rows = slice(self._corner(y) + start, self._corner(y) + stop + 1)
-                between = _between(bounds[:, rows][:, :-1], bounds[:, rows][:, 1:], self._share(y, 1))
-                pairs = sliding_window_view(lines[:, rows], 2, axis=1)
-                for x in range(scale):
-                    left = self._corner(x)
-                    weights = self._weights[y, x, :, :, start:stop]
-                    line, right = (
-                        np.einsum("ihw,nhwi->nhw", weights[:, j], pairs[:, :, left + j : left + j + width])
-                        for j in (0, 1)
-                    )
-                    line += right
-                    values = line[:n]
-                    values *= guide[y, x, :, start:stop]
-                    values += line[n:]
-                    limits = _between(
-                        between[..., left : left + width], between[..., left + 1 : left + 1 + width], self._share(x, 1)
-                    )
-                    np.clip(values, limits[:n], limits[n:], out=target[:, y::scale, x::scale])
-
-    def _padded(self, planes: Array) -> Array:
-        """The chosen rows of planes (n, h, w), and one pixel more on each side; the edge is repeated."""
-        rows = slice(max(self._rows.start - 1, 0), self._rows.stop + 1)
-        top = 1 - (self._rows.start - rows.start)
-        bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
-        return np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
-
-    def _corner(self, phase: int) -> int:
-        """Row or column, in :meth:`_padded`, of the first corner of a phase's first pixel."""
-        return int(2 * phase + 1 > self._scale)
-
-    def _share(self, phase: int, corner: int) -> float:
-        """How much the first (0) or second (1) corner of a phase counts in linear interpolation."""
-        position = (phase + 0.5) / self._scale - 0.5
-        second = position if position > 0 else 1 + position
-        return second if corner else 1 - second
-
-
-def _between(first: Array, second: Array, share: float) -> Array:
-    """Linear interpolation; ``share`` is that of the second."""
-    result = second - first
-    result *= np.float32(share)
-    result += first
-    return result
-
-
-def _smoothed(planes: Array, log: Array) -> Array:
-    """Planes (n, h, w) without noise: a guided filter (He et al. 2010) over 3 x 3 pixels, guided by the beauty."""
-    mean = _blurred(log)
-    variance = _blurred(log * log) - mean * mean + np.float32(FLAT)
-    result = np.empty_like(planes)
-
-    def smooth(part: slice) -> None:
-        for plane, out in zip(planes[part], result[part], strict=True):
-            average = _blurred(plane)
-            slope = (_blurred(plane * log) - average * mean) / variance
-            np.add(average, slope * (log - mean), out=out)
-
-    for_row_blocks(smooth, len(planes), log.size)
-    return result
 
 
 def _total(lights: Mapping[AdditiveLayer, Array], layers: Iterable[AdditiveLayer]) -> Array:
@@ -939,22 +607,3 @@ def _make_sum(layers: Array, beauty: Array, doubts: Array | None) -> None:
         part *= wanted
 
     for_row_blocks(work, beauty.shape[1], layers[:, :, 0].size)
-
-
-def _blurred(plane: Array) -> Array:
-    """Mean over 3 x 3 pixels with the weights 1, 2, 1 in rows and in columns; the edge is repeated."""
-    for axis in (0, 1):
-        lines = plane.swapaxes(0, axis)
-        total = 2 * lines
-        total[1:] += lines[:-1]
-        total[:-1] += lines[1:]
-        total[0] += lines[0]
-        total[-1] += lines[-1]
-        total *= np.float32(1 / 4)
-        plane = total.swapaxes(0, axis)
-    return plane
-
-
-def _downsampled(planes: Array, scale: int) -> Array:
-    """Planes (n, h, w), averaged over ``scale`` x ``scale`` pixels."""
-    return planes_of(box_downsample(np.moveaxis(planes, 0, -1), scale))

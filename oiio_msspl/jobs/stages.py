@@ -24,7 +24,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
-from oiio_msspl.fusion.passes import pass_features
+from oiio_msspl.fusion.pass_plan import pass_features
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, lacking_passes
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
 from oiio_msspl.fusion.warp import Mask

@@ -185,7 +185,7 @@ def mean_note(rows: Sequence[Row]) -> str:
     clean = [name for name in names if name not in NOISY_REFERENCE]
     left_out = [name for name in names if name in NOISY_REFERENCE]
     note = f"Means are over {len(clean)} scenes: {', '.join(clean)}."
-    return note + f" Not over {', '.join(left_out)}, whose reference is noisy." * bool(left_out)
+    return note + f" Left out, because the reference is noisy: {', '.join(left_out)}." * bool(left_out)
 
 
 def cell(row: Row | None, *measures: str) -> str:

@@ -200,7 +200,7 @@ def spread_noise() -> str:
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
         best = sum(max(SPREAD_NOISE, key=lambda m, s=scene: found[s, 2, m]["psnr"]) == method for scene in clean)
         body.append([name, *cells, f"{best} of {len(clean)}"])
-    head = ["method", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "best at 2 spp (PSNR)"]
+    head = ["method", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "scenes on which it is best (PSNR, 2 spp)"]
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
 

@@ -39,8 +39,13 @@ EXAMPLES = """[bold]Examples[/bold]
 
 [bold]Exit code[/bold]
 
-  0: every frame is fused, or was there (--skip-existing). 2: a mistake in files or options. 1: any other failure, such
-  as a full disk. For a shot: 1 if any frame failed in that way, otherwise 2 if any frame was not fused.
+  0: every frame is fused, or was there (--skip-existing)
+
+  1: a failure that is not in the input, such as a full disk
+
+  2: a mistake in files or options, or in a shot a frame that was not fused
+
+  129, 130, 143: stopped by SIGHUP, by Ctrl-C, by SIGTERM
 """
 
 

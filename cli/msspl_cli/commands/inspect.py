@@ -34,8 +34,8 @@ def inspect(
 ) -> None:
     """Print what a render contains, and which of its layers a model would read.
 
-    If the next frame lies beside a file, the two verify its motion vectors. The two renders of a frame tell whether a
-    pixel filter has spread their noise.
+    If the next frame lies beside a file, the two verify its motion vectors. The
+    two renders of a frame tell whether a pixel filter has spread their noise.
 
     If a file can't be used, the reason is printed and the exit code is 2.
     """

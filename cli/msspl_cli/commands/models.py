@@ -17,7 +17,7 @@ EXAMPLES = """[bold]Examples[/bold]
 
 
 def models(as_json: options.Json = False, debug: options.Debug = False, help_all: options.HelpAll = False) -> None:
-    """List the models in the package, and the devices on which they can run.
+    """List the models in the package, and the devices that ONNX Runtime was built for.
 
     PSNR and RelMSE are those of five scenes with 2 and 8 samples per pixel in all, for
     models with -spread of the same scenes with a filter that spreads each sample.

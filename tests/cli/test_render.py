@@ -220,6 +220,7 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
     code, out, err, _ = run(*shot, "--skip-existing", code=ASKS)
     assert (code, err) == (0, "")
     assert "Fused with 4 frames before and after each, along the motion vectors of Cycles" in out
+    assert "all s" in out and "plain rendering" not in out
     assert [line.split()[0] for line in (folder / "log").read_text().splitlines()] == [
         str(number) for number in range(1001, 1007)
     ]

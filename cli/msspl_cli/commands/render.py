@@ -298,7 +298,7 @@ def render(
         if as_json:
             print(json.dumps(reports, indent=2))
         elif reports and not quiet:
-            _print(reports)
+            _print(reports, alone=not over_time.count(model))
             if fuser.text:
                 print(f"Fused {fuser.text}")
     if not (targets or as_json or quiet):
@@ -379,12 +379,15 @@ def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Pat
     return [(numbers[0] if numbers else None, output)]
 
 
-def _print(reports: list[dict[str, Any]]) -> None:
-    """Print the time of each step, and what ordinary rendering gives in the same time."""
+def _print(reports: list[dict[str, Any]], *, alone: bool) -> None:
+    """Print the time of each step, and what ordinary rendering gives in the same time. If frames are not fused alone,
+    the time of one does not say what it costs: it holds the work for frames that have waited for it."""
     first = reports[0]
     for key, name in (("lrhs", "LRHS"), ("hrls", "HRLS")):
         print(f"{name} {first[key]['size'][0]}x{first[key]['size'][1]}, {first[key]['spp']} spp")
-    rows: list[tuple[str, ...]] = [("frame", "LRHS s", "HRLS s", "fuse s", "all s", "plain rendering in that time")]
+    titles = ("frame", "LRHS s", "HRLS s", "fuse s", "all s", "plain rendering in that time")
+    columns = len(titles) if alone or any("oidn" in report for report in reports) else len(titles) - 1
+    rows: list[tuple[str, ...]] = [titles[:columns]]
     for report in reports:
         oidn = report.get("oidn")
         plain = (
@@ -393,6 +396,6 @@ def _print(reports: list[dict[str, Any]]) -> None:
             else f"about {report['plain_spp']:.1f} spp"
         )
         seconds = report["lrhs"]["seconds"], report["hrls"]["seconds"], report["fuse_seconds"], report["seconds"]
-        rows.append((str(report["frame"]), *(f"{value:.2f}" for value in seconds), plain))
+        rows.append((str(report["frame"]), *(f"{value:.2f}" for value in seconds), plain)[:columns])
     console.table(rows, header=True)
     print(f"Wrote {reports[0]['output']}" + (f" to {reports[-1]['output']}" if len(reports) > 1 else ""))

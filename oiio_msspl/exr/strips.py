@@ -22,6 +22,8 @@ from oiio_msspl.arrays import blank, unload
 ROWS_PER_STRIP = 64
 #: Bytes of a strip with all channels of its part, unless a single chunk has more.
 LARGEST_STRIP = 64 << 20
+#: Fewer bytes of a strip are not put into a temporary file.
+SMALLEST_FILE = 1 << 20
 
 
 class StripKey(NamedTuple):
@@ -77,7 +79,8 @@ class StripCache:
         return self.bytes + strip.nbytes <= self.max_bytes
 
     def keep_all(self, parts: Mapping[StripKey, NDArray[Any]]) -> None:
-        """Keep copies of parts of a strip, in one temporary file those for which there is no room.
+        """Keep copies of parts of a strip, in one temporary file those for which there is no room. Small parts are always
+        kept in memory.
 
         Raises:
             MssplError: the disk has no room.
@@ -88,7 +91,8 @@ class StripCache:
                 self.keep(key, part.copy())
             else:
                 left[key] = part
-        if not left:
+        if sum(part.nbytes for part in left.values()) < SMALLEST_FILE:
+            self._strips |= {key: part.copy() for key, part in left.items()}
             return
         ends = np.cumsum([part.size for part in left.values()])
         block = blank((int(ends[-1]),), next(iter(left.values())).dtype, on_disk=True)

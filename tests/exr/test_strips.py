@@ -7,7 +7,7 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl.exr import reader
+from oiio_msspl.exr import reader, strips
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
@@ -187,8 +187,9 @@ def test_only_what_is_still_to_be_written_is_kept(tmp_path, decoded):
 
 
 @pytest.mark.parametrize("room", [0, 1])
-def test_layers_that_do_not_fit_wait_in_a_file(tmp_path, decoded, room):
+def test_layers_that_do_not_fit_wait_in_a_file(tmp_path, decoded, room, monkeypatch):
     """The cache has room for no strip, or for one. No row is decoded twice, and no more memory is taken."""
+    monkeypatch.setattr(strips, "SMALLEST_FILE", 1)
     values = {name: picture(HEIGHT, WIDTH, seed).astype(np.float16) for seed, name in enumerate("abc")}
     channels = {key: plane for name, image in values.items() for key, plane in rgb(image, f"{name}.").items()}
     file = open_exr(write_exr(tmp_path / "a.exr", channels))

@@ -70,12 +70,8 @@ def _color_passes(scene, options):
         with override(scene, render_settings.hrls(scene, options)):
             passes = list(list_render_passes(scene, find_view_layer(scene, options)))
         return [name for name, _, kind in passes if kind == "COLOR"]
-    except (
-        ImportError,
-        AttributeError,
-        TypeError,
-        ValueError,
-    ):  # Cycles lists them for Blender, and may do so in another way one day.
+    except (ImportError, AttributeError, TypeError, ValueError):
+        # Cycles lists them for Blender, and may do so in another way one day.
         return None
 
 

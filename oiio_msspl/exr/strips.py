@@ -79,8 +79,8 @@ class StripCache:
         return self.bytes + strip.nbytes <= self.max_bytes
 
     def keep_all(self, parts: Mapping[StripKey, NDArray[Any]]) -> None:
-        """Keep copies of parts of a strip, in one temporary file those for which there is no room. Small parts are always
-        kept in memory.
+        """Keep copies of parts of a strip, in one temporary file those for which there is no room. If these are small,
+        they are kept in memory all the same.
 
         Raises:
             MssplError: the disk has no room.

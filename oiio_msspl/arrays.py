@@ -19,6 +19,7 @@ from oiio_msspl.errors import MssplError
 from oiio_msspl.parallel import for_row_blocks
 
 Array = NDArray[np.float32]
+Mask = NDArray[np.bool_]
 
 #: Largest finite values of half and of float.
 HALF_MAX, FLOAT_MAX = 65504.0, float(np.finfo(np.float32).max)

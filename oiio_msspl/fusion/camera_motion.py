@@ -15,9 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.fusion.motion_guides import FramePair
-from oiio_msspl.fusion.motion_vectors import Mask, sample_linear
+from oiio_msspl.fusion.motion_vectors import sample_linear
 from oiio_msspl.parallel import for_row_blocks
 
 #: Header attributes that hold such a matrix, in lower case: by Arnold, Karma, Mantra and RenderMan.

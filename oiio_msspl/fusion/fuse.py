@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.arrays import HALF_MAX, Array, blank, unload
+from oiio_msspl.arrays import HALF_MAX, Array, Mask, blank, unload
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels

@@ -13,15 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
-from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.arrays import Array, Mask, box_downsample
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import for_row_blocks
-
-Mask = NDArray[np.bool_]
 
 #: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
 #: render, but for rare light (:func:`_rare_light`). The LRHS is the mean of s x s HRLS pixels, so s^2 would be the

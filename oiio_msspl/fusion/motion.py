@@ -21,14 +21,14 @@ import numpy as np
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionField, user_fields
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
 from oiio_msspl.fusion.motion_check import FieldCheck, check_field
 from oiio_msspl.fusion.motion_guides import FramePair, has_guide, open_pair, still_and_moved
-from oiio_msspl.fusion.motion_vectors import Mask, channels_to_read, invert, judged_vectors
+from oiio_msspl.fusion.motion_vectors import channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.surface_check import other_surfaces
 from oiio_msspl.parallel import in_parallel

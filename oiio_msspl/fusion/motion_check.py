@@ -15,9 +15,9 @@ from functools import partial
 import numpy as np
 
 from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.fusion.motion_guides import POSITION, FramePair, Guide
-from oiio_msspl.fusion.motion_vectors import Mask, sample_linear
+from oiio_msspl.fusion.motion_vectors import sample_linear
 from oiio_msspl.parallel import in_parallel
 
 #: The best format must fit so many times as well as no motion, and as the runner-up.

@@ -15,10 +15,9 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, box_downsample
+from oiio_msspl.arrays import Array, Mask, box_downsample
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.motion_vectors import Mask
 from oiio_msspl.parallel import in_parallel
 
 #: Reads a window of a frame, (h, w, c).

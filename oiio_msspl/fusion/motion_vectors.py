@@ -15,12 +15,10 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionFormat
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.parallel import for_row_blocks
-
-Mask = NDArray[np.bool_]
 
 #: Shorter vectors are no movement, in pixels.
 NO_MOTION = 1e-3

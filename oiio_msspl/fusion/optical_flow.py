@@ -9,10 +9,10 @@ from importlib.util import find_spec
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.motion_vectors import Mask, nearest_values, sample_linear
+from oiio_msspl.fusion.motion_vectors import nearest_values, sample_linear
 
 #: A vector is believed if the way there and back ends this close to its pixel, in pixels.
 ROUND_TRIP = 0.75

@@ -22,13 +22,13 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, repair, unload
+from oiio_msspl.arrays import Array, Mask, blank, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid, wide_mean
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
-from oiio_msspl.fusion.warp import Mask, Path, Step, grown, nearest_indices, sample_cubic
+from oiio_msspl.fusion.warp import Path, Step, grown, nearest_indices, sample_cubic
 from oiio_msspl.fusion.weighted_sum import Rows, WeightedSum, rows_of
 from oiio_msspl.parallel import for_row_blocks
 

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.exr.render import ReadableRender, Window
-from oiio_msspl.fusion.warp import Mask, nearest_indices
+from oiio_msspl.fusion.warp import nearest_indices
 from oiio_msspl.parallel import for_row_blocks
 
 #: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of what pixels of

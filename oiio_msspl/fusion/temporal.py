@@ -19,12 +19,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, to_grid
-from oiio_msspl.fusion.warp import Mask, Path, Step, grown, near_borders, sample_cubic
+from oiio_msspl.fusion.warp import Path, Step, grown, near_borders, sample_cubic
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.

@@ -11,13 +11,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import NORMAL, RGB
-from oiio_msspl.arrays import Array, enlarged, filled, interpolate, repair
+from oiio_msspl.arrays import Array, Mask, enlarged, filled, interpolate, repair
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.tiling import Tile
 
 Indices = NDArray[np.int64]
-Mask = NDArray[np.bool_]
 T = TypeVar("T", bound=np.generic)
 
 #: Features that may be negative.

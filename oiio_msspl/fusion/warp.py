@@ -10,12 +10,10 @@ from typing import Any, Generic, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array
+from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.parallel import for_row_blocks
-
-Mask = NDArray[np.bool_]
 
 #: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
 #: Vectors of optical flow are estimates, so more is allowed.

@@ -9,14 +9,14 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, kept
+from oiio_msspl.arrays import Array, Mask, kept
 from oiio_msspl.errors import InputError, explain
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import FLOW, MotionFrame
 from oiio_msspl.fusion.render_average import RenderPair, lacking_passes, shared_noise
 from oiio_msspl.fusion.temporal import accumulate
-from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Mask, Placed, Step
+from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Placed, Step
 from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal

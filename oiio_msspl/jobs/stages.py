@@ -14,7 +14,7 @@ from pathlib import Path
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, has_many_pixels, kept
+from oiio_msspl.arrays import Array, Mask, has_many_pixels, kept
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.preview import is_our_preview
@@ -27,7 +27,6 @@ from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
 from oiio_msspl.fusion.pass_plan import pass_features
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, lacking_passes
 from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.fusion.warp import Mask
 from oiio_msspl.jobs.frame import (
     check_frame_memory,
     check_written_layers,

@@ -22,7 +22,6 @@ from oiio_msspl.fusion.guards import (
     FAR,
     LAYER_REACH,
     EmptyRegions,
-    Mask,
     bright_lights,
     check_finite,
     dim_fireflies,

@@ -23,7 +23,7 @@ REFERENCE = "reference"
 #: Sequences by which the method was chosen. It was not changed after a look at the others.
 DEVELOPMENT = (
     "lamp/moving", "lamp/static", "staircase2/moving", "staircase2/static",
-    "room/slide", "room/shadow", "room/mirror", "room/lamp_on", "room/dolly",
+    "room/slide", "room/shadow", "room/mirror", "room/lamp_on", "room/dolly", "room/foliage",
 )  # fmt: skip
 #: Sequences whose camera moves.
 MOVING_CAMERA = ("lamp/moving", "staircase2/moving", "room/mirror", "room/foliage", "room/dolly", "cycles/slide")

@@ -87,7 +87,8 @@ def test_means_leave_out_noisy_references_and_methods_that_were_not_measured_eve
     mean, *of_scenes = quality.with_means(rows)
     assert mean == row("mean", "x", 20.0)  # the two views of "a" count once
     assert of_scenes == [row("a", "x", 15.0), *rows[2:]]
-    assert quality.mean_note(of_scenes) == f"Means are over 2 scenes: a, b. Not over {noisy}, whose reference is noisy."
+    left_out = f"Left out, because the reference is noisy: {noisy}."
+    assert quality.mean_note(of_scenes) == f"Means are over 2 scenes: a, b. {left_out}"
 
 
 def test_quality_measures_only_the_methods_that_are_asked_for(tmp_path, bilinear_models):

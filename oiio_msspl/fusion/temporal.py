@@ -4,8 +4,8 @@
 Two questions decide how much a pixel of a neighbour counts:
 
 - Does it show the same surface? A vector leads to the neighbour, and the neighbour's own vector must lead back. A pixel
-  at the border of two surfaces has the light of both, and their shares differ from frame to frame. So there a neighbour
-  also counts less the more its brightness differs.
+  at the border of two surfaces has the light of both, and their shares differ from frame to frame. So at the borders of
+  either frame a neighbour also counts less the more its brightness differs.
 - Has the light changed? See :mod:`oiio_msspl.fusion.light`.
 
 A pixel that no neighbour may change keeps its bits.

@@ -145,6 +145,14 @@ class Light:
         return trust
 
 
+def relative_difference(own: Array, other: Array, darkest: float) -> Array:
+    """The difference of two luminances, divided by the root of their product. At least ``darkest`` counts for each."""
+    own, other = (np.maximum(each, np.float32(darkest)) for each in (own, other))
+    with np.errstate(over="ignore", under="ignore", divide="ignore"):  # the product could overflow, as the ratio may
+        ratio = np.sqrt(own / other)
+        return np.asarray(ratio - 1 / ratio, np.float32)
+
+
 def wide_mean(plane: Array, radius: int) -> Array:
     """Mean over the pixels up to ``radius`` rows and columns away that exist, in a time that does not depend on it."""
     for axis in (0, 1):

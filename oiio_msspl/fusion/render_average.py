@@ -25,7 +25,16 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, Mask, blank, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.light import Light, for_bands, from_grid, grid_rows, rows_in_bands, to_grid, wide_mean
+from oiio_msspl.fusion.light import (
+    Light,
+    for_bands,
+    from_grid,
+    grid_rows,
+    relative_difference,
+    rows_in_bands,
+    to_grid,
+    wide_mean,
+)
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
 from oiio_msspl.fusion.warp import Path, Step, grown, nearest_indices, sample_cubic
@@ -254,9 +263,9 @@ class _Band:
 
     def _as_bright(self, lrhs: Array) -> Array:
         """How much a neighbour counts by the luminance (h, w) of its LRHS, where it may show another surface, too."""
-        own, other = (np.maximum(each, self._light.darkest) for each in (self._low_luminance, lrhs))
-        difference = (own - other) / np.sqrt(own * other)
-        return np.asarray(1 / (1 + np.square(np.square(difference / OTHER_LIGHT))), np.float32)
+        difference = relative_difference(self._low_luminance, lrhs, self._light.darkest) / OTHER_LIGHT
+        with np.errstate(over="ignore"):
+            return np.asarray(1 / (1 + np.square(np.square(difference))), np.float32)
 
     def finish(self) -> Array:
         """Turn the sums into means. Returns the number of frames of each pixel, as :attr:`AveragedPair.frames`."""

@@ -23,7 +23,7 @@ from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.light import Light, for_bands, from_grid, rows_in_bands, to_grid
+from oiio_msspl.fusion.light import Light, for_bands, from_grid, relative_difference, rows_in_bands, to_grid
 from oiio_msspl.fusion.warp import Path, Step, grown, near_borders, sample_cubic
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
@@ -150,9 +150,9 @@ def _likeness(own: Array, other: Array, darkest: float) -> Array:
         own, other: luminance.
         darkest: differences are relative to at least this luminance.
     """
-    own, other = (np.maximum(each, np.float32(darkest)) for each in (own, other))
-    difference = (own - other) / np.sqrt(own * other)
-    return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
+    difference = relative_difference(own, other, darkest)
+    with np.errstate(over="ignore"):
+        return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:

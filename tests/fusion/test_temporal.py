@@ -211,3 +211,10 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
     whole, parts = result(1024), result(16)
     assert np.allclose(whole.rgb, parts.rgb, rtol=1e-5) and np.allclose(whole.frames, parts.frames, rtol=1e-5)
     assert alpha == (parts.alpha is not None)
+
+
+def test_differences_of_any_brightness_are_relative():
+    own, other = np.float32([1, 4, 0, 3e38, 3e38, 0]), np.float32([1, 1, 0, 1.5e38, 0, 3e38])
+    found = light.relative_difference(own, other, 1e-20)
+    np.testing.assert_allclose(found[:4], [0, 1.5, 0, np.sqrt(0.5)], rtol=1e-5)
+    assert found[4] > 1e18 and found[5] < -1e18

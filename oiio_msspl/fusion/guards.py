@@ -205,7 +205,7 @@ class EmptyRegions:
         """
         if not self._black[window].any():
             return None
-        empty = holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
+        empty = _holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
         empty &= _shows_no_surface(pair.hrls) | enlarge(self._black_far_around[window], pair.scale)
         return empty
 
@@ -225,7 +225,7 @@ def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
     return Window(int(x0), int(y0), int(x1), int(y1)).shift(window.x0, window.y0)
 
 
-def holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
+def _holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
     """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
     return enlarge(reduce(np.logical_and, _neighbours(lrhs)), scale) & hrls
 

@@ -126,7 +126,7 @@ def _uneven(vectors: Array) -> Mask:
     motion = np.ascontiguousarray(vectors).view(np.complex64)[..., 0]
     result = np.zeros(motion.shape, np.bool_)
     for turned, found in ((motion, result), (motion.T, result.T)):
-        with np.errstate(invalid="ignore"):
+        with np.errstate(all="ignore"):  # vectors that are not believed may have any values
             steps = np.diff(turned, axis=0)
             fast = np.abs(steps) > UNEVEN
             found[1:-1] |= fast[1:] & fast[:-1] & ((steps[1:] * steps[:-1].conj()).real > 0)

@@ -461,6 +461,13 @@ def test_what_turns_fast_is_not_followed(turn, followed):
     assert uneven[x**2 + y**2 < 22**2].all() != followed
 
 
+@pytest.mark.filterwarnings("error")
+def test_vectors_of_any_value_are_judged_without_a_warning():
+    values = np.random.default_rng(0).uniform(-3e38, 3e38, (8, 8, 2)).astype(np.float32)
+    values[0, 0], values[3, 3] = np.nan, np.inf
+    motion_vectors._uneven(values)
+
+
 @pytest.mark.parametrize("step", [1, -1])
 def test_vectors_that_are_read_with_the_pixels_are_those_of_the_file(tmp_path, step):
     """Those of the other direction are inverted, from the vectors of both frames."""

@@ -16,7 +16,7 @@ import socket
 import sys
 import tempfile
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from functools import lru_cache
 from hashlib import sha256
@@ -116,7 +116,9 @@ def make_folder(folder: Path) -> None:
 
 
 @contextmanager
-def replacing(path: Path, *, overwrite: bool = False, stale: Path | None = None) -> Iterator[Path]:
+def replacing(
+    path: Path, *, overwrite: bool = False, before_rename: Callable[[], object] | None = None
+) -> Iterator[Path]:
     """Give the ``with`` block a temporary file, and rename it to ``path`` when the block ends.
 
     If the block raises, the temporary file is deleted and ``path`` stays as it was. If ``path`` is a link, the file
@@ -125,7 +127,7 @@ def replacing(path: Path, *, overwrite: bool = False, stale: Path | None = None)
     Args:
         path: the file to write.
         overwrite: replace an existing file.
-        stale: a file that is deleted just before the rename, such as the preview of the file that is replaced.
+        before_rename: called when the temporary file is complete. If it raises, ``path`` stays as it was.
 
     Yields:
         The path of the temporary file, in the same folder.
@@ -142,8 +144,8 @@ def replacing(path: Path, *, overwrite: bool = False, stale: Path | None = None)
         # The pixels must be on the disk before the rename: a crash must not leave half a file under the final name.
         with open(temporary, "rb+") as file:
             os.fsync(file.fileno())
-        if stale is not None:
-            stale.unlink(missing_ok=True)
+        if before_rename is not None:
+            before_rename()
         if overwrite:
             if target.exists():
                 os.chmod(temporary, target.stat().st_mode & 0o7777)

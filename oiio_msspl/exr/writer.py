@@ -43,7 +43,7 @@ def write_fused(
     replaced: ReplacedChannels | None = None,
     overwrite: bool = False,
     cache_bytes: int = 0,
-    stale: Path | None = None,
+    before_rename: Callable[[], object] | None = None,
 ) -> list[str]:
     """Write the fused frame to ``path``, atomically.
 
@@ -60,7 +60,7 @@ def write_fused(
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
             files.
-        stale: a file that is deleted just before the EXR gets its name: the preview of the EXR that it replaces.
+        before_rename: called just before the EXR gets its name, see :func:`oiio_msspl.exr.atomic.replacing`.
 
     Returns:
         Warnings, one sentence each.
@@ -72,7 +72,7 @@ def write_fused(
     pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
     dropped = dropped_channels(source, beauty, options.layers)
     contents = FileContents(source, tuple(beauty), dropped, pixels, attributes, options, replaced)
-    with replacing(path, overwrite=overwrite, stale=stale) as temporary:
+    with replacing(path, overwrite=overwrite, before_rename=before_rename) as temporary:
         if options.layout == "multilayer":
             write_single_part(temporary, contents)
         else:

@@ -79,11 +79,18 @@ class Frame:
     lr: Path | None
     hr: Path | None
     output: Path
+    preview: Path | None = None
+    """The PNG to write beside the EXR, if any."""
+
+    @property
+    def targets(self) -> list[Path]:
+        """The files to write."""
+        return [path for path in (self.output, self.preview) if path is not None]
 
     def absolute(self) -> Frame:
         """The same with absolute paths, for workers with other working directories."""
-        lr, hr = (None if path is None else path.absolute() for path in (self.lr, self.hr))
-        return Frame(self.number, lr, hr, self.output.absolute())
+        lr, hr, preview = (None if path is None else path.absolute() for path in (self.lr, self.hr, self.preview))
+        return Frame(self.number, lr, hr, self.output.absolute(), preview)
 
 
 @dataclass(frozen=True)

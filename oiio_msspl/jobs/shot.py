@@ -96,8 +96,9 @@ def fuse_shot(
     if previews and view_transform is not None:
         check_view(view_transform)
     report_path = None if report_path is None else Path(report_path)
-    pngs = [frame.output.with_suffix(".png") for frame in shot.frames] if previews else []
-    prepare_output(shot, inputs, model, [*pngs, *([report_path] if report_path else [])])
+    if previews:
+        shot = replace(shot, frames=[replace(each, preview=each.output.with_suffix(".png")) for each in shot.frames])
+    prepare_output(shot, inputs, model, [] if report_path is None else [report_path])
     with limit_threads(threads):
         over_time = plan_temporal(shot, inputs, temporal, model, write)
     report = ShotReport(shot, temporal=over_time.text)
@@ -133,7 +134,6 @@ def fuse_shot(
         device=device,
         threads=threads,
         max_memory=max_memory,
-        previews=previews,
         view_transform=view_transform,
         overwrite=overwrite,
         skip_existing=skip_existing or update,

@@ -12,13 +12,14 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.jobs.frame import check_written_layers, require_outputs
+from oiio_msspl.jobs.frame_checks import check_written_layers, require_outputs
+from oiio_msspl.jobs.frame_passes import check_passes
 from oiio_msspl.jobs.inputs import InputOptions, map_pair, resolve_auto
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
-from oiio_msspl.jobs.stages import Stages, is_left_over
-from oiio_msspl.jobs.views import check_passes, find_other_views
+from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import family_of, load_model
 
 log = logging.getLogger(__name__)
@@ -30,7 +31,7 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
     Args:
         shot: the shot.
         inputs, model: what all frames are made from, beside their pairs.
-        more_targets: what is written beside the EXRs.
+        more_targets: what is written beside the frames.
 
     Raises:
         InputError: the folder can't be created or written to, or a result would replace an input.
@@ -74,7 +75,7 @@ def check_no_input(
     pairs = {path for frame in shot.frames for path in (frame.lr, frame.hr) if path is not None}
     # Without its path an HRLS can't have siblings either.
     others = [inputs.files(frame.hr, model) for frame in shot.frames if frame.hr is not None]
-    check_separate(pairs.union(*others), [*(frame.output for frame in shot.frames), *more_targets])
+    check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 
 def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]:
@@ -108,7 +109,7 @@ def check_wanted_outputs(frames: Sequence[Frame], inputs: InputOptions, write: W
         except InputError:  # files that an option names may exist on the workers only
             continue
         check_written_layers(hr, write)
-        check_passes(hr, others, write)
+        check_passes([hr, *others.hrls], write)
         if write.error_layer or write.data_passes:
             require_outputs(load_model(align(lr, hr).scale, model), write)
         return
@@ -135,9 +136,8 @@ def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None
         return result_of(frame, FAILED, "the output exists; pass --skip-existing or --overwrite", 2)
     try:
         check_target(frame.output, overwrite=overwrite)
-        if stages.previews:
-            png = frame.output.with_suffix(".png")
-            check_target(png, overwrite=overwrite or (stages.skip_existing and is_left_over(png)))
+        if frame.preview is not None:
+            check_target(frame.preview, overwrite=stages.replaces_preview(frame.preview))
     except InputError as error:
         return result_of(frame, FAILED, str(error), error.exit_code)
     return None

@@ -1,60 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
 """The three stages of a frame: read the pair, fuse it, write the result.
 
-A shot, and each chunk of frames on a Dask worker, runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`).
+A single frame takes them one after the other (:mod:`oiio_msspl.jobs.frame`). A shot, and each chunk of frames on a Dask
+worker, runs them in a pipeline (:mod:`oiio_msspl.jobs.pipeline`).
 """
 
 from __future__ import annotations
 
 import time
 import traceback
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, Mask, has_many_pixels, kept
+from oiio_msspl.arrays import Array, Mask, kept
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
+from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.preview import is_our_preview
-from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FusedFrame, fuse, result_bytes
+from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.pass_plan import pass_features
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, lacking_passes
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY, TILE_MEMORY
-from oiio_msspl.jobs.frame import (
-    check_frame_memory,
-    check_written_layers,
-    require_outputs,
-    write_frame,
-    write_frame_preview,
-)
+from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
+from oiio_msspl.jobs.frame_memory import FrameMemory, is_large, light_features
+from oiio_msspl.jobs.frame_passes import check_passes, fuse_frame_passes, sets_to_fuse, uses_clean_aovs
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
+from oiio_msspl.jobs.frame_writing import write_frame
 from oiio_msspl.jobs.inputs import InputOptions, files_by_name, files_read, map_pair
 from oiio_msspl.jobs.report import FrameReport, add_other_views, name_of, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
-from oiio_msspl.jobs.views import (
-    OtherViews,
-    View,
-    check_passes,
-    find_other_views,
-    fuse_frame_passes,
-    fuse_other_views,
-    sets_to_fuse,
-    store_view,
-    uses_clean_aovs,
-)
+from oiio_msspl.jobs.views import FusedViews, OtherViews, View, find_other_views, fuse_other_views, store_view
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
-
-#: Bytes of a pixel for each channel of motion vectors that is read: as stored, decoded, and compared with zero.
-READ_VECTOR_BYTES = 12
 
 
 @dataclass(frozen=True)
@@ -96,7 +81,6 @@ class Stages:
     device: str = "cpu"
     threads: int = 0
     max_memory: int = MAX_MEMORY
-    previews: bool = False
     view_transform: str | None = None
     overwrite: bool = False
     skip_existing: bool = False
@@ -105,6 +89,8 @@ class Stages:
     """Which neighbours each frame is fused with."""
     held_by_other_views: int = 0
     """Memory that frames of other views take while they wait. It is 0 if only one view is averaged."""
+    reads_ahead: bool = True
+    """Whether the pixels of a frame are read while another one is fused. If not, there is only one frame at a time."""
     sessions: dict[tuple[int, str | None], Session] = field(default_factory=dict)
     """Models that are loaded, by scale and ``model``."""
 
@@ -115,6 +101,11 @@ class Stages:
     def replaces(self, lr: Path | None, hr: Path | None, output: Path) -> bool:
         """Whether an EXR that exists is replaced: with ``overwrite`` always, with ``update`` if an input is newer."""
         return self.overwrite or (self.update and bool(self.newer_inputs(lr, hr, output)))
+
+    def replaces_preview(self, png: Path | None) -> bool:
+        """Whether a PNG that exists is replaced. If frames that exist are skipped, only a preview of ours is: a killed
+        run may have left it, or it shows an EXR that is replaced."""
+        return self.overwrite or (self.skip_existing and png is not None and is_our_preview(png))
 
     def newer_inputs(self, lr: Path | None, hr: Path | None, output: Path) -> list[Path]:
         """The files that a frame is made from and that were changed after ``output``, which exists."""
@@ -149,11 +140,10 @@ class Stages:
         assert frame.lr is not None and frame.hr is not None
         lr, hr = map_pair(frame.lr, frame.hr, self.inputs)
         others = find_other_views(lr, hr, self.inputs, self.write_options)
-        targets = [frame.output, frame.output.with_suffix(".png")] if self.previews else [frame.output]
-        check_separate(files_read(lr, hr, self.inputs, self.model), targets)
+        check_separate(files_read(lr, hr, self.inputs, self.model), frame.targets)
         align(lr, hr)  # refuses the pair before its pixels are read
         check_written_layers(hr, self.write_options)
-        check_passes(hr, others, self.write_options)
+        check_passes([hr, *others.hrls], self.write_options)
         over_time = [view for view in others.views if view.hr.view in self.temporal.views]
         alone = replace(others, views=tuple(view for view in others.views if view not in over_time))
         found: dict[str | None, LoadedFrame | Exception] = {}
@@ -174,7 +164,8 @@ class Stages:
         if not plans:
             waiting = [0]
         else:
-            waiting = [each._waiting_bytes(view.lr, view.hr) for each, view in zip(stages, views, strict=True)]
+            pairs = [each._with_passes(*view) for each, view in zip(stages, views, strict=True)]
+            waiting = [each._memory(*pair).waiting for each, pair in zip(stages, pairs, strict=True)]
             waiting += [max(waiting)] * (len(plans) - len(others))  # a frame may lack a view of which others wait
         for view, each, own in zip(views, stages, waiting, strict=False):
             yield view, replace(each, held_by_other_views=sum(waiting) - own)
@@ -191,14 +182,14 @@ class Stages:
         """Read the pixels of a view if the frames that are held fit into memory beside a tile."""
         start = time.perf_counter()
         low, high = self._with_passes(lr, hr)
-        if not self._fits(low, high):
+        memory = self._memory(low, high) if self.reads_ahead else None
+        if memory is None or not memory.fits:
             return LoadedFrame(frame, lr, hr, low, high, low, high, time.perf_counter() - start, self)
-        features, channels, motion = self._features(low, high), self._read_ahead(low, high), self.temporal.motion
-        on_disk = self._waits_on_disk(low, high)
-        pixels, stored = high.load_with(channels, features, on_disk=on_disk)
+        motion, channels = self.temporal.motion, memory.vectors_ahead
+        pixels, stored = high.load_with(channels, memory.features, on_disk=memory.on_disk)
         vectors = motion.vectors_of(hr, pixels, stored) if motion and channels else {}
         waiting = {step: (kept(each), kept(known)) for step, (each, known) in vectors.items()}
-        low_pixels = low.load(features, on_disk=on_disk)
+        low_pixels = low.load(memory.features, on_disk=memory.on_disk)
         seconds = time.perf_counter() - start
         return LoadedFrame(frame, lr, hr, low, high, low_pixels, pixels, seconds, self, waiting)
 
@@ -208,44 +199,11 @@ class Stages:
         sets = sets_to_fuse(hr, self.write_options) if self.temporal.renders else []
         return pass_features(lr, hr, sets) if sets else (lr, hr)
 
-    def _fits(self, lr: MappedRender, hr: MappedRender) -> bool:
-        """Whether there is room for the pixels of all frames that are held, beside a tile and two results."""
-        return self._room(lr, hr, self._frames_in_memory(lr, hr)) >= 0
-
-    def _room(self, lr: MappedRender, hr: MappedRender, frames: int) -> int:
-        """Memory that is left beside the pixels of so many frames; negative if they don't fit."""
+    def _memory(self, lr: MappedRender, hr: MappedRender) -> FrameMemory:
+        """The memory of the frames of a view, from a pair of :meth:`_with_passes`."""
+        error = self.write_options.error_layer
         features = self._features(lr, hr)
-        result = result_bytes(align(lr, hr), error=self.write_options.error_layer)
-        other = FIXED_MEMORY + TILE_MEMORY + 2 * result + _pixel_bytes(lr, features)
-        other += self._temporal_bytes(lr, hr) + self.held_by_other_views
-        return self.max_memory - other - frames * sum(_pixel_bytes(render, features) for render in (lr, hr))
-
-    @property
-    def _frames_held(self) -> int:
-        """Frames whose pixels are held: the one that is fused, its neighbours, and the next one to come."""
-        return 2 * self.temporal.renders + 2
-
-    def _frames_in_memory(self, lr: MappedRender, hr: MappedRender) -> int:
-        return 0 if self._waits_on_disk(lr, hr) else self._frames_held
-
-    def _waits_on_disk(self, lr: MappedRender, hr: MappedRender) -> bool:
-        """Whether renders that wait for their neighbours lie in temporary files: those of large frames that do not fit
-        into memory with their motion vectors, and all if other views are averaged, too."""
-        if not self.temporal.renders:
-            return False
-        if self.held_by_other_views:
-            return True
-        return _is_large(hr) and self._room(lr, hr, self._frames_held) < _vector_bytes(hr, self._motion_channels(hr))
-
-    def _motion_channels(self, hr: MappedRender) -> list[Channel]:
-        """The channels of the motion vectors; none if the motion is known otherwise."""
-        motion = self.temporal.motion
-        return motion.channels(hr) if motion else []
-
-    def _read_ahead(self, lr: MappedRender, hr: MappedRender) -> list[Channel]:
-        """The motion vectors that are read with the pixels, if they fit beside these. Otherwise they are read later."""
-        channels = self._motion_channels(hr)
-        return channels if _vector_bytes(hr, channels) <= self._room(lr, hr, self._frames_in_memory(lr, hr)) else []
+        return FrameMemory(lr, hr, features, self.temporal, error, self.max_memory, self.held_by_other_views)
 
     def session(self, loaded: LoadedFrame) -> Session:
         """The model for this pair's scale. Each model is loaded once.
@@ -267,17 +225,24 @@ class Stages:
     def _features(self, lr: MappedRender, hr: MappedRender) -> list[str]:
         """The features of a pair that are read: a file may have many more, and to decode and keep these takes long."""
         try:
-            return [*_features_read(self._session(lr, hr)), *_light_features(hr)]
+            return [*_features_read(self._session(lr, hr)), *light_features(hr)]
         except InputError:  # which `session` raises, too, when the frame's turn has come
-            return [*HRLS_FEATURES, "alpha", *_light_features(hr)]
+            return [*HRLS_FEATURES, "alpha", *light_features(hr)]
 
-    def fuse(self, loaded: LoadedFrame, session: Session, neighbours: Neighbours) -> FusedAlone:
+    def fuse(
+        self,
+        loaded: LoadedFrame,
+        session: Session,
+        neighbours: Neighbours,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> FusedAlone:
         """Fuse the beauty of a pair.
 
         Args:
             loaded: the pair.
             session: a model for its scale.
             neighbours: frames before and after it, whose renders are averaged with its own before.
+            progress: called with (tiles done, tiles in all).
 
         Raises:
             InputError: the pair does not fit into memory, or pixels can't be decoded.
@@ -288,13 +253,13 @@ class Stages:
         check_frame_memory(loaded.lr, loaded.hr, session, self.write_options, self.max_memory, held)
         pair, frames, averaged = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None, None
         if any(neighbours):
-            passes = _light_features(loaded.averaged_hr)
+            passes = light_features(loaded.averaged_hr)
             if any(lacking_passes(pair, step.frame) for steps in neighbours for step in steps):
                 passes = []
             means = average_renders(pair, *neighbours, [*_features_read(session), *passes])
             pair, frames = RenderPair(means.lr, means.hr), means.frames
             if passes:
-                on_disk = _is_large(loaded.hr)
+                on_disk = is_large(loaded.hr)
                 averaged = _kept(means.lr, on_disk=on_disk), _kept(means.hr, on_disk=on_disk)
         fused = fuse(
             pair.lr,
@@ -302,16 +267,39 @@ class Stages:
             session,
             error=self.write_options.error_layer,
             clean_aovs=uses_clean_aovs(loaded.hr, self.write_options),
+            # Fused frames that are averaged are float.
+            half=stored_type(loaded.hr.beauty_channels, self.write_options) == "half" and not self.temporal.count,
             max_memory=self.max_memory,
             held=held,
+            progress=progress,
         )
         fused.frames = frames
         # The pixels in memory are not needed any more. A neighbour may need the frame for a while.
         alone = replace(loaded, lr_pixels=loaded.averaged_lr, hr_pixels=loaded.averaged_hr)
         return FusedAlone(alone, session, fused, time.perf_counter() - start, averaged)
 
+    def fuse_others(
+        self, loaded: LoadedFrame, session: Session, held: int = 0, progress: Callable[[int, int], None] | None = None
+    ) -> FusedViews:
+        """Fuse the views beside the first one that are fused by themselves.
+
+        Args:
+            loaded, session, progress: see :meth:`fuse`.
+            held: memory of other frames.
+
+        Raises:
+            InputError, MssplError: see :meth:`fuse`.
+        """
+        options = self.write_options
+        return fuse_other_views(loaded.others, session, options, self.max_memory, held=held, progress=progress)
+
     def complete(
-        self, alone: FusedAlone, fused: FusedFrame, views: Iterable[tuple[FusedAlone, FusedFrame]] = ()
+        self,
+        alone: FusedAlone,
+        fused: FusedFrame,
+        views: Iterable[tuple[FusedAlone, FusedFrame]] = (),
+        others: FusedViews | None = None,
+        progress: Callable[[int, int], None] | None = None,
     ) -> FrameReport:
         """Fuse what depends on the final beauty: the passes, and other views.
 
@@ -319,6 +307,8 @@ class Stages:
             alone: the frame.
             fused: its final beauty; gets the passes.
             views: the same for each view beside the first one that is averaged with its neighbours.
+            others: what :meth:`fuse_others` returned, if it was called before.
+            progress: called with (steps done, steps in all) of each set of passes.
 
         Returns:
             The report, complete but for the time and the warnings of writing.
@@ -327,17 +317,16 @@ class Stages:
             InputError, MssplError: see :meth:`fuse`.
         """
         start, busy = time.perf_counter(), alone.seconds
-        loaded, session, held = alone.loaded, alone.session, self._held_bytes(alone.loaded)
-        fused.replaced, reports = fuse_other_views(
-            loaded.others, session, self.write_options, self.max_memory, held=held
-        )
+        loaded, session = alone.loaded, alone.session
+        if others is None:
+            others = self.fuse_others(loaded, session, self._held_bytes(loaded) + fused.nbytes)
+        fused.replaced, reports = others
         for report, seconds in self._complete_views(fused, views):
             reports.append(report)
             busy += seconds
         reports.sort(key=lambda each: loaded.hr.other_views.index(each.hr.view))
-        self._fuse_passes(alone, fused)
-        preview_path = loaded.frame.output.with_suffix(".png") if self.previews else None
-        report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, preview_path)
+        self._fuse_passes(alone, fused, progress)
+        report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, loaded.frame.preview)
         add_other_views(report, reports, [*loaded.others.passed_on, *self._not_planned(loaded.others)])
         busy += time.perf_counter() - start
         report.seconds = {"read": loaded.seconds, "fuse": busy, "network": report.network_seconds}
@@ -363,78 +352,43 @@ class Stages:
             fused.replaced = final.replaced
             yield store_view(View(alone.loaded.lr, alone.loaded.hr), final, alone.session), alone.seconds
 
-    def _fuse_passes(self, alone: FusedAlone, fused: FusedFrame) -> None:
+    def _fuse_passes(
+        self, alone: FusedAlone, fused: FusedFrame, progress: Callable[[int, int], None] | None = None
+    ) -> None:
         """Fuse the passes of a view, given its final beauty."""
         loaded, session = alone.loaded, alone.session
         room = self.max_memory - self._held_bytes(loaded)
-        fuse_frame_passes(loaded.lr, loaded.hr, fused, session, self.write_options, room, averaged=alone.averaged)
+        fuse_frame_passes(
+            loaded.lr, loaded.hr, fused, session, self.write_options, room, progress, averaged=alone.averaged
+        )
 
     def _held_bytes(self, loaded: LoadedFrame) -> int:
-        """Memory of other frames: pixels of the next one, the result of the previous one, and neighbours."""
-        lr, hr = loaded.averaged_lr, loaded.averaged_hr
-        held = result_bytes(align(lr, hr), error=self.write_options.error_layer)
-        features = self._features(lr, hr)
-        if self._fits(lr, hr):
-            held += self._frames_in_memory(lr, hr) * sum(_pixel_bytes(render, features) for render in (lr, hr))
-            held += _vector_bytes(hr, self._read_ahead(lr, hr))
-        return held + self._temporal_bytes(lr, hr) + self.held_by_other_views
-
-    def _temporal_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Memory of averaging, and of averaged renders that wait for their passes to be fused."""
-        channels = _channels(hr, self._features(lr, hr))
-        averaging = self.temporal.memory(hr.data_window, channels, align(lr, hr).scale)
-        return averaging + self._averaged_bytes(lr, hr)
-
-    def _averaged_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Memory of averaged renders that wait for their passes to be fused."""
-        if not _light_features(hr) or _is_large(hr):  # large ones wait in temporary files
-            return 0
-        waiting = self.temporal.results + 2
-        return waiting * sum(_pixel_bytes(each, [RGB, ALBEDO, NORMAL, *_light_features(each)]) for each in (lr, hr))
-
-    def _waiting_bytes(self, lr: MappedRender, hr: MappedRender) -> int:
-        """Most memory that the frames of a view take while another view is fused."""
-        low, high = self._with_passes(lr, hr)
-        features = self._features(low, high)
-        waiting = self.temporal.waiting(hr.data_window, _channels(high, features), align(lr, hr).scale)
-        waiting += self._averaged_bytes(low, high)
-        if self.temporal.renders:  # they wait in temporary files
-            return waiting
-        return waiting + self._frames_held * sum(_pixel_bytes(render, features) for render in (low, high))
+        """Memory of other frames while one is fused."""
+        return self._memory(loaded.averaged_lr, loaded.averaged_hr).held if self.reads_ahead else 0
 
     def write(self, report: FrameReport, fused: FusedFrame) -> None:
-        """Write preview and EXR.
-
-        A new EXR gets its name after its preview, so an EXR that exists is a frame that is complete.
+        """Write preview and EXR, see :func:`oiio_msspl.jobs.frame_writing.write_frame`.
 
         Raises:
             InputError: another process has put a file there in the meantime.
             MssplError: the file system refused. An old frame is as it was; of a new one nothing is left.
         """
         start = time.perf_counter()
-        if report.output.exists() and self.replaces(report.lr.file.path, report.hr.file.path, report.output):
-            # The EXR goes first: if it can't be replaced, the old frame keeps its preview.
-            write_frame(report, fused, self.write_options, overwrite=True)
-            write_frame_preview(report, fused, self.view_transform, overwrite=True)
-        else:
-            self._write_new(report, fused)
+        overwrite = self.overwrite or (
+            report.output.exists() and self.replaces(report.lr.file.path, report.hr.file.path, report.output)
+        )
+        # Half of what is left: compression and the preview need memory, too. In a shot, the next frame needs all.
+        cache_bytes = 0 if self.reads_ahead else max(0, self.max_memory - FIXED_MEMORY - fused.nbytes) // 2
+        write_frame(
+            report,
+            fused,
+            self.write_options,
+            self.view_transform,
+            overwrite=overwrite,
+            overwrite_preview=self.replaces_preview(report.preview),
+            cache_bytes=cache_bytes,
+        )
         report.seconds["write"] = time.perf_counter() - start
-
-    def _write_new(self, report: FrameReport, fused: FusedFrame) -> None:
-        replaces = self.skip_existing and report.preview is not None and is_left_over(report.preview)
-        write_frame_preview(report, fused, self.view_transform, overwrite=self.overwrite or replaces)
-        try:
-            write_frame(report, fused, self.write_options, overwrite=self.overwrite)
-        except BaseException:
-            # If another run has put the frame there in the meantime, the preview belongs to that frame.
-            if report.preview is not None and not report.output.exists():
-                report.preview.unlink(missing_ok=True)
-            raise
-
-
-def is_left_over(png: Path) -> bool:
-    """Whether a PNG whose EXR does not exist is a preview that a killed run left, and not somebody's picture."""
-    return png.is_file() and is_our_preview(png)
 
 
 def _features_read(session: Session) -> list[str]:
@@ -442,33 +396,7 @@ def _features_read(session: Session) -> list[str]:
     return list(dict.fromkeys([*session.contract.hrls, *session.contract.lrhs, ALBEDO, NORMAL, "alpha"]))
 
 
-def _light_features(render: MappedRender) -> list[str]:
-    """Features of a render that are the light of passes."""
-    return [name for name in render.features if is_light_of_pass(name)]
-
-
-def _is_large(hr: MappedRender) -> bool:
-    """Whether a frame has so many pixels that what waits of it may lie in temporary files."""
-    return has_many_pixels(hr.data_window.height, hr.data_window.width)
-
-
 def _kept(render: Render, *, on_disk: bool) -> Render:
     """What passes are fused from of a render that waits for its neighbours."""
     needed = [name for name in render.layers if name in (RGB, ALBEDO, NORMAL) or is_light_of_pass(name)]
     return replace(render, layers={name: kept(render.layers[name], on_disk=on_disk) for name in needed})
-
-
-def _channels(render: MappedRender, features: Sequence[str]) -> int:
-    """Channels of the features that a render has of these. Light of passes has three."""
-    counts = [HRLS_FEATURES.get(name, 3) for name in render.features if name in features]
-    return sum(counts) + (render.alpha is not None)
-
-
-def _vector_bytes(render: MappedRender, channels: Sequence[Channel]) -> int:
-    """Memory of motion vectors while they are read."""
-    return READ_VECTOR_BYTES * len(channels) * render.data_window.width * render.data_window.height
-
-
-def _pixel_bytes(render: MappedRender, features: Sequence[str]) -> int:
-    """Bytes of a render's features in memory, those that it has of these."""
-    return render.data_window.width * render.data_window.height * _channels(render, features) * 4

@@ -1,42 +1,40 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The views and view layers of a pair, and their passes.
+"""The views and view layers of a pair.
 
-The first view goes the way of a file that has only one. The others are fused before it, one after the other, into a
-temporary file, so memory holds one view at a time. In a shot, each view whose motion is known is averaged with its own
-neighbours instead (:mod:`oiio_msspl.jobs.view_windows`), and memory holds frames of all these views.
+The first view goes the way of a file that has only one. The others are fused one after the other into a temporary file.
+A single frame does that before its first view, so memory holds one view at a time. In a shot, each view whose motion is
+known is averaged with its own neighbours instead (:mod:`oiio_msspl.jobs.view_windows`), and memory holds frames of all
+these views.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
-from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.contents import dropped_channels, stored_type, widest_type
-from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.contents import dropped_channels, widest_type
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.fuse import FusedFrame, fuse, layer_fuser, memory_to_fuse, tile_count
-from oiio_msspl.fusion.passes import fuse_passes, pass_steps
-from oiio_msspl.fusion.tiling import require_memory, strips_memory
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
+from oiio_msspl.fusion.tiling import require_memory
+from oiio_msspl.jobs.frame_passes import fuse_frame_passes, sets_to_fuse
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import limit_threads
 
 #: Rows of a fused view that are stored at a time.
 ROWS_PER_PUT = 256
 
 
-@dataclass(frozen=True)
-class View:
+class View(NamedTuple):
     """A pair, mapped for one view or view layer."""
 
     lr: MappedRender
@@ -51,6 +49,15 @@ class OtherViews:
     """Those that are fused."""
     passed_on: tuple[str, ...] = ()
     """Why others are not, one sentence each."""
+
+    @property
+    def hrls(self) -> list[MappedRender]:
+        """The HRLS, mapped for each of ``views``."""
+        return [view.hr for view in self.views]
+
+
+#: Views beside the first one that are fused: their channels, None if there are none; and a report on each.
+FusedViews = tuple[ReplacedChannels | None, list[FrameReport]]
 
 
 def find_other_views(
@@ -108,7 +115,7 @@ def fuse_other_views(
     *,
     held: int = 0,
     progress: Callable[[int, int], None] | None = None,
-) -> tuple[ReplacedChannels | None, list[FrameReport]]:
+) -> FusedViews:
     """Fuse the views beside the first one.
 
     Args:
@@ -117,7 +124,8 @@ def fuse_other_views(
         write: which passes are fused.
         max_memory: bytes that the process should stay below.
         held: bytes of these that other frames need.
-        progress: called with (steps done, steps in all) of each part of the work, see :class:`Progress`.
+        progress: called with (steps done, steps in all) of each part of the work, see
+            :class:`oiio_msspl.jobs.frame_passes.Progress`.
 
     Returns:
         The fused channels, None without other views; and a report on each view.
@@ -162,118 +170,3 @@ def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> N
     clipped = int(np.count_nonzero(fused.rgb > HALF_MAX)) if widest_type(channels) == "half" else 0
     if clipped:
         fused.warnings.append(f"{clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}")
-
-
-def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
-    """The additive sets of a view that are asked for and of which a layer is written."""
-    return [each for each in _written_sets(hr, write) if not write.passes or any(each.matches(p) for p in write.passes)]
-
-
-def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
-    """Whether albedo and normal without noise are of use: as layers, or to fuse passes."""
-    return write.data_passes or bool(sets_to_fuse(hr, write))
-
-
-def check_passes(hr: MappedRender, others: OtherViews, write: WriteOptions) -> None:
-    """Raise InputError if the user asks for additive sets by a name that no view has, names a sum that is not to be
-    fused, or asks for data passes that the first view lacks."""
-    if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
-        raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
-    if write.passes == ("none",) and any(each.by_user for each in hr.additive_sets):
-        raise InputError("--sum and --passes none exclude each other: fuse the layers of the sum, or leave it out")
-    views = [hr, *(view.hr for view in others.views)]
-    if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
-        if any(each.matches(p) for view in views for each in view.additive_sets for p in write.passes):
-            raise InputError(
-                f"--passes {', '.join(write.passes)}: --layers {', '.join(write.layers)} leaves these layers out; "
-                "name them there, too"
-            )
-        names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))
-        known = ", ".join(names) or "none"
-        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
-
-
-def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
-    if write.passes == ("none",):
-        return []
-    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
-    return [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
-
-
-def fuse_frame_passes(
-    lr: MappedRender,
-    hr: MappedRender,
-    fused: FusedFrame,
-    session: Session,
-    write: WriteOptions,
-    max_memory: int,
-    progress: Callable[[int, int], None] | None = None,
-    averaged: tuple[Render, Render] | None = None,
-) -> None:
-    """Fuse the additive sets of :func:`sets_to_fuse` and add them to ``fused``.
-
-    Args:
-        lr, hr: the pair, as files.
-        fused: its fused beauty.
-        session: the model of the beauty. Its memory is used for the passes.
-        write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
-        max_memory: bytes that the process should stay below.
-        progress: called with (steps done, steps in all) of this part of the work.
-        averaged: see :func:`oiio_msspl.fusion.passes.fuse_passes`.
-
-    Raises:
-        InputError: pixels can't be decoded.
-    """
-    sets = sets_to_fuse(hr, write)
-    if sets:
-        session.release_memory()
-        beauty = fused.rgb
-        if stored_type(hr.beauty_channels, write) == "half" and beauty.dtype != np.float16:
-            # The passes sum to the beauty that is written.
-            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
-        with limit_threads(session.threads):
-            fused.passes = fuse_passes(
-                lr,
-                hr,
-                beauty,
-                fused.alignment,
-                sets,
-                cache_bytes=strips_memory(max_memory, fused.nbytes),
-                pixels=fused.replaced,
-                guides=fused.clean_aovs,
-                fuse_layers=layer_fuser(session, fused),
-                averaged=averaged,
-                progress=progress,
-            )
-        fused.replaced = fused.passes.pixels
-        if session.layer_session is not None:
-            session.layer_session.release_memory()
-
-
-class Progress:
-    """Joins the progress of all parts of a frame's work: tiles and passes of each view.
-
-    Args:
-        tell: called with (steps done, steps in all).
-        steps: in all.
-    """
-
-    def __init__(self, tell: Callable[[int, int], None], steps: int) -> None:
-        self._tell, self._steps, self._before = tell, steps, 0
-
-    def __call__(self, done: int, count: int) -> None:
-        """A part has done so many of its steps. It ends with all of them."""
-        self._tell(self._before + done, self._steps)
-        if done == count:
-            self._before += count
-
-
-def steps_of(views: Sequence[View], session: Session, write: WriteOptions) -> int:
-    """The steps in which views are fused: a tile is one, and so is each set of passes in each band of rows."""
-    steps = 0
-    for view in views:
-        alignment = align(view.lr, view.hr)
-        by_network = session.layers is not None
-        steps += tile_count(alignment, session)
-        steps += pass_steps(alignment, sets_to_fuse(view.hr, write), by_network=by_network)
-    return steps

@@ -12,7 +12,7 @@ import pytest
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
 from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.jobs import frame
+from oiio_msspl.jobs import frame_writing, stages
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.shot_checks import check_wanted_outputs
@@ -48,7 +48,7 @@ def test_the_result_is_written_over_the_hrls_s_data_window(pair, tmp_path, bilin
     ],
 )
 def test_what_is_wrong_is_said_before_the_work(pair, tmp_path, monkeypatch, output, more, message):
-    monkeypatch.setattr(frame, "Session", pytest.fail)
+    monkeypatch.setattr(stages, "load_model", pytest.fail)
     with pytest.raises(InputError, match=message):
         fuse_files(*pair, tmp_path / output, **more)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr"]
@@ -77,7 +77,7 @@ def test_a_frame_without_its_preview_is_a_warning(pair, tmp_path, bilinear_model
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
 
-    monkeypatch.setattr(frame, "write_preview", full_disk)
+    monkeypatch.setattr(frame_writing, "write_preview", full_disk)
     out = tmp_path / "out.exr"
     report = fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=tmp_path / "out.png")
     assert out.is_file()
@@ -129,7 +129,7 @@ def luxcore_pair(folder):
 @pytest.mark.parametrize("kind", ["output", "preview"])
 def test_no_file_that_is_read_is_written_even_with_overwrite(tmp_path, monkeypatch, target, kind):
     """A file of --map, the mapping's file, the model, and the sibling files of a LuxCore beauty, by name or by link."""
-    monkeypatch.setattr(frame, "Session", pytest.fail)
+    monkeypatch.setattr(stages, "load_model", pytest.fail)
     pair = luxcore_pair(tmp_path)
     write_exr(tmp_path / "other.exr", rgb(picture(HEIGHT, WIDTH)))
     for name in ("map.toml", "model.onnx"):
@@ -168,10 +168,10 @@ def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bili
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
 
-    for preview, writes in ((None, frame.write_preview), (png, full_disk)):
+    for preview, writes in ((None, frame_writing.write_preview), (png, full_disk)):
         out.write_text("old")
         write_png(png, np.zeros((2, 2, 3)), overwrite=True)
-        monkeypatch.setattr(frame, "write_preview", writes)
+        monkeypatch.setattr(frame_writing, "write_preview", writes)
         fuse_files(*pair, out, model=model, preview_path=preview, overwrite=True)
         assert not png.exists()
     png.write_text("somebody's picture")

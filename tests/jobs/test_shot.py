@@ -17,8 +17,7 @@ from oiio_msspl import InputError, InputOptions, MssplError, fuse_files, fuse_sh
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
-from oiio_msspl.jobs import shot, stages
-from oiio_msspl.jobs.frame import write_frame
+from oiio_msspl.jobs import frame_memory, frame_writing, shot, stages
 from oiio_msspl.jobs.shot_report import fused_result, read_earlier
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
@@ -56,7 +55,7 @@ def test_frames_without_room_in_memory_are_read_as_they_are_fused(tmp_path, bili
     folder = make_shot(tmp_path, 2)
     assert run(folder, bilinear_models[4]).exit_code == 0
     whole = contents(folder / "out")
-    monkeypatch.setattr(stages, "_pixel_bytes", lambda render, features: 1 << 40)
+    monkeypatch.setattr(frame_memory, "_pixel_bytes", lambda render, features: 1 << 40)
     monkeypatch.setattr("oiio_msspl.aovs.mapped_render.MappedRender.load", pytest.fail)
     assert run(folder, bilinear_models[4], overwrite=True).exit_code == 0
     assert contents(folder / "out") == whole
@@ -327,23 +326,23 @@ def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeyp
     """An old frame that can't be replaced, and one that another run puts there meanwhile."""
     folder = make_shot(tmp_path, 1)
     assert run(folder, bilinear_models[4], previews=True).exit_code == 0
-    before, real = contents(folder / "out"), write_frame
+    before, real = contents(folder / "out"), frame_writing.write_fused
 
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
 
-    def too_late(report, *arguments, **more):
-        report.output.write_text("theirs")
-        real(report, *arguments, **more)
+    def too_late(path, *arguments, **more):
+        path.write_text("theirs")
+        return real(path, *arguments, **more)
 
     write_exr(folder / "lr/lr.1001.exr", {c: values / 2 for c, values in low_layers(1).items()})
-    monkeypatch.setattr(stages, "write_frame", full_disk)
+    monkeypatch.setattr(frame_writing, "write_fused", full_disk)
     assert run(folder, bilinear_models[4], previews=True, overwrite=True).results[1001].message == "disk full"
     assert contents(folder / "out") == before
     (folder / "out/beauty.1001.exr").unlink()
     assert run(folder, bilinear_models[4], previews=True, skip_existing=True).results[1001].message == "disk full"
     assert contents(folder / "out") == {}
-    monkeypatch.setattr(stages, "write_frame", too_late)
+    monkeypatch.setattr(frame_writing, "write_fused", too_late)
     assert "appeared while" in run(folder, bilinear_models[4], previews=True).results[1001].message
     assert (folder / "out/beauty.1001.png").exists()
 

@@ -17,7 +17,8 @@ from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion import FLOW, VECTORS
-from oiio_msspl.jobs import frame_window, stages
+from oiio_msspl.jobs import frame_memory, frame_window, stages
+from oiio_msspl.jobs.frame_memory import FrameMemory
 from oiio_msspl.jobs.frame_window import FrameWindow
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, shares
@@ -184,7 +185,7 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     folder = make_moving_shot(tmp_path, count=4)
     damaged = folder / "hr/hr.1003.exr"
     damaged.write_bytes(damaged.read_bytes()[:-2000])
-    monkeypatch.setattr(stages.Stages, "_fits", lambda self, lr, hr: in_memory)
+    monkeypatch.setattr(FrameMemory, "fits", in_memory)
     report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     assert [report.results[n].status for n in range(1001, 1005)] == ["fused", "fused", "failed", "fused"]
     assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)
@@ -200,9 +201,9 @@ def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bili
     monkeypatch.setattr(stages.Stages, "_load", lambda *arguments: loaded.append(real(*arguments)) or loaded[-1])
     monkeypatch.setattr("oiio_msspl.arrays.MOST_PIXELS", 10)
     if place == "disk":
-        monkeypatch.setattr(stages, "_vector_bytes", lambda render, channels: 1 << 32)
+        monkeypatch.setattr(frame_memory, "_vector_bytes", lambda render, channels: 1 << 32)
     else:
-        monkeypatch.setattr(stages, "_pixel_bytes", lambda render, features: 1 << 40)
+        monkeypatch.setattr(frame_memory, "_pixel_bytes", lambda render, features: 1 << 40)
     fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]), overwrite=True)
     assert contents(folder / "out") == in_memory
     pixels = [each.hr_pixels for each in loaded]

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputOptions, WriteOptions, fuse_shot
-from oiio_msspl.jobs import stages
+from oiio_msspl.jobs import frame_memory, stages
+from oiio_msspl.jobs.frame_memory import FrameMemory
 from oiio_msspl.jobs.temporal import TemporalOptions
 from tests.conftest import downsample, noisy, read_bits, rgb, same_bits, write_exr
 from tests.moving_plane import positions, texture, truck, vectors
@@ -140,7 +141,7 @@ def test_chunks_of_several_views_are_one_run_bit_for_bit(shot, whole, bilinear_m
 
 
 def test_large_renders_of_several_views_wait_in_files(shot, whole, bilinear_models, monkeypatch):
-    monkeypatch.setattr(stages, "has_many_pixels", lambda height, width: True)
+    monkeypatch.setattr(frame_memory, "has_many_pixels", lambda height, width: True)
     run(shot, bilinear_models[4], "on disk")
     once, again = (pixels_of(shot, name, 3) for name in ("whole", "on disk"))
     assert all(same_bits(once[name], again[name]) for name in once)
@@ -228,7 +229,7 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
     cut_part(path, view)
     results = []
     for name, fits in (("in memory", True), ("in files", False)):
-        monkeypatch.setattr(stages.Stages, "_fits", lambda *_, fits=fits: fits)
+        monkeypatch.setattr(FrameMemory, "fits", fits)
         out = shot / name
         out.mkdir()
         options = TemporalOptions("auto")
@@ -249,7 +250,7 @@ def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeyp
         loaded = real(self, *arguments)
         if loaded.hr.view == "bg":
             held.append(weakref.ref(loaded.hr_pixels.layers["rgb"]))
-            most.append((sum(pixels() is not None for pixels in held), self._frames_held))
+            most.append((sum(pixels() is not None for pixels in held), 2 * self.temporal.renders + 2))
         return loaded
 
     monkeypatch.setattr(stages.Stages, "_load", load)

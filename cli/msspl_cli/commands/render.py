@@ -325,7 +325,7 @@ def _make_fuser(
     """
     from msspl_cli.rendered_shot import RenderedShot
     from oiio_msspl.exr.reader import use_threads
-    from oiio_msspl.jobs.frame import require_outputs
+    from oiio_msspl.jobs.frame_checks import require_outputs
     from oiio_msspl.jobs.sequence import Frame
     from oiio_msspl.jobs.stages import Stages
     from oiio_msspl.model.catalogue import family_of, load_model

@@ -1,0 +1,146 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The passes of a frame: which sets of layers are fused, and their turn in the work on the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.arrays import HALF_MAX
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.contents import dropped_channels, stored_type
+from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.fuse import FusedFrame, layer_fuser, tile_count
+from oiio_msspl.fusion.passes import fuse_passes, pass_steps
+from oiio_msspl.fusion.tiling import strips_memory
+from oiio_msspl.model.session import Session
+from oiio_msspl.parallel import limit_threads
+
+
+def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
+    """The additive sets of a view that are asked for and of which a layer is written."""
+    return [each for each in _written_sets(hr, write) if not write.passes or any(each.matches(p) for p in write.passes)]
+
+
+def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
+    """Whether albedo and normal without noise are of use: as layers, or to fuse passes."""
+    return write.data_passes or bool(sets_to_fuse(hr, write))
+
+
+def check_passes(views: Sequence[MappedRender], write: WriteOptions) -> None:
+    """Check what is asked for by the headers.
+
+    Args:
+        views: the HRLS, mapped for each of its views; the first one in front.
+        write: what is asked for.
+
+    Raises:
+        InputError: no view has additive sets of this name, a sum of the user's is not to be fused, or the first view
+            lacks the data passes.
+    """
+    hr = views[0]
+    if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
+        raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
+    if write.passes == ("none",) and any(each.by_user for each in hr.additive_sets):
+        raise InputError("--sum and --passes none exclude each other: fuse the layers of the sum, or leave it out")
+    if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
+        if any(each.matches(p) for view in views for each in view.additive_sets for p in write.passes):
+            raise InputError(
+                f"--passes {', '.join(write.passes)}: --layers {', '.join(write.layers)} leaves these layers out; "
+                "name them there, too"
+            )
+        names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))
+        known = ", ".join(names) or "none"
+        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
+
+
+def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
+    if write.passes == ("none",):
+        return []
+    dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
+    return [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
+
+
+def fuse_frame_passes(
+    lr: MappedRender,
+    hr: MappedRender,
+    fused: FusedFrame,
+    session: Session,
+    write: WriteOptions,
+    max_memory: int,
+    progress: Callable[[int, int], None] | None = None,
+    averaged: tuple[Render, Render] | None = None,
+) -> None:
+    """Fuse the additive sets of :func:`sets_to_fuse` and add them to ``fused``.
+
+    Args:
+        lr, hr: the pair, as files.
+        fused: its fused beauty.
+        session: the model of the beauty. Its memory is used for the passes.
+        write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
+        max_memory: bytes that the process should stay below.
+        progress: called with (steps done, steps in all) of this part of the work.
+        averaged: see :func:`oiio_msspl.fusion.passes.fuse_passes`.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    sets = sets_to_fuse(hr, write)
+    if sets:
+        session.release_memory()
+        beauty = fused.rgb
+        if stored_type(hr.beauty_channels, write) == "half" and beauty.dtype != np.float16:
+            # The passes sum to the beauty that is written.
+            beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
+        with limit_threads(session.threads):
+            fused.passes = fuse_passes(
+                lr,
+                hr,
+                beauty,
+                fused.alignment,
+                sets,
+                cache_bytes=strips_memory(max_memory, fused.nbytes),
+                pixels=fused.replaced,
+                guides=fused.clean_aovs,
+                fuse_layers=layer_fuser(session, fused),
+                averaged=averaged,
+                progress=progress,
+            )
+        fused.replaced = fused.passes.pixels
+        if session.layer_session is not None:
+            session.layer_session.release_memory()
+
+
+class Progress:
+    """Joins the progress of all parts of a frame's work: tiles and passes of each view.
+
+    Args:
+        tell: called with (steps done, steps in all).
+        steps: in all.
+    """
+
+    def __init__(self, tell: Callable[[int, int], None], steps: int) -> None:
+        self._tell, self._steps, self._before = tell, steps, 0
+
+    def __call__(self, done: int, count: int) -> None:
+        """A part has done so many of its steps. It ends with all of them."""
+        self._tell(self._before + done, self._steps)
+        if done == count:
+            self._before += count
+
+
+def steps_of(views: Sequence[tuple[MappedRender, MappedRender]], session: Session, write: WriteOptions) -> int:
+    """The steps in which the pairs of some views are fused: a tile is one, and so is each set of passes in each band of
+    rows."""
+    steps = 0
+    for lr, hr in views:
+        alignment = align(lr, hr)
+        steps += tile_count(alignment, session)
+        steps += pass_steps(alignment, sets_to_fuse(hr, write), by_network=session.layers is not None)
+    return steps

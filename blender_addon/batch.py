@@ -55,24 +55,26 @@ def run_job(job, send, receive):
             scene.frame_set(number)
         if index == 0:
             check_scene(scene, options)
-            send(size=hrls_size(scene), layers=_color_passes(scene, options))
+            send(size=hrls_size(scene), **_passes(scene, options))
         if output is not None:
             send(report=_run_frame(scene, options, job, Path(output), send, receive))
         elif options.vectors:
             _run_frame(scene, options, job, None, send, receive)
 
 
-def _color_passes(scene, options):
-    """The names of the passes with colours that both renders will have; None if Cycles does not tell."""
+def _passes(scene, options):
+    """The passes that both renders will have, as msspl-render gets them, see :mod:`.headless`."""
     try:
         from cycles.engine import list_render_passes
 
         with override(scene, render_settings.hrls(scene, options)):
             passes = list(list_render_passes(scene, find_view_layer(scene, options)))
-        return [name for name, _, kind in passes if kind == "COLOR"]
+            value_bytes = 2 if scene.render.image_settings.color_depth == "16" else 4
+        colours = [name for name, _, kind in passes if kind == "COLOR"]
+        return {"layers": colours, "pixel_bytes": value_bytes * sum(len(channels) for _, channels, _ in passes)}
     except (ImportError, AttributeError, TypeError, ValueError):
         # Cycles lists them for Blender, and may do so in another way one day.
-        return None
+        return {"layers": None, "pixel_bytes": 0}
 
 
 def _run_frame(scene, options, job, output, send, receive):

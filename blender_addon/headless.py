@@ -19,8 +19,9 @@ Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON
 ``MSSPL {"fuse": {"lrhs": file, "hrls": file}}``, msspl-render fuses these files, and deletes them when no frame needs
 them any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
 
-The line ``MSSPL {"size": [width, height], "layers": names or null}`` comes before the first frame is rendered: the size
-of the HRLS and the passes that it will have. If they can't be fused, msspl-render ends this process.
+The line ``MSSPL {"size": [width, height], "layers": names or null, "pixel_bytes": number}`` comes before the first
+frame is rendered: the size of the HRLS, the passes with colours that it will have, and the bytes of all passes for each
+pixel (0 if they are not known). If they can't be fused, msspl-render ends this process.
 
 The line ``MSSPL {"no_vectors": reason}`` says that frames can't be fused with their neighbours, ``MSSPL {"warning":
 sentence}`` that all frames may be wrong.

@@ -11,14 +11,15 @@ from pathlib import Path
 from oiio_msspl.aovs.additive_sets import AdditiveSet, find_additive_sets
 from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.aovs.views import Beauty
-from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.layers import Layer
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.fuse import memory_to_fuse
+from oiio_msspl.fusion.fuse import result_bytes
 from oiio_msspl.fusion.motion import VECTORS, MotionSource
-from oiio_msspl.fusion.tiling import require_memory
+from oiio_msspl.fusion.render_average import USUAL_CHANNELS
+from oiio_msspl.jobs.frame_checks import require_frame_memory
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import map_pair, resolve_auto
 from oiio_msspl.jobs.sequence import Frame
@@ -114,12 +115,13 @@ class RenderedShot:
             raise InputError(f"--temporal {self._temporal.count}: {reason}")
         self._plan(Temporal(text=f"frame by frame: {reason}"))
 
-    def check(self, size: tuple[int, int], layers: Sequence[str] | None) -> None:
+    def check(self, size: tuple[int, int], layers: Sequence[str] | None, pixel_bytes: int) -> None:
         """Refuse a frame that could not be fused, before it is rendered.
 
         Args:
             size: width and height of the HRLS.
             layers: names of the passes that Cycles will render; None if they are not known.
+            pixel_bytes: bytes of all passes for each pixel, at least.
 
         Raises:
             InputError: the frame needs more memory than it may take, or a pattern of ``--passes`` matches no pass.
@@ -128,11 +130,11 @@ class RenderedShot:
         (session,) = self._stages.sessions.values()
         width, height = size
         scale = session.contract.scale
-        grid = Window(0, 0, -(-width // scale), -(-height // scale))
-        needed = memory_to_fuse(
-            Alignment(scale, grid, grid, Window(0, 0, width, height)), session, error=write.error_layer
-        )
-        require_memory(needed, session.contract, self._stages.max_memory)
+        window, grid = Window(0, 0, width, height), Window(0, 0, -(-width // scale), -(-height // scale))
+        alignment = Alignment(scale, grid, grid, window)
+        held = result_bytes(alignment, error=write.error_layer) + self._temporal.memory(window, USUAL_CHANNELS, scale)
+        written = pixel_bytes * width * height if write.layout == "multilayer" else 0
+        require_frame_memory(alignment, session, write, self._stages.max_memory, layers=written, held=held)
         if layers is None or write.passes in ((), ("none",)):
             return
         sets = _cycles_sets(layers)
@@ -164,11 +166,12 @@ class RenderedShot:
                     self._at_work = ready.number
                     assert isinstance(outcome, FusedAlone)
                     self._write(ready, outcome)
-        except MssplError as error:
-            said = self._keep_failed(self._renders.get(self._at_work, frame), str(error))
+        except Exception as error:
+            said, code = explain(error)
+            said = self._keep_failed(self._renders.get(self._at_work, frame), said)
             if len(self._shot) > 1:
                 said = f"frame {self._at_work}: {said}"
-            raise type(error)(said) from error
+            raise (InputError if code == InputError.exit_code else MssplError)(said) from error
         self._release()
 
     def _keep_failed(self, frame: Frame, said: str) -> str:

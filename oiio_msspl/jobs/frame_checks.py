@@ -55,9 +55,20 @@ def check_frame_memory(
     Raises:
         InputError: it does not fit. The message says how much does.
     """
-    alignment = align(lr, hr)
+    layers = bytes_held(hr.file, hr.beauty_channels, write)
+    require_frame_memory(align(lr, hr), session, write, max_memory, layers=layers, held=held)
+
+
+def require_frame_memory(
+    alignment: Alignment, session: Session, write: WriteOptions, max_memory: int, *, layers: int, held: int
+) -> None:
+    """The same for a pair that need not exist yet.
+
+    Args:
+        layers: bytes of other layers that writing holds at once.
+    """
     to_fuse = memory_to_fuse(alignment, session, error=write.error_layer)
-    to_write = memory_to_write(alignment, hr, write)
+    to_write = FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + layers
     only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
     hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""
     require_memory(max(to_fuse, to_write) + held, session.contract, max_memory, hint)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, TypeVar
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, Mask, kept
-from oiio_msspl.errors import InputError, explain
+from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import FLOW, MotionFrame
@@ -113,8 +113,11 @@ class FrameWindow:
         return ready
 
     def accumulate(self, number: int) -> FusedFrame:
-        """A frame averaged with its fused neighbours. Neighbours that are missing or broken are named in its
-        warnings."""
+        """A frame averaged with its fused neighbours. Neighbours that are missing or broken are named in its warnings.
+
+        Raises:
+            MssplError: a neighbour has failed, and not for its files.
+        """
         fused = self._fused[number]
         assert isinstance(fused, FusedAlone)
         if not self._temporal.count:
@@ -156,10 +159,14 @@ class FrameWindow:
         missing = self._temporal.missing(number)
         warnings = [f"frame {each} is missing, so fewer neighbours are averaged" for each in missing]
         self._warnings[number] = warnings
-        steps: list[Sequence[Step[RenderPair]]] = [(), ()]
+        before: Sequence[Step[RenderPair]] = ()
+        after: Sequence[Step[RenderPair]] = ()
         if self._temporal.renders:
-            steps = [self._steps(number, step, self._loaded, self._pair, warnings) for step in (-1, 1)]
-        outcome = self._fuse(loaded, (steps[0], steps[1]))
+            try:
+                before, after = (self._steps(number, step, self._loaded, self._pair, warnings) for step in (-1, 1))
+            except Exception as error:
+                return error
+        outcome = self._fuse(loaded, (before, after))
         if isinstance(outcome, FusedAlone) and self._temporal.results:
             fused = outcome.fused
             fused.rgb = kept(fused.rgb)
@@ -180,7 +187,10 @@ class FrameWindow:
         placed: Callable[[T], tuple[LoadedFrame, F]],
         warnings: list[str],
     ) -> list[Step[F]]:
-        """The way from a frame to its neighbours on one side, up to the first that can't be used.
+        """The way from a frame to its neighbours on one side, up to the first whose files can't be used.
+
+        Any other failure of a neighbour may pass, such as a full disk or too little memory. A frame that were averaged
+        without it would have other pixels than in another run, so the frame fails, too.
 
         Args:
             number: of the frame.
@@ -188,24 +198,29 @@ class FrameWindow:
             outcomes: the frames as they are averaged: their renders, or fused.
             placed: a frame's files, and its pixels.
             warnings: gets what is wrong with a neighbour.
+
+        Raises:
+            MssplError: a neighbour has failed, and not for its files.
         """
         steps: list[Step[F]] = []
-        here = self._placed(outcomes[number], placed)
+        own = outcomes[number]
+        assert not isinstance(own, Exception)
+        here = placed(own)
         count = self._temporal.renders if outcomes is self._loaded else self._temporal.results
         neighbours = [n for n in self._temporal.neighbours(number, count) if (n - number) * step > 0]
         motion = self._temporal.motion
         tolerance = ROUND_TRIP_OF_FLOW if motion is not None and motion.kind == FLOW else ROUND_TRIP
         for n in neighbours[::step]:
             try:
-                there = self._placed(outcomes[n], placed)
+                there = placed(_usable(n, outcomes[n]))
                 _check_alike(here, there)
                 if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {min(number, n)} and {max(number, n)} {SAME_SEED}")
                 (vectors, valid, moved_objects), (back, back_valid, _) = self._read_both_ways(n - step, n)
-            except Exception as error:
-                warnings.append(f"frame {n} is not averaged: {explain(error)[0]}")
+            except InputError as error:
+                warnings.append(f"frame {n} is not averaged: {error}")
                 break
             steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance, moved_objects))
             if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
@@ -213,11 +228,6 @@ class FrameWindow:
                 if names:
                     warnings.append(f"frame {n} has no set of passes with {names}, so passes are not averaged")
         return steps
-
-    def _placed(self, outcome: T | Exception, placed: Callable[[T], tuple[LoadedFrame, F]]) -> tuple[LoadedFrame, F]:
-        if isinstance(outcome, Exception):
-            raise outcome
-        return placed(outcome)
 
     def _read_both_ways(self, start: int, end: int) -> tuple[Way, Way]:
         """Motion from one frame to the next or the previous one, and back."""
@@ -267,6 +277,15 @@ class FrameWindow:
             return MotionFrame(fused.loaded.hr, fused.fused.rgb, fused.loaded.vectors, fused.loaded.hr_pixels)
         assert loaded is not None and not isinstance(loaded, Exception)
         return MotionFrame(loaded.hr, vectors=loaded.vectors, pixels=loaded.hr_pixels)
+
+
+def _usable(number: int, outcome: T | Exception) -> T:
+    """A frame, or an error that says why it can't be used: an InputError if its files are the reason."""
+    if isinstance(outcome, InputError):
+        raise outcome
+    if isinstance(outcome, Exception):
+        raise MssplError(f"frame {number}, its neighbour, has failed: {explain(outcome)[0]}") from outcome
+    return outcome
 
 
 def _fused_frame(alone: FusedAlone) -> tuple[LoadedFrame, FusedFrame]:

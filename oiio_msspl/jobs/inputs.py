@@ -190,13 +190,21 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     if family is None:
         assert model is not None
         return model
-    if family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
-        family = QUALITIES[DEFAULT_QUALITY]
+    suited = family_for_layers(hr, family)
+    if suited != family:
+        family = suited
         hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
     if not is_noise_spread(lr, hr, align(lr, hr)):
         return family
     hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
     return family + SPREAD
+
+
+def family_for_layers(hr: MappedRender, family: str) -> str:
+    """A family of models, or the default quality's in place of that of ``best`` for an HRLS without the layers that
+    this one needs."""
+    lacks = family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL))
+    return QUALITIES[DEFAULT_QUALITY] if lacks else family
 
 
 def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:

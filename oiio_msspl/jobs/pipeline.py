@@ -42,7 +42,7 @@ def run_pipeline(
     writing: tuple[Frame, FrameReport, Future[None]] | None = None
 
     def record_failure(frame: Frame, error: Exception) -> None:
-        # The error says that the EXR appeared while it was computed.
+        # If another run has written the EXR in the meantime, the frame is complete, whatever failed here.
         record(frame, None if stages.skips(frame) else error)
 
     def finish_writing() -> None:

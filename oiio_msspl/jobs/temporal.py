@@ -9,20 +9,20 @@ from __future__ import annotations
 
 import functools
 import logging
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import has_many_pixels
-from oiio_msspl.errors import InputError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
 from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
-from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, family_for_layers, map_other_hrls, map_pair
 from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.views import find_other_views
@@ -70,7 +70,7 @@ class TemporalOptions:
         """Frames before and after each frame, if their motion is known.
 
         Args:
-            model: what the user has chosen, see :func:`oiio_msspl.model.catalogue.find_model`.
+            model: what is used, or its family.
         """
         if self.frames == AUTO:
             return AUTO_COUNT_SLOW if _is_slow(model) else AUTO_COUNT
@@ -169,24 +169,25 @@ def plan_temporal(
     Each view and view layer has its own motion. If that of the first view is not known, all are fused frame by frame.
 
     Args:
-        model: see :meth:`TemporalOptions.count`.
+        model: what the user has chosen, see :func:`oiio_msspl.model.catalogue.find_model`.
         write: views whose beauty is not written are not planned.
 
     Raises:
         InputError: the user asks for neighbours, and nothing is known of the motion.
     """
-    count, asked = options.count(model), options.frames != AUTO
-    if count == 0:
+    if options.frames == OFF:
         return Temporal()
+    asked = options.frames != AUTO
     low, high = shot.lr.files, shot.hr.files
     frames = {n: Frame(n, low[n], high[n], shot.output.path(n)) for n in sorted(low.keys() & high.keys())}
     pairs = [n for n in frames if n + 1 in frames]
     if not pairs:
         if asked:
-            raise InputError(f"--temporal {count}: {shot.hr.pattern} has no two frames that follow each other")
+            raise InputError(f"--temporal {options.frames}: {shot.hr.pattern} has no two frames that follow each other")
         return Temporal(text="frame by frame: no two frames follow each other")
     looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1])))
     mapped = functools.cache(lambda number: _map_frame(frames[number], inputs))
+    count = options.count(_family_of_shot(mapped, frames, model))
     first = _plan(_motion_of(mapped, looked_at, inputs, options, required=asked), count, frames, asked=asked)
     if not first.count:
         return first
@@ -200,6 +201,15 @@ def plan_temporal(
         else:
             text += f"; {name_of(label)} {plan.text}"
     return replace(first, views=views, looked_at=frozenset(others), text=text)
+
+
+def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model: str | None) -> str | None:
+    """The family of models that the first pair's layers are enough for; ``model`` itself if it is none."""
+    family = family_of(model)
+    for number in numbers if family is not None else ():
+        with suppress(MssplError):  # the run says so when the turn of this frame has come
+            return family_for_layers(mapped(number)[1], family or "")
+    return model
 
 
 def _plan(source: MotionSource, count: int, frames: Mapping[int, Frame], *, asked: bool) -> Temporal:

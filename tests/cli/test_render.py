@@ -20,6 +20,7 @@ from msspl_cli.rendered_shot import RenderedShot
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import temporary_folder
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.jobs import frame_memory
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.shot import fuse_shot
 from oiio_msspl.jobs.stages import Stages
@@ -232,10 +233,10 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
 def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, bilinear_models, moving, monkeypatch):
     """And their memory is counted."""
     loaded, counted = [], []
-    load, held = Stages._load, Stages._held_bytes
+    load, counts = Stages._load, frame_memory._vector_bytes
     monkeypatch.setattr(Stages, "_load", lambda *given: loaded.append(load(*given)) or loaded[-1])
     monkeypatch.setattr(
-        Stages, "_held_bytes", lambda self, each: counted.append(self._motion_channels(each.hr)) or held(self, each)
+        frame_memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels)
     )
     frames = [Frame(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
     shot = RenderedShot(Stages(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
@@ -268,16 +269,56 @@ def test_without_vectors_frames_are_fused_one_by_one(farm, model, moving, monkey
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--passes", "foo*"], "--passes foo*: the scene renders no such set of layers; it has 'light groups'"),
+        (
+            ["--layout", "spec", "--passes", "foo*"],
+            "foo*: the scene renders no such set of layers; it has 'light groups'",
+        ),
         (["--passes", "light*", "--max-memory", "400M"], "--max-memory: this frame needs more with model bilinear-x4"),
+        (["--max-memory", "4G"], "or use --layout spec, which does not hold all layers at once"),
+        (["-o", "out.##.exr", "--frames", "1-3", "--layout", "spec", "--temporal", "2", "--max-memory", "2G"], "needs"),
     ],
 )
 def test_wrong_options_are_refused_before_anything_is_rendered(farm, model, options, message):
+    """The layout multilayer holds all passes when it is written, and averaging takes memory."""
     _, run, _ = farm
-    told = "tell(size=[8192, 8192], layers=['Combined', 'Combined_key', 'Combined_rest', 'Diffuse Direct'])"
+    layers = ["Combined", "Combined_key", "Combined_rest", "Diffuse Direct"]
+    told = f"tell(size=[8192, 4096], layers={layers}, pixel_bytes=100)"
     code, _, err, left = run("--model", model, *options, code=f"{told}; time.sleep(300)")
     assert (code, left, err.count("\n")) == (2, [], 1)
     assert message in err
+
+
+@posix
+def test_renders_are_kept_whatever_went_wrong_and_a_resumed_shot_replaces_them(farm, model):
+    """A model that is no model any more stands for a fault of the program."""
+    _, run, folder = farm
+    (folder / "sitecustomize.py").write_text(
+        "import sys, os\n"
+        "if os.environ.pop('FAULT', '') and sys.argv[0] == '-c':\n"
+        "    import oiio_msspl.jobs.stages as stages\n"
+        "    def fuse(*arguments, **more): raise MemoryError\n"
+        "    stages.fuse = fuse\n"
+    )
+    arguments = ["-o", "out.##.exr", "--frames", "1-2", "--model", model, "--keep", "--skip-existing"]
+    environment = {"PYTHONPATH": f"{folder}:{os.environ.get('PYTHONPATH', '')}", "FAULT": "1"}
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        code, _, err, left = run(*arguments, code=ASKS)
+    kept = ["out.01_hr.exr", "out.01_lr.exr"]
+    assert (code, [name for name in left if name.endswith(".exr")]) == (1, kept)
+    assert err.startswith("error: frame 1: out of memory; try a smaller --max-memory; both renders are kept"), err
+    assert run(*arguments, code=ASKS)[0] == 0
+    assert sorted(path.name for path in folder.glob("out*")) == [
+        f"out.0{number}{suffix}.exr" for number in (1, 2) for suffix in ("", "_hr", "_lr")
+    ]
+
+
+@posix
+def test_an_existing_result_is_noticed_before_rendering_whatever_its_extension(farm):
+    _, run, folder = farm
+    (folder / "b.EXR").write_text("old")
+    assert run("-o", "b.EXR")[::2] == (2, "error: b.EXR: exists; pass --overwrite to replace it\n")
 
 
 @posix
@@ -331,6 +372,7 @@ def test_a_shot_and_a_report_for_machines(farm):
         (["--overwrite", "--skip-existing"], "", 2, "exclude each other"),
         (["--blender", "nothing"], "", 2, "--blender nothing: no such program"),
         (["--model", "nothing"], "", 2, "no model 'nothing'"),
+        (["--model", "joint-x2"], "", 2, "--model joint-x2: is for x2, but --scale is 4"),
         (["--device", "abacus"], "", 2, "--device 'abacus': use one of cpu"),
         (["--layout", "x"], "", 2, "--layout 'x': use one of spec"),
         (["--model", "paper", "--error-layer"], "", 2, "paper-x4 does not predict its error"),

@@ -3,9 +3,12 @@
 
 import pytest
 
-from oiio_msspl import InputError, WriteOptions, fuse_files, fuse_shot, open_exr
+from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot, open_exr
 from oiio_msspl.arrays import box_downsample
+from oiio_msspl.fusion.motion import VECTORS, MotionSource
 from oiio_msspl.jobs.openjd import make_job
+from oiio_msspl.jobs.sequence import find_shot
+from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture, rgb, write_exr
 from tests.fusion.test_noise import spread
@@ -48,6 +51,20 @@ def test_the_best_quality_needs_an_albedo_or_a_normal(tmp_path, caplog):
     write_pair(tmp_path, "normal", None, "N")
     report = fuse_files(tmp_path / "lr/normal.exr", tmp_path / "hr/normal.exr", tmp_path / "out2.exr", model="best")
     assert report.model == "ensemble-x4"
+
+
+def test_a_job_s_model_has_as_many_neighbours_as_one_run(tmp_path, monkeypatch):
+    """Without an albedo and a normal, best is the default quality, also in this."""
+    for number in range(3):
+        write_pair(tmp_path, f"a.{number:04}", None)
+    pair, options = (tmp_path / "lr", tmp_path / "hr"), TemporalOptions()
+    shot = find_shot(*pair, tmp_path / "out")
+    job = make_job(*pair, tmp_path / "out", model="best").template["steps"][0]["script"]["actions"]["onRun"]["args"]
+    assert job[-2:] == ["--model", "joint"]
+    found = MotionSource(VECTORS, "as vectors say")
+    monkeypatch.setattr("oiio_msspl.jobs.temporal.find_motion", lambda *arguments, **more: found)
+    plans = [plan_temporal(shot, InputOptions(), options, model) for model in ("best", "joint", "ensemble")]
+    assert [plan.count for plan in plans] == [4, 4, 6]
 
 
 @pytest.mark.parametrize(

@@ -322,6 +322,18 @@ def test_a_picture_that_is_no_preview_of_ours_is_left_alone(tmp_path, bilinear_m
     assert oiio.ImageBuf(str(folder / "out/beauty.1002.png")).spec().width == WIDTH
 
 
+def test_update_leaves_a_picture_that_is_no_preview_of_ours_alone(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 1)
+    assert run(folder, bilinear_models[4]).exit_code == 0
+    mine = folder / "out/beauty.1001.png"
+    mine.write_text("my picture")
+    later = (folder / "out/beauty.1001.exr").stat().st_mtime + 9
+    os.utime(folder / "hr/beauty.1001.exr", (later, later))
+    report = run(folder, bilinear_models[4], previews=True, update=True)
+    assert "beauty.1001.png: exists; pass --overwrite" in report.results[1001].message
+    assert mine.read_text() == "my picture"
+
+
 def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeypatch):
     """An old frame that can't be replaced, and one that another run puts there meanwhile."""
     folder = make_shot(tmp_path, 1)

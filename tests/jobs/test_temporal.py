@@ -191,6 +191,34 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)
 
 
+@pytest.mark.parametrize("stage", ["_load", "fuse"])
+def test_frames_beside_one_that_failed_for_another_reason_fail_too(tmp_path, bilinear_models, monkeypatch, stage):
+    """Without it they would have other pixels than in a run that does not meet that failure."""
+    folder = make_moving_shot(tmp_path, count=7)
+    more = {"model": str(bilinear_models[4]), "temporal": TemporalOptions("2")}
+    pair = folder / "lr", folder / "hr"
+    fuse_shot(*pair, folder / "clean", **more)
+    real = getattr(stages.Stages, stage)
+
+    def faulty(self, given, *arguments):
+        frame = given if stage == "_load" else given.frame
+        if frame.number == 1004:
+            raise MemoryError
+        return real(self, given, *arguments)
+
+    monkeypatch.setattr(stages.Stages, stage, faulty)
+    report = fuse_shot(*pair, folder / "out", **more)
+    failed = [n for n, result in report.results.items() if result.status == "failed"]
+    # With one frame's renders and one fused frame on each side, a frame depends on two.
+    assert failed == ([1002, 1003, 1004, 1005, 1006] if stage == "_load" else [1003, 1004, 1005])
+    assert report.results[1004].message.startswith("out of memory")
+    assert "frame 1004, its neighbour, has failed: out of memory" in report.results[1003].message
+    assert report.exit_code == 1
+    monkeypatch.undo()
+    assert fuse_shot(*pair, folder / "out", skip_existing=True, **more).exit_code == 0
+    assert contents(folder / "out") == contents(folder / "clean")
+
+
 @pytest.mark.parametrize("place", ["disk", "files"])
 def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bilinear_models, monkeypatch, place):
     folder = make_moving_shot(tmp_path, count=4)

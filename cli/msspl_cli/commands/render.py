@@ -208,21 +208,25 @@ def render(
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
     over_time = options.make_temporal_options(temporal, None)
     memory = options.parse_bytes(max_memory)
-    shot = targets = name_targets(output, frames)
+    targets = name_targets(output, frames)
     folder = output.parent
     makes_folder = is_pattern(output) and not folder.exists()
     if makes_folder:
         check_folder(folder)
-    suffixes = ["", *(["_lr", "_hr"] if keep else []), *(["_oidn"] if compare else [])]
+    suffixes = [*(["lr", "hr"] if keep else []), *(["oidn"] if compare else [])]
     for _, target in targets:
         if target.suffix.lower() != ".exr":
             raise InputError(f"{target}: the result is an EXR; name it .exr")
+    shot = targets
     if skip_existing:
         targets = [(number, target) for number, target in targets if not target.exists()]
-    for _, target in [] if makes_folder else targets:
-        for suffix in suffixes:
-            check_target(target.with_name(f"{target.stem}{suffix}.exr"), overwrite=overwrite)
-    check_separate([scene], [target for _, target in targets])
+    written = [[target, *(beside(target, suffix) for suffix in suffixes)] for _, target in targets]
+    for target, *more in [] if makes_folder else written:
+        check_target(target, overwrite=overwrite)
+        for path in more:
+            # A resumed shot replaces what an earlier run left beside a frame that it could not complete.
+            check_target(path, overwrite=overwrite or skip_existing)
+    check_separate([scene], [path for paths in written for path in paths])
     write = options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes)
     model = options.choose_model(model, quality)
     wanted = {target.absolute() for _, target in targets}
@@ -276,7 +280,7 @@ def render(
         if "no_vectors" in event:
             fuser.fuse_alone(event["no_vectors"])
         if "size" in event:
-            fuser.check(event["size"], event["layers"])
+            fuser.check(event["size"], event["layers"], event["pixel_bytes"])
         if "warning" in event:
             warnings.append(event["warning"])
         if "report" in event:
@@ -332,6 +336,8 @@ def _make_fuser(
 
     use_threads(threads)
     session = load_model(scale, model, device, threads)
+    if session.contract.scale != scale:
+        raise InputError(f"--model {model}: is for x{session.contract.scale}, but --scale is {scale}")
     require_outputs(session, write)
     stages = Stages(
         write_options=write,

@@ -15,12 +15,12 @@ import pytest
 from msspl_cli.blender_process import command, find_blender
 from msspl_cli.commands.render import name_targets
 from msspl_cli.installed import shipped_folder
-from msspl_cli.rendered_shot import RenderedShot
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import temporary_folder
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.jobs import frame_memory
+from oiio_msspl.jobs.rendered_shot import RenderedShot
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.shot import fuse_shot
 from oiio_msspl.jobs.stages import Stages

@@ -22,9 +22,8 @@ from oiio_msspl.exr.atomic import (
 )
 
 if TYPE_CHECKING:
-    from msspl_cli.rendered_shot import RenderedShot
-    from oiio_msspl.exr.write_options import WriteOptions
-    from oiio_msspl.jobs.temporal import TemporalOptions
+    from oiio_msspl.jobs.rendered_shot import RenderedShot
+    from oiio_msspl.jobs.stages import Stages
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -196,7 +195,10 @@ def render(
     """
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
-    from msspl_cli.rendered_shot import beside
+    from oiio_msspl.exr.reader import use_threads
+    from oiio_msspl.jobs.rendered_shot import RenderedShot, beside
+    from oiio_msspl.jobs.sequence import Frame
+    from oiio_msspl.jobs.stages import Stages
     from oiio_msspl.model.contract import SCALES
 
     if scale not in SCALES:
@@ -207,7 +209,6 @@ def render(
     if overwrite and skip_existing:
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
     over_time = options.make_temporal_options(temporal, None)
-    memory = options.parse_bytes(max_memory)
     targets = name_targets(output, frames)
     folder = output.parent
     makes_folder = is_pattern(output) and not folder.exists()
@@ -229,8 +230,21 @@ def render(
     check_separate([scene], [path for paths in written for path in paths])
     write = options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes)
     model = options.choose_model(model, quality)
+    use_threads(threads)
+    stages = Stages(
+        write_options=write,
+        model=model,
+        device=device,
+        threads=threads,
+        max_memory=options.parse_bytes(max_memory),
+        overwrite=overwrite,
+    )
+    _load_model(stages, scale)
+    frames_of_shot = [Frame(number or 0, None, None, target.absolute()) for number, target in shot]
     wanted = {target.absolute() for _, target in targets}
-    fuser = _make_fuser(shot, wanted, scale, model, device, threads, memory, write, overwrite, over_time, keep)
+    fuser = RenderedShot(
+        stages, frames_of_shot, [each for each in frames_of_shot if each.output in wanted], over_time, keep=keep
+    )
     job = {
         "scene": str(scene.absolute()),
         "scene_name": scene_name,
@@ -256,100 +270,95 @@ def render(
         make_folder(folder)
     remove_leftovers(target for _, target in shot)
     remove_left_folders(folder)
-    reports: list[dict[str, Any]] = []
-    waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
-    warnings: list[str] = []  # about all frames
-    bar = console.ProgressBar(shown=not quiet and not verbose)
-    label = ""
-
-    def finish() -> None:
-        """Report the frames that are written."""
-        while waiting and not fuser.waits(result := Path(waiting[0]["output"])):
-            report = waiting.pop(0)
-            report["temporal"] = fuser.text
-            report["warnings"] += [*warnings, *fuser.warnings(result)]
-            for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
-                report[render]["file"] = str(beside(result, suffix)) if keep else None
-            reports.append(report)
-            bar.hide()
-            for warning in [] if quiet else report["warnings"]:
-                console.say(f"warning: frame {report['frame']}: {warning}", error=True)
-
-    def show(event: dict[str, Any]) -> None:
-        nonlocal label
-        if "no_vectors" in event:
-            fuser.fuse_alone(event["no_vectors"])
-        if "size" in event:
-            fuser.check(event["size"], event["layers"], event["pixel_bytes"])
-        if "warning" in event:
-            warnings.append(event["warning"])
-        if "report" in event:
-            waiting.append(event["report"])
-            finish()
-            return
-        if "step" in event:
-            number = event.get("frame")
-            label = event["step"] if number is None else f"frame {number}: {event['step']}"
-        bar.update(label, event.get("samples", 0), 1)
-
+    reports = _Reports(fuser, keep=keep, quiet=quiet, bar=console.ProgressBar(shown=not quiet and not verbose))
     try:
         if targets:
-            render_frames(program, scene, job, folder, show, fuser.fuse, verbose=bool(verbose))
+            render_frames(program, scene, job, folder, reports.show, fuser.fuse, verbose=bool(verbose))
     finally:
-        finish()
-        # Frames that ended are reported even if a later one failed.
-        bar.hide()
+        reports.end()  # frames that are written are reported even if a later one failed
         if as_json:
-            print(json.dumps(reports, indent=2))
-        elif reports and not quiet:
-            _print(reports, alone=not over_time.count(model))
+            print(json.dumps(reports.written, indent=2))
+        elif reports.written and not quiet:
+            _print(reports.written, alone=not over_time.count(model))
             if fuser.text:
                 print(f"Fused {fuser.text}")
     if not (targets or as_json or quiet):
         print(f"{output}: every frame exists")
 
 
-def _make_fuser(
-    shot: list[tuple[int | None, Path]],
-    wanted: set[Path],
-    scale: int,
-    model: str,
-    device: str,
-    threads: int,
-    max_memory: int,
-    write: WriteOptions,
-    overwrite: bool,
-    temporal: TemporalOptions,
-    keep: bool,
-) -> RenderedShot:
-    """What fuses the frames. Its model is loaded once.
+def _load_model(stages: Stages, scale: int) -> None:
+    """Load the model of all frames.
 
     Raises:
-        InputError: the model, the device or the neighbours can't be had. No frame was rendered for nothing.
+        InputError: the model or the device can't be had. No frame was rendered for nothing.
     """
-    from msspl_cli.rendered_shot import RenderedShot
-    from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.frame_checks import require_outputs
-    from oiio_msspl.jobs.sequence import Frame
-    from oiio_msspl.jobs.stages import Stages
     from oiio_msspl.model.catalogue import family_of, load_model
 
-    use_threads(threads)
-    session = load_model(scale, model, device, threads)
+    session = load_model(scale, stages.model, stages.device, stages.threads)
     if session.contract.scale != scale:
-        raise InputError(f"--model {model}: is for x{session.contract.scale}, but --scale is {scale}")
-    require_outputs(session, write)
-    stages = Stages(
-        write_options=write,
-        model=model,
-        device=device,
-        threads=threads,
-        max_memory=max_memory,
-        overwrite=overwrite,
-        sessions={(scale, family_of(model) or model): session},
-    )
-    frames = [Frame(number or 0, None, None, target.absolute()) for number, target in shot]
-    return RenderedShot(stages, frames, [each for each in frames if each.output in wanted], temporal, keep=keep)
+        raise InputError(f"--model {stages.model}: is for x{session.contract.scale}, but --scale is {scale}")
+    require_outputs(session, stages.write_options)
+    stages.sessions[scale, family_of(stages.model) or stages.model] = session
+
+
+class _Reports:
+    """The reports of a shot's frames, while they are rendered.
+
+    Args:
+        fuser: what fuses the frames.
+        keep: whether the renders are kept.
+        quiet: print no warnings.
+        bar: shows the progress.
+    """
+
+    def __init__(self, fuser: RenderedShot, *, keep: bool, quiet: bool, bar: console.ProgressBar) -> None:
+        self._fuser, self._keep, self._quiet, self._bar = fuser, keep, quiet, bar
+        self.written: list[dict[str, Any]] = []
+        """Reports of the frames that are written."""
+        self._waiting: list[dict[str, Any]] = []  # of frames that wait for their neighbours
+        self._warnings: list[str] = []  # about all frames
+        self._label = ""
+
+    def show(self, event: dict[str, Any]) -> None:
+        """Take an event of :func:`msspl_cli.blender_process.render_frames`.
+
+        Raises:
+            InputError: the frames that it is about could not be fused.
+        """
+        if "no_vectors" in event:
+            self._fuser.fuse_alone(event["no_vectors"])
+        if "size" in event:
+            self._fuser.check(event["size"], event["layers"], event["pixel_bytes"])
+        if "warning" in event:
+            self._warnings.append(event["warning"])
+        if "report" in event:
+            self._waiting.append(event["report"])
+            self._report()
+            return
+        if "step" in event:
+            number = event.get("frame")
+            self._label = event["step"] if number is None else f"frame {number}: {event['step']}"
+        self._bar.update(self._label, event.get("samples", 0), 1)
+
+    def end(self) -> None:
+        """Report what is written, and hide the progress."""
+        self._report()
+        self._bar.hide()
+
+    def _report(self) -> None:
+        from oiio_msspl.jobs.rendered_shot import beside
+
+        while self._waiting and not self._fuser.waits(result := Path(self._waiting[0]["output"])):
+            report = self._waiting.pop(0)
+            report["temporal"] = self._fuser.text
+            report["warnings"] += [*self._warnings, *self._fuser.warnings(result)]
+            for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
+                report[render]["file"] = str(beside(result, suffix)) if self._keep else None
+            self.written.append(report)
+            self._bar.hide()
+            for warning in [] if self._quiet else report["warnings"]:
+                console.say(f"warning: frame {report['frame']}: {warning}", error=True)
 
 
 def is_pattern(output: Path) -> bool:

@@ -129,13 +129,20 @@ def _name(contents: FileContents, channel: Channel) -> str:
 
 
 def _header(contents: FileContents) -> dict[str, Any]:
-    """The header of the HRLS's beauty, with the compression and the attributes of the contents."""
+    """The header of the HRLS's beauty, with the compression and the attributes of the contents.
+
+    Metadata of the other parts is added, such as Cryptomatte's manifests. Where two parts differ, the beauty's counts,
+    then that of the first part.
+    """
     import OpenEXR
 
     path = contents.source.path
     try:
         with OpenEXR.File(str(path), header_only=True) as source:
             header = dict(source.parts[contents.home.index].header)
+            for part, _ in _passed_on(contents):
+                others = source.parts[part.index].header
+                header = {key: value for key, value in others.items() if key != "view"} | header
     except UnicodeDecodeError as error:
         raise InputError(
             f"--layout multilayer: the header of {path} has names or texts that are not UTF-8; use --layout spec"

@@ -1,11 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
+import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import check_layout
+from oiio_msspl.exr.writer import check_layout, write_fused
 from tests.conftest import picture, rgb, write_exr
 from tests.exr.sources import H, W, everything, written
 
@@ -35,3 +37,27 @@ def test_a_channel_of_an_added_layer_and_one_of_two_parts_are_told_apart(tmp_pat
     two = map_render(open_exr(write_exr(tmp_path / "two.exr", parts)))
     with pytest.raises(InputError, match=r"two parts of .*two\.exr hold a channel 'a\.Y'; use --layout spec"):
         check_layout(two.file, two.beauty_channels, multilayer, [])
+
+
+def test_metadata_of_all_parts_is_kept(tmp_path):
+    """Cryptomatte's manifests among it. A part that is left out takes its own along; the beauty's counts most."""
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    manifest = {"cryptomatte/abc1234/name": "CryptoObject", "cryptomatte/abc1234/manifest": '{"box": "00ff"}'}
+    plane = picture(H, W)[..., 0]
+    source = [
+        OpenEXR.Part(header | {"comments": "beauty"}, rgb(picture(H, W)), "rgba"),
+        OpenEXR.Part(header | manifest | {"comments": "ids"}, {"R": plane, "G": plane}, "CryptoObject00"),
+        OpenEXR.Part(header | {"far": 10.0, "view": "left"}, {"Z": plane}, "depth"),
+    ]
+    with OpenEXR.File(source) as file:
+        file.write(str(tmp_path / "hr.exr"))
+    hr = map_render(open_exr(tmp_path / "hr.exr"))
+    for layers, is_kept in (((), True), (("depth",), False)):
+        options = WriteOptions(layout="multilayer", layers=layers)
+        out = tmp_path / f"{len(layers)}.exr"
+        write_fused(out, hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, options)
+        with OpenEXR.File(str(out), header_only=True) as file:
+            written_header = dict(file.parts[0].header)
+        assert (written_header["comments"], written_header["far"]) == ("beauty", 10)
+        assert not written_header.keys() & {"view", "name"}
+        assert (manifest.items() <= written_header.items()) == is_kept

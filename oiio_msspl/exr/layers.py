@@ -88,12 +88,12 @@ def _views(file: ExrFile) -> list[str]:
 def _split_name(name: str, part: Part, views: list[str], *, several: bool) -> tuple[str, str, str]:
     """View, layer and component of a channel, in a file of one part or of several.
 
-    In a ``multiView`` file the view stands between the layer and the component (``diffuse.left.R``); channels without
-    one belong to the default view.
+    In a ``multiView`` file the view stands between the layer and the component (``diffuse.left.R``), and perhaps in a
+    part of one view, too. Other channels belong to the view of the part, or else to the default view.
     """
     prefix, _, component = name.rpartition(".")
     view = part.view or (views[0] if views else "")
-    if views and prefix.rpartition(".")[2] in views:
+    if (last := prefix.rpartition(".")[2]) and last in (*views, part.view):
         prefix, _, view = prefix.rpartition(".")
     return view, prefix or (_part_layer(part) if several else ""), _COMPONENTS.get(component.lower(), component)
 

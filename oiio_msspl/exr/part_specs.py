@@ -53,12 +53,12 @@ def beauty_spec(contents: FileContents) -> Any:
     """The part of the fused beauty."""
     home = contents.home
     if contents.options.layout == "nuke":
-        name, channels = _nuke_name("rgba", home.view), ["R", "G", "B", "A"][: len(contents.beauty)]
+        name, channels = _nuke_name("rgba", contents.view), ["R", "G", "B", "A"][: len(contents.beauty)]
     else:
         # In a file of one part, its name says nothing; in the result, it would name a layer of plain channels.
         named = home.name and (len(contents.source.parts) > 1 or "." in contents.beauty[0].name)
         name, channels = home.name if named else "rgba", [channel.name for channel in contents.beauty]
-    spec = _spec(home, name, channels, contents.pixels.kind)
+    spec = _spec(home, name, channels, contents.pixels.kind, contents.view)
     _compress(spec, contents.compression)
     for key, value in contents.attributes.items():
         spec.attribute(key, value)
@@ -69,7 +69,7 @@ def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
     """The part of a further layer; its name is not among ``taken`` and is added to them."""
     prefix = "" if contents.options.layout == "nuke" else f"{name}."
     channels = [f"{prefix}{component}" for component in COMPONENTS[name]]
-    spec = _spec(contents.home, _unique(name, taken), channels, contents.pixels.kind)
+    spec = _spec(contents.home, _unique(name, taken), channels, contents.pixels.kind, contents.view)
     _drop_repeated_attributes(spec)
     _compress(spec, contents.compression)
     return spec
@@ -154,11 +154,9 @@ def _layer_part(
         plain = f"{plain}.{view}"
     name = _unique(plain, taken)
     names = components if nuke else [c.name for c in channels]
-    spec = _spec(part, name, names, channels[0].type)
+    spec = _spec(part, name, names, channels[0].type, view)
     if repeats_metadata:
         _drop_repeated_attributes(spec)
-    if view:
-        spec.attribute("view", view)
     return PassedOnPart(spec, part, tuple(runs(channels)))
 
 
@@ -187,8 +185,11 @@ def _unique(name: str, taken: set[str]) -> str:
     return candidate
 
 
-def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
-    """A part of scan lines with other channels than ``part``, keeping its windows and metadata."""
+def _spec(part: Part, name: str, channels: list[str], kind: str, view: str) -> Any:
+    """A part of scan lines with other channels than ``part``, keeping its windows and metadata.
+
+    All its channels are of one view. ``multiView`` names the views of a part that has several.
+    """
     spec = oiio.ImageSpec(part.spec)
     spec.tile_width = spec.tile_height = spec.tile_depth = 0
     spec.nchannels = len(channels)
@@ -196,6 +197,9 @@ def _spec(part: Part, name: str, channels: list[str], kind: str) -> Any:
     spec.channelformats = ()
     spec.format = oiio.TypeDesc(kind)
     _name_and_compress(spec, name, lossless(part))
+    spec.erase_attribute("multiView")
+    if view:
+        spec.attribute("view", view)
     return spec
 
 

@@ -149,10 +149,15 @@ def _header(contents: FileContents) -> dict[str, Any]:
         ) from error
     for key in _STRUCTURE:
         header.pop(key, None)
-    views = [contents.view, *(layer.view for layer in contents.layers.values())]
-    if len(several := list(dict.fromkeys(view for view in views if view))) > 1:
+    layers = contents.layers
+    views = [
+        contents.view,
+        *(layers[c].view for _, passed_on in _passed_on(contents) for c in passed_on if c in layers),
+    ]
+    written = list(dict.fromkeys(view for view in views if view))
+    if len(written) > 1 or "multiView" in header:
         header.pop("view", None)
-        header["multiView"] = several
+        header["multiView"] = written
     name = "NO" if contents.compression == "none" else contents.compression.upper()
     header["compression"] = getattr(OpenEXR, f"{name}_COMPRESSION")
     header["type"] = OpenEXR.scanlineimage

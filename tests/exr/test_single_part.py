@@ -9,7 +9,7 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import check_layout, write_fused
 from tests.conftest import picture, rgb, write_exr
-from tests.exr.sources import H, W, everything, written
+from tests.exr.sources import H, W, everything, stereo, written
 
 
 def test_multilayer_layout_is_one_part(tmp_path):
@@ -37,6 +37,15 @@ def test_a_channel_of_an_added_layer_and_one_of_two_parts_are_told_apart(tmp_pat
     two = map_render(open_exr(write_exr(tmp_path / "two.exr", parts)))
     with pytest.raises(InputError, match=r"two parts of .*two\.exr hold a channel 'a\.Y'; use --layout spec"):
         check_layout(two.file, two.beauty_channels, multilayer, [])
+
+
+@pytest.mark.parametrize(
+    ("layers", "views"), [((), ("right", "left")), (("none",), ("right",)), (("*.A",), ("right", "left"))]
+)
+def test_only_the_views_that_are_written_are_named(tmp_path, layers, views):
+    options = WriteOptions(layout="multilayer", layers=layers)
+    _, out, _ = written(tmp_path, stereo(), options, multiView=["right", "left"])
+    assert open_exr(out).metadata["multiView"] == views
 
 
 def test_metadata_of_all_parts_is_kept(tmp_path):

@@ -14,6 +14,7 @@ import pytest
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
 from oiio_msspl.exr.writer import write_fused
@@ -160,8 +161,23 @@ def test_every_layout_keeps_all_views(tmp_path, layout, stored):
 def test_nuke_layout_keeps_views_apart(tmp_path):
     _, out, _ = written(tmp_path, stereo(), WriteOptions(layout="nuke"), multiView=["right", "left"])
     views = {part.name: part.view for part in open_exr(out).parts}
-    assert views["diffuse.left"] == "left"
-    assert views["diffuse.right"] == "right"
+    expected = ["rgba.right", "rgba.left", "diffuse.right", "diffuse.left"]
+    assert views == {name: name.partition(".")[2] for name in expected}
+
+
+@pytest.mark.parametrize("layout", ["spec", "nuke"])
+@pytest.mark.parametrize("layers", [(), ("none",)])
+def test_every_part_of_a_stereo_file_is_of_one_view(tmp_path, layout, layers):
+    """The fused beauty and a layer about it, too. The attribute of a part with several views is not in the result."""
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", stereo(), multiView=["right", "left"])), view="left")
+    pixels, error = np.ones((H, W, 3), np.float32), {"error": np.ones((H, W, 1), np.float32)}
+    options = WriteOptions(layout, layers=layers)
+    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, pixels, pixels[..., :1], {}, options, extra=error)
+    result = open_exr(tmp_path / "out.exr")
+    assert "multiView" not in result.metadata
+    assert [part.view for part in result.parts[:2]] == ["left", "left"]
+    assert {part.view for part in result.parts[2:]} == (set() if layers else {"left", "right"})
+    assert {layer.name for layer in layers_of(result)} <= {"", "error", "diffuse", "depth"}
 
 
 def test_a_damaged_layer_names_the_input(tmp_path):

@@ -48,6 +48,8 @@ class ShotReport:
     shot: Shot
     results: dict[int, FrameResult] = field(default_factory=dict)
     """By frame number. A frame that the run has not reached has no entry."""
+    others: list[dict[str, Any]] = field(default_factory=list)
+    """Entries of an earlier report about frames that are not in this run."""
     first: dict[str, Any] | None = None
     """The whole report of the first fused frame: scale, model and the layers that were read."""
     seconds: float = 0.0
@@ -72,18 +74,21 @@ class ShotReport:
 
     def as_dict(self) -> dict[str, Any]:
         """The report as JSON values."""
-        counts = Counter(result.status for result in self.results.values())
+        entries = [asdict(self.results[f.number]) for f in self.shot.frames if f.number in self.results]
+        entries = [*self.others, *entries]
+        count = len(self.shot.frames) + len(self.others)
+        counts = Counter(entry.get("status") for entry in entries)
         return {
             "lrhs": str(self.shot.lr.pattern),
             "hrls": str(self.shot.hr.pattern),
             "output": str(self.shot.output),
             "finished": len(self.results) == len(self.shot.frames),
             "exit_code": self.exit_code,
-            "counts": {"all": len(self.shot.frames), **{status: counts[status] for status in STATUSES}},
+            "counts": {"all": count, **{status: counts[status] for status in STATUSES}},
             "seconds": {k: round(v, 3) for k, v in {"wall": self.seconds, **self.stage_seconds}.items()},
             "temporal": self.temporal,
             "first_fused": self.first,
-            "frames": [asdict(self.results[f.number]) for f in self.shot.frames if f.number in self.results],
+            "frames": entries,
             "version": __version__,
         }
 
@@ -133,7 +138,7 @@ def read_earlier(
     """Read the report of the run that ``skip_existing`` resumes, and check that a report can be written.
 
     Args:
-        report: gets ``first`` from the earlier report.
+        report: gets ``first`` and ``others`` from the earlier report.
         path: the report's file; None for no report.
         overwrite, skip_existing: whether the file may exist.
 
@@ -155,8 +160,11 @@ def read_earlier(
             entry["frame"]: {k: entry[k] for k in ("warnings", "repaired", "seconds")} for entry in data["frames"]
         }
         first = data["first_fused"]
-        if skip_existing and first is not None and first.keys() >= FIRST_FUSED:
-            report.first = first
+        if skip_existing:
+            numbers = {frame.number for frame in report.shot.frames}
+            report.others = [entry for entry in data["frames"] if entry["frame"] not in numbers]
+            if first is not None and first.keys() >= FIRST_FUSED:
+                report.first = first
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: exists and is no report of a shot; name another file") from error
     return entries if skip_existing else {}

@@ -379,6 +379,22 @@ def test_what_is_done_is_skipped_and_its_report_kept(tmp_path, bilinear_models):
         run(folder, bilinear_models[4], skip_existing=True, report_path=report_path)
 
 
+def test_a_resumed_report_keeps_the_frames_of_other_runs(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 4)
+    (folder / "lr/lr.1003.exr").write_text("no EXR")
+    report_path = folder / "r.json"
+    assert run(folder, bilinear_models[4], frames="1001,1003", report_path=report_path).exit_code == 2
+    before = json.loads(report_path.read_text())["frames"]
+    more = {"skip_existing": True, "report_path": report_path}
+    assert run(folder, bilinear_models[4], frames="1004", **more).exit_code == 0
+    saved = json.loads(report_path.read_text())
+    assert saved["frames"][:2] == before and [entry["frame"] for entry in saved["frames"]] == [1001, 1003, 1004]
+    assert saved["counts"] == {"all": 3, "fused": 2, "skipped": 0, "failed": 1, "missing": 0}
+    assert saved["finished"] and saved["exit_code"] == 0
+    run(folder, bilinear_models[4], frames="1004", overwrite=True, report_path=report_path)
+    assert [entry["frame"] for entry in json.loads(report_path.read_text())["frames"]] == [1004]
+
+
 # ------------------------------------------------------------------------------------------------ runs that are ended
 
 
@@ -598,7 +614,7 @@ def test_write_protected_frames_are_not_replaced(tmp_path, bilinear_models):
 
 
 def test_a_report_of_another_version_does_not_stop_a_resumed_shot(tmp_path):
-    path, report = tmp_path / "report.json", SimpleNamespace(first=None)
+    path, report = tmp_path / "report.json", SimpleNamespace(first=None, shot=SimpleNamespace(frames=[]))
     path.write_text(json.dumps({"frames": [], "first_fused": {"frame": 1001, "aovs": []}}))
     assert read_earlier(report, path, overwrite=False, skip_existing=True) == {} and report.first is None
     path.write_text(json.dumps({"frames": [], "first_fused": "1001"}))

@@ -17,6 +17,9 @@ from oiio_msspl.jobs.sequence import Frame, Shot
 #: What is read of ``first_fused`` in an earlier report. A report of another version may lack some of it.
 FIRST_FUSED = {"frame", "renderer", "scale", "model", "aovs", "notes", "passes"}
 
+#: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
+LARGEST_REPORT = 128 << 20
+
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
 
 
@@ -154,6 +157,10 @@ def read_earlier(
     check_target(path, overwrite=overwrite or skip_existing)
     if not path.exists():
         return {}
+    if not path.is_file():
+        raise InputError(f"{path}: is no ordinary file; name another file for the report")
+    if path.stat().st_size > LARGEST_REPORT:
+        raise InputError(f"{path}: exists and is too large for a report of a shot; name another file")
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {

@@ -117,19 +117,22 @@ def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport)
     Args:
         frame: the frame.
         frame_report: its :meth:`oiio_msspl.jobs.report.FrameReport.as_dict`.
-        report: of the shot. A feature that the first fused frame read from elsewhere gives a warning.
+        report: of the shot. Another scale, model or source of a feature than in the first fused frame gives a warning.
     """
     first = report.first = report.first or {"frame": frame.number, **frame_report}
     warnings = list(frame_report["warnings"])
     if frame_report["repaired"]:
         warnings.append(f"repaired values that were NaN or infinite in {', '.join(frame_report['repaired'])}")
-    first_status = {row["feature"]: row["status"] for row in first["aovs"]}
+    there = {row["feature"]: row["status"] for row in first["aovs"]}
+    changes = {row["feature"]: (row["status"], there[row["feature"]]) for row in frame_report["aovs"]}
+    changes["the scale"] = f"x{frame_report['scale']}", f"x{first['scale']}"
+    if frame_report["scale"] == first["scale"]:  # each scale has models of its own
+        changes["the model"] = frame_report["model"], first["model"]
     words = {"default": "not found", "absent": "not found"}
-    for row in frame_report["aovs"]:
-        here, there = row["status"], first_status[row["feature"]]
-        if here != there:
-            here, there = words.get(here, here), words.get(there, there)
-            warnings.append(f"{row['feature']} is {here} here and {there} in frame {first['frame']}: it may flicker")
+    for what, states in changes.items():
+        here, before = (words.get(state, state) for state in states)
+        if states[0] != states[1] and "unused" not in states:  # another model reads other features
+            warnings.append(f"{what} is {here} here and {before} in frame {first['frame']}: it may flicker")
     return result_of(
         frame, FUSED, warnings=warnings, repaired=frame_report["repaired"], seconds=frame_report["seconds"]
     )

@@ -395,6 +395,18 @@ def test_a_resumed_report_keeps_the_frames_of_other_runs(tmp_path, bilinear_mode
     assert [entry["frame"] for entry in json.loads(report_path.read_text())["frames"]] == [1004]
 
 
+def test_another_model_or_scale_than_that_of_the_first_frame_is_a_warning(tmp_path, bilinear_models):
+    """Of this run, and of the earlier one that it resumes."""
+    folder = make_shot(tmp_path, 3)
+    write_exr(folder / "lr/lr.1003.exr", rgb(downsample(picture(HEIGHT, WIDTH), 2)))
+    more = {"skip_existing": True, "report_path": folder / "r.json"}
+    assert run(folder, bilinear_models[4], frames="1001", **more).results[1001].warnings == []
+    report = run(folder, "fast", **more)
+    (same_scale,), (other_scale,) = (report.results[number].warnings for number in (1002, 1003))
+    assert same_scale == "the model is joint-small-x4 here and bilinear-x4 in frame 1001: it may flicker"
+    assert other_scale == "the scale is x2 here and x4 in frame 1001: it may flicker"
+
+
 # ------------------------------------------------------------------------------------------------ runs that are ended
 
 

@@ -29,6 +29,9 @@ from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, StripCache, Str
 oiio.attribute("limits:channels", 1 << 16)
 oiio.attribute("limits:imagesize_MB", 0)
 
+#: Characters of an error of OpenImageIO that are quoted.
+LONGEST_REASON = 200
+
 
 @dataclass(frozen=True)
 class Channel:
@@ -340,10 +343,14 @@ def _text(value: Any) -> Any:
 
 
 def reason_of(source: Any) -> str:
-    """The last error of OpenImageIO, or of one of its files, on one line."""
+    """The error of OpenImageIO, or of one of its files, on one line: the first one, of which others may be the result.
+
+    It is cut because a damaged header may be quoted in it.
+    """
     try:
         # What follows is advice for programmers: to raise a limit of the library.
-        reason = str(source.geterror()).partition("Possible corrupt input?")[0]
-        return " ".join(reason.split()) or "no reason given"
+        reason = str(source.geterror()).partition("Possible corrupt input?")[0].strip()
+        first = " ".join(reason.partition("\n")[0].split())
+        return f"{first[:LONGEST_REASON]}..." if len(first) > LONGEST_REASON else first or "no reason given"
     except UnicodeDecodeError:  # the message quotes bytes of the file, and OpenImageIO's binding expects UTF-8
         return "its header or its pixels are damaged"

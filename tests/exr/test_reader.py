@@ -5,7 +5,7 @@ import OpenImageIO as oiio
 import pytest
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.reader import open_exr, use_threads
+from oiio_msspl.exr.reader import open_exr, reason_of, use_threads
 from oiio_msspl.exr.render import Window
 from tests.conftest import SHARED, needs_shared, picture, rgb, write_exr
 
@@ -87,6 +87,24 @@ def test_a_truncated_file_says_where_it_ends(tmp_path):
     file = open_exr(path)
     with pytest.raises(InputError, match=r"a\.exr: part 0 .*rows \d+ to \d+ can't be read"):
         file.read(file.parts[0].channels, file.parts[0].data_window)
+
+
+def test_a_damaged_header_is_told_in_one_error(tmp_path):
+    """OpenImageIO quotes each piece of the header that it can't read."""
+    manifest = ", ".join(f'"object {number}": "{number:08x}"' for number in range(400))
+    path = write_exr(tmp_path / "a.exr", rgb(picture(8, 8)), **{"cryptomatte/1/manifest": manifest})
+    path.write_bytes(path.read_bytes()[:3000])
+    with pytest.raises(InputError, match="can't be opened as an EXR") as caught:
+        open_exr(path)
+    assert len(str(caught.value)) < 400 and str(caught.value).count("EXR Error") == 1
+
+
+def test_a_long_error_is_cut():
+    class Source:
+        def geterror(self):
+            return f"  channel {'x' * 5000}\nmore"
+
+    assert reason_of(Source()) == f"channel {'x' * 192}..."
 
 
 @needs_shared("exr")

@@ -20,7 +20,11 @@ from oiio_msspl.errors import InputError
 #: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq understands each of these, but
 #: it splits the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no
 #: number in ``a.####_v2.exr``, it takes ``a.#.##.exr`` for subframes, and it refuses a folder named ``lr#1``.
-_NUMBER_FIELD = re.compile(r"#+|@+|%\d*d|\$F\d*")
+_NUMBER_FIELD = re.compile(r"#+|@@+|%\d+d|\$F\d*")
+
+#: The same in its shortest forms, if there is no longer one. They also occur in ordinary names (``still@2x.exr``,
+#: ``100%done.exr``), so ``@`` counts only between separators, and ``%d`` only if no letter or digit follows.
+_SHORT_FIELD = re.compile(r"(?<![^._ -])@(?![^._ -])|%d(?![^\W_])")
 
 #: A name whose number is not at its end, such as ``anim.0001_lr.exr``: head, number, tail. A number that follows a
 #: letter is none: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
@@ -105,7 +109,12 @@ class Shot:
 
 def is_sequence(path: Path) -> bool:
     """Whether this is a folder or a pattern, and not a single file."""
-    return path.is_dir() or (_NUMBER_FIELD.search(path.name) is not None and not path.exists())
+    return path.is_dir() or (bool(_number_fields(path.name)) and not path.exists())
+
+
+def _number_fields(name: str) -> list[re.Match[str]]:
+    """Where a name marks the frame number; empty if it is no pattern."""
+    return list(_NUMBER_FIELD.finditer(name)) or list(_SHORT_FIELD.finditer(name))
 
 
 def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | Iterable[int] | None = None) -> Shot:
@@ -164,7 +173,7 @@ def parse_pattern(path: Path) -> Pattern:
     Raises:
         InputError: the name has no frame number, or several.
     """
-    fields = list(_NUMBER_FIELD.finditer(path.name))
+    fields = _number_fields(path.name)
     if len(fields) != 1:
         raise InputError(f"{path}: a pattern has its frame number in one place, such as name.####.exr or name.%04d.exr")
     start, end = fields[0].span()
@@ -258,7 +267,7 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
 
 def _output_pattern(output: Path, hr: Pattern) -> Pattern:
     """The names of the fused frames."""
-    if _NUMBER_FIELD.search(output.name) and not output.is_dir():
+    if _number_fields(output.name) and not output.is_dir():
         pattern = parse_pattern(output)
         if not pattern.tail.lower().endswith(".exr"):
             raise InputError(f"{output}: the results are EXRs; name them .exr")

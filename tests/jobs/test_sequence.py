@@ -4,7 +4,7 @@
 import pytest
 
 from oiio_msspl import InputError
-from oiio_msspl.jobs.sequence import find_shot, format_frames, parse_frames, parse_pattern
+from oiio_msspl.jobs.sequence import find_shot, format_frames, is_sequence, parse_frames, parse_pattern
 
 
 def touch(folder, *names):
@@ -23,6 +23,19 @@ def test_every_way_to_write_a_pattern_means_the_same_files(tmp_path, pattern):
     assert [frame.number for frame in found.frames] == [-3, 7, 10000]
     assert [frame.lr.name for frame in found.frames] == ["a.-003.exr", "a.0007.exr", "a.10000.exr"]
     assert found.frames[1].output == tmp_path / "a.0007.exr"
+
+
+@pytest.mark.parametrize("name", ["still@2x.exr", "me@home.exr", "100%done.exr", "a.exr"])
+def test_ordinary_names_are_no_patterns(tmp_path, name):
+    assert not is_sequence(tmp_path / name)
+    longer = name.replace(".exr", ".####.exr")
+    assert parse_pattern(tmp_path / longer).path(7).name == name.replace(".exr", ".0007.exr")
+
+
+@pytest.mark.parametrize("name", ["a.@.exr", "@.exr", "a_@-b.exr", "a%d.exr", "a.%d_lr.exr", "%d"])
+def test_the_shortest_patterns_are_of_one_digit(tmp_path, name):
+    assert is_sequence(tmp_path / name)
+    assert parse_pattern(tmp_path / name).path(7).name == name.replace("@", "7").replace("%d", "7")
 
 
 def test_folders_pair_by_number_whatever_names_and_padding(tmp_path):

@@ -222,17 +222,20 @@ MotionFormat = Annotated[
 
 
 class _OneLine(logging.Formatter):
-    """Prints a message on one line: it may contain names out of a file. A traceback follows on lines of its own."""
+    """Prints a message on one line: it may contain names out of a file. A traceback follows on lines of its own.
+
+    Nuke's node reads lines that begin with ``warning:`` and ``error:``, as the commands print them.
+    """
 
     def formatMessage(self, record: logging.LogRecord) -> str:
-        return printable(super().formatMessage(record))
+        return printable(f"{record.levelname.lower()}: {record.message}")
 
 
 def set_up_logging(verbose: int, quiet: bool) -> None:
     """Send the library's log to standard error: warnings, with -v information, with -vv all."""
     level = logging.ERROR if quiet else (logging.WARNING, logging.INFO, logging.DEBUG)[min(verbose, 2)]
     handler = logging.StreamHandler()
-    handler.setFormatter(_OneLine("%(levelname)s: %(message)s"))
+    handler.setFormatter(_OneLine())
     logging.basicConfig(level=level, handlers=[handler], force=True)
 
 

@@ -2,12 +2,13 @@
 """What people see on a terminal, and what a pipe gets."""
 
 import json
+import logging
 import os
 import subprocess
 import sys
 
 import pytest
-from msspl_cli import console
+from msspl_cli import console, options
 
 from tests.shots import make_shot
 
@@ -39,6 +40,16 @@ def test_where_a_feature_comes_from_is_said_in_words(capsys, row, text):
     note = "scaled" if status == "computed" else ""
     console.aov_table([{"feature": feature, "status": status, "source": source, "note": note}], ["n"])
     assert capsys.readouterr().out == f"  {feature}  {text}\n  note: n\n"
+
+
+def test_the_library_s_log_is_printed_like_all_other_messages(capsys, monkeypatch):
+    """In lower case, as Nuke's node reads it, and on one line."""
+    monkeypatch.setattr(logging.root, "handlers", [])
+    monkeypatch.setattr(logging.root, "level", logging.root.level)
+    options.set_up_logging(verbose=1, quiet=False)
+    logging.getLogger("oiio_msspl.jobs.shot").warning("frame %d: a\nb", 3)
+    logging.info("step 1 of 2")
+    assert capsys.readouterr().err == "warning: frame 3: a\\nb\ninfo: step 1 of 2\n"
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs a pseudo-terminal")

@@ -43,6 +43,8 @@ def printable(text: str) -> str:
 
 #: Why the file system refuses a path that the caller can change.
 _REFUSED = {errno.EACCES, errno.EPERM, errno.ENAMETOOLONG, errno.ELOOP, errno.ENOENT, errno.ENOTDIR}
+#: The disk, or the user's share of it, is full.
+_FULL = {errno.ENOSPC, errno.EDQUOT}
 
 
 def explain(error: Exception) -> tuple[str, int]:
@@ -51,8 +53,15 @@ def explain(error: Exception) -> tuple[str, int]:
         return str(error), error.exit_code
     if isinstance(error, MemoryError):
         return "out of memory; try a smaller --max-memory", 1
-    if isinstance(error, OSError) and error.errno in _REFUSED:
+    if isinstance(error, OSError):
         path = error.filename2 or error.filename
-        if isinstance(path, str | bytes | os.PathLike):
-            return f"{os.fsdecode(path)}: can't be used ({error.strerror})", InputError.exit_code
+        name = os.fsdecode(path) if isinstance(path, str | bytes | os.PathLike) else ""
+        if name and error.errno in _REFUSED:
+            return f"{name}: can't be used ({error.strerror})", InputError.exit_code
+        if error.errno in _FULL:
+            name = name or "standard output or a temporary file"
+            return f"{name}: can't be written ({error.strerror}); free space", 1
+        if "temporary directory" in str(error.strerror):  # Python's tempfile has tried all folders that it knows
+            reason = f"no folder for temporary files can be used ({error.strerror})"
+            return f"{reason}; free space, or export TMPDIR=/another/folder", 1
     return f"unexpected {type(error).__name__}: {error} (--debug shows where)", 1

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """What all programs have in common: --help, and that they are installed."""
 
+import os
 import re
 import shutil
 import subprocess
@@ -80,3 +81,12 @@ def test_help_all_of_submit_lists_the_options_of_msspl_fuse():
         done = run("msspl", "submit", *arguments, "--help-all")
         assert done.returncode == 0
         assert {"--scheduler", "--half", "--layout"} <= options_in(done.stdout)
+
+
+@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs a device that is always full")
+def test_a_full_disk_behind_standard_output_is_told():
+    code = "import sys; from msspl_cli.app import msspl as main; sys.argv[0] = 'msspl'; main()"
+    with open("/dev/full", "w") as full:
+        done = subprocess.run([sys.executable, "-c", code, "models"], stdout=full, stderr=subprocess.PIPE, text=True)
+    assert done.returncode == 1
+    assert done.stderr.startswith("error: standard output or a temporary file: can't be written (")

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 import tomllib
 from fnmatch import fnmatchcase
@@ -30,7 +31,7 @@ def detect_renderer(file: ExrFile, layers: list[Layer]) -> dict[str, Any]:
 
 
 def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) -> float | None:
-    """Samples per pixel as the header says, or None.
+    """Samples per pixel as the header says; None if it says nothing, or no number above 0.
 
     Args:
         renderer: entry of the table.
@@ -42,9 +43,10 @@ def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) 
         keys = [key for key in found if view_layer and view_layer in key] or list(found)
         if keys:
             try:
-                return float(found[keys[0]]) ** rule.get("power", 1)
-            except (TypeError, ValueError):
+                spp = float(found[keys[0]]) ** rule.get("power", 1)
+            except (TypeError, ValueError, OverflowError):
                 return None
+            return spp if 0 < spp < math.inf else None
     return None
 
 

@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -43,6 +44,11 @@ class InputOptions:
     """The user's additive sets, as ``NAME=a+b+c*d``."""
     map_file: Path | None = None
     """The file that ``mapping`` was read from, if any."""
+
+    def __post_init__(self) -> None:
+        for option, spp in (("--lr-spp", self.lr_spp), ("--hr-spp", self.hr_spp)):
+            if spp is not None and not 0 < spp < math.inf:
+                raise InputError(f"{option} {spp:g}: give the samples per pixel, a number above 0")
 
     def absolute(self) -> InputOptions:
         """The same with an absolute path, for workers with other working directories. Paths in ``mapping`` are full."""

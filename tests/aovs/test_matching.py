@@ -112,6 +112,13 @@ def test_stereo_views_of_one_part(tmp_path):
     assert left.read(left.data_window)["rgb"][0, 0, 0] == 2
 
 
+@pytest.mark.parametrize("samples", ["inf", "nan", "0", "-4", "1e999", "many"])
+def test_a_header_without_a_number_of_samples_says_nothing(tmp_path, samples):
+    attributes = {"cycles.ViewLayer.samples": samples}
+    render = mapped(tmp_path, layer("ViewLayer.Combined", 1), attributes=attributes)
+    assert (render.renderer, render.spp) == ("Cycles", None)
+
+
 def test_a_variance_per_sample_without_spp_is_defaulted_and_said(tmp_path):
     channels = layer("", 1) | layer("Albedo", 2) | layer("Ns", 0, "XYZ") | layer("Variance", 3)
     render = mapped(tmp_path, channels)

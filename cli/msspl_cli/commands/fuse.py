@@ -61,7 +61,6 @@ def fuse(
         float | None,
         typer.Option(
             "--lr-spp",
-            min=0,
             metavar="N",
             help="Samples per pixel of LR, if its header does not say.",
             rich_help_panel=options.INPUT,
@@ -72,7 +71,6 @@ def fuse(
         float | None,
         typer.Option(
             "--hr-spp",
-            min=0,
             metavar="N",
             help="Samples per pixel of HR, if its header does not say.",
             rich_help_panel=options.INPUT,

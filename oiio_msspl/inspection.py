@@ -16,6 +16,7 @@ from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.motion import user_fields
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
@@ -145,7 +146,7 @@ def inspect_file(
                 result.other_views.append(view)
             except InputError as error:
                 facts = [f"can't be fused: {str(error).removeprefix(f'{path}: ')}"]
-            result.facts += [f"{label or '(unnamed)'}: {fact}" for fact in facts]
+            result.facts += [f"{name_of(label)}: {fact}" for fact in facts]
         result.unused = render.unused_layers(result.other_views, result.fused_sets)
         _inspect_motion(result, render, inputs, motion_format)
     except InputError as error:
@@ -220,7 +221,7 @@ def _next_frame(path: Path) -> Path | None:
 
 def _renderer_fact(render: MappedRender) -> str:
     spp = "unknown spp" if render.spp is None else f"{render.spp:g} spp"
-    others = f"; also {', '.join(each or '(unnamed)' for each in render.other_views)}" if render.other_views else ""
+    others = f"; also {', '.join(map(name_of, render.other_views))}" if render.other_views else ""
     view = f", {render.view}" if render.view else ""
     return f"renderer: {render.renderer}, {spp}{view}{others}"
 

@@ -87,10 +87,11 @@ def _print_json(result: FrameResult, report: ShotReport) -> None:
 
 def print_table(report: ShotReport) -> None:
     """Print which layers were read, and which frames ended in which way and why."""
+    from oiio_msspl.aovs.views import name_of
     from oiio_msspl.jobs.sequence import format_frames
 
     if first := report.first:
-        fused = [each["view"] or "(unnamed)" for each in first.get("fused_views", ())]
+        fused = [name_of(each["view"]) for each in first.get("fused_views", ())]
         view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
         pairs = f"{first['renderer']} pairs at x{first['scale']}, {first['model']}"
         console.say(f"{pairs}{view}; layers of frame {first['frame']}:")

@@ -27,6 +27,11 @@ class Beauty(NamedTuple):
         return "/".join(name for name in (self.view, self.view_layer) if name)
 
 
+def name_of(view: str) -> str:
+    """A view or view layer, in words."""
+    return view or "(unnamed)"
+
+
 def find_beauties(layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty]:
     """The beauties of all views and view layers: the layers that match the first candidate that matches any."""
     for candidate in candidates:
@@ -54,5 +59,5 @@ def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> 
     for beauty in sorted(beauties, key=lambda each: each.label != wanted):  # the whole name counts more than a part
         if wanted in (beauty.view, beauty.view_layer, beauty.label):
             return beauty
-    known = ", ".join(dict.fromkeys(beauty.label or "(unnamed)" for beauty in beauties))
+    known = ", ".join(dict.fromkeys(name_of(beauty.label) for beauty in beauties))
     raise InputError(f"{file.path}: no view or view layer {wanted!r}; the file has {known}")

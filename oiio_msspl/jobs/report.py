@@ -12,6 +12,7 @@ from typing import Any
 from oiio_msspl._version import __version__
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
@@ -163,11 +164,6 @@ def merged(sentences: Mapping[str, Sequence[str]]) -> list[str]:
         for text in texts:
             views.setdefault(text, []).append(name_of(view))
     return [text if len(who) == len(sentences) else f"{', '.join(who)}: {text}" for text, who in views.items()]
-
-
-def name_of(view: str) -> str:
-    """A view or view layer, in words."""
-    return view or "(unnamed)"
 
 
 def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:

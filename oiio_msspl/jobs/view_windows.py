@@ -6,10 +6,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import TYPE_CHECKING
 
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
-from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 

@@ -17,6 +17,7 @@ import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels, widest_type
@@ -87,7 +88,7 @@ def find_other_views(
             if not taken.isdisjoint(view.hr.beauty_channels):
                 raise InputError("its beauty is a layer of another view")
         except InputError as error:
-            passed_on.append(f"{label or '(unnamed)'} is passed on as it is: {error}")
+            passed_on.append(f"{name_of(label)} is passed on as it is: {error}")
             continue
         if not dropped.issuperset(view.hr.beauty_channels):
             # A layer of no view layer may be found for several.

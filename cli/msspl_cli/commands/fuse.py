@@ -299,11 +299,13 @@ def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
 
 def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each step."""
+    from oiio_msspl.aovs.views import name_of
+
     spp = report.spp_avg
     renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
-    fused = [each.hr.view or "(unnamed)" for each in report.fused_views()]
+    fused = [name_of(each.hr.view) for each in report.fused_views()]
     view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
-    rest = [each or "(unnamed)" for each in report.hr.other_views if (each or "(unnamed)") not in fused]
+    rest = [name for name in map(name_of, report.hr.other_views) if name not in fused]
     others = f" (also there: {', '.join(rest)})" if rest else ""
     average = f", {spp:g} spp on average" if spp is not None else ""
     console.say(f"{renderer} at x{report.scale}{average}{view}{others}")
@@ -313,7 +315,7 @@ def _print(report: FrameReport, seconds: float) -> None:
         read = [f"{row['feature']} {row['source']}" for row in rows if row["status"] in ("found", "computed")]
         if any((row["feature"], row["status"]) == ("albedo", "default") for row in rows):
             read.append("albedo none: expect blur")
-        console.say(f"  view {other.hr.view or '(unnamed)'}: {', '.join(read)}")
+        console.say(f"  view {name_of(other.hr.view)}: {', '.join(read)}")
     if lrhs_aovs := report.found_lrhs_aovs():
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
     for name, done in report.passes.items():

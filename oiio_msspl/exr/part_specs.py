@@ -118,6 +118,11 @@ def _stays_whole(part: Part, contents: FileContents) -> bool:
     return _has_one_type(part) or (part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART)
 
 
+def is_held_whole(part: Part, contents: FileContents) -> bool:
+    """Whether a part is held in memory while it is copied, because it stays whole and has several pixel types."""
+    return not part.deep and not _has_one_type(part) and _stays_whole(part, contents)
+
+
 def _has_one_type(part: Part) -> bool:
     return len({channel.type for channel in part.channels}) == 1
 

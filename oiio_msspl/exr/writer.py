@@ -21,7 +21,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
-from oiio_msspl.exr.part_specs import LARGEST_MIXED_PART, PassedOnPart, beauty_spec, extra_spec, passed_on_parts
+from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, extra_spec, is_held_whole, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import check_single_part, write_single_part
@@ -94,23 +94,32 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
     Raises:
         InputError: it can't, or a pattern of ``options`` matches nothing.
     """
-    dropped = dropped_channels(source, beauty, options.layers)
+    contents = _without_pixels(source, beauty, options, extra)
     if options.layout == "multilayer":
-        nothing = np.empty((0, 0, 3), np.float32)
-        pixels = FusedPixels(nothing, None, dict.fromkeys(extra, nothing), stored_type(beauty, options))
-        check_single_part(FileContents(source, tuple(beauty), dropped, pixels, {}, options))
+        check_single_part(contents)
 
 
 def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:
     """Memory of the pixels that :func:`write_fused` holds at once, beside the fused frame; from the headers alone."""
+    contents = _without_pixels(source, beauty, options)
     if options.layout == "multilayer":
-        dropped = dropped_channels(source, beauty, options.layers)
         flat = [part for part in source.parts if not part.deep]
-        return sum(part.plane_bytes(c) for part in flat for c in part.channels if c not in dropped)
-    if options.layout == "nuke":
-        return 0  # splits all parts
-    mixed = [part.nbytes for part in source.parts if len({channel.type for channel in part.channels}) > 1]
-    return max((size for size in mixed if size <= LARGEST_MIXED_PART), default=0)
+        return sum(part.plane_bytes(c) for part in flat for c in part.channels if c not in contents.dropped)
+    return max((part.nbytes for part in source.parts if is_held_whole(part, contents)), default=0)
+
+
+def _without_pixels(
+    source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str] = ()
+) -> FileContents:
+    """What :func:`write_fused` would write, as far as the headers tell.
+
+    Raises:
+        InputError: a pattern of ``options`` matches nothing.
+    """
+    nothing = np.empty((0, 0, 3), np.float32)
+    pixels = FusedPixels(nothing, None, dict.fromkeys(extra, nothing), stored_type(beauty, options))
+    dropped = dropped_channels(source, beauty, options.layers)
+    return FileContents(source, tuple(beauty), dropped, pixels, {}, options)
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:

@@ -17,7 +17,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
-from oiio_msspl.exr.writer import write_fused
+from oiio_msspl.exr.writer import bytes_held, write_fused
 from tests.conftest import picture, read_bits, rgb, same_bits, write_exr
 from tests.exr.sources import SOURCES, H, W, everything, flat, plain, stereo, written
 
@@ -233,6 +233,18 @@ def test_mixed_parts_are_copied_whole(tmp_path):
         assert same_bits(parts[1][1][name], plane), name
 
 
+@pytest.mark.parametrize(("layers", "is_held"), [((), True), (("id",), False), (("none",), False)])
+def test_only_parts_that_stay_whole_are_held_in_memory(tmp_path, layers, is_held):
+    """One that holds the beauty is split, and so is one of which not all is written."""
+    rest = {name: plane for name, plane in everything().items() if name not in "RGBA"}
+    alone = map_render(open_exr(write_exr(tmp_path / "alone.exr", everything())))
+    assert bytes_held(alone.file, alone.beauty_channels, WriteOptions(layers=layers)) == 0
+    parts = [("rgba", rgb(picture(H, W)), (0, 0)), ("rest", rest, (0, 0))]
+    beside = map_render(open_exr(write_exr(tmp_path / "beside.exr", parts)))
+    expected = sum(plane.nbytes for plane in rest.values()) if is_held else 0
+    assert bytes_held(beside.file, beside.beauty_channels, WriteOptions(layers=layers)) == expected
+
+
 def test_windows_and_metadata_are_kept(tmp_path):
     display = (np.array([0, 0], np.int32), np.array([99, 79], np.int32))
     _, out, _ = written(
@@ -344,7 +356,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.exr.writer import write_fused
+from oiio_msspl.exr.writer import bytes_held, write_fused
 limit = int(sys.argv[2])
 if limit:
     import signal

@@ -26,7 +26,7 @@ import OpenImageIO as oiio
 from benchmarks import results
 from benchmarks.results import Row
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.compare import compare_files
+from oiio_msspl.compare import open_comparison, score_images
 from oiio_msspl.exr.reader import open_exr
 
 
@@ -92,7 +92,7 @@ def run_pair(lr: Path, hr: Path, out: Path, arguments: list[str]) -> dict[str, A
     }
     reference = hr.with_name("ref.exr")
     if reference.exists():
-        fused, high, low = compare_files([out, hr, lr], reference)
+        fused, high, low = score_images(open_comparison([out, hr, lr], reference))
         result["scores"] = {"fused": fused, "hrls": high, "lrhs bicubic": low}
     return result
 

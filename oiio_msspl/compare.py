@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple
+from dataclasses import astuple, dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -40,50 +41,73 @@ def scores(image: Array, reference: Array) -> dict[str, float]:
     }
 
 
-def compare_files(images: Sequence[Path], reference: Path) -> list[dict[str, float]]:
-    """Score the beauty of each image against that of the reference, over the part of the frame that all files show.
+@dataclass(frozen=True)
+class Comparison:
+    """EXR files whose beauties are compared, over the part of the frame that all of them show."""
+
+    renders: list[MappedRender]
+    """The images, and behind them the reference if there is one."""
+    has_reference: bool
+    largest: int
+    """Position of the render at whose size all are compared: the reference, or else the largest image."""
+    windows: list[Window]
+    """What is compared of each render, see :func:`common_windows`."""
+
+    @cached_property
+    def truth(self) -> Array:
+        """The beauty of the reference, (height, width, 3)."""
+        return self._read(-1)
+
+    def image(self, position: int) -> Array:
+        """The beauty of an image, upsampled to the size of the reference if it is smaller."""
+        image, (height, width) = self._read(position), self.truth.shape[:2]
+        return image if image.shape == self.truth.shape else upsample_bicubic(image, width, height)
+
+    def _read(self, position: int) -> Array:
+        """The beauty of a render without NaN and infinities."""
+        return repair(self.renders[position].read(self.windows[position], [RGB])[RGB])[0]
+
+
+def open_comparison(images: Sequence[Path], reference: Path | None = None) -> Comparison:
+    """Read the headers of the files to compare.
 
     Args:
-        images: EXR files. One that is smaller by x2, x4 or x8 is upsampled bicubically first.
+        images: EXR files. One may be smaller than the largest by x2, x4 or x8.
         reference: EXR file of what the images should be.
 
-    Returns:
-        :func:`scores` of each image.
+    Raises:
+        InputError: a file can't be read or has no beauty, or see :func:`common_windows`.
+    """
+    paths = [*images, *([reference] if reference else [])]
+    renders = [map_render(open_exr(path), features=()) for path in paths]
+    sizes = [each.data_window.width * each.data_window.height for each in renders]
+    largest = len(renders) - 1 if reference else sizes.index(max(sizes))
+    return Comparison(renders, reference is not None, largest, common_windows(renders, renders[largest]))
+
+
+def score_images(comparison: Comparison) -> list[dict[str, float]]:
+    """The :func:`scores` of each image. One that is smaller than the reference is upsampled bicubically first.
 
     Raises:
-        InputError: a file can't be read, an image's size does not fit the reference, the files have no part of the
-            frame in common, or that part is too small.
+        InputError: pixels can't be read, or what is compared is too small.
     """
-    *renders, last = [open_beauty(path) for path in (*images, reference)]
-    *windows, window = common_windows([*renders, last], last)
+    render, window = comparison.renders[-1], comparison.windows[-1]
     if min(window.height, window.width) < SSIM_WINDOW:
-        what = "is" if window == last.data_window else "the part that all files show is"
-        raise InputError(f"{reference}: {what} {window.size}; SSIM needs at least {SSIM_WINDOW} pixels each way")
-    truth = _read(last, window)
-    return [scores(_read_at_size_of(truth, each, part), truth) for each, part in zip(renders, windows, strict=True)]
+        what = "is" if window == render.data_window else "the part that all files show is"
+        raise InputError(f"{render.name}: {what} {window.size}; SSIM needs at least {SSIM_WINDOW} pixels each way")
+    return [scores(comparison.image(i), comparison.truth) for i in range(len(comparison.renders) - 1)]
 
 
-def note_on_windows(images: Sequence[Path], reference: Path | None = None) -> str:
+def note_on_windows(comparison: Comparison) -> str:
     """A sentence for the user if not all files show the whole frame, so that only a part can be compared.
 
     Returns:
         An empty text if all that the files show is compared.
-
-    Raises:
-        InputError: a file can't be read, or see :func:`common_windows`.
     """
-    renders = [open_beauty(path) for path in (*images, *([reference] if reference else []))]
-    largest = largest_of(renders, has_reference=reference is not None)
-    windows = common_windows(renders, largest)
-    if all(window == render.data_window for render, window in zip(renders, windows, strict=True)):
+    if comparison.windows == [render.data_window for render in comparison.renders]:
         return ""
-    part = next(window for render, window in zip(renders, windows, strict=True) if render is largest)
+    part = comparison.windows[comparison.largest]
     return f"The data windows differ; only the part that all pictures show is compared: {part}"
-
-
-def largest_of(renders: Sequence[MappedRender], *, has_reference: bool) -> MappedRender:
-    """The render at whose size all are compared: the last one if that is the reference, otherwise the largest."""
-    return renders[-1] if has_reference else max(renders, key=lambda r: r.data_window.width * r.data_window.height)
 
 
 def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> list[Window]:
@@ -151,22 +175,19 @@ def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) ->
     check_separate(compared, [path])
 
 
-def write_error_map(path: Path, image: Path, reference: Path, *, overwrite: bool) -> None:
-    """Write the :func:`error_map` of an image as a PNG.
+def write_error_map(path: Path, comparison: Comparison, *, overwrite: bool) -> None:
+    """Write the :func:`error_map` of the first image as a PNG.
 
     Args:
         path: the PNG to write.
-        image, reference: EXR files, as for :func:`compare_files`.
+        comparison: the image and its reference.
         overwrite: replace an existing file.
 
     Raises:
-        InputError: a file can't be read, the image does not fit the reference, or ``path`` exists.
+        InputError: pixels can't be read, or ``path`` exists.
         MssplError: the PNG can't be written.
     """
-    render, last = (open_beauty(each) for each in (image, reference))
-    part, window = common_windows([render, last], last)
-    truth = _read(last, window)
-    write_png(path, error_map(_read_at_size_of(truth, render, part), truth), overwrite=overwrite)
+    write_png(path, error_map(comparison.image(0), comparison.truth), overwrite=overwrite)
 
 
 def error_map(image: Array, truth: Array) -> Array:
@@ -200,23 +221,3 @@ def upsample_bicubic(image: Array, width: int, height: int) -> Array:
     buffer = oiio.ImageBuf(np.ascontiguousarray(image))
     result = oiio.ImageBufAlgo.resize(buffer, filtername="cubic", roi=oiio.ROI(0, width, 0, height))
     return np.maximum(np.asarray(result.get_pixels(oiio.FLOAT), dtype=np.float32), 0)
-
-
-def open_beauty(path: Path) -> MappedRender:
-    """Open an EXR and find its beauty alone.
-
-    Raises:
-        InputError: it can't be read, or has no beauty.
-    """
-    return map_render(open_exr(path), features=())
-
-
-def _read(render: MappedRender, window: Window) -> Array:
-    """The beauty over a window, without NaN and infinities: (height, width, 3)."""
-    return repair(render.read(window, [RGB])[RGB])[0]
-
-
-def _read_at_size_of(truth: Array, render: MappedRender, window: Window) -> Array:
-    """The beauty over a window, upsampled to the size of the reference if it is smaller."""
-    image = _read(render, window)
-    return image if image.shape == truth.shape else upsample_bicubic(image, truth.shape[1], truth.shape[0])

@@ -35,14 +35,7 @@ from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX, Array, repair
 from oiio_msspl.colour import REC709, conversion, space_of
-from oiio_msspl.compare import (
-    common_windows,
-    error_colours,
-    error_levels,
-    largest_of,
-    open_beauty,
-    upsample_bicubic,
-)
+from oiio_msspl.compare import Comparison, error_colours, error_levels, upsample_bicubic
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate, check_target, replacing
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
@@ -101,7 +94,6 @@ class _Layer:
 class _Picture:
     """One of the files that are shown."""
 
-    path: Path
     render: MappedRender
     layers: dict[str, _Layer]
     """All that the file holds, by their names without what programs spell differently."""
@@ -136,8 +128,7 @@ def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None
 
 def write_page(
     path: Path,
-    images: Sequence[Path],
-    reference: Path | None = None,
+    comparison: Comparison,
     *,
     layers: Sequence[str] = (),
     overwrite: bool = False,
@@ -147,25 +138,18 @@ def write_page(
 
     Args:
         path: the page to write.
-        images: EXR files. They may be smaller than the reference, or than the largest of them, by x2, x4 or x8. The
-            page shows such an image with its own large pixels. Scores and error maps upsample it bicubically.
-        reference: EXR file of what the images should be. Without it there are no scores and error maps.
+        comparison: the images, and perhaps a reference. Without it there are no scores and error maps. The page shows
+            an image that is smaller with its own large pixels. Scores and error maps upsample it bicubically.
         layers: patterns of the layers to show beside the beauty. Without any, those that sum to the beauty are shown.
         overwrite: replace an existing file.
         progress: called with the number of layers done and of all.
 
     Raises:
-        InputError: a file can't be read, sizes or data windows do not fit, no file has a layer of a pattern, or
-            ``path`` exists.
+        InputError: a file can't be read, no file has a layer of a pattern, or ``path`` exists.
         MssplError: the page can't be written.
     """
-    paths = [*images, *([reference] if reference else [])]
-    pictures = [_open(each) for each in paths]
-    renders = [each.render for each in pictures]
-    at_size_of = largest_of(renders, has_reference=reference is not None)
-    windows = common_windows(renders, at_size_of)
-    pictures = [replace(each, window=window) for each, window in zip(pictures, windows, strict=True)]
-    largest = next(each for each in pictures if each.render is at_size_of)
+    pictures = list(map(_picture, comparison.renders, comparison.windows))
+    largest, has_reference = pictures[comparison.largest], comparison.has_reference
     keys = _chosen(pictures, layers)
     head, tail = resources.files("oiio_msspl").joinpath(TEMPLATE).read_text(encoding="utf-8").split(DATA)
     with replacing(path, overwrite=overwrite) as temporary:
@@ -174,8 +158,8 @@ def write_page(
             shown = []
             for done, key in enumerate(keys):
                 progress(done, len(keys))
-                shown.append(_write_layer(out, done, key, pictures, largest if reference else None))
-            manifest = _manifest(pictures, largest, reference is not None, shown)
+                shown.append(_write_layer(out, done, key, pictures, largest if has_reference else None))
+            manifest = _manifest(pictures, largest, has_reference, shown)
             # A name may hold "</script>"; JSON may write any character as an escape.
             text = json.dumps(manifest, allow_nan=False).replace("<", "\\u003c")
             out.write(f'<script type="application/json" id="manifest">{text}</script>')
@@ -184,9 +168,8 @@ def write_page(
     return PageSummary(size, tuple(layer["name"] for layer in shown))
 
 
-def _open(path: Path) -> _Picture:
-    """Read the headers of a file, and find its layers."""
-    render = open_beauty(path)
+def _picture(render: MappedRender, window: Window) -> _Picture:
+    """Find the layers of a file."""
     beauty = render.features[RGB]
     found = {BEAUTY: _Layer(BEAUTY, beauty, True, stored=beauty.text)}
     in_sets = set()
@@ -209,7 +192,7 @@ def _open(path: Path) -> _Picture:
                 is_colour = len(channels) == 3 and channels[0] is stored.channels.get("R")
                 layer = _Layer(label, FeatureFormula((channels,), text=label), is_colour, stored=stored.name)
                 found.setdefault(same_spelling(label), layer)
-    return _Picture(path, render, found, render.data_window)
+    return _Picture(render, found, window)
 
 
 def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
@@ -353,7 +336,7 @@ def _manifest(
         "codesPerStop": CODES_PER_STOP,
         "stopsBelowOne": STOPS_BELOW_ONE,
         "errorColours": np.round(colours * 255).astype(int).tolist(),
-        "pictures": list(_labels([picture.path for picture in pictures])),
+        "pictures": list(_labels([picture.render.file.path for picture in pictures])),
         "reference": len(pictures) - 1 if has_reference else None,
         "layers": list(layers),
     }

@@ -5,8 +5,17 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.compare import compare_files, error_map, note_on_windows, scores, upsample_bicubic
+from oiio_msspl.compare import (
+    error_map,
+    note_on_windows,
+    open_comparison,
+    score_images,
+    scores,
+    upsample_bicubic,
+    write_error_map,
+)
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.metrics import RELMSE_GHARBI, relmse
 from tests.conftest import downsample, picture, rgb, write_exr
 
@@ -31,19 +40,30 @@ def test_pictures_are_compared_where_they_lie(tmp_path):
     image = part_of(tmp_path / "image.exr", truth, 6, 0, 58, 48)
     moved = part_of(tmp_path / "moved.exr", truth, 0, 0, 64, 44)  # of the reference's size
     low = write_exr(tmp_path / "low.exr", rgb(downsample(truth[4:], 4)))
-    found = compare_files([image, moved, low], reference)
+    comparison = open_comparison([image, moved, low], reference)
+    found = score_images(comparison)
     assert [each["relmse"] for each in found[:2]] == [0, 0]
     shown = upsample_bicubic(downsample(truth[4:], 4)[:10, 2:], 56, 40)
     assert found[2]["relmse"] == pytest.approx(relmse(shown, truth[4:44, 8:]), rel=1e-4)
-    assert note_on_windows([image, moved, low], reference).endswith(" is compared: 56x40+8+4")
-    assert note_on_windows([low], reference) == ""
+    assert note_on_windows(comparison).endswith(" is compared: 56x40+8+4")
+    assert note_on_windows(open_comparison([low], reference)) == ""
 
 
 def test_pictures_of_two_parts_of_the_frame_are_refused(tmp_path):
     truth = picture(48, 64)
     left, right = (part_of(tmp_path / f"{x}.exr", truth, x, 0, 32, 48) for x in (0, 32))
     with pytest.raises(InputError, match=r"no part of the frame in common: .*0\.exr \(32x48\+0\+0\), .*32\.exr \("):
-        compare_files([left], right)
+        open_comparison([left], right)
+
+
+def test_scores_and_error_map_read_the_reference_once(tmp_path, monkeypatch):
+    paths = [write_exr(tmp_path / f"{n}.exr", rgb(picture(32, 32, n))) for n in range(3)]
+    comparison = open_comparison(paths[:2], paths[2])
+    read, decode = [], ExrFile.read
+    monkeypatch.setattr(ExrFile, "read", lambda self, *more: (read.append(self.path), decode(self, *more))[1])
+    score_images(comparison)
+    write_error_map(tmp_path / "error.png", comparison, overwrite=False)
+    assert read.count(paths[2]) == 1
 
 
 def test_an_enlarged_picture_has_no_negative_light():

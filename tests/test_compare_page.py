@@ -13,7 +13,7 @@ import OpenEXR
 import pytest
 
 from oiio_msspl.colour import ACESCG, REC709, conversion, srgb
-from oiio_msspl.compare import error_map, upsample_bicubic
+from oiio_msspl.compare import error_map, open_comparison, upsample_bicubic
 from oiio_msspl.compare_page import from_codes, pack, to_codes, write_page
 from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import psnr, relmse
@@ -89,7 +89,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def page(folder):
     images = [folder / name for name in ("out.exr", "hr.exr", "lr.exr")]
-    write_page(folder / "page.html", images, folder / "ref.exr", layers=["light_*", "Z"])
+    write_page(folder / "page.html", open_comparison(images, folder / "ref.exr"), layers=["light_*", "Z"])
     return folder / "page.html"
 
 
@@ -119,7 +119,7 @@ def test_the_page_shows_the_part_that_all_pictures_hold(tmp_path):
     for name, top in (("image", 0), ("ref", 4)):
         part = ("rgba", rgb(LIGHT_1[top : top + 44]), (0, top))
         write_exr(tmp_path / f"{name}.exr", [part], display=display)
-    write_page(tmp_path / "page.html", [tmp_path / "image.exr"], tmp_path / "ref.exr")
+    write_page(tmp_path / "page.html", open_comparison([tmp_path / "image.exr"], tmp_path / "ref.exr"))
     made = manifest(tmp_path / "page.html")
     image = made["layers"][0]["images"]["0"]
     assert (made["height"], image["height"], image["relmse"]) == (40, 40, 0)
@@ -131,19 +131,18 @@ def test_the_page_needs_nothing_from_outside(page):
 
 
 def test_by_default_the_page_shows_layers_that_sum_to_the_beauty(folder):
-    found = write_page(folder / "sets.html", [folder / "hr.exr"], overwrite=True)
+    image = open_comparison([folder / "hr.exr"])
+    found = write_page(folder / "sets.html", image, overwrite=True)
     assert found.layers == ("beauty", "light_1", "light_2")
     assert found.size == (folder / "sets.html").stat().st_size
-    assert write_page(folder / "sets.html", [folder / "hr.exr"], layers=["beauty"], overwrite=True).layers == (
-        "beauty",
-    )
-    everything = write_page(folder / "sets.html", [folder / "hr.exr"], layers=["*"], overwrite=True)
+    assert write_page(folder / "sets.html", image, layers=["beauty"], overwrite=True).layers == ("beauty",)
+    everything = write_page(folder / "sets.html", image, layers=["*"], overwrite=True)
     assert everything.layers == ("beauty", "light_1", "light_2", "Z")  # no numbers of objects
 
 
 def test_colours_are_those_of_srgb(tmp_path):
     write_exr(tmp_path / "aces.exr", rgb(picture(16, 16)), chromaticities=ACESCG.chromaticities)
-    write_page(tmp_path / "page.html", [tmp_path / "aces.exr"])
+    write_page(tmp_path / "page.html", open_comparison([tmp_path / "aces.exr"]))
     entry = manifest(tmp_path / "page.html")["layers"][0]["images"]["0"]
     text = re.search(rf'id="{entry["id"]}">(.*?)<', (tmp_path / "page.html").read_text(encoding="utf-8"))[1]
     found = from_codes(unpack(base64.b64decode(text), entry["differences"], 16, 16, 3).astype(np.int16))
@@ -154,10 +153,10 @@ def test_colours_are_those_of_srgb(tmp_path):
 
 def test_what_can_not_be_shown_is_refused(folder, tmp_path):
     with pytest.raises(InputError, match="no image has such a layer; they have: beauty, light_1, light_2, Z"):
-        write_page(tmp_path / "page.html", [folder / "hr.exr"], layers=["nothing"])
+        write_page(tmp_path / "page.html", open_comparison([folder / "hr.exr"]), layers=["nothing"])
     write_exr(tmp_path / "small.exr", rgb(picture(20, 20)))
     with pytest.raises(InputError, match=r"small.exr is 20x20, but .*hr.exr is 64x48"):
-        write_page(tmp_path / "page.html", [tmp_path / "small.exr", folder / "hr.exr"])
+        write_page(tmp_path / "page.html", open_comparison([tmp_path / "small.exr", folder / "hr.exr"]))
     assert [path.name for path in tmp_path.iterdir()] == ["small.exr"]
 
 
@@ -290,7 +289,7 @@ def test_names_out_of_files_are_texts(tmp_path):
     name = "</script><h1>light_1"
     channels = rgb(picture(16, 16)) | rgb(picture(16, 16), f"{name}.")
     write_exr(tmp_path / "a.exr", channels, compression=OpenEXR.ZIP_COMPRESSION)
-    write_page(tmp_path / "page.html", [tmp_path / "a.exr"], layers=["*"])
+    write_page(tmp_path / "page.html", open_comparison([tmp_path / "a.exr"]), layers=["*"])
     html = dump_dom((tmp_path / "page.html").as_uri())
     assert "<h1>" not in html.split('id="manifest"')[0]
     assert "&lt;/script&gt;&lt;h1&gt;light_1</option>" in html

@@ -6,12 +6,15 @@ from __future__ import annotations
 import json
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from msspl_cli import console, options
 from oiio_msspl.errors import InputError
+
+if TYPE_CHECKING:
+    from oiio_msspl.compare import Comparison
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -64,7 +67,7 @@ def compare(
     RelMSE has two columns, one for each convention in the paper. Images smaller
     than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
-    from oiio_msspl.compare import check_error_map, compare_files, note_on_windows, write_error_map
+    from oiio_msspl.compare import check_error_map, note_on_windows, open_comparison, score_images, write_error_map
     from oiio_msspl.compare_page import check_page
 
     if reference is None and (html is None or error_map is not None):
@@ -76,12 +79,13 @@ def compare(
         check_error_map(error_map, compared, overwrite=overwrite)
     if html is not None:
         check_page(html, compared, overwrite=overwrite)
-    if note := note_on_windows(images, reference):
+    comparison = open_comparison(images, reference)
+    if note := note_on_windows(comparison):
         console.say(note, error=True)
-    results = compare_files(images, reference) if reference else [{} for _ in images]
-    if error_map is not None and reference is not None:
-        write_error_map(error_map, images[0], reference, overwrite=overwrite)
-    wrote = _write_page(html, images, reference, layers, overwrite) if html else ""
+    results = score_images(comparison) if reference else [{} for _ in images]
+    if error_map is not None:
+        write_error_map(error_map, comparison, overwrite=overwrite)
+    wrote = _write_page(html, comparison, layers, overwrite) if html else ""
     if as_json:
         # The PSNR of equal pictures is infinite, which JSON can't express.
         rows = [{k: v if math.isfinite(v) else None for k, v in scores.items()} for scores in results]
@@ -108,15 +112,14 @@ def _print(images: list[Path], results: list[dict[str, float]]) -> None:
     console.table(table, header=True, indent=0)
 
 
-def _write_page(html: Path, images: list[Path], reference: Path | None, layers: list[str], overwrite: bool) -> str:
+def _write_page(html: Path, comparison: Comparison, layers: list[str], overwrite: bool) -> str:
     """Write the page. Returns a sentence about it."""
     from oiio_msspl.compare_page import write_page
 
     with console.ProgressBar() as bar:
         page = write_page(
             html,
-            images,
-            reference,
+            comparison,
             layers=layers,
             overwrite=overwrite,
             progress=lambda done, total: bar.update("writing layers", done, total),

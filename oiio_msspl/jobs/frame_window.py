@@ -9,6 +9,7 @@ from functools import partial
 from typing import TYPE_CHECKING, TypeVar
 
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import Array, Mask, kept
 from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.render import Render
@@ -17,7 +18,6 @@ from oiio_msspl.fusion.motion import FLOW, MotionFrame
 from oiio_msspl.fusion.render_average import RenderPair, lacking_passes, shared_noise
 from oiio_msspl.fusion.temporal import accumulate
 from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Placed, Step
-from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session

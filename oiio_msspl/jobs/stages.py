@@ -15,6 +15,7 @@ from pathlib import Path
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import Array, Mask, kept
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
@@ -34,7 +35,7 @@ from oiio_msspl.jobs.frame_passes import check_passes, fuse_frame_passes, sets_t
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.frame_writing import write_frame
 from oiio_msspl.jobs.inputs import InputOptions, files_by_name, files_read, map_pair
-from oiio_msspl.jobs.report import FrameReport, add_other_views, name_of, report_on
+from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.jobs.views import FusedViews, OtherViews, View, find_other_views, fuse_other_views, store_view

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import has_many_pixels
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.render import Window
@@ -23,7 +24,6 @@ from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, Motion
 from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
 from oiio_msspl.jobs.inputs import InputOptions, family_for_layers, map_other_hrls, map_pair
-from oiio_msspl.jobs.report import name_of
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of

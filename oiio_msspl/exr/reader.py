@@ -296,9 +296,7 @@ def _open(path: Path) -> Any:
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
         reason = reason_of(oiio)
-        hint = "render it again"
-        if "twice" in reason:
-            hint = "if its channels are subsampled (luminance and chroma), convert it to RGB"
+        hint = "convert it to RGB" if "ubsampled" in reason else "render it again"
         raise InputError(f"{path}: can't be opened as an EXR ({reason}); {hint}")
     if handle.format_name() != "openexr":
         raise InputError(

@@ -99,6 +99,15 @@ def test_a_damaged_header_is_told_in_one_error(tmp_path):
     assert len(str(caught.value)) < 400 and str(caught.value).count("EXR Error") == 1
 
 
+def test_subsampled_channels_are_to_be_converted(tmp_path):
+    path = write_exr(tmp_path / "a.exr", rgb(picture(8, 8)))
+    header = path.read_bytes()
+    sampling = header.index(b"B\0", header.index(b"chlist")) + 2 + 8  # behind name, type and reserved bytes
+    path.write_bytes(header[:sampling] + 2 * b"\2\0\0\0" + header[sampling + 8 :])
+    with pytest.raises(InputError, match=r"a\.exr: can't be opened .*ubsampled.*; convert it to RGB"):
+        open_exr(path)
+
+
 def test_a_long_error_is_cut():
     class Source:
         def geterror(self):

@@ -22,6 +22,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -30,6 +31,8 @@ from benchmarks import results
 from benchmarks.results import Row
 
 OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
+#: See :func:`benchmarks.peers.oidn_split`.
+OIDN_SPLIT = "OIDN prefiltered, on every second pixel"
 #: As :mod:`benchmarks.quality` calls them -> as they are called here, where it does not matter which render they get.
 SAME_WORK = {
     "OIDN on the HRLS": OIDN,
@@ -37,6 +40,7 @@ SAME_WORK = {
     "OIDN fast on the HRLS": OIDN_FAST,
     "OIDN prefiltered on the HRLS": OIDN_PREFILTERED,
     "OIDN prefiltered, same samples": OIDN_PREFILTERED,
+    "OIDN prefiltered and split, same samples": OIDN_SPLIT,
 }
 
 
@@ -64,10 +68,13 @@ def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[
 
 def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
     """A call of OIDN on arrays."""
-    from benchmarks import oidn
+    from benchmarks import oidn, peers
+    from oiio_msspl import Render
 
     layers = frame(height, width)
     images = {"color": layers["rgb"], "albedo": layers["albedo"], "normal": layers["normal"]}
+    if name == OIDN_SPLIT:
+        return partial(peers.oidn_split, Render.from_arrays("full", **layers))
     if name == OIDN_PREFILTERED:
         return lambda: oidn.denoise_prefiltered(**images)
     return lambda: oidn.denoise(**images, quality="fast" if name == OIDN_FAST else "high")
@@ -127,7 +134,7 @@ def compare(args: argparse.Namespace) -> list[Row]:
     """A row for each method: median, fastest and slowest seconds, and peak memory."""
     from oiio_msspl.model.catalogue import shipped_models
 
-    cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED]
+    cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_SPLIT]
     cases = [case for case in cases if fnmatch.fnmatchcase(case, args.methods or "*")]
     measured: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
     settings = "--size", args.size, "--repeats", str(args.repeats), "--threads", str(args.threads)

@@ -138,6 +138,16 @@ def means_of(rows: Iterable[Row]) -> Found:
     return results.index((row for row in rows if row["scene"] == MEAN), "spp", "method")
 
 
+def share_of_oidn(times: Found, method: str) -> str:
+    """Time of a method of :mod:`benchmarks.quality` as a share of OIDN's; empty if it was not measured.
+
+    Args:
+        times: rows of :mod:`benchmarks.runtime` by method.
+    """
+    time = times.get(SAME_WORK.get(method, method.partition(", ")[0]))
+    return f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else ""
+
+
 def when_it_pays() -> str:
     """Accuracy at 2 and 8 spp on average, and time, of what a user can choose from."""
     rows = results.read("quality")
@@ -145,10 +155,7 @@ def when_it_pays() -> str:
     means = means_of(rows)
     body = []
     for method, (name, needs) in WHEN_IT_PAYS.items():
-        relative = []
-        for times in runs:
-            time = times.get(SAME_WORK.get(method, method.partition(", ")[0]))
-            relative.append(f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else "")
+        relative = [share_of_oidn(times, method) for times in runs]
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
         body.append([name, needs, *cells, *relative])
     head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE"]
@@ -191,16 +198,18 @@ def goals_of_time() -> str:
 
 
 def spread_noise() -> str:
-    """Accuracy on renders whose pixel filter has spread the noise, and on how many scenes that is best."""
+    """Accuracy on renders whose pixel filter has spread the noise, on how many scenes that is best, and time."""
     rows = results.read("quality_gauss")
+    times = results.index(results.read(MACHINES["VNNI"][0]), "method")
     means, found = means_of(rows), results.index(rows, *quality.KEYS)
     clean = versus.clean_scenes(rows)
     body = []
     for method, name in SPREAD_NOISE.items():
         cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
         best = sum(max(SPREAD_NOISE, key=lambda m, s=scene: found[s, 2, m]["psnr"]) == method for scene in clean)
-        body.append([name, *cells, f"{best} of {len(clean)}"])
+        body.append([name, *cells, f"{best} of {len(clean)}", share_of_oidn(times, method)])
     head = ["method", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "scenes on which it is best (PSNR, 2 spp)"]
+    head.append("time / OIDN's, VNNI")
     return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
 
 

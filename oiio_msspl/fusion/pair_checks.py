@@ -80,6 +80,7 @@ class HrlsAverages:
             difference of luminance, and how large it would be by the noise of the HRLS alone.
         noisy_pixels, equal_pixels: LRHS pixels over which the HRLS is noisy, and those of them that equal one of its
             pixels.
+        is_lost: whether the HRLS's beauty is NaN in all tiles, so that its averages are those of the LRHS.
     """
 
     def __init__(self, alignment: Alignment) -> None:
@@ -92,9 +93,11 @@ class HrlsAverages:
         self.normal_edges: Array | None = None
         self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
         self.noisy_pixels = self.equal_pixels = 0
+        self.is_lost = True
 
     def add(self, pair: TilePair) -> None:
         """Add the core of a tile."""
+        self.is_lost &= pair.hrls_is_lost
         rows, columns = pair.core
         area, grid = pair.lrhs_area, self.alignment.grid
         core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
@@ -194,8 +197,8 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     high, alignment = hrls.rgb, hrls.alignment
     if not low.any() and not high.any():
         return [BOTH_BLACK]
-    for name, values, other in ((lr_name, low, hr_name), (hr_name, high, lr_name)):
-        if not values.any():
+    for name, lit, other in ((lr_name, low.any(), hr_name), (hr_name, high.any() and not hrls.is_lost, lr_name)):
+        if not lit:
             raise InputError(
                 f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
                 "check which layer it is (--map rgb=LAYER)"

@@ -59,6 +59,8 @@ class TilePair:
     """Rows and columns of ``lrhs`` that the tile contributes and that are inside the alignment's grid."""
     inside: tuple[slice, slice]
     """Rows and columns of ``lrhs`` that are inside the alignment's grid. The others only fill up the tile's size."""
+    hrls_is_lost: bool = False
+    """The HRLS's beauty is NaN or minus infinity in all pixels, so it is filled from the LRHS alone."""
 
 
 def read_tile(
@@ -82,8 +84,7 @@ def read_tile(
     window = tile.area.slices(grid)
     broken: dict[str, Mask] = {}
     hrls = read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core, broken=broken)
-    if RGB in broken and not broken[RGB].all():
-        # The LRHS knows the light of a bucket that failed. A frame that failed stays black, and is refused for that.
+    if RGB in broken:  # the LRHS knows the light of a bucket that failed
         hrls[RGB] = np.where(broken[RGB][..., None], enlarged(lrhs[RGB][window], scale), hrls[RGB])
     return TilePair(
         lrhs={name: values[window] for name, values in lrhs.items()},
@@ -94,6 +95,7 @@ def read_tile(
         hrls_target=core.intersect(alignment.hr_data_window),
         core=tile.core.intersect(alignment.grid).slices(tile.area),
         inside=tile.area.intersect(alignment.grid).slices(tile.area),
+        hrls_is_lost=RGB in broken and bool(broken[RGB].all()),
     )
 
 

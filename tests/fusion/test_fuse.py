@@ -129,6 +129,25 @@ def test_a_bucket_that_failed_is_filled_from_the_lrhs():
     assert error < 3 * expected
 
 
+def test_a_failed_region_as_large_as_tiles_is_filled_from_the_lrhs(session, scale, monkeypatch):
+    low, high, _ = pair_of(scale, 60 * scale, 90 * scale)
+    high.layers["rgb"][:, 20 * scale :] = np.nan
+    tiles_of(monkeypatch, session, (36 * scale) ** 2)
+    fused = fuse(low, high, session)
+    assert fused.tiles > 4
+    assert fused.warnings == []
+    lrhs, hrls = (image[:, 24:] for image in (fused.lrhs_luminance, fused.hrls_luminance))
+    assert np.abs(hrls - lrhs).mean() < 0.1 * lrhs.mean()
+
+
+def test_a_frame_of_nan_is_refused_however_many_tiles_it_has(session, scale, monkeypatch):
+    low, high, _ = pair_of(scale, 60 * scale, 90 * scale)
+    high.layers["rgb"][:] = np.nan
+    tiles_of(monkeypatch, session, (36 * scale) ** 2)
+    with pytest.raises(InputError, match=r"hr: the beauty is black \(or NaN\) everywhere, while that of lr is not"):
+        fuse(low, high, session)
+
+
 @pytest.mark.parametrize("family", ["ensemble", "ensemble-spread"])
 def test_albedo_and_normal_without_noise(monkeypatch, family):
     """They are cleaner, tiles or not, and the beauty is the same bit for bit."""

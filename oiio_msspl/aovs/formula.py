@@ -56,7 +56,11 @@ class FeatureFormula:
             value = value + take(term)
         if self.factor is not None:
             value = value * take(self.factor)
-        return value * 2 - 1 if self.encoding == "unsigned" else value
+        if self.encoding != "unsigned":
+            return value
+        normal = value * 2 - 1
+        normal[~value.any(axis=-1)] = 0  # renderers store an empty background as 0, which no normal is
+        return normal
 
     def evaluate_variance(self, take: Take, mean: Array, spp: float | None) -> Array:
         """Variance of the pixel's mean luminance, (height, width, 1).

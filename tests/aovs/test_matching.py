@@ -143,6 +143,7 @@ def test_encoded_normals_are_recognised_wherever_there_is_a_surface(tmp_path):
     light = {c: np.ones((400, W), np.float32) for c in "RGB"}
     render = mapped(tmp_path, light | rgb(stored, "normal."))
     np.testing.assert_array_equal(render.read(render.data_window)["normal"][-1, 0], [0, 0, 1])
+    assert not render.read(render.data_window)["normal"][H].any()
 
 
 def test_the_users_mapping_wins(tmp_path):

@@ -39,11 +39,11 @@ def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) 
         view_layer: the one that was chosen: Blender writes one attribute for each.
     """
     for rule in renderer.get("spp", ()):
-        found = {key: value for key, value in file.metadata.items() if re.search(rule["attribute"], key)}
-        keys = [key for key in found if view_layer and view_layer in key] or list(found)
-        if keys:
+        found = [match for key in file.metadata if (match := re.search(rule["attribute"], key))]
+        if found:
+            match = next((match for match in found if view_layer in match.groups()), found[0])
             try:
-                spp = float(found[keys[0]]) ** rule.get("power", 1)
+                spp = float(file.metadata[match.string]) ** rule.get("power", 1)
             except (TypeError, ValueError, OverflowError):
                 return None
             return spp if 0 < spp < math.inf else None

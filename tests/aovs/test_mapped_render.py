@@ -158,6 +158,15 @@ def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_pat
         np.testing.assert_array_equal(first, second)
 
 
+@pytest.mark.parametrize(("view_layer", "spp"), [("View", 1), ("View Layer", 64), ("View Layer.001", 4)])
+def test_each_view_layer_has_its_own_spp(tmp_path, view_layer, spp):
+    """Also where its name is a part of another one's."""
+    counts = {"View Layer.001": 4, "View Layer": 64, "View": 1}
+    channels = {k: v for name in counts for k, v in layer(f"{name}.Combined", 1).items()}
+    attributes = {f"cycles.{name}.samples": str(count) for name, count in counts.items()}
+    assert mapped(tmp_path, channels, attributes=attributes, view=view_layer).spp == spp
+
+
 def test_the_users_spp_win_over_the_headers():
     file = open_exr(EXAMPLES / "hr.exr")
     assert map_render(file).spp == 1

@@ -59,8 +59,8 @@ NOISY = 0.01
 MIN_NOISY_BLOCKS = 64
 #: The LRHS is the HRLS's nearest pixels if this share of its noisy pixels equal an HRLS pixel.
 EQUAL_PIXELS = 0.5
-#: A render is black around a rectangle by chance if no more pixels of the other one are lit there: so many, or this
-#: share of them.
+#: A render is black by chance if no more pixels of the other one are lit: so many. Around a rectangle, also this share
+#: of them.
 MOST_BY_CHANCE, REGION = 64, 0.05
 #: The warning for a pair that fits, and shows nothing.
 BOTH_BLACK = "both renders are black (or NaN) everywhere: the result is black"
@@ -192,17 +192,19 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
         Warnings, one sentence each.
 
     Raises:
-        InputError: one render is black, most likely a wrong layer, and the other is not.
+        InputError: one render is black, most likely a wrong layer, and the other is not: more of it is lit than by
+            chance.
     """
     high, alignment = hrls.rgb, hrls.alignment
     if not low.any() and not high.any():
         return [BOTH_BLACK]
-    for name, lit, other in ((lr_name, low.any(), hr_name), (hr_name, high.any() and not hrls.is_lost, lr_name)):
-        if not lit:
-            raise InputError(
-                f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
-                "check which layer it is (--map rgb=LAYER)"
-            )
+    if hrls.is_lost:
+        raise _black_beauty(hr_name, lr_name)
+    for name, values, other, lit in ((lr_name, low, hr_name, high), (hr_name, high, lr_name, low)):
+        if not values.any():
+            if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
+                raise _black_beauty(name, other)
+            return []  # a dark frame in which few samples find the light
     warnings = []
     for name, values, other, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
         if _is_region(values, lit):
@@ -252,6 +254,13 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
             "the same frame, with the same lights and objects?"
         )
     return warnings
+
+
+def _black_beauty(name: str, other: str) -> InputError:
+    return InputError(
+        f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
+        "check which layer it is (--map rgb=LAYER)"
+    )
 
 
 def _is_region(values: Array, other: Array) -> bool:

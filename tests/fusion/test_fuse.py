@@ -444,6 +444,15 @@ def test_a_black_beauty_is_refused(session, scale):
         fuse(low, high, session)
 
 
+@pytest.mark.parametrize("black", ["LRHS", "HRLS"])
+def test_a_dark_frame_in_which_one_render_found_no_light_is_fused(session, scale, black):
+    low, high = np.zeros((96 // scale, 128 // scale, 3)), np.zeros((96, 128, 3))
+    (high if black == "LRHS" else low)[5, 5] = 1e-4
+    fused = fuse(*renders(low, high), session)
+    assert np.isfinite(fused.rgb).all()
+    assert fused.warnings == []
+
+
 def test_two_black_frames_give_a_black_frame(scale):
     """A fade to black is a legitimate shot, also with the network that ships."""
     low, high, _ = pair_of(scale)

@@ -412,7 +412,7 @@ def _fuse_tile(tile: _PreparedTile, session: Session, frame: FusedFrame, shares:
         for name in tile.aovs:
             if name not in frame.clean_aovs:
                 frame.clean_aovs[name] = blank(frame.rgb.shape, np.float16)
-            frame.clean_aovs[name][target] = images[name][core]
+            frame.clean_aovs[name][target] = images[name][core].clip(-HALF_MAX, HALF_MAX)
         rgb = images["fused"][core]
         if tile.lights is not None:
             lights = tile.lights[core]
@@ -445,7 +445,7 @@ def _run_network(tile: _PreparedTile, session: Session, exposure: float, shares:
     check_finite(session, *images.values())
     if ALBEDO in images:
         # The albedo of an emitter may be its light. The network only knows albedos up to 1.
-        albedo = np.minimum(tile.pair.hrls[ALBEDO], np.float32(HALF_MAX))
+        albedo = tile.pair.hrls[ALBEDO]
         images[ALBEDO] = np.where((albedo > 1).any(axis=-1, keepdims=True), albedo, images[ALBEDO])
     return images
 

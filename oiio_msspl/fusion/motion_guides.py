@@ -150,8 +150,9 @@ def smooth(image: Array) -> Array:
 def _steepness(image: Array) -> Array:
     total = np.zeros(image.shape[:2], np.float32)
     for plane in np.moveaxis(image, -1, 0):
-        for slope in np.gradient(plane):
-            total += np.abs(slope)
+        for axis in (0, 1):
+            if plane.shape[axis] > 1:
+                total += np.abs(np.gradient(plane, axis=axis))
     return total / np.float32(image.shape[-1])
 
 

@@ -18,6 +18,8 @@ from oiio_msspl.fusion.motion_vectors import nearest_values, sample_linear
 ROUND_TRIP = 0.75
 #: Stops below and above the mean brightness that DIS sees, which reads 8 bits.
 STOPS_BELOW, STOPS_ABOVE = 6.0, 4.0
+#: Pixels on each side that DIS needs. It halves smaller pictures too often, and OpenCV may crash.
+SMALLEST = 16
 
 
 def has_optical_flow() -> bool:
@@ -26,7 +28,7 @@ def has_optical_flow() -> bool:
 
 
 def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: Window) -> tuple[Array, Mask]:
-    """Vectors to a neighbour (h, w, 2), and where they can be believed (h, w).
+    """Vectors to a neighbour (h, w, 2), and where they can be believed (h, w): nowhere in frames of a few pixels.
 
     Args:
         frame, neighbour: fused beauties (h, w, 3), which have little noise.
@@ -34,6 +36,8 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
     """
     import cv2
 
+    if min(frame.shape[:2]) < SMALLEST:
+        return np.zeros((*frame.shape[:2], 2), np.float32), np.zeros(frame.shape[:2], np.bool_)
     key = _mean_brightness(frame)
     first, second = _eight_bit(frame, key), np.zeros(frame.shape[:2], np.uint8)
     shared = window.intersect(other_window)

@@ -303,8 +303,7 @@ class _Band:
 
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
         names = [name for name in stored if name in light or is_light_of_pass(name)]
-        with np.errstate(invalid="ignore"):  # NaN is sorted out later
-            smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape)
+        smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape)
         return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable
 
 

@@ -209,6 +209,11 @@ def sample_cubic(
     result = np.empty((len(padded), height, width), np.float32)
 
     def work(rows: slice) -> None:
+        # NumPy's settings for errors belong to the thread. The caller sorts out what is not finite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            interpolate(rows)
+
+    def interpolate(rows: slice) -> None:
         x, y = positions(rows)
         x = np.clip(x, -1, columns_in - 0.01)
         y = np.clip(y, -1, rows_in - 0.01)

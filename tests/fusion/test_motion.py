@@ -12,8 +12,10 @@ from oiio_msspl.aovs.motion import MotionFormat, user_fields
 from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion import motion, motion_vectors
 from oiio_msspl.fusion.motion import MotionFrame, MotionSource, find_motion
+from oiio_msspl.fusion.optical_flow import flow_vectors
 from tests.conftest import rgb, write_exr
 from tests.moving_plane import (
     FOCAL,
@@ -371,6 +373,14 @@ def test_frames_without_a_common_part_tell_nothing(tmp_path):
     assert source.kind == "none" and "no common part" in source.text
 
 
+@pytest.mark.parametrize("size", [(1, WIDTH), (HEIGHT, 1)])
+def test_frames_that_share_a_row_or_a_column_are_read(tmp_path, size):
+    window = dict(zip(("height", "width"), size, strict=True))
+    moving = layer("velocity", np.full((*size, 2), 2, np.float32))
+    frames = [frame(tmp_path, t, moving, window=window) for t in (0, 1)]
+    assert find_motion(*frames).kind in ("camera", "none")
+
+
 def test_large_frames_are_verified_on_fewer_pixels(tmp_path, monkeypatch):
     """The vectors that are read stay whole."""
     monkeypatch.setattr("oiio_msspl.fusion.motion_guides.MAX_PIXELS", WIDTH * HEIGHT // 3)
@@ -391,6 +401,14 @@ def test_optical_flow_is_the_last_resort(tmp_path, monkeypatch):
     found, known = source.read(*shown, 1)
     wrong = np.hypot(*np.moveaxis(found - vectors(truck_and_dolly, 0, 1), -1, 0))
     assert known.mean() > 0.7 and np.median(wrong[known]) < 0.2
+
+
+@pytest.mark.parametrize("size", [(1, 1), (11, 300), (12, 300), (300, 5)])
+def test_optical_flow_of_a_few_pixels_is_not_believed(size):
+    pytest.importorskip("cv2")
+    image, window = np.ones((*size, 3), np.float32), Window(0, 0, size[1], size[0])
+    vectors, known = flow_vectors(image, image, window, window)
+    assert vectors.shape == (*size, 2) and not vectors.any() and not known.any()
 
 
 def test_without_anything_the_user_learns_what_to_render(tmp_path):

@@ -125,6 +125,16 @@ def test_values_that_are_not_finite_do_not_count():
     assert np.argwhere(bad).tolist() == [[70, 70]]
 
 
+@pytest.mark.filterwarnings("error")
+def test_values_that_are_not_finite_bring_no_warning(monkeypatch):
+    """Nor in other threads: each has NumPy's settings for errors of its own."""
+    monkeypatch.setattr("oiio_msspl.parallel.BLOCK_VALUES", 256)
+    pairs = [pair_of(texture(), seed) for seed in range(2)]
+    pairs[1].lr.layers["rgb"][::7, ::7] = np.inf
+    with limit_threads(4):
+        average_renders(pairs[0], [moved(pairs[1], 2.6, 0.8)], [])
+
+
 def test_the_variance_of_a_mean_is_smaller():
     variance = np.full((HEIGHT, WIDTH, 1), 0.25, np.float32)
     pairs = [pair_of(texture(), seed, variance=variance) for seed in range(2)]

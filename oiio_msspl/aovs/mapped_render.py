@@ -130,7 +130,8 @@ class MappedRender:
         self, window: Window, features: Iterable[str] | None, more: Sequence[Channel]
     ) -> tuple[dict[str, Array], Array]:
         """What :meth:`read` returns, and more channels as they are stored, (height, width, channels)."""
-        wanted = [f for f in (features or (*FEATURES, "alpha")) if f in self.features or (f == "alpha" and self.alpha)]
+        names = (*FEATURES, "alpha") if features is None else features
+        wanted = [f for f in names if f in self.features or (f == "alpha" and self.alpha)]
         channels = list(dict.fromkeys([*self._channels(wanted), *more]))
         pixels = self.file.read(channels, window)
         place = {channel: i for i, channel in enumerate(channels)}

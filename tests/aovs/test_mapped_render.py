@@ -158,6 +158,11 @@ def test_a_mapped_render_and_a_loaded_one_can_be_read_with_cached_strips(tmp_pat
         np.testing.assert_array_equal(first, second)
 
 
+def test_no_features_are_read_if_none_is_asked_for(tmp_path):
+    render = mapped(tmp_path, layer("", 1) | layer("albedo", 2))
+    assert render.read(render.data_window, []) == render.load([]).layers == {}
+
+
 @pytest.mark.parametrize(("view_layer", "spp"), [("View", 1), ("View Layer", 64), ("View Layer.001", 4)])
 def test_each_view_layer_has_its_own_spp(tmp_path, view_layer, spp):
     """Also where its name is a part of another one's."""

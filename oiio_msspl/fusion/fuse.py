@@ -64,7 +64,7 @@ class FusedFrame:
     repaired: dict[str, int]
     """Numbers of values that were NaN or infinite, by layer, as ``lrhs.rgb``."""
     lrhs_luminance: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
-    """(h, w): luminance of the LRHS over the alignment's grid."""
+    """(h, w): luminance of the LRHS over the alignment's grid, at the places of its HRLS pixels."""
     hrls_luminance: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
     frames: Array | None = None
@@ -142,7 +142,7 @@ def fuse(
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
-        frame.warnings += pair.check(frame.lrhs_luminance)
+        frame.warnings += pair.check()
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
     frame.seconds = session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
@@ -357,14 +357,17 @@ class _Pair:
         return _FrameShares(find_shares(rgb, self.exposure), find_shares(alpha, 1.0) if alpha else {})
 
     def luminances(self) -> tuple[Array, Array]:
-        """Luminance of both renders over the grid, (h, w) each, once all tiles are prepared."""
+        """Luminance of both renders at the same places, (h, w) each over the grid, once all tiles are prepared."""
         assert self._averages is not None
-        return bounded_luminance(self._lrhs_rgb), self._averages.rgb
+        lrhs, alignment = self._lrhs_rgb, self._alignment
+        if alignment.stretch != (1.0, 1.0):  # networks read the nearest pixels, which lie beside these places
+            lrhs = read_lrhs(self._lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
+        return bounded_luminance(lrhs), self._averages.rgb
 
-    def check(self, lrhs_luminance: Array) -> list[str]:
+    def check(self) -> list[str]:
         """Compare the two renders once all tiles are prepared, see :func:`check_pair`."""
         assert self._averages is not None
-        return check_pair(lrhs_luminance, self._averages, self._lr.name, self._hr.name)
+        return check_pair(bounded_luminance(self._lrhs_rgb), self._averages, self._lr.name, self._hr.name)
 
 
 @dataclass(frozen=True)

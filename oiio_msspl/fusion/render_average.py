@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, Mask, blank, repair, unload
+from oiio_msspl.arrays import Array, Mask, blank, interpolate, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.light import (
@@ -71,9 +71,12 @@ class RenderPair:
 
     @cached_property
     def luminances(self) -> tuple[Array, Array]:
-        """Luminance of the LRHS, and of the HRLS averaged over its pixels, (h, w) each over the alignment's grid."""
+        """Luminance of the LRHS, and of the HRLS averaged over its pixels, (h, w) each over the alignment's grid.
+
+        Both show the same places: where an odd size was rounded, the LRHS is interpolated.
+        """
         alignment = self.alignment
-        lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts())[RGB]
+        lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
         high = for_bands(
             alignment, lambda core, _: to_grid(alignment, _luminance(_read(self.hr, core, [RGB])[RGB]), core)
         )
@@ -238,7 +241,7 @@ class _Band:
             usable &= _make_finite(low) & (share >= COVERED)
             own = self._luminance
             hrls = to_grid(self._alignment, np.where(valid, high.luminance(), own), self._area)
-            lrhs = np.where(usable, _luminance(low[RGB]), self._low_luminance)
+            lrhs = self._in_grid(_luminance(low[RGB]), usable, step.frame.alignment.stretch)
             trust = self._light.trust(lrhs, hrls, self._area)
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = trust if trusted is None else np.minimum(trusted, trust)
@@ -250,6 +253,26 @@ class _Band:
             place = self._low_place.slices(self._grid)
             self._low.add(rows_of({name: values[place] for name, values in low.items()}), (counted * usable)[place])
             step.frame.unload()
+
+    def _in_grid(self, lrhs: Array, usable: Mask, stretch: tuple[float, float]) -> Array:
+        """Luminance (h, w) of a neighbour's LRHS at the places of the grid pixels; that of the frame where the
+        neighbour has none that is ``usable``.
+
+        Args:
+            lrhs: the same at LRHS pixels, which lie elsewhere if a size was rounded.
+            stretch: of the neighbour, see :attr:`Alignment.stretch`.
+        """
+        if stretch != (1.0, 1.0):
+            grid = self._grid
+            columns, rows = (
+                np.arange(start + 0.5, stop) * size - 0.5 - start
+                for start, stop, size in zip((grid.x0, grid.y0), (grid.x1, grid.y1), stretch, strict=True)
+            )
+            lrhs, share = (
+                interpolate(interpolate(plane, rows, 0), columns, 1) for plane in (lrhs, usable.astype(np.float32))
+            )
+            usable = share > 0.999  # a sum of shares may be rounded
+        return np.where(usable, lrhs, self._low_luminance)
 
     def _far_from(self, moved_objects: Mask) -> Array:
         """How much a neighbour counts around objects that are not followed: 0 to 1, (h, w) at the LRHS's resolution.

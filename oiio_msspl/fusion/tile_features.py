@@ -100,7 +100,13 @@ def read_tile(
 
 
 def read_lrhs(
-    lr: ReadableRender, alignment: Alignment, grid: Window, features: Iterable[str], counts: RepairCounts
+    lr: ReadableRender,
+    alignment: Alignment,
+    grid: Window,
+    features: Iterable[str],
+    counts: RepairCounts,
+    *,
+    exact: bool = False,
 ) -> dict[str, Array]:
     """Read features of the LRHS over ``grid``, those that it has.
 
@@ -111,24 +117,25 @@ def read_lrhs(
 
     Args:
         counts: repaired values are added here.
+        exact: interpolate everywhere, for what compares both renders.
     """
-    data = alignment.lr_data_window
-    hrls_rows, hrls_columns = _mirrored_pixels(in_hrls_pixels(grid, alignment.scale), alignment.hr_data_window)
-    rows = np.clip(_lrhs_positions(hrls_rows, alignment.scale, alignment.stretch[1]), data.y0, data.y1 - 1)
-    columns = np.clip(_lrhs_positions(hrls_columns, alignment.scale, alignment.stretch[0]), data.x0, data.x1 - 1)
+    data, scale = alignment.lr_data_window, alignment.scale
+    hrls_rows, hrls_columns = _mirrored_pixels(in_hrls_pixels(grid, scale), alignment.hr_data_window)
+    rows = np.clip(_lrhs_positions(hrls_rows, scale, alignment.stretch[1], exact), data.y0, data.y1 - 1)
+    columns = np.clip(_lrhs_positions(hrls_columns, scale, alignment.stretch[0], exact), data.x0, data.x1 - 1)
     y0, x0 = int(np.floor(rows.min())), int(np.floor(columns.min()))
     stored = Window(x0, y0, int(np.ceil(columns.max())) + 1, int(np.ceil(rows.max())) + 1)
     layers = read_features(lr, stored, data, features, counts=counts, counted=stored)
     return {name: interpolate(interpolate(v, rows - y0, 0), columns - x0, 1) for name, v in layers.items()}
 
 
-def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float) -> NDArray[np.float64]:
-    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is; a whole pixel where these
-    are not mirrored."""
+def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float, exact: bool) -> NDArray[np.float64]:
+    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is; unless ``exact``, a whole
+    pixel where these are not mirrored."""
     groups = hrls_pixels.reshape(-1, scale)
     positions = (groups.mean(axis=1) + 0.5) / scale * stretch - 0.5
     in_place = (groups[:, 0] % scale == 0) & (groups[:, -1] - groups[:, 0] == scale - 1)
-    return np.where(in_place, np.rint(positions), positions)
+    return positions if exact else np.where(in_place, np.rint(positions), positions)
 
 
 def read_features(

@@ -38,6 +38,17 @@ def test_the_result_has_the_size_of_the_hrls_and_the_light_of_the_lrhs(session, 
     assert fused.rgb.mean() == pytest.approx(low.layers["rgb"].mean(), rel=0.1)
 
 
+@pytest.mark.parametrize("rounded_up", [False, True])
+def test_the_luminances_of_both_renders_show_the_same_places(session, scale, rounded_up):
+    """A ramp tells where a pixel is in the frame, which has an odd width."""
+    width = 128 + scale // 2 - 1 + (scale == 2)
+    sizes = (96 // scale, 128 // scale + rounded_up), (96, width)
+    low, high = (1 + np.broadcast_to(np.linspace(0, 1, 2 * w + 1)[1::2, None], (h, w, 3)) for h, w in sizes)
+    fused = fuse(*renders(low, high), session)
+    inside = np.s_[:, 1:-2]
+    np.testing.assert_allclose(fused.lrhs_luminance[inside], fused.hrls_luminance[inside], rtol=1e-5)
+
+
 def test_tiled_and_untiled_agree_to_half_rounding(session, scale, monkeypatch):
     """No seam: the tiled result differs from the whole by less than a half float can tell."""
     low, high, _ = pair_of(scale, 60 * scale, 90 * scale)

@@ -182,6 +182,30 @@ def test_an_lrhs_that_was_rounded_is_averaged():
             assert made.shape == own.shape and made.std() < 0.7 * own.std()
 
 
+@pytest.mark.parametrize("side", [32, 33])
+def test_light_that_changes_is_not_averaged_where_an_lrhs_was_rounded(side):
+    """A board of black and white squares: half a pixel beside an edge, the LRHS and the HRLS differ by more than noise,
+    which would hide a change of the light."""
+    scale, size = 8, 257
+
+    def board(side, samples):
+        places = (np.arange(side * samples) + 0.5) / (side * samples)
+        squares = np.sign(np.sin(60 * places[:, None]) * np.cos(45 * places))
+        return box_downsample(np.repeat(0.5 + 0.45 * squares[..., None], 3, axis=-1), samples)
+
+    def odd(seed, brightness):
+        rng = np.random.default_rng(seed)
+        both = ((side, 24, 0.1), (size, 3, 0.2))
+        low, high = (brightness * board(n, samples) * rng.normal(1, noise, (n, n, 1)) for n, samples, noise in both)
+        return RenderPair(Render.from_arrays(rgb=low), Render.from_arrays(rgb=high))
+
+    for change, least, most in ((1, 2.5, 3), (1.5, 1, 1.25)):
+        frame, *neighbours = (odd(seed, factor) for seed, factor in enumerate((1, change, change)))
+        assert frame.alignment.scale == scale
+        result = average_renders(frame, [still(neighbours[0])], [still(neighbours[1])])
+        assert least <= result.frames.mean() <= most
+
+
 def test_bands_of_rows_agree(monkeypatch):
     pairs = [pair_of(texture(0.7 * seed), seed) for seed in range(3)]
 

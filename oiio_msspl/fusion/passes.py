@@ -34,6 +34,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
 from oiio_msspl.fusion.line_fit import STEPS, LineFit, LinesNearby, blurred, downsampled, smoothed
+from oiio_msspl.fusion.pass_layers import SharesAround, dimmed, in_both, to_be_fitted
 from oiio_msspl.fusion.pass_plan import PassJob, plan_passes
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
 from oiio_msspl.parallel import for_row_blocks, half_of_the_threads, in_parallel, one_ahead
@@ -46,8 +47,6 @@ BAND_ROWS = 128
 SPREAD = {ALBEDO: 0.2, NORMAL: 0.4, RGB: 0.5}
 #: Light below this share of the frame's median counts as equal.
 DARK = 0.3
-#: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
-FIREFLY = 4.0
 #: A layer has no sample where its brightest pixel around is below this share of its mean over pixels that look alike.
 NO_SAMPLE = 0.25
 #: A render whose logarithm of light differs by this much from that of the fused beauty has 1/e of the weight.
@@ -164,11 +163,12 @@ def fuse_passes(
                 tell(done, steps)
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
     dark = DARK * float(np.median(lit)) if lit.size else 1.0
+    shares = SharesAround(low, high, rgb, alignment)
     with hr.cache_strips(cache_bytes // 2), lr.cache_strips(cache_bytes // 2):
 
         def prepare(core: Window) -> _Band:
             with half_of_the_threads():
-                return _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, fused_light)
+                return _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, fused_light, shares)
 
         # The next band is read and compared while the layers of this one are fitted.
         for band in one_ahead(map(prepare, _bands(alignment))) if jobs else []:
@@ -308,6 +308,7 @@ class _Band:
         jobs: Sequence[PassJob],
         guides: Guides,
         fused_light: Mapping[AdditiveLayer, Array],
+        shares: SharesAround,
     ) -> None:
         """
         Args:
@@ -316,8 +317,9 @@ class _Band:
             dark: light that counts as equal to none in logarithms.
             guides: see :func:`fuse_passes`.
             fused_light: light (height, width, 3) of the layers that a network has fused, over the HRLS's data window.
+            shares: of the layers, where none has a sample near.
         """
-        self._fused_light = fused_light
+        self._fused_light, self._shares = fused_light, shares
         self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, dark
         reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
@@ -441,22 +443,23 @@ class _Band:
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._fused_light:
                 planes[:] = self._over_core(self._fused_light[layer])
-        noisy, renders = fitted, self._renders_of(job)
+        renders = self._renders_of(job)
         doubts = self._doubts(job, *renders) if job.lrhs else None
         if job in self._to_fit:
             missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
-            noisy = self._average(job, *renders)
-            self._fit_layers(noisy, missing, fitted)
+            self._fit_layers(self._average(job, *renders), missing, fitted)
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._ranges:
                 np.clip(planes, *self._ranges[layer], out=planes)
         # The squares of light beyond 1e19 overflow, so there is no fit there.
         fitted[:, ~np.isfinite(fitted).all(axis=0)] = 0
         np.clip(fitted, 0, BRIGHTEST, out=fitted)
-        # Where no layer is left, the beauty is divided as in the whole band.
-        dark = fitted.sum(axis=0) == 0
+        # Where no layer is left, the beauty is divided as it is around.
+        dark = (fitted.sum(axis=0) == 0) & (light > 0)
         if dark.any():
-            fitted[:, dark] = np.minimum(noisy, BRIGHTEST).mean(axis=(1, 2, 3))[:, None]
+            _, y, x = np.nonzero(dark)
+            core = in_hrls_pixels(self._core, self._scale)
+            fitted[:, dark] = self._shares.at(job, x + core.x0, y + core.y0)
         for i, layer in enumerate(layers):
             if layer in colours:
                 fitted[i] *= colours[layer] >= DARKEST_COLOUR
@@ -499,21 +502,21 @@ class _Band:
             for_row_blocks(fit, len(lit), self._beauty_core.size)
 
     def _renders_of(self, job: PassJob) -> list[Array]:
-        """The layers of the HRLS, and of the LRHS if it has some, see :meth:`_dimmed`. Empty if they were not read."""
-        renders = [self._dimmed(job, self._low_layers)] if job.lrhs or job in self._to_fit else []
-        return [*renders, self._dimmed(job, self._lrhs_layers)] if job.lrhs else renders
+        """The layers of the HRLS, and of the LRHS if it has some, see :func:`dimmed`. Empty if they were not read."""
+        renders = [dimmed(job, self._low_layers, self._low_beauty)] if job.lrhs or job in self._to_fit else []
+        return [*renders, dimmed(job, self._lrhs_layers, self._low_beauty)] if job.lrhs else renders
 
     def _doubts(self, job: PassJob, hrls: Array, lrhs: Array) -> Array:
         """How uncertain each layer is, (layers, h, w) over the core, at most 1: the root of the mean difference between
         the two renders, relative to the layer where that is largest. A layer that the LRHS lacks is most uncertain."""
-        both = _in_both(job, len(hrls))
+        both = in_both(job, len(hrls))
         differences = np.abs(hrls - lrhs[: len(hrls)]).mean(axis=1)
         differences[~both] = 0
-        doubts = np.sqrt([blurred(plane) for plane in _to_be_fitted(job, differences)])
+        doubts = np.sqrt([blurred(plane) for plane in to_be_fitted(job, differences)])
         most = doubts.max(axis=0)
         doubts = np.divide(doubts, most, out=np.ones_like(doubts), where=(most > 0) & np.isfinite(most))
         np.maximum(doubts, LEAST_DOUBT, out=doubts)
-        doubts[~_to_be_fitted(job, both)] = 1
+        doubts[~to_be_fitted(job, both)] = 1
         return np.stack([upsample_linear(plane, self._scale, self._core_rows) for plane in doubts])
 
     def _average(self, job: PassJob, hrls: Array, lrhs: Array | None = None) -> Array:
@@ -521,23 +524,10 @@ class _Band:
         ``hrls``."""
         if lrhs is not None:
             weight = self._likeness(lrhs)
-            for i in np.flatnonzero(_in_both(job, len(hrls))):
+            for i in np.flatnonzero(in_both(job, len(hrls))):
                 hrls[i] += weight * lrhs[i]
                 hrls[i] /= 1 + weight
-        return _to_be_fitted(job, hrls)
-
-    def _dimmed(self, job: PassJob, pixels: Mapping[str, Array]) -> Array:
-        """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Layers that it lacks are
-        black. The rest of its beauty is the last layer, if layers are missing or light is in none."""
-        black = np.zeros_like(self._low_beauty)
-        layers = np.stack([planes_of(pixels[key]) if key in pixels else black for key in job.keys.values()])
-        if job.remainder or not pixels.keys() >= set(job.keys.values()):
-            rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
-            layers = np.concatenate([layers, rest[None]])
-        light = layers.sum(axis=(0, 1))
-        allowed = FIREFLY * max_3x3(self._low_beauty.sum(axis=0))
-        layers *= np.minimum(1, allowed / np.maximum(light, 1e-20))
-        return layers
+        return to_be_fitted(job, hrls)
 
     def _likeness(self, layers: Array) -> Array:
         """The weight (h, w) of the LRHS's layers (layers, 3, h, w): 1 where the fused beauty has as much light.
@@ -548,19 +538,6 @@ class _Band:
         lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
         ours, fused = (np.log(light + 3 * self._dark) for light in lights)
         return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
-
-
-def _in_both(job: PassJob, count: int) -> NDArray[np.bool_]:
-    """Which of the first ``count`` layers of a set both renders have. The remainder comes behind them: both have it if
-    they have all layers."""
-    both = [key in job.lrhs for key in job.keys.values()]
-    return np.array([*both, all(both)])[:count]
-
-
-def _to_be_fitted(job: PassJob, layers: NDArray[T]) -> NDArray[T]:
-    """Those layers of a set, on the first axis, that are to be fitted."""
-    known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
-    return np.delete(layers, known, axis=0) if known else layers
 
 
 def _is_black(render: ReadableRender, layer: str, area: Window) -> bool:

@@ -11,7 +11,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.fusion import tiling
+from oiio_msspl.fusion import passes, tiling
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import _Pair, fuse, layer_fuser
 from oiio_msspl.fusion.passes import _make_sum, fuse_passes, pass_steps
@@ -199,6 +199,46 @@ def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
     result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets)
     found = result.pixels.get(result.sets[0].layers[1].channels[0], 0, HEIGHT)
     assert found[8:-8, 8:-8].min() > 0.1 * np.median(found)  # a corner has few samples around
+
+
+@pytest.mark.parametrize("low", [True, False])
+@pytest.mark.parametrize("rows", [32, 128])
+def test_where_no_layer_has_a_sample_the_beauty_is_divided_as_around(tmp_path, monkeypatch, low, rows):
+    """Whatever the height of the bands: here most of them have no sample at all."""
+    monkeypatch.setattr(passes, "BAND_ROWS", rows)
+    parts = {"light_a": 0.6, "light_b": 0.2, "light_off": 0.0}
+    for name, size in (("lr", (96, 32)), ("hr", (384, 128))):
+        light = np.zeros((*size, 3), np.float32)
+        light[-size[0] // 8 :] = 1
+        channels = rgb(light * np.float32(0.8))
+        for layer_name, part in parts.items():
+            channels |= rgb(light * np.float32(part), f"{layer_name}.") if low or name == "hr" else {}
+        write_exr(tmp_path / f"{name}.exr", channels)
+    lr, hr = (map_render(open_exr(tmp_path / f"{name}.exr")) for name in ("lr", "hr"))
+    result = fuse_passes(lr, hr, np.full((384, 128, 3), 0.8, np.float32), align(lr, hr), hr.additive_sets)
+    for each in result.sets[0].layers:
+        found = result.pixels.get(each.channels[0], 0, 384)
+        np.testing.assert_allclose(found, parts[each.name], rtol=1e-3, err_msg=each.name)
+
+
+@pytest.mark.parametrize("samples", [0.5, 0.01])
+def test_bands_of_rows_agree(tmp_path, monkeypatch, samples):
+    rng = np.random.default_rng(0)
+    shares = np.linspace(0.1, 0.9, 320)[:, None, None] * np.ones((1, 64, 3))
+    lit = rng.random((320, 64, 1)) < samples
+    layers = {"light_a": shares * lit, "light_b": (1 - shares) * lit}
+    channels = rgb(sum(layers.values()).astype(np.float32))
+    for name, values in layers.items():
+        channels |= rgb(values.astype(np.float32), f"{name}.")
+    hr = map_render(open_exr(write_exr(tmp_path / "hr.exr", channels)))
+    lr = map_render(open_exr(write_exr(tmp_path / "lr.exr", rgb(np.ones((160, 32, 3), np.float32)))))
+    found = []
+    for rows in (128, 32):
+        monkeypatch.setattr(passes, "BAND_ROWS", rows)
+        result = fuse_passes(lr, hr, np.full((320, 64, 3), samples, np.float32), align(lr, hr), hr.additive_sets)
+        found.append([result.pixels.get(each.channels[0], 0, 320) for each in result.sets[0].layers])
+        np.testing.assert_allclose(sum(found[-1]), samples, rtol=1e-5)
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-3)
 
 
 def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_path, monkeypatch):

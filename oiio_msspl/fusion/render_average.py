@@ -326,7 +326,7 @@ class _Band:
 
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
         names = [name for name in stored if name in light or is_light_of_pass(name)]
-        smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape)
+        smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape, usable & (share >= COVERED))
         return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable
 
 

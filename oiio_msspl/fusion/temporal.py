@@ -156,7 +156,7 @@ def _likeness(own: Array, other: Array, darkest: float) -> Array:
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:
-    """Colour and alpha of another frame at the positions of a path, (h, w, c) each."""
+    """Colour and alpha of another frame at the valid positions of a path, (h, w, c) each."""
     place = path.place_in(frame.alignment.hr_data_window)
     images = _images(frame, place)
     if path.x is None:
@@ -166,7 +166,8 @@ def _warp(frame: FusedFrame, path: Path) -> Images:
         x, y = path.positions(rows)
         return x - place.x0, y - place.y0
 
-    return dict(zip(images, sample_cubic(list(images.values()), positions, path.valid.shape), strict=True))
+    warped = sample_cubic(list(images.values()), positions, path.valid.shape, path.valid)
+    return dict(zip(images, warped, strict=True))
 
 
 def _images(frame: FusedFrame, area: Window) -> Images:

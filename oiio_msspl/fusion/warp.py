@@ -20,6 +20,8 @@ from oiio_msspl.parallel import for_row_blocks
 ROUND_TRIP, ROUND_TRIP_OF_FLOW = 0.25, 1.0
 #: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer ones blur with every frame.
 SHARPNESS = -1.0
+#: Pixels of a block are interpolated together, unless fewer than this share of them lie between pixels.
+MOST_CHOSEN = 0.8
 
 
 class Placed(Protocol):
@@ -184,7 +186,10 @@ def nearest_indices(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
 
 
 def sample_cubic(
-    images: Sequence[Array], positions: Callable[[slice], tuple[Array, Array]], size: tuple[int, int]
+    images: Sequence[Array],
+    positions: Callable[[slice], tuple[Array, Array]],
+    size: tuple[int, int],
+    valid: Mask | None = None,
 ) -> list[Array]:
     """Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
 
@@ -192,6 +197,7 @@ def sample_cubic(
         images: (h, w, c) each, of one size.
         positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of the images.
         size: height and width of the result.
+        valid: where (height, width) the result counts, which saves time elsewhere; everywhere if None.
 
     Returns:
         (*size, c) each; their channels are contiguous in memory.
@@ -204,31 +210,63 @@ def sample_cubic(
     padded[:, :2, 2:-2], padded[:, -2:, 2:-2] = padded[:, 2:3, 2:-2], padded[:, -3:-2, 2:-2]
     padded[..., :2], padded[..., -2:] = padded[..., 2:3], padded[..., -3:-2]
     planes = padded.reshape(len(padded), -1)
+    even = [plane.min() == plane.max() for plane in planes]
     stride = columns_in + 4
     height, width = size
     result = np.empty((len(padded), height, width), np.float32)
 
     def work(rows: slice) -> None:
-        # NumPy's settings for errors belong to the thread. The caller sorts out what is not finite.
-        with np.errstate(over="ignore", invalid="ignore"):
-            interpolate(rows)
-
-    def interpolate(rows: slice) -> None:
         x, y = positions(rows)
         x = np.clip(x, -1, columns_in - 0.01)
         y = np.clip(y, -1, rows_in - 0.01)
         left, top = np.floor(x), np.floor(y)
         # The pixel above and to the left of the four nearest ones.
         first = (top.astype(np.intp) + 1) * stride + left.astype(np.intp) + 1
-        across, down = _keys(x - left), _keys(y - top)
-        line, low, high, values = np.empty((4, *x.shape), np.float32)
-        for plane, out in zip(planes, result, strict=True):
-            total = out[rows]
-            for i, weight_y in enumerate(down):
-                for j, weight_x in enumerate(across):
+        right, down = x - left, y - top
+        between = (right != 0) | (down != 0)
+        if valid is not None:
+            between &= valid[rows]
+        chosen: NDArray[np.intp] | None = None
+        if np.count_nonzero(between) < MOST_CHOSEN * between.size:
+            chosen, pixel = np.flatnonzero(between), first + (stride + 1)
+            right, down, first = right.take(chosen), down.take(chosen), first.take(chosen)
+        cubic = _Cubic(right, down, first, stride)
+        for plane, is_even, out in zip(planes, even, result[:, rows], strict=True):
+            if is_even:
+                out[:] = plane[0]
+            elif chosen is None:
+                cubic.sample(plane, out)
+            else:
+                # "wrap" makes NumPy write straight into the result; no index needs it.
+                plane.take(pixel, out=out, mode="wrap")
+                out.reshape(-1)[chosen] = cubic.sample(plane, np.empty(chosen.shape, np.float32))
+
+    for_row_blocks(work, height, 2 * width)  # the dozen arrays of a block then nearly fit into a core's cache
+    return [np.moveaxis(part, 0, -1) for part in np.split(result, np.cumsum(counts)[:-1])]
+
+
+class _Cubic:
+    """Keys' cubic at some positions of planes.
+
+    Args:
+        right, down: how far the positions lie beyond a pixel, from 0 to 1.
+        first: flat indices of the pixels above and to the left of that one.
+        stride: pixels in a row of a plane.
+    """
+
+    def __init__(self, right: Array, down: Array, first: NDArray[np.intp], stride: int) -> None:
+        self._across, self._down, self._first, self._stride = _keys(right), _keys(down), first, stride
+        self._buffers = np.empty((4, *first.shape), np.float32)
+
+    def sample(self, plane: Array, out: Array) -> Array:
+        """Fill ``out`` with the samples of a plane (n), and return it."""
+        line, low, high, values = self._buffers
+        # NumPy's settings for errors belong to the thread. The caller sorts out what is not finite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, weight_y in enumerate(self._down):
+                for j, weight_x in enumerate(self._across):
                     pixels = values if j else line
-                    # "wrap" makes NumPy write straight into `pixels`; no index needs it.
-                    plane[i * stride + j :].take(first, out=pixels, mode="wrap")
+                    plane[i * self._stride + j :].take(self._first, out=pixels, mode="wrap")
                     if (i, j) == (1, 1):
                         low[:] = high[:] = pixels
                     elif {i, j} <= {1, 2}:
@@ -239,13 +277,10 @@ def sample_cubic(
                         line += pixels
                 if i:
                     line *= weight_y
-                    total += line
+                    out += line
                 else:
-                    np.multiply(line, weight_y, out=total)
-            np.clip(total, low, high, out=total)
-
-    for_row_blocks(work, height, 2 * width)  # the dozen arrays of a block then nearly fit into a core's cache
-    return [np.moveaxis(part, 0, -1) for part in np.split(result, np.cumsum(counts)[:-1])]
+                    np.multiply(line, weight_y, out=out)
+            return np.clip(out, low, high, out=out)
 
 
 def _keys(t: Array) -> list[Array]:

@@ -32,13 +32,13 @@ class WeightedSum:
         """
 
         def work(rows: slice) -> None:
-            part = weight[rows]
-            square = np.square(part)
-            self._weights[rows] += part
-            self._squares[rows] += square
+            part = _Weights(weight[rows])
+            self._weights[rows] += part.weights
+            self._squares[rows] += part.squares
             with np.errstate(over="ignore", invalid="ignore"):  # the frame's own pixels may be NaN or infinite
                 for name, image in self._images.items():
-                    image[rows] += (square if name == VARIANCE else part)[..., None] * feature(name, rows)
+                    values = feature(name, rows)
+                    image[rows] += part.of(name, values) * values
 
         self._for_blocks(work)
 
@@ -51,11 +51,10 @@ class WeightedSum:
         """
 
         def work(rows: slice) -> None:
-            weights = self._weights[rows][..., None]
+            weights = _Weights(self._weights[rows])
             with np.errstate(over="ignore", invalid="ignore"):
                 for name, image in self._images.items():
-                    # The variance of a mean is a mean with squared weights.
-                    image[rows] /= np.square(weights) if name == VARIANCE else weights
+                    image[rows] /= weights.of(name, image[rows])
 
         self._for_blocks(work)
         return np.divide(np.square(self._weights), self._squares, dtype=np.float32)[..., None]
@@ -63,6 +62,29 @@ class WeightedSum:
     def _for_blocks(self, work: Callable[[slice], None]) -> None:
         width = sum(image.shape[-1] for image in self._images.values())
         for_row_blocks(work, len(self._weights), self._weights.shape[1] * width)
+
+
+class _Weights:
+    """Weights of some rows (n, w), and the same for images with several channels."""
+
+    def __init__(self, weights: Array) -> None:
+        self.weights, self.squares = weights, np.square(weights)
+        self._repeated: dict[int, Array] = {}
+
+    def of(self, feature: str, values: Array) -> Array:
+        """The weights for the values (n, w, c) of a feature.
+
+        They are repeated for channels that lie beside each other. NumPy takes twice as long for an axis of a few
+        channels.
+        """
+        if feature == VARIANCE:
+            return self.squares[..., None]  # the variance of a mean is a mean with squared weights
+        channels = values.shape[-1]
+        if channels == 1 or values.strides[-1] != values.itemsize:
+            return self.weights[..., None]
+        if channels not in self._repeated:
+            self._repeated[channels] = self.weights.repeat(channels, axis=1).reshape(*self.weights.shape, channels)
+        return self._repeated[channels]
 
 
 def rows_of(images: Mapping[str, Array]) -> Rows:

@@ -124,7 +124,7 @@ def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) ->
     if not steps:
         return None
     first, part = steps[0], area.slices(window)
-    borders = None if first.vectors is None else near_borders(first.vectors[part], first.tolerance)
+    borders = None if first.vectors is None else _near_borders(first.vectors, first.borders, first.tolerance, part)
     if first.moved_objects is None:
         return borders
     moved_objects = grown(grown(first.moved_objects[part]))
@@ -137,10 +137,15 @@ def _borders_there(step: Step[FusedFrame], path: Path) -> Mask | None:
         return None
     window = step.frame.alignment.hr_data_window
     place = path.place_in(window)
-    borders = near_borders(step.back[place.slices(window)], step.tolerance)
+    borders = _near_borders(step.back, step.back_borders, step.tolerance, place.slices(window))
     if path.nearest is None:
         return borders
     return borders.reshape(-1).take(path.nearest - (place.y0 - window.y0) * window.width, mode="clip")
+
+
+def _near_borders(vectors: Array, known: Mask | None, tolerance: float, part: tuple[slice, slice]) -> Mask:
+    """:func:`near_borders` over a part of a frame: as ``known`` for all of it, or computed."""
+    return near_borders(vectors[part], tolerance) if known is None else known[part]
 
 
 def _likeness(own: Array, other: Array, darkest: float) -> Array:

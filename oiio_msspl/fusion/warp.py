@@ -54,6 +54,10 @@ class Step(Generic[F]):
     moved_objects: Mask | None = None
     """(h, w): where an object has moved that the vectors do not follow, see
     :meth:`oiio_msspl.fusion.motion.MotionSource.moved_objects`. Such pixels are not ``valid``."""
+    borders: Mask | None = None
+    """(h, w): :func:`near_borders` of ``vectors``; None if it is not known yet."""
+    back_borders: Mask | None = None
+    """(h, w): :func:`near_borders` of ``back``; None if it is not known yet."""
 
 
 class Path:

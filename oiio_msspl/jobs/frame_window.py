@@ -17,7 +17,7 @@ from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.motion import FLOW, MotionFrame
 from oiio_msspl.fusion.render_average import RenderPair, lacking_passes, shared_noise
 from oiio_msspl.fusion.temporal import accumulate
-from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Placed, Step
+from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Placed, Step, near_borders
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session
@@ -35,9 +35,9 @@ SAME_SEED = "have the same noise, which no average removes; let the renderer cha
 #: Vectors of frames with more pixels are read one way after the other.
 LARGEST_READ = 1 << 22
 
-#: Vectors to a neighbour, where they can be believed, and where objects have moved that they do not follow, as
-#: :class:`oiio_msspl.fusion.warp.Step` has them.
-Way = tuple[Array | None, Mask | None, Mask | None]
+#: Vectors to a neighbour, where they can be believed, where objects have moved that they do not follow, and where they
+#: change, as :class:`oiio_msspl.fusion.warp.Step` has them.
+Way = tuple[Array | None, Mask | None, Mask | None, Mask | None]
 #: The ways to the neighbours whose renders are averaged: those before a frame, and those after it.
 Neighbours = tuple[Sequence[Step[RenderPair]], Sequence[Step[RenderPair]]]
 
@@ -208,8 +208,6 @@ class FrameWindow:
         here = placed(own)
         count = self._temporal.renders if outcomes is self._loaded else self._temporal.results
         neighbours = [n for n in self._temporal.neighbours(number, count) if (n - number) * step > 0]
-        motion = self._temporal.motion
-        tolerance = ROUND_TRIP_OF_FLOW if motion is not None and motion.kind == FLOW else ROUND_TRIP
         for n in neighbours[::step]:
             try:
                 there = placed(_usable(n, outcomes[n]))
@@ -218,11 +216,11 @@ class FrameWindow:
                     _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
                     if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
                         warnings.append(f"frames {min(number, n)} and {max(number, n)} {SAME_SEED}")
-                (vectors, valid, moved_objects), (back, back_valid, _) = self._read_both_ways(n - step, n)
+                way, back = self._read_both_ways(n - step, n)
             except InputError as error:
                 warnings.append(f"frame {n} is not averaged: {error}")
                 break
-            steps.append(Step(there[1], vectors, valid, back, back_valid, tolerance, moved_objects))
+            steps.append(_step(there[1], way, back, self._tolerance))
             if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
                 names = " and ".join(lacking_passes(here[1], there[1]))
                 if names:
@@ -252,9 +250,18 @@ class FrameWindow:
             moved_objects = self._find_moved_objects(frame, neighbour, vectors, known, {start, end})
             if moved_objects is not None:
                 known &= ~moved_objects
-            way = kept(vectors) if vectors.any() else None, None if known.all() else kept(known), moved_objects
+            moves = vectors.any()
+            # Only the second average needs them.
+            borders = kept(near_borders(vectors, self._tolerance)) if moves and self._temporal.results else None
+            way = kept(vectors) if moves else None, None if known.all() else kept(known), moved_objects, borders
             self._vectors[start, end] = way
         return self._vectors[start, end]
+
+    @property
+    def _tolerance(self) -> float:
+        """See :attr:`oiio_msspl.fusion.warp.Step.tolerance`."""
+        motion = self._temporal.motion
+        return ROUND_TRIP_OF_FLOW if motion is not None and motion.kind == FLOW else ROUND_TRIP
 
     def _find_moved_objects(
         self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask, numbers: set[int]
@@ -286,6 +293,12 @@ def _usable(number: int, outcome: T | Exception) -> T:
     if isinstance(outcome, Exception):
         raise MssplError(f"frame {number}, its neighbour, has failed: {explain(outcome)[0]}") from outcome
     return outcome
+
+
+def _step(frame: F, way: Way, way_back: Way, tolerance: float) -> Step[F]:
+    vectors, valid, moved_objects, borders = way
+    back, back_valid, _, back_borders = way_back
+    return Step(frame, vectors, valid, back, back_valid, tolerance, moved_objects, borders, back_borders)
 
 
 def _fused_frame(alone: FusedAlone) -> tuple[LoadedFrame, FusedFrame]:

@@ -77,10 +77,29 @@ class RenderPair:
         """
         alignment = self.alignment
         lrhs = read_lrhs(self.lr, alignment, alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
-        high = for_bands(
-            alignment, lambda core, _: to_grid(alignment, _luminance(_read(self.hr, core, [RGB])[RGB]), core)
-        )
+        high = for_bands(alignment, lambda core, _: to_grid(alignment, self.read_hr_luminance(core), core))
         return bounded_luminance(lrhs), np.concatenate(high)
+
+    @cached_property
+    def hr_luminance(self) -> Array | None:
+        """Luminance (h, w) of the HRLS over its data window, finite and >= 0; None if its pixels are not in memory."""
+        if not isinstance(self.hr, Render):
+            return None
+        rgb = np.asarray(self.hr.layers[RGB])
+        result: Array = blank(rgb.shape[:2])
+
+        def work(rows: slice) -> None:
+            result[rows] = _luminance(rgb[rows])
+
+        for_row_blocks(work, len(rgb), rgb[0].size)
+        unload(result)
+        return result
+
+    def read_hr_luminance(self, window: Window) -> Array:
+        """The same over a window that is relative to the top left of the display window, in memory or not."""
+        if self.hr_luminance is None:
+            return _luminance(_read(self.hr, window, [RGB])[RGB])
+        return np.asarray(self.hr_luminance)[window.slices(self.alignment.hr_data_window)]
 
     @cached_property
     def hr_is_finite(self) -> bool:
@@ -91,6 +110,8 @@ class RenderPair:
         """Give the memory of pixels that wait in temporary files back to the system."""
         self.lr.unload()
         self.hr.unload()
+        if self.hr_luminance is not None:
+            unload(self.hr_luminance)
 
 
 @dataclass(frozen=True)
@@ -220,7 +241,7 @@ class _Band:
         for name, values in _read(pair.hr, core, self._features).items():
             high[name][:] = values
         self._high = WeightedSum(high)
-        self._luminance = _luminance(_read(pair.hr, area, [RGB])[RGB])
+        self._luminance = pair.read_hr_luminance(area)
         self._low_luminance = pair.luminances[0][rows]
         core_grid = Window(grid.x0, grid.y0 + core_rows.start, grid.x1, grid.y0 + core_rows.stop)
         #: The LRHS may lack a row or a column of the grid.
@@ -362,6 +383,7 @@ class _Nearest:
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
         self._finite = None if frame.hr_is_finite else _finite_pixels(self._flat)
+        self._luminance = None if frame.hr_luminance is None else frame.read_hr_luminance(place).reshape(-1)
 
     def finite(self) -> Mask:
         """Where all features are finite, (h, w)."""
@@ -374,7 +396,10 @@ class _Nearest:
         result = np.empty(self._size, np.float32)
 
         def work(rows: slice) -> None:
-            result[rows] = _luminance(self._pixels(RGB, rows))
+            if self._luminance is None:
+                result[rows] = _luminance(self._pixels(RGB, rows))
+            else:
+                self._luminance.take(self._indices(rows), out=result[rows], mode="wrap")
 
         for_row_blocks(work, self._size[0], 3 * self._size[1])
         return result

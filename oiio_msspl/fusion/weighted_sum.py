@@ -20,7 +20,8 @@ class WeightedSum:
 
     def __init__(self, images: dict[str, Array]) -> None:
         """``images`` (h, w, c) count with a weight of 1."""
-        self._images = images
+        # NumPy takes longer for a part of an image in a temporary file than for one of any other.
+        self._images = {name: np.asarray(image) for name, image in images.items()}
         self._weights: Array = np.ones(next(iter(images.values())).shape[:2], np.float32)
         self._squares = np.ones_like(self._weights)
 

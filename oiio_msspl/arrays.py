@@ -234,23 +234,6 @@ def filled(image: Array, missing: NDArray[np.bool_]) -> Array:
     return np.where(missing[..., None], around, image)
 
 
-def mean_around(plane: Array, radius: int) -> Array:
-    """Mean over the pixels up to ``radius`` rows and columns away that exist."""
-    for axis in (0, 1):
-        size = plane.shape[axis]
-        total, count = plane.copy(), np.ones(size, np.float32)
-        for offset in range(1, min(radius, size - 1) + 1):
-            low, high = (slice(None, -offset), slice(offset, None))
-            take = (lambda s: (s, slice(None))) if axis == 0 else (lambda s: (slice(None), s))
-            total[take(low)] += plane[take(high)]
-            total[take(high)] += plane[take(low)]
-            count[low] += 1
-            count[high] += 1
-        total /= count[:, None] if axis == 0 else count
-        plane = total
-    return plane
-
-
 def upsample_linear(plane: Array, scale: int, rows: slice) -> Array:
     """Interpolate a plane linearly at ``scale`` times its resolution; only these of its rows, in its own pixels."""
     padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")

@@ -7,7 +7,8 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.guards import all_within, check_finite, enlarge
+from oiio_msspl.fusion.guards import check_finite, enlarge
+from oiio_msspl.fusion.neighbourhood import all_within
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.session import Session

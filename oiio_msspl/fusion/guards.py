@@ -4,18 +4,15 @@ through."""
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Iterator
 from functools import reduce
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.arrays import Array, Mask, box_downsample
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.neighbourhood import all_within, max_3x3, neighbours
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
@@ -90,7 +87,7 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     clipped_share = box_downsample((hrls_rgb > least).astype(np.float32), scale)
     excess = np.maximum(lrhs_rgb - box_downsample(np.minimum(hrls_rgb, least), scale), 0)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
-        light, share = (reduce(np.add, _neighbours(values)) for values in (excess, clipped_share))
+        light, share = (reduce(np.add, neighbours(values)) for values in (excess, clipped_share))
         small_light = least + light / np.maximum(share, np.float32(1 / scale**2))
         limit = np.maximum(max_3x3(lrhs_rgb), small_light)
         # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
@@ -131,17 +128,6 @@ def _rare_light(rgb: Array, top: int, left: int) -> Array:
     nine = np.stack([around[y : y + rows, x : x + columns] for y in range(3) for x in range(3)])
     light = np.median(nine, axis=0)
     return light.repeat(_SQUARE, axis=0).repeat(_SQUARE, axis=1)[top : top + height, left : left + width]
-
-
-def max_3x3(values: Array) -> Array:
-    """The largest of the 3 x 3 pixels around each, (h, w, c)."""
-    largest = values.copy()
-    for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns
-        lines = largest.swapaxes(0, axis)
-        before = lines.copy(order="K")
-        np.maximum(lines[1:], before[:-1], out=lines[1:])
-        np.maximum(lines[:-1], before[1:], out=lines[:-1])
-    return largest
 
 
 def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
@@ -227,21 +213,12 @@ def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
 
 def _holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
     """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
-    return enlarge(reduce(np.logical_and, _neighbours(lrhs)), scale) & hrls
+    return enlarge(reduce(np.logical_and, neighbours(lrhs)), scale) & hrls
 
 
 def enlarge(lrhs: Mask, scale: int) -> Mask:
     """(h, w, 1) to (s*h, s*w, 1)."""
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
-
-
-def all_within(mask: Mask, reach: int) -> Mask:
-    """Where a mask holds for all pixels up to ``reach`` rows and columns away."""
-    distance = 1
-    while reach > 0:
-        mask = reduce(np.logical_and, _neighbours(mask, min(distance, reach)))
-        reach, distance = reach - distance, 2 * distance
-    return mask
 
 
 def _is_zero(values: Array) -> Mask:
@@ -255,11 +232,3 @@ def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
     names = [name for name in ("alpha", NORMAL) if name in hrls] or [name for name in (ALBEDO,) if name in hrls]
     signs = [_is_zero(hrls[name]) for name in names]
     return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)
-
-
-def _neighbours(values: NDArray[Any], distance: int = 1) -> Iterator[NDArray[Any]]:
-    """The 3 x 3 neighbours of each pixel (h, w, c) at a distance, one (h, w, c) each; the edge pixel is repeated."""
-    height, width = values.shape[:2]
-    padded = np.pad(values, ((distance, distance), (distance, distance), (0, 0)), mode="edge")
-    for y, x in itertools.product(range(0, 3 * distance, distance), repeat=2):
-        yield padded[y : y + height, x : x + width]

@@ -13,12 +13,13 @@ from typing import TypeVar
 
 import numpy as np
 
-from oiio_msspl.arrays import Array, box_downsample, mean_around, upsample_linear
+from oiio_msspl.arrays import Array, box_downsample, upsample_linear
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.neighbourhood import mean_around
 from oiio_msspl.fusion.tile_features import mirrored
 from oiio_msspl.model.contract import SCALES
-from oiio_msspl.parallel import for_row_blocks, two_at_a_time
+from oiio_msspl.parallel import two_at_a_time
 
 T = TypeVar("T")
 
@@ -119,7 +120,7 @@ class Light:
         noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
         scale = alignment.scale
         #: For each radius in LRHS pixels: the variance of the mean of both renders.
-        self._noise = {reach: wide_mean(noise, reach) for reach in (max(1, round(r / scale)) for r in RADII)}
+        self._noise = {reach: mean_around(noise, reach) for reach in (max(1, round(r / scale)) for r in RADII)}
 
     def trust(self, lrhs: Array, hrls: Array, area: Window) -> Array:
         """How much a neighbour counts, from 0 to 1, (h, w) over :func:`grid_rows` of ``area``.
@@ -140,7 +141,7 @@ class Light:
             noise = variance[rows]
             own_error = noise * np.float32(self._alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
             uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
-            change = np.maximum(wide_mean(product, reach) - uncertainty - own_error, 0)
+            change = np.maximum(mean_around(product, reach) - uncertainty - own_error, 0)
             np.minimum(trust, own_error / (own_error + change), out=trust)
         return trust
 
@@ -151,39 +152,3 @@ def relative_difference(own: Array, other: Array, darkest: float) -> Array:
     with np.errstate(over="ignore", under="ignore", divide="ignore"):  # the product could overflow, as the ratio may
         ratio = np.sqrt(own / other)
         return np.asarray(ratio - 1 / ratio, np.float32)
-
-
-def wide_mean(plane: Array, radius: int) -> Array:
-    """Mean over the pixels up to ``radius`` rows and columns away that exist, in a time that does not depend on it."""
-    for axis in (0, 1):
-        plane = _mean_along(plane, radius, axis)
-    return plane
-
-
-def _mean_along(plane: Array, radius: int, axis: int) -> Array:
-    """The same along one axis."""
-    size = plane.shape[axis]
-    start, stop = (np.clip(np.arange(size) + offset, 0, size) for offset in (-radius, radius + 1))
-    count = (stop - start)[:, None] if axis == 0 else stop - start
-    result = np.empty_like(plane)
-
-    def lines(which: slice) -> tuple[slice, ...]:
-        return (which, slice(None)) if axis == 0 else (slice(None), which)
-
-    def work(part: slice) -> None:
-        block = plane[:, part] if axis == 0 else plane[part]
-        sums = np.zeros([n + (i == axis) for i, n in enumerate(block.shape)])
-        np.cumsum(block, axis=axis, out=sums[lines(slice(1, None))])
-        if size > 2 * radius:  # slices are read much faster than by index
-            total = np.empty(block.shape)
-            first, last = lines(slice(0, radius)), lines(slice(size - radius, size))
-            total[first] = sums[lines(slice(radius + 1, 2 * radius + 1))]
-            inner = lines(slice(2 * radius + 1, None)), lines(slice(0, size - 2 * radius))
-            np.subtract(sums[inner[0]], sums[inner[1]], out=total[lines(slice(radius, size - radius))])
-            total[last] = sums[lines(slice(size, None))] - sums[lines(slice(size - 2 * radius, size - radius))]
-        else:
-            total = sums.take(stop, axis) - sums.take(start, axis)
-        (result[:, part] if axis == 0 else result[part])[:] = total / count
-
-    for_row_blocks(work, plane.shape[1 - axis], 4 * size)
-    return result

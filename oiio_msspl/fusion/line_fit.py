@@ -13,6 +13,7 @@ import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
 from oiio_msspl.arrays import Array, box_downsample, planes_of
+from oiio_msspl.fusion.neighbourhood import blurred
 from oiio_msspl.parallel import for_row_blocks
 
 #: Rows of a band whose weights stay in a core's cache while several planes are averaged.
@@ -202,20 +203,6 @@ def smoothed(planes: Array, log: Array) -> Array:
 
     for_row_blocks(smooth, len(planes), log.size)
     return result
-
-
-def blurred(plane: Array) -> Array:
-    """Mean over 3 x 3 pixels with the weights 1, 2, 1 in rows and in columns; the edge is repeated."""
-    for axis in (0, 1):
-        lines = plane.swapaxes(0, axis)
-        total = 2 * lines
-        total[1:] += lines[:-1]
-        total[:-1] += lines[1:]
-        total[0] += lines[0]
-        total[-1] += lines[-1]
-        total *= np.float32(1 / 4)
-        plane = total.swapaxes(0, axis)
-    return plane
 
 
 def downsampled(planes: Array, scale: int) -> Array:

@@ -18,6 +18,7 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, Mask, box_downsample
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.neighbourhood import sum_3x3
 from oiio_msspl.parallel import in_parallel
 
 #: Reads a window of a frame, (h, w, c).
@@ -91,7 +92,8 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
 
     def image(name: str, read: Reader) -> Array:
         values = reduced(read, window, reduction)
-        return values if name == POSITION else smooth(values)
+        # Means lower the noise of few samples.
+        return values if name == POSITION else sum_3x3(values) / np.float32(9)
 
     guides = [
         Guide(name, in_parallel(*(partial(image, name, read) for read in reads)))
@@ -134,17 +136,6 @@ def reduced(read: Reader, window: Window, reduction: int) -> Array:
         result[y : y + rows] = box_downsample(strip, reduction) if reduction > 1 else strip
     assert result is not None
     return result
-
-
-def smooth(image: Array) -> Array:
-    """Mean over 3 x 3 pixels of (h, w, c), to lower the noise of few samples; the edge is repeated."""
-    for axis in (0, 1):
-        lines = np.concatenate([image.take([0], axis), image, image.take([-1], axis)], axis=axis).swapaxes(0, axis)
-        total = lines[:-2] + lines[1:-1]
-        total += lines[2:]
-        total /= np.float32(3)
-        image = total.swapaxes(0, axis)
-    return image
 
 
 def _steepness(image: Array) -> Array:

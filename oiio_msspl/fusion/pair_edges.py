@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.arrays import Array, quantile
-from oiio_msspl.fusion.pair_framing import SMALLEST, central_area, smooth
+from oiio_msspl.fusion.neighbourhood import blurred
+from oiio_msspl.fusion.pair_framing import SMALLEST, central_area
 
 #: Shifts in LRHS pixels that the control consists of; smaller ones than the first still overlap the edges.
 CONTROL = (4, 16)
@@ -83,10 +84,8 @@ def _length(steps: list[Array]) -> Array:
 
 def _local_contrast(values: Array) -> Array:
     """What stands out of its neighbourhood, in units of its local RMS: a noisy or bright corner does not dominate."""
-    fine = values - smooth(smooth(values))
-    power = np.square(fine)
-    for _ in range(6):
-        power = smooth(power)
+    fine = values - blurred(values, 4)
+    power = blurred(np.square(fine), 12)
     return fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
 
 

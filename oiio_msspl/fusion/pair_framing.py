@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array, box_downsample, interpolate, quantile
+from oiio_msspl.fusion.neighbourhood import blurred
 
 #: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
 FRAMING_CORRELATION = 0.8
@@ -57,12 +58,12 @@ def find_framing(low: Array, high: Array) -> Framing:
     low, high = central_area(low), central_area(high)
     grey = quantile(low[low > 0], 0.5) if low.any() else 1.0
     # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
-    low, high = (smooth(v / (v + grey)) for v in (low, high))
+    low, high = (blurred(v / (v + grey), 2) for v in (low, high))
     if not (np.isfinite(low).all() and np.isfinite(high).all()):
         return Framing()  # radiance near the limit of float32
     starts = [np.zeros(3)]
     if min(low.shape) >= SMALLEST_COARSE:
-        coarse = _fit(smooth(downsample_4(low)), smooth(downsample_4(high)), np.zeros(3)).estimate * 4
+        coarse = _fit(blurred(downsample_4(low), 2), blurred(downsample_4(high), 2), np.zeros(3)).estimate * 4
         # A start less than half a pixel away would lead to the same result.
         if np.abs(coarse).max() >= 0.5:
             starts.append(np.clip(coarse, -12, 12))
@@ -98,7 +99,7 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
         inner = slice(margin, -margin)
         gy, gx = np.gradient(moved)
         zoom = gx * across + gy * down[:, None]
-        blur = smooth(moved) - moved
+        blur = blurred(moved, 2) - moved
         known = [-gx, -gy, -zoom, moved, np.square(moved), blur, np.ones_like(moved)]
         planes = np.stack([*known, high - moved])[:, inner, inner]
         # For each part of the frame, the products of all planes with all planes. Double precision, because the planes
@@ -123,7 +124,7 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
 
 def _unmoved_residual(low: Array, high: Array, inner: slice) -> float:
     """Squared difference within rows and columns that a tone curve and a blur of the LRHS do not explain."""
-    known = [low, np.square(low), smooth(low) - low, np.ones_like(low)]
+    known = [low, np.square(low), blurred(low, 2) - low, np.ones_like(low)]
     planes = np.stack([*known, high - low])[:, inner, inner].reshape(5, -1).astype(np.float64)
     dots = planes @ planes.T
     coefficients = np.linalg.lstsq(dots[:4, :4], dots[:4, 4], rcond=None)[0]
@@ -159,20 +160,6 @@ def parts(values: Array) -> list[Array]:
 def jackknife_error(without_part: NDArray[np.float64]) -> NDArray[np.float64]:
     """Standard error of an estimate, from the estimates (n, ...) that leave out one of n parts each."""
     return np.sqrt((len(without_part) - 1) * without_part.var(axis=0))
-
-
-def smooth(values: Array) -> Array:
-    """Binomial filter of 5 x 5 pixels."""
-    for axis in (0, 1, 0, 1):
-        lines = values.swapaxes(0, axis)
-        result = np.empty_like(values)
-        sums = result.swapaxes(0, axis)
-        np.add(lines[:-2], lines[2:], out=sums[1:-1])
-        sums[0], sums[-1] = lines[0] + lines[1], lines[-2] + lines[-1]  # the edge pixel is repeated
-        sums += 2 * lines
-        sums /= np.float32(4)
-        values = result
-    return values
 
 
 def downsample_4(values: Array) -> Array:

@@ -13,9 +13,9 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array, box_downsample, filled, planes_of
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.guards import max_3x3
 from oiio_msspl.fusion.line_fit import downsampled
 from oiio_msspl.fusion.motion_vectors import sample_linear
+from oiio_msspl.fusion.neighbourhood import max_3x3
 from oiio_msspl.fusion.pass_plan import PassJob
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
 

@@ -32,8 +32,9 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.guards import LAYER_REACH, all_within, max_3x3
-from oiio_msspl.fusion.line_fit import STEPS, LineFit, LinesNearby, blurred, downsampled, smoothed
+from oiio_msspl.fusion.guards import LAYER_REACH
+from oiio_msspl.fusion.line_fit import STEPS, LineFit, LinesNearby, downsampled, smoothed
+from oiio_msspl.fusion.neighbourhood import blurred, grown, max_3x3
 from oiio_msspl.fusion.pass_layers import SharesAround, dimmed, in_both, to_be_fitted
 from oiio_msspl.fusion.pass_plan import PassJob, plan_passes
 from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
@@ -492,8 +493,7 @@ class _Band:
             # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
             # light has no sample by chance, the mean over pixels that look alike is the bound. This ends two LRHS
             # pixels before LAYER_REACH, because the bounds are interpolated.
-            black = np.all(layer == 0, axis=0)[..., None]
-            near_light = ~all_within(black, LAYER_REACH // self._scale - 2)[..., 0]
+            near_light = grown(np.any(layer != 0, axis=0), LAYER_REACH // self._scale - 2)
             lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
             highest = np.where(near_light & (highest < means * np.float32(NO_SAMPLE)), means, highest)
             self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty_core, out)

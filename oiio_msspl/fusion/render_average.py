@@ -33,11 +33,11 @@ from oiio_msspl.fusion.light import (
     relative_difference,
     rows_in_bands,
     to_grid,
-    wide_mean,
 )
+from oiio_msspl.fusion.neighbourhood import grown, mean_around
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
-from oiio_msspl.fusion.warp import Path, Step, grown, nearest_indices, sample_cubic
+from oiio_msspl.fusion.warp import Path, Step, nearest_indices, sample_cubic
 from oiio_msspl.fusion.weighted_sum import Rows, WeightedSum, rows_of
 from oiio_msspl.parallel import for_row_blocks
 
@@ -267,7 +267,7 @@ class _Band:
             # A light that has changed in the nearer frame has changed in the farther one.
             trusted = trust if trusted is None else np.minimum(trusted, trust)
             counted = trusted if path.moved_objects is None else trusted * self._far_from(path.moved_objects)
-            hidden = grown(grown(share < 1))
+            hidden = grown(share < 1, 2)
             counted = counted * np.where(hidden, self._as_bright(lrhs), np.float32(1))
             weight = from_grid(self._alignment, counted, self._area) * valid
             self._high.add(high.below(self._rows.start), weight[self._rows])
@@ -302,7 +302,7 @@ class _Band:
         single noisy pixels for detail.
         """
         share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
-        near = wide_mean(share, max(1, round(NEAR_OBJECTS / self._alignment.scale)))
+        near = mean_around(share, max(1, round(NEAR_OBJECTS / self._alignment.scale)))
         return np.maximum(1 - near / np.float32(FEW), 0)
 
     def _as_bright(self, lrhs: Array) -> Array:

@@ -12,6 +12,7 @@ import numpy as np
 
 from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.neighbourhood import grown, sum_3x3
 from oiio_msspl.fusion.warp import nearest_indices
 from oiio_msspl.parallel import for_row_blocks
 
@@ -95,8 +96,8 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
             limit *= np.float32(MULTIPLE)
             limit += np.float32(DIFFERENCE)
             differs = (_distance(one, two) > limit) & compared[around]
-            other |= _sum3(differs.astype(np.float32)) >= PIXELS
-        result[rows] = (_sum3(other.astype(np.float32)) > 0)[first - around.start :][: last - first]
+            other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
+        result[rows] = grown(other)[first - around.start :][: last - first]
 
     for_row_blocks(work, height, width)
     return result
@@ -122,7 +123,7 @@ def _roughness(planes: Array) -> Array:
             sums[1:-1] += np.minimum(steps[1:], steps[:-1])
             sums[0] += steps[0]
             sums[-1] += steps[-1]
-    result = _sum3(total)
+    result = sum_3x3(total)
     result /= 9
     return result
 
@@ -135,14 +136,3 @@ def _distance(one: Array, two: Array) -> Array:
         step *= step
         total += step
     return np.sqrt(total, out=total)
-
-
-def _sum3(plane: Array) -> Array:
-    """Sum over 3 x 3 pixels; the edge is repeated."""
-    for _ in (0, 1):
-        plane = plane.T
-        total = plane.copy(order="K")
-        for pixels, beside in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None)), ((0,), (0,)), ((-1,), (-1,))):
-            total[pixels] += plane[beside]
-        plane = total
-    return plane

@@ -24,7 +24,8 @@ from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.light import Light, for_bands, from_grid, relative_difference, rows_in_bands, to_grid
-from oiio_msspl.fusion.warp import Path, Step, grown, near_borders, sample_cubic
+from oiio_msspl.fusion.neighbourhood import grown
+from oiio_msspl.fusion.warp import Path, Step, near_borders, sample_cubic
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of
 
 #: At the border of two surfaces, a neighbour counts half if it is brighter or darker by this share.
@@ -127,7 +128,7 @@ def _borders(steps: Sequence[Step[FusedFrame]], area: Window, window: Window) ->
     borders = None if first.vectors is None else _near_borders(first.vectors, first.borders, first.tolerance, part)
     if first.moved_objects is None:
         return borders
-    moved_objects = grown(grown(first.moved_objects[part]))
+    moved_objects = grown(first.moved_objects[part], 2)
     return moved_objects if borders is None else borders | moved_objects
 
 

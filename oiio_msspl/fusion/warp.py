@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.neighbourhood import grown
 from oiio_msspl.parallel import for_row_blocks
 
 #: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
@@ -164,17 +165,6 @@ def near_borders(vectors: Array, tolerance: float) -> Mask:
     for pixels in (borders[:-1], borders[1:]):
         pixels |= down
     return grown(borders)
-
-
-def grown(mask: Mask) -> Mask:
-    """A mask (h, w) with all pixels beside it, diagonally, too."""
-    for axis in (0, 1):
-        mask = np.moveaxis(mask, axis, 0)
-        beside = mask.copy()
-        beside[1:] |= mask[:-1]
-        beside[:-1] |= mask[1:]
-        mask = np.moveaxis(beside, 0, axis)
-    return mask
 
 
 def _as_complex(vectors: Array) -> NDArray[np.complex64]:

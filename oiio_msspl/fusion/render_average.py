@@ -25,15 +25,8 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import Array, Mask, blank, interpolate, repair, unload
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.light import (
-    Light,
-    for_bands,
-    from_grid,
-    grid_rows,
-    relative_difference,
-    rows_in_bands,
-    to_grid,
-)
+from oiio_msspl.fusion.bands import for_bands, from_grid, grid_rows, rows_in_bands, to_grid
+from oiio_msspl.fusion.light import Light, relative_difference
 from oiio_msspl.fusion.neighbourhood import grown, mean_around
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
@@ -212,7 +205,7 @@ def memory_to_average(window: Window, channels: int) -> int:
 
 
 def _weight(channels: int) -> float:
-    """See :func:`oiio_msspl.fusion.light.for_bands`."""
+    """See :func:`oiio_msspl.fusion.bands.for_bands`."""
     usual, needed = (BYTES_PER_PIXEL + 4 * count for count in (USUAL_CHANNELS, channels))
     return max(1.0, needed / usual)
 
@@ -225,7 +218,7 @@ class _Band:
     ) -> None:
         """
         Args:
-            core, area: see :func:`oiio_msspl.fusion.light.for_bands`.
+            core, area: see :func:`oiio_msspl.fusion.bands.for_bands`.
             high: gets the HRLS's features over ``core``.
             low: the LRHS's features over its data window; the rows of ``core`` are changed.
         """

@@ -22,8 +22,9 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.arrays import Array, Mask
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.bands import for_bands, from_grid, rows_in_bands, to_grid
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.light import Light, for_bands, from_grid, relative_difference, rows_in_bands, to_grid
+from oiio_msspl.fusion.light import Light, relative_difference
 from oiio_msspl.fusion.neighbourhood import grown
 from oiio_msspl.fusion.warp import Path, Step, near_borders, sample_cubic
 from oiio_msspl.fusion.weighted_sum import WeightedSum, rows_of

@@ -7,7 +7,7 @@ import pytest
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.exr.render import Render, Window
-from oiio_msspl.fusion import light
+from oiio_msspl.fusion import bands
 from oiio_msspl.fusion.render_average import RenderPair, average_renders, shared_noise
 from oiio_msspl.fusion.warp import Step
 from oiio_msspl.parallel import limit_threads
@@ -210,8 +210,8 @@ def test_bands_of_rows_agree(monkeypatch):
     pairs = [pair_of(texture(0.7 * seed), seed) for seed in range(3)]
 
     def result(rows):
-        monkeypatch.setattr(light, "BAND_ROWS", rows)
-        monkeypatch.setattr(light, "BAND_PIXELS", 1)
+        monkeypatch.setattr(bands, "BAND_ROWS", rows)
+        monkeypatch.setattr(bands, "BAND_PIXELS", 1)
         fresh = [RenderPair(pair.lr, pair.hr) for pair in pairs]
         return average_renders(fresh[1], [moved(fresh[0], -0.7, 0.4)], [moved(fresh[2], 0.7, -3.3)])
 
@@ -224,8 +224,8 @@ def test_bands_of_rows_agree(monkeypatch):
 def test_rows_above_the_frame_are_averaged_like_others(monkeypatch):
     """The same pixels, once all inside the display window and once all above it. Some surfaces move further than the
     others, so that the first row that is read belongs to them."""
-    monkeypatch.setattr(light, "BAND_ROWS", 16)
-    monkeypatch.setattr(light, "BAND_PIXELS", 1)
+    monkeypatch.setattr(bands, "BAND_ROWS", 16)
+    monkeypatch.setattr(bands, "BAND_PIXELS", 1)
     pairs = [pair_of(np.full((HEIGHT, WIDTH, 3), 0.5, np.float32), seed) for seed in range(2)]
     way, back = np.zeros((2, HEIGHT, WIDTH, 2), np.float32)
     way[40:48, 32:64, 1], back[10:18, 32:64, 1] = -30, 30
@@ -243,8 +243,8 @@ def test_rows_above_the_frame_are_averaged_like_others(monkeypatch):
 
 def test_bands_read_a_file_at_the_same_time(monkeypatch, tmp_path):
     """As for frames that don't fit into memory."""
-    monkeypatch.setattr(light, "BAND_ROWS", 16)
-    monkeypatch.setattr(light, "BAND_PIXELS", 1)
+    monkeypatch.setattr(bands, "BAND_ROWS", 16)
+    monkeypatch.setattr(bands, "BAND_PIXELS", 1)
     pairs = [pair_of(texture(0.7 * seed), seed) for seed in range(3)]
 
     def on_disk(render, name):

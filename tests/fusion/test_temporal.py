@@ -7,9 +7,10 @@ import pytest
 from oiio_msspl.arrays import box_downsample
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Render, Window
-from oiio_msspl.fusion import light
+from oiio_msspl.fusion import bands
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.light import relative_difference
 from oiio_msspl.fusion.temporal import accumulate
 from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Step, near_borders
 from tests.fusion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
@@ -204,8 +205,8 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
     frames[2].rgb *= dark
 
     def result(rows):
-        monkeypatch.setattr(light, "BAND_ROWS", rows)
-        monkeypatch.setattr(light, "BAND_PIXELS", 1)
+        monkeypatch.setattr(bands, "BAND_ROWS", rows)
+        monkeypatch.setattr(bands, "BAND_PIXELS", 1)
         return accumulate(frames[1], [moved(frames[0], -0.7, 0.4)], [moved(frames[2], 0.7, -3.3)])
 
     whole, parts = result(1024), result(16)
@@ -215,6 +216,6 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
 
 def test_differences_of_any_brightness_are_relative():
     own, other = np.float32([1, 4, 0, 3e38, 3e38, 0]), np.float32([1, 1, 0, 1.5e38, 0, 3e38])
-    found = light.relative_difference(own, other, 1e-20)
+    found = relative_difference(own, other, 1e-20)
     np.testing.assert_allclose(found[:4], [0, 1.5, 0, np.sqrt(0.5)], rtol=1e-5)
     assert found[4] > 1e18 and found[5] < -1e18

@@ -33,7 +33,7 @@ FEWEST = 64
 #: Two formats are different if they say different places for a pixel, in pixels.
 DIFFERENT = 0.25
 #: Scales of vectors that are known to occur; 2 is a shutter of 180 degrees.
-SCALES = (1.0, 2.0, 0.5)
+VECTOR_SCALES = (1.0, 2.0, 0.5)
 #: Scales of vectors that are encoded as colours, in pixels: the renderer's setting is not in the file.
 ENCODED_SCALES = tuple(2.0 ** (k / 2) for k in range(2, 23))
 
@@ -133,7 +133,7 @@ def _formats(field: MotionField, *, encoded: bool, scales: Iterable[float] = ())
     yield expected
     words = [(getattr(expected, word),) if word in fixed else CHOICES[word] for word in ("to", "x", "y", "unit")]
     for to, x, y, unit in itertools.product(*words):
-        known = scales or (ENCODED_SCALES if encoded and unit == "pixels" else SCALES)
+        known = scales or (ENCODED_SCALES if encoded and unit == "pixels" else VECTOR_SCALES)
         for scale in (expected.scale,) if "scale" in fixed else known:
             yield replace(expected, to=to, x=x, y=y, unit=unit, scale=scale)
 

@@ -26,7 +26,7 @@ NO_MOTION = 1e-3
 #: back ends at its pixel would depend on how places are rounded to pixels.
 UNEVEN = 0.25
 #: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
-ROUNDS, ROUND_TRIP = 3, 0.5
+INVERSION_ROUNDS, INVERSION_ERROR = 3, 0.5
 
 
 def channels_to_read(render: MappedRender, channels: tuple[Channel, Channel]) -> list[Channel]:
@@ -161,14 +161,14 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
     def work(rows: slice) -> None:
         y, x = np.mgrid[rows.start : rows.stop, 0:width].astype(np.float32)
         way = -own[rows]
-        for _ in range(ROUNDS):
+        for _ in range(INVERSION_ROUNDS):
             way = -sample_linear(other, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
         at_x, at_y = x + way[..., 0] + shift_x, y + way[..., 1] + shift_y
         back = sample_linear(other, at_x, at_y) + way
         vectors[rows] = way
         inside = (at_x >= -0.5) & (at_y >= -0.5) & (at_x <= other.shape[1] - 0.5) & (at_y <= other.shape[0] - 0.5)
         known[rows] = (
-            inside & (np.hypot(back[..., 0], back[..., 1]) < ROUND_TRIP) & nearest_values(other_known, at_x, at_y)
+            inside & (np.hypot(back[..., 0], back[..., 1]) < INVERSION_ERROR) & nearest_values(other_known, at_x, at_y)
         )
 
     for_row_blocks(work, height, width * 8)

@@ -15,7 +15,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion_vectors import nearest_values, sample_linear
 
 #: A vector is believed if the way there and back ends this close to its pixel, in pixels.
-ROUND_TRIP = 0.75
+FLOW_ERROR = 0.75
 #: Stops below and above the mean brightness that DIS sees, which reads 8 bits.
 STOPS_BELOW, STOPS_ABOVE = 6.0, 4.0
 #: Pixels on each side that DIS needs. It halves smaller pictures too often, and OpenCV may crash.
@@ -51,7 +51,7 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
     rendered = np.zeros(frame.shape[:2], np.bool_)
     rendered[shared.slices(window)] = True
     inside = (at_x >= 0) & (at_y >= 0) & (at_x <= window.width - 1) & (at_y <= window.height - 1)
-    known = inside & (np.hypot(trip[..., 0], trip[..., 1]) < ROUND_TRIP) & nearest_values(rendered, at_x, at_y)
+    known = inside & (np.hypot(trip[..., 0], trip[..., 1]) < FLOW_ERROR) & nearest_values(rendered, at_x, at_y)
     there[~known] = 0
     return there, known
 

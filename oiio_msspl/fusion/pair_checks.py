@@ -36,7 +36,7 @@ EXPOSURE_RATIO = 4 / 3
 #: off by its nature, and this in LRHS pixels.
 MAX_SHIFT = (0.75, 0.5)
 #: Or if the zoom moves the edge of the frame by more LRHS pixels than this.
-MAX_ZOOM = 0.8
+MAX_ZOOM_AT_EDGE = 0.8
 #: A difference of exposure must be this many standard errors from none.
 CERTAIN = 6.0
 #: Brighter pixels count as this bright, because sums of squares over a frame would overflow float32.
@@ -241,7 +241,7 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
             f"the HRLS is shifted against the LRHS by {abs(x):.1f} pixels to the {'right' if x > 0 else 'left'} and "
             f"{abs(y):.1f} pixels {'down' if y > 0 else 'up'}: are camera, crop and overscan the same?"
         )
-    if abs(found.zoom_at_edge) > MAX_ZOOM:
+    if abs(found.zoom_at_edge) > MAX_ZOOM_AT_EDGE:
         tighter = "HRLS" if found.zoom > 0 else "LRHS"
         warnings.append(
             f"the {tighter} is framed {100 * abs(found.zoom):.1f} % tighter than the other render: are focal length, "

@@ -34,7 +34,7 @@ SMALLEST = 44
 #: Smaller pictures are not searched for shifts of several pixels: at a quarter of their size little is left.
 SMALLEST_COARSE = 80
 #: Largest zoom that is looked for.
-MAX_ZOOM = 0.1
+LARGEST_ZOOM_SEARCHED = 0.1
 
 
 @dataclass(frozen=True)
@@ -91,7 +91,7 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
     half = max(low.shape) / 2
     across, down = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) / np.float32(half) for n in (width, height))
     # Shift and zoom together leave some rows and columns to compare.
-    largest = np.full(3, (min(low.shape) / 2 - 5) / 2).clip(max=(np.inf, np.inf, MAX_ZOOM * half))
+    largest = np.full(3, (min(low.shape) / 2 - 5) / 2).clip(max=(np.inf, np.inf, LARGEST_ZOOM_SEARCHED * half))
     estimate = np.clip(start, -largest, largest)
     for _ in range(8):
         moved = _move(low, estimate / (1, 1, half))

@@ -51,7 +51,7 @@ DARK = 0.3
 #: A layer has no sample where its brightest pixel around is below this share of its mean over pixels that look alike.
 NO_SAMPLE = 0.25
 #: A render whose logarithm of light differs by this much from that of the fused beauty has 1/e of the weight.
-OTHER_LIGHT = 1.0
+LIGHT_SPREAD = 1.0
 #: The least doubt of a layer, relative to the largest. Without it, a layer gains up to 0.01 dB more, but one that has
 #: hardly any noise by chance would push a large error into others.
 LEAST_DOUBT = np.float32(0.25)
@@ -537,7 +537,7 @@ class _Band:
         """
         lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
         ours, fused = (np.log(light + 3 * self._dark) for light in lights)
-        return np.exp(-np.square((ours - fused) / OTHER_LIGHT)).astype(np.float32)
+        return np.exp(-np.square((ours - fused) / LIGHT_SPREAD)).astype(np.float32)
 
 
 def _is_black(render: ReadableRender, layer: str, area: Window) -> bool:

@@ -41,7 +41,7 @@ COVERED = 0.9
 NEAR_OBJECTS, FEW = 8, 0.125
 #: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided
 #: by the root of the product. That is a factor of 5.
-OTHER_LIGHT = np.float32(4 / np.sqrt(5))
+OTHER_BRIGHTNESS = np.float32(4 / np.sqrt(5))
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
 #: With more channels, as passes have, bands have fewer rows.
@@ -300,7 +300,7 @@ class _Band:
 
     def _as_bright(self, lrhs: Array) -> Array:
         """How much a neighbour counts by the luminance (h, w) of its LRHS, where it may show another surface, too."""
-        difference = relative_difference(self._low_luminance, lrhs, self._light.darkest) / OTHER_LIGHT
+        difference = relative_difference(self._low_luminance, lrhs, self._light.darkest) / OTHER_BRIGHTNESS
         with np.errstate(over="ignore"):
             return np.asarray(1 / (1 + np.square(np.square(difference))), np.float32)
 

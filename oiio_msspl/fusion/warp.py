@@ -46,10 +46,11 @@ class Step(Generic[F]):
     """(h, w, 2) over the data window of the frame that it starts from: where the surface of a pixel is, in HRLS pixels
     from there, as (x, y) with y downwards. None: it stays."""
     valid: Mask | None
-    """(h, w): which of them can be believed; None if all can."""
+    """(h, w) over the same window: which of them can be believed; None if all can."""
     back: Array | None
     """(h, w, 2) over the data window of ``frame``: the way back. None: it stays."""
     back_valid: Mask | None
+    """(h, w) over the data window of ``frame``: which of ``back`` can be believed; None if all can."""
     tolerance: float = ROUND_TRIP
     """How far the way back may miss the pixel, in HRLS pixels."""
     moved_objects: Mask | None = None
@@ -82,8 +83,8 @@ class Path:
         start, end = self._last, step.frame.alignment.hr_data_window
         valid = self.valid.copy()
         moves = step.vectors is not None
-        # A complex number is gathered in half the time of two real ones.
         moved = step.moved_objects
+        # A complex number is gathered in half the time of two real ones.
         vectors, back = (None if v is None else _as_complex(v) for v in (step.vectors, step.back))
         shape = valid.shape
         moved_objects = np.zeros(shape, np.bool_)

@@ -32,11 +32,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
-from oiio_msspl.aovs.features import HRLS_FEATURES, LRHS_FEATURES
+from oiio_msspl.aovs.features import HRLS_FEATURES, RGB
 from oiio_msspl.model.contract import SCALES
 from training.ops import conv3x3
 
-LRHS_CHANNELS = sum(LRHS_FEATURES.values())
+#: The LRHS branch reads RGB alone.
+LRHS_CHANNELS = HRLS_FEATURES[RGB]
 HRLS_CHANNELS = sum(HRLS_FEATURES.values())
 
 

@@ -23,8 +23,6 @@ VARIANCE = "variance"
 
 #: Feature -> number of channels, in the order in which the network's HRLS branch stacks them.
 HRLS_FEATURES: dict[str, int] = {RGB: 3, ALBEDO: 3, NORMAL: 3, DIFFUSE: 3, SPECULAR: 3, VARIANCE: 1}
-#: The same for the LRHS branch.
-LRHS_FEATURES: dict[str, int] = {RGB: 3}
 #: All features, in order.
 FEATURES = tuple(HRLS_FEATURES)
 #: Features that are radiance: they scale with the brightness of the scene.

@@ -12,7 +12,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.arrays import Array, Mask, box_downsample
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.neighbourhood import all_within, max_3x3, neighbours
+from oiio_msspl.fusion.neighbourhood import all_within, grown, max_3x3, neighbours
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
@@ -172,7 +172,8 @@ class EmptyRegions:
     empty.
 
     A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only where the LRHS is
-    black far around.
+    black far around. The same holds where light is rare: a defocused lamp before an empty background is hit by few
+    samples, and the others find the background.
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
@@ -181,7 +182,11 @@ class EmptyRegions:
 
     def __init__(self, lrhs_rgb: Array, reach: int = FAR) -> None:
         self._black = _is_zero(lrhs_rgb)
-        self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
+        self._black_far_around = self._has_rare_light = self._black
+        if self._black.any():
+            self._black_far_around = all_within(self._black, reach)
+            light = reduce(np.maximum, (lrhs_rgb[..., c : c + 1] for c in range(3)))
+            self._has_rare_light = grown(_rare_light(light, 0, 0) > 0, _SQUARE)
 
     def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
         """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
@@ -192,7 +197,8 @@ class EmptyRegions:
         if not self._black[window].any():
             return None
         empty = _holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
-        empty &= _shows_no_surface(pair.hrls) | enlarge(self._black_far_around[window], pair.scale)
+        no_surface = _shows_no_surface(pair.hrls) & ~enlarge(self._has_rare_light[window], pair.scale)
+        empty &= no_surface | enlarge(self._black_far_around[window], pair.scale)
         return empty
 
 

@@ -5,8 +5,10 @@ through."""
 from __future__ import annotations
 
 from functools import reduce
+from typing import TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.arrays import Array, Mask, box_downsample
@@ -17,6 +19,8 @@ from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import for_row_blocks
+
+T = TypeVar("T", bound=np.generic)
 
 #: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
 #: render, but for rare light (:func:`_rare_light`). The LRHS is the mean of s x s HRLS pixels, so s^2 would be the
@@ -70,9 +74,10 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
 
     Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
     light, and its rim would be too bright. It is as bright as in the HRLS, and at most as bright as the brightest of
-    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that: as bright as
-    what the LRHS exceeds the clipped HRLS by, spread over the clipped pixels. Pixel filters move light between
-    neighbours, so both are counted over 3 x 3 LRHS pixels.
+    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that: by what the
+    LRHS exceeds the clipped HRLS by, spread over the clipped pixels: evenly, or as the HRLS has it, whatever gives a
+    pixel more. Pixel filters move light between neighbours, so both are counted over 3 x 3 LRHS pixels. If a pixel is
+    more than twice as bright as they are on average, it is a firefly in a lamp, and light is spread evenly.
 
     Args:
         lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
@@ -85,14 +90,26 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
         return None
     scale = len(hrls_rgb) // len(lrhs_rgb)
     clipped_share = box_downsample((hrls_rgb > least).astype(np.float32), scale)
-    excess = np.maximum(lrhs_rgb - box_downsample(np.minimum(hrls_rgb, least), scale), 0)
-    with np.errstate(over="ignore"):  # a limit that overflows is no limit
-        light, share = (reduce(np.add, neighbours(values)) for values in (excess, clipped_share))
-        small_light = least + light / np.maximum(share, np.float32(1 / scale**2))
-        limit = np.maximum(max_3x3(lrhs_rgb), small_light)
+    clipped = box_downsample(np.minimum(hrls_rgb, least), scale)
+    with np.errstate(over="ignore", invalid="ignore"):  # a limit that overflows is no limit
+        excesses = [np.maximum(mean - clipped, 0) for mean in (lrhs_rgb, box_downsample(hrls_rgb, scale))]
+        light, own, share = (reduce(np.add, neighbours(values)) for values in (*excesses, clipped_share))
+        even = least + light / np.maximum(share, np.float32(1 / scale**2))
+        limit = np.maximum(max_3x3(lrhs_rgb), even)
+        factor = np.nan_to_num(np.minimum(light / np.maximum(own, np.float32(1e-30)), 1))
+        blocks = hrls_rgb.reshape(len(lrhs_rgb), scale, -1, scale, 3)
+        factor[(max_3x3(blocks.max(axis=(1, 3))) - least) * share > 2 * own] = 0
         # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
-        limit = np.minimum(limit, lrhs_rgb * np.float32(FIREFLY_FACTOR))
-    agreed = _limit(hrls_rgb, _as_wide_as_hrls(limit, scale), scale)
+        most = lrhs_rgb * np.float32(FIREFLY_FACTOR)
+    agreed = np.empty_like(hrls_rgb)
+
+    def work(rows: slice) -> None:
+        part, place = hrls_rgb[rows], slice(rows.start // scale, rows.stop // scale)
+        in_proportion = least + (part - least) * enlarge(factor[place], scale)
+        bound = np.minimum(np.maximum(enlarge(limit[place], scale), in_proportion), enlarge(most[place], scale))
+        np.minimum(part, bound, out=agreed[rows])
+
+    for_row_blocks(work, len(hrls_rgb), hrls_rgb[0].size, multiple=scale)
     agreed[np.all(agreed <= least, axis=-1)] = 0
     return agreed
 
@@ -222,8 +239,8 @@ def _holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
     return enlarge(reduce(np.logical_and, neighbours(lrhs)), scale) & hrls
 
 
-def enlarge(lrhs: Mask, scale: int) -> Mask:
-    """(h, w, 1) to (s*h, s*w, 1)."""
+def enlarge(lrhs: NDArray[T], scale: int) -> NDArray[T]:
+    """(h, w, c) to (s*h, s*w, c): each pixel becomes s x s equal ones."""
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 
 

@@ -56,8 +56,11 @@ LIGHT_SPREAD = 1.0
 #: hardly any noise by chance would push a large error into others.
 LEAST_DOUBT = np.float32(0.25)
 #: What is spread by doubt adds at most this share to the sum of the layers, and takes at most this share of a layer's
-#: light, so none becomes black where the sum is far off. The rest is spread by light alone.
+#: light, so none becomes black where the sum is far off.
 MOST_SPREAD = np.float32(0.9)
+#: What is still lacking then is spread by the square of the doubt, at least this. It is the light of a rare lamp that
+#: the layers of few samples miss, and not of a sky behind it, which they know.
+LEAST_SQUARED_DOUBT = np.float32(1e-3)
 #: A colour below this can't carry light: a product of light and colour is written as product / colour.
 DARKEST_COLOUR = 1e-3
 #: What known layers leave of the beauty counts as rounding below this share of it.
@@ -515,7 +518,6 @@ class _Band:
         doubts = np.sqrt([blurred(plane) for plane in to_be_fitted(job, differences)])
         most = doubts.max(axis=0)
         doubts = np.divide(doubts, most, out=np.ones_like(doubts), where=(most > 0) & np.isfinite(most))
-        np.maximum(doubts, LEAST_DOUBT, out=doubts)
         doubts[~to_be_fitted(job, both)] = 1
         return np.stack([upsample_linear(plane, self._scale, self._core_rows) for plane in doubts])
 
@@ -565,20 +567,30 @@ def _make_sum(layers: Array, beauty: Array, doubts: Array | None) -> None:
     black, they stay black.
 
     Args:
-        doubts: how uncertain each layer is (n, h, w). What is lacking is spread in proportion to light times doubt; in
-            proportion to light if this is None.
+        doubts: how uncertain each layer is (n, h, w), from 0 to 1. What is lacking is spread in proportion to light
+            times doubt, and the rest of it to light times squared doubt; in proportion to light if this is None.
     """
+
+    tiny = np.finfo(np.float32).tiny
 
     def work(rows: slice) -> None:
         part, wanted = layers[:, :, rows], beauty[:, rows]
         total = part.sum(axis=0)
         if doubts is not None:
+            doubt = doubts[:, None, rows]
             lacking = np.clip(wanted - total, -MOST_SPREAD * total, MOST_SPREAD * total)
-            weights = part * doubts[:, None, rows]
-            lacking /= np.maximum(weights.sum(axis=0), np.finfo(np.float32).tiny)
+            weights = part * np.maximum(doubt, LEAST_DOUBT)
+            lacking /= np.maximum(weights.sum(axis=0), tiny)
             weights *= lacking
             part += np.maximum(weights, -MOST_SPREAD * part)
             total = part.sum(axis=0)
+            lacking = wanted - total
+            if (lacking > 0).any():
+                weights = part * np.maximum(np.square(doubt), LEAST_SQUARED_DOUBT)
+                weights /= np.maximum(weights.sum(axis=0), tiny)
+                weights *= np.maximum(lacking, 0)
+                part += weights
+                total = part.sum(axis=0)
         # The beauty divided by a tiny total would overflow; a layer's share of the total never does.
         part /= np.where(total > 0, total, 1)
         part *= wanted

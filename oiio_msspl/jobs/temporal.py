@@ -42,8 +42,8 @@ AUTO_COUNT, AUTO_COUNT_SLOW = 4, 6
 MOST_RESULTS = 2
 #: The most that can be asked for.
 MOST = 8
-#: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, whether an object
-#: has moved that it does not follow, and whether it is at a border; and the averaged frame.
+#: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, whether an
+#: object has moved that it does not follow, and whether it is at a border; and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 11, 20
 #: Bytes of an LRHS pixel that the luminance of both renders takes for each frame that is held.
 LUMINANCE_BYTES = 8

@@ -249,6 +249,19 @@ def test_a_lamp_is_as_bright_as_in_both_renders(scale, family, lamp, room):
     assert fused[~on].max() < 0.2 * 65504 * room / 0.18  # a fifth of the ceiling: what the networks themselves spread
 
 
+def test_pixels_of_a_small_lamp_may_differ(session, scale):
+    """It is smaller than an LRHS pixel, and a pixel at its rim shows a part of it. If the LRHS has less of it, the
+    brighter pixel loses light."""
+    clean = np.full((96, 128, 3), 0.05, np.float32)
+    high, lamp = noisy(clean, 4), np.float32([3e4, 1e4])[:, None, None]
+    for image in (clean, high):
+        image[48:50, 64:65] = lamp
+    for share, expected in ((1, (3e4, 1e4)), (0.8, (2.4e4, 1e4))):
+        low = downsample(np.where(clean > 1, share * clean, clean), scale)
+        fused = fuse(*renders(low, high), session).rgb[48:50, 64]
+        np.testing.assert_allclose(fused, np.float32(expected)[:, None].repeat(3, axis=1), rtol=0.02)
+
+
 def test_a_lamp_keeps_its_colour_where_one_channel_alone_is_bright(session, scale):
     clean = np.full((96, 128, 3), 0.05, np.float32)
     high, colour = noisy(clean, 4), np.float32([3000, 300, 0])

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Frames are averaged with their neighbours where these show the same surface in the same light, and nowhere else."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -78,6 +80,20 @@ def test_the_rim_of_a_lamp_in_the_neighbour_leaves_no_ghost():
     for vectors in (None, none):
         result = accumulate(frame, [Step(neighbour, vectors, None, back, None)], [])
         assert (result.rgb[rim] < 1.1 * frame.rgb[rim]).all()
+
+
+def test_borders_that_are_known_change_no_bit(monkeypatch):
+    monkeypatch.setattr(bands, "BAND_ROWS", 16)
+    monkeypatch.setattr(bands, "BAND_PIXELS", 1)
+    frame, neighbour = frame_of(texture(), 1), frame_of(texture(), 2)
+    neighbour.rgb[30:50] *= 1.5
+    vectors = np.zeros((HEIGHT, WIDTH, 2), np.float32)
+    vectors[20:60, 30:80] = (0.2, 0.1)
+    vectors[33, ::9] = 0.4
+    steps = [Step(neighbour, way, None, -way, None) for way in (vectors, vectors[::-1].copy())]
+    for step in steps:
+        known = replace(step, borders=near_borders(step.vectors, 0.25), back_borders=near_borders(step.back, 0.25))
+        assert np.array_equal(accumulate(frame, [step], []).rgb, accumulate(frame, [known], []).rgb)
 
 
 def test_borders_reach_one_pixel_to_each_side():

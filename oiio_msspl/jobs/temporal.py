@@ -45,8 +45,8 @@ MOST = 8
 #: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, whether an
 #: object has moved that it does not follow, and whether it is at a border; and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 11, 20
-#: Bytes of an LRHS pixel that the luminance of both renders takes for each frame that is held.
-LUMINANCE_BYTES = 8
+#: Bytes that luminance takes for each frame that is held: of an LRHS pixel for both renders, and of an HRLS pixel.
+LUMINANCE_BYTES, HRLS_LUMINANCE_BYTES = 8, 4
 
 
 @dataclass(frozen=True)
@@ -140,6 +140,7 @@ class Temporal:
         pixels = window.width * window.height
         in_memory = not has_many_pixels(window.height, window.width)
         held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
+        held += (2 * self.renders + 2) * HRLS_LUMINANCE_BYTES * (self.renders > 0)
         luminance = LUMINANCE_BYTES * (2 * self.count + 2) * pixels // scale**2
         return (held * in_memory + RESULT_BYTES) * pixels + luminance
 

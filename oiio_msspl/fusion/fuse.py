@@ -292,7 +292,7 @@ class _Pair:
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         self.exposure = find_exposure(self._lrhs_rgb) if beauty is None else beauty.exposure
         reach = FAR if beauty is None else max(LAYER_REACH // alignment.scale - 1, 1)
-        self._empty_regions = EmptyRegions(self._lrhs[RGB], reach)
+        self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_layer=beauty is not None)
         self._part = None if beauty is None else self._lit_part(reach)
         self._averages = HrlsAverages(alignment) if beauty is None else None
 

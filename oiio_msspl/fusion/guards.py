@@ -189,19 +189,23 @@ class EmptyRegions:
     empty.
 
     A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only where the LRHS is
-    black far around. The same holds where light is rare: a defocused lamp before an empty background is hit by few
-    samples, and the others find the background.
+    black far around.
+
+    The same holds for layers where light is rare: a defocused lamp before an empty background is hit by few samples,
+    and the others find the background. Light that the beauty has there would go to other layers. In a beauty, rare
+    light before an empty background is more often that of stars, and the space between them stays black.
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
         reach: how far, in LRHS pixels.
+        of_layer: whether the pair shows a layer.
     """
 
-    def __init__(self, lrhs_rgb: Array, reach: int = FAR) -> None:
+    def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_layer: bool = False) -> None:
         self._black = _is_zero(lrhs_rgb)
-        self._black_far_around = self._has_rare_light = self._black
-        if self._black.any():
-            self._black_far_around = all_within(self._black, reach)
+        self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
+        self._has_rare_light = np.zeros_like(self._black)
+        if of_layer and self._black.any():
             light = reduce(np.maximum, (lrhs_rgb[..., c : c + 1] for c in range(3)))
             self._has_rare_light = grown(_rare_light(light, 0, 0) > 0, _SQUARE)
 

@@ -667,13 +667,13 @@ def test_empty_tiles_never_reach_the_network(session, scale, monkeypatch):
     np.testing.assert_allclose(tiled.rgb, whole.rgb, rtol=1e-5, atol=1e-6)
 
 
-def test_what_hardly_a_sample_lights_has_no_holes(bilinear_models, monkeypatch):
-    """Black in both renders, 3 x 3 LRHS pixels around included: dark where light is rare, as that of a defocused lamp
-    before an empty background, and where a surface is; empty where there is no light far around, and beside what is
-    lit densely."""
+def test_a_surface_that_hardly_a_sample_lights_has_no_holes(bilinear_models, monkeypatch):
+    """Black in both renders, 3 x 3 LRHS pixels around included: empty where nothing is, dark where a surface is, unless
+    there is no light far around either."""
     session = Session(bilinear_models[4])
     monkeypatch.setattr(session, "run", lambda lrhs, hrls, *_, **more: {"fused": np.full_like(hrls["rgb"], 0.3)})
     low, high = np.zeros((32, 64, 3), np.float32), np.zeros((128, 256, 3), np.float32)
+    low[::8, :32:8], high[::32, :128:32] = 1.0, 1.0  # a sample in 64 finds light; right half: none
     surface = np.zeros_like(high)
     surface[:64] = (0, 0, 1)
 
@@ -681,17 +681,12 @@ def test_what_hardly_a_sample_lights_has_no_holes(bilinear_models, monkeypatch):
         fused = fuse(Render.from_arrays("lr", rgb=low), Render.from_arrays("hr", rgb=high, **layers), session).rgb
         return (fused == 0).all(-1)
 
-    all_layers = ({"normal": surface}, {"alpha": surface[..., 2:]}, {})
-    low[::8, :32:8], high[::32, :128:32] = 1.0, 1.0  # a sample in 64 finds light; right half: none
-    for layers in all_layers:
+    for layers in ({"normal": surface}, {"alpha": surface[..., 2:]}):
         found = empty(**layers)
-        assert not found[:, :128].any()
+        assert not found[:64, :128].any()
+        assert found[64:, :128].mean() > 0.5
         assert found[:, 192:].all()
-    low[:, :32], high[:, :128] = 1.0, 0.5
-    for layers in all_layers:
-        found = empty(**layers)
-        assert not found[:, :128].any() and found[64:, 136:].all()
-        assert found[:64, 136:176].any() == (not layers)
+    assert empty()[:, :128].mean() > 0.5  # nothing tells
 
 
 def test_where_both_renders_agree_the_hrls_is_the_result(bilinear_models):

@@ -4,9 +4,9 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.aovs.features import ALBEDO, RADIANCE_FEATURES, RGB
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.guards import FIREFLY_FACTOR, _rare_light, dim_fireflies
+from oiio_msspl.fusion.guards import FIREFLY_FACTOR, EmptyRegions, _rare_light, dim_fireflies
 from oiio_msspl.fusion.tile_features import TilePair
 
 
@@ -61,6 +61,16 @@ def test_rare_light_is_no_firefly(size):
     high[30, 30] = low[20, 20] = 1e6
     lrhs, dimmed = dim_fireflies(tile(low, {RGB: high}))
     assert 40 <= dimmed[RGB][30, 30].max() <= 64 * 40 and lrhs[20, 20].max() <= 64 * 40
+
+
+def test_a_layer_with_rare_light_has_no_holes():
+    """Few samples find a defocused lamp, and the others the empty background. Far from the lamp, nothing is."""
+    low, high = np.zeros((64, 64, 3), np.float32), np.zeros((128, 128, 3), np.float32)
+    low[::8, :32:8], high[::16, :64:16] = 1.0, 1.0
+    pair, whole = tile(low, {RGB: high, NORMAL: np.zeros_like(high)}), (slice(0, 64), slice(0, 64))
+    beauty, layer = (EmptyRegions(low, 7, of_layer=of_layer).mask(pair, whole) for of_layer in (False, True))
+    assert beauty[:, :48].mean() > 0.5 and not layer[:, :48].any()
+    assert layer[:, 112:].all()
 
 
 def test_a_lamp_makes_no_fireflies_around_it_believable():

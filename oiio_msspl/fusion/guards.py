@@ -74,10 +74,11 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
 
     Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
     light, and its rim would be too bright. It is as bright as in the HRLS, and at most as bright as the brightest of
-    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that: by what the
-    LRHS exceeds the clipped HRLS by, spread over the clipped pixels: evenly, or as the HRLS has it, whatever gives a
-    pixel more. Pixel filters move light between neighbours, so both are counted over 3 x 3 LRHS pixels. If a pixel is
-    more than twice as bright as they are on average, it is a firefly in a lamp, and light is spread evenly.
+    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that. The LRHS then
+    has more light than the clipped HRLS, and the difference is spread over the clipped pixels: evenly, or in the
+    proportions of the HRLS, whichever gives a pixel more. Pixel filters move light between neighbours, so both are
+    counted over 3 x 3 LRHS pixels. A pixel that is more than twice as bright as the clipped pixels are on average is a
+    firefly in a lamp. The light around it is spread evenly.
 
     Args:
         lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
@@ -191,9 +192,10 @@ class EmptyRegions:
     A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only where the LRHS is
     black far around.
 
-    The same holds for layers where light is rare: a defocused lamp before an empty background is hit by few samples,
-    and the others find the background. Light that the beauty has there would go to other layers. In a beauty, rare
-    light before an empty background is more often that of stars, and the space between them stays black.
+    The same holds for layers where light is rare. Few samples find a lamp that is out of focus, and the others find
+    the empty background behind it. If the lamp's layer were black there, the light that the beauty has would go to
+    other layers. In a beauty, rare light in front of an empty background is more often that of stars, and the space
+    between them stays black.
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).

@@ -577,18 +577,18 @@ def _make_sum(layers: Array, beauty: Array, doubts: Array | None) -> None:
         part, wanted = layers[:, :, rows], beauty[:, rows]
         total = part.sum(axis=0)
         if doubts is not None:
-            doubt = doubts[:, None, rows]
-            lacking = np.clip(wanted - total, -MOST_SPREAD * total, MOST_SPREAD * total)
+            doubt, most = doubts[:, None, rows], MOST_SPREAD * total
+            is_far = bool((wanted - total > most).any())
+            lacking = np.clip(wanted - total, -most, most)
             weights = part * np.maximum(doubt, LEAST_DOUBT)
             lacking /= np.maximum(weights.sum(axis=0), tiny)
             weights *= lacking
             part += np.maximum(weights, -MOST_SPREAD * part)
             total = part.sum(axis=0)
-            lacking = wanted - total
-            if (lacking > 0).any():
+            if is_far:
                 weights = part * np.maximum(np.square(doubt), LEAST_SQUARED_DOUBT)
                 weights /= np.maximum(weights.sum(axis=0), tiny)
-                weights *= np.maximum(lacking, 0)
+                weights *= np.maximum(wanted - total, 0)
                 part += weights
                 total = part.sum(axis=0)
         # The beauty divided by a tiny total would overflow; a layer's share of the total never does.

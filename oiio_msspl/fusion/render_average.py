@@ -252,7 +252,7 @@ class _Band:
             valid = high.finite() & path.valid
             share = to_grid(self._alignment, valid.astype(np.float32), self._area)
             low, usable = self._fetch_low(step.frame, path, valid, share)
-            usable &= _make_finite(low) & (share >= COVERED)
+            usable &= _make_finite(low)
             own = self._luminance
             hrls = to_grid(self._alignment, np.where(valid, high.luminance(), own), self._area)
             lrhs = self._in_grid(_luminance(low[RGB]), usable, step.frame.alignment.stretch)
@@ -310,8 +310,8 @@ class _Band:
         return self._high.divide()
 
     def _fetch_low(self, frame: RenderPair, path: Path, valid: Mask, share: Array) -> tuple[Features, Mask]:
-        """The neighbour's LRHS over the grid pixels, and which of them lie in it: moved as their HRLS pixels are on
-        average."""
+        """The neighbour's LRHS over the grid pixels, moved as their HRLS pixels are on average; and which of these can
+        be used, because they lie in it and enough of their HRLS pixels show the same surface."""
         data, grid, scale = frame.alignment.lr_data_window, self._grid, self._alignment.scale
         x, y = np.broadcast_arrays(
             np.arange(grid.x0, grid.x1, dtype=np.float32), np.arange(grid.y0, grid.y1, dtype=np.float32)[:, None]
@@ -325,6 +325,7 @@ class _Band:
                 own + to_grid(self._alignment, each, area) / pixels for own, each in zip((x, y), moved, strict=True)
             )
         usable = (x > data.x0 - 0.5) & (x < data.x1 - 0.5) & (y > data.y0 - 0.5) & (y < data.y1 - 0.5)
+        usable &= share >= COVERED
         x, y = np.clip(x, data.x0, data.x1 - 1), np.clip(y, data.y0, data.y1 - 1)
         top = max(int(np.floor(y.min())) - 1, data.y0)
         bottom = min(int(np.floor(y.max())) + 3, data.y1)
@@ -340,7 +341,7 @@ class _Band:
 
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
         names = [name for name in stored if name in light or is_light_of_pass(name)]
-        smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape, usable & (share >= COVERED))
+        smooth = sample_cubic([stored.pop(name) for name in names], positions, x.shape, usable)
         return _nearest_pixels(stored, positions, x.shape) | dict(zip(names, smooth, strict=True)), usable
 
 

@@ -189,8 +189,8 @@ class FrameWindow:
     ) -> list[Step[F]]:
         """The way from a frame to its neighbours on one side, up to the first whose files can't be used.
 
-        Any other failure of a neighbour may pass, such as a full disk or too little memory. A frame that were averaged
-        without it would have other pixels than in another run, so the frame fails, too.
+        Other failures of a neighbour may not occur again, such as a full disk or too little memory. Without that
+        neighbour, the frame would have other pixels than in another run. So it fails, too.
 
         Args:
             number: of the frame.

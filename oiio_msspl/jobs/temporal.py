@@ -207,10 +207,12 @@ def plan_temporal(
 def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model: str | None) -> str | None:
     """The family of models that the first pair's layers are enough for; ``model`` itself if it is none."""
     family = family_of(model)
-    for number in numbers if family is not None else ():
+    if family is None:
+        return model
+    for number in numbers:
         with suppress(MssplError):  # the run says so when the turn of this frame has come
-            return family_for_layers(mapped(number)[1], family or "")
-    return model
+            return family_for_layers(mapped(number)[1], family)
+    return family
 
 
 def _plan(source: MotionSource, count: int, frames: Mapping[int, Frame], *, asked: bool) -> Temporal:

@@ -14,6 +14,8 @@ samples a pixel are L * s^2 samples for each LRHS pixel at scale s.
 
 * ``ref``: uint32 (R * H, R * W), the reference at R = ``REF_CELLS`` times the resolution, filtered with a box of one of
   its own pixels. Filters for the reference are applied to these cells. It is independent of all samples.
+* ``ref_albedo`` and ``ref_normal``: as ``albedo`` and ``normal``, (R * H, R * W, 3), of a reference that is to be
+  denoised.
 * ``meta``: a JSON string, as in :mod:`datagen.views`.
 """
 
@@ -62,7 +64,12 @@ def decode(stored: NDArray[np.uint32]) -> NDArray[np.float32]:
 
 
 def pack(
-    hr: dict[str, np.ndarray], lr: dict[str, np.ndarray], ref: np.ndarray, rng: np.random.Generator, meta: dict
+    hr: dict[str, np.ndarray],
+    lr: dict[str, np.ndarray],
+    ref: np.ndarray,
+    rng: np.random.Generator,
+    meta: dict,
+    ref_layers: dict[str, np.ndarray] | None = None,
 ) -> dict[str, np.ndarray]:
     """All arrays of a view's file, at a random exposure within three decades.
 
@@ -71,6 +78,7 @@ def pack(
         lr: the first four of them, each (L, H, W, C).
         ref: (R * H, R * W, 3).
         meta: entries of ``meta``; the exposure is added.
+        ref_layers: ``albedo`` and ``normal`` of the reference, to be stored with it.
     """
     target = 10 ** rng.uniform(-1.5, 1.3)
     scale = target / log_mean(ref)
@@ -90,5 +98,6 @@ def pack(
         **{name: stored(name, values) for name, values in hr.items()},
         **{f"lr_{name}": stored(name, values) for name, values in lr.items()},
         "ref": encode(ref * scale),
+        **{f"ref_{name}": stored(name, values) for name, values in (ref_layers or {}).items()},
         "meta": np.array(json.dumps({**meta, "exposure": {"scale": scale, "log_mean": target}})),
     }

@@ -81,6 +81,8 @@ class Sampling:
     """Share without the variance, which few renderers write."""
     drop_all: float = 0.05
     """Share with colour only."""
+    correlated: bool | None = None
+    """Of views with single samples: only pixel filters that spread samples, only others, or all (None)."""
 
 
 #: The paper's sampling, as far as its text describes it: crops only, all features, clipped, nearest-neighbour LRHS.
@@ -204,6 +206,8 @@ class SampleTensors:
     """The arrays of a view with single samples as tensors, see :mod:`datagen.samples`."""
 
     arrays: dict[str, Tensor]
+    clean_reference: Tensor | None = None
+    """(1, 3, R*H, R*W), in place of the stored reference."""
 
     @classmethod
     def of(cls, view: SampleView, device: torch.device) -> SampleTensors:
@@ -215,6 +219,13 @@ class SampleTensors:
     @property
     def device(self) -> torch.device:
         return self.arrays["ref"].device
+
+    def noisy_reference(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Colour, albedo and normal, (1, 3, R*H, R*W), of a reference that is to be denoised; else None."""
+        if "ref_albedo" not in self.arrays:
+            return None
+        albedo, normal = (self.arrays[f"ref_{name}"].float().movedim(-1, 0)[None] for name in (ALBEDO, NORMAL))
+        return _decode_radiance(self.arrays["ref"][None]), albedo / 255, normal / 127
 
     @property
     def size(self) -> tuple[int, int]:
@@ -238,7 +249,7 @@ class SampleTensors:
 
         Both renders and the reference have the same filter, the LRHS in its own pixels.
         """
-        pixel_filter = draw_filter(rng)
+        pixel_filter = draw_filter(rng, correlated=sampling.correlated)
         lr_count = len(self.arrays["lr_color"])
         n, lr_samples = _draw_spp(np.ones(lr_count), sampling, False, rng)
         # Importance sampling leaves pixels without enough samples, unless there are more to choose from
@@ -275,8 +286,11 @@ class SampleTensors:
         lrhs = apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator)
 
         cells = [slice(w.start * REF_CELLS, w.stop * REF_CELLS) for w in wide]
-        ref = _lit(_decode_radiance(self.arrays["ref"][None, *cells]), light)[0]
-        target = filter_reference(pixel_filter, ref, REF_CELLS)[inner].movedim(0, -1)
+        if self.clean_reference is None:
+            ref = _decode_radiance(self.arrays["ref"][None, *cells])
+        else:
+            ref = self.clean_reference[:, :, *cells]
+        target = filter_reference(pixel_filter, _lit(ref, light)[0], REF_CELLS)[inner].movedim(0, -1)
         return Rendered(
             features,
             filtered.variance[inner[1:]] if has_variance and filtered.variance is not None else None,

@@ -17,14 +17,14 @@ import torch
 from torch.optim.lr_scheduler import LambdaLR
 
 from training import checkpoints, data, losses
-from training.joint import JointFusion
-from training.networks import preparation, run
+from training.export import denoiser_for
+from training.joint import JointFusion, with_denoised_mean, with_mean
 from training.train import lr_factor
 
 PATCH, BATCH, LEARNING_RATE = 256, 3, 2e-3
 
 
-def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prepare | None, steps: int) -> float:
+def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prepare, steps: int) -> float:
     """Train the prediction in place; return the mean loss of the last tenth of the steps."""
     network.requires_grad_(False)
     network.error.requires_grad_(True)
@@ -34,8 +34,7 @@ def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prep
     last = []
     for step, pair in zip(range(steps), batches, strict=False):
         with torch.autocast("cpu", torch.bfloat16):
-            output, log_error = run(network, pair["lrhs"], pair["hrls"])
-        assert log_error is not None
+            output, log_error = network(pair["lrhs"], network.prepared(pair["hrls"]))
         loss = losses.error_likelihood(log_error, output.float(), pair["target"])
         optimizer.zero_grad()
         loss.backward()
@@ -59,7 +58,10 @@ def main() -> None:
         raise SystemExit(f"{args.checkpoint}: not a joint network; the paper's does not predict its error")
     network.reset_error()
     scales = [int(scale) for scale in state["training_spp"]]
-    loss = fit(network, args.data, scales, preparation(state["architecture"]), args.steps)
+    prepare = with_mean
+    if network.mean_denoiser is None:
+        prepare = with_denoised_mean(denoiser_for(network, network.denoiser(scales[0])))
+    loss = fit(network, args.data, scales, prepare, args.steps)
     # In the precision of the checkpoint: training.average stores half floats
     state["ema"] = {name: values.to(state["ema"][name].dtype) for name, values in network.state_dict().items()}
     state["provenance"]["error_steps"] = args.steps

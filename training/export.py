@@ -4,9 +4,11 @@
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
     python -m training.export JOINT.pt --scale 2 --name joint-x2 -o joint-x2.onnx --int8 VIEWS --overlap 48
+    python -m training.export LARGE.pt --scale 2 4 8 --name joint-large -o joint-large --int8 VIEWS --overlap 48
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
-computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`).
+computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`). Files of several scales share their
+weights; ``-x2.onnx`` and so on are added to ``--name`` and to the output.
 """
 
 from __future__ import annotations
@@ -16,6 +18,7 @@ import collections
 import copy
 import datetime
 import timeit
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -40,16 +43,20 @@ from training.networks import Network, denoiser_of, run
 from training.oidn import provenance
 from training.paper import MultiResolutionFusion
 from training.quantise import joint
+from training.quantise.layers import Networks, brightened, quantised
 from training.tracing import IR_VERSION, shuffle, traced, unshuffle
 from training.validation import ValidationPair
 from training.whole_model import CHECKPOINTS, InTorch, example, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
-MEMORY = {"paper": 1000, "joint-small": 700, "joint": 800, "ensemble": 1160}
+MEMORY = {"paper": 1000, "joint-small": 700, "joint": 800, "ensemble": 1160, "joint-large": 1160}
 
 #: Smaller tensors, such as biases, stay float32.
 HALF_ELEMENTS = 256
+
+#: Inputs of a joint network.
+Pair = tuple[torch.Tensor, torch.Tensor]
 
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
@@ -73,7 +80,7 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
         training_spp=state["training_spp"][str(scale)],
         provenance=state["provenance"]
         | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()}
-        | (provenance(SIZES[network.size]) if isinstance(network, JointFusion) else {}),
+        | (provenance(SIZES[network.size][0]) if isinstance(network, JointFusion) else {}),
     )
 
 
@@ -86,11 +93,12 @@ def network_example(network: Network, scale: int, alignment: int) -> tuple[torch
 def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
     """The denoiser of both renders' mean for a value of ``Contract.denoiser``. Where it is not the network's own, it is
     that of `joint`, or of `joint-spread`."""
-    if network.denoiser(SCALES[0]) == mode:
-        return network.mean_denoiser
-    joint, _ = load(CHECKPOINTS / ("joint_spread.pt" if network.spread else "joint.pt"))
-    assert isinstance(joint, JointFusion)
-    return joint.mean_denoiser
+    if network.mean_denoiser is None or network.denoiser(SCALES[0]) != mode:
+        loaded, _ = load(CHECKPOINTS / ("joint_spread.pt" if network.spread else "joint.pt"))
+        assert isinstance(loaded, JointFusion)
+        network = loaded
+    assert network.mean_denoiser is not None
+    return network.mean_denoiser
 
 
 # Graph
@@ -122,10 +130,8 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
 
 
 @torch.inference_mode()
-def joint_to_onnx(
-    network: JointFusion, contract: Contract, pairs: list[tuple[torch.Tensor, torch.Tensor]]
-) -> onnx.ModelProto:
-    """Export a joint network with 8-bit convolutions, calibrated on pairs, as :func:`to_onnx`."""
+def mixing_of(network: JointFusion, contract: Contract) -> onnx.ModelProto:
+    """The graph of :class:`training.quantise.joint.Blend` for a joint network."""
     scale, alignment = contract.scale, contract.alignment
     lrhs, hrls = network_example(network, scale, alignment)
     levels = range(scale.bit_length())
@@ -133,8 +139,25 @@ def joint_to_onnx(
     image = hrls[:, :3]
     inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
     names = [*joint.Blend.inputs, *(f"logits{level}" for level in levels)]
-    mixing = traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
-    return joint.to_onnx(network, scale, pairs, mixing)
+    return traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
+
+
+@torch.inference_mode()
+def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Sequence[Pair]) -> list[onnx.ModelProto]:
+    """Export a joint network with 8-bit convolutions for several scales, as :func:`to_onnx`.
+
+    The graphs have the same weights. They are calibrated on pairs of the network's inputs, of all these scales.
+    """
+    layers: Networks | None = None
+    if network.layers is not None:
+        images = brightened([hrls for _, hrls in pairs])
+        layers, clean = quantised(network.layers, images)
+        pairs = [
+            (lrhs, torch.cat([image[:, :3], albedo, 2 * normal - 1], dim=1))
+            for (lrhs, _), image, (albedo, normal) in zip(pairs, images, clean, strict=True)
+        ]
+    fit = joint.fitted(network, max(contract.scale for contract in contracts), pairs)
+    return [joint.to_onnx(fit, each.scale, mixing_of(network, each), layers) for each in contracts]
 
 
 def _space_to_depth(x, downscale_factor: int):
@@ -252,7 +275,7 @@ def describe(path: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
-    parser.add_argument("--scale", type=int, help="scale to export, of a network for several")
+    parser.add_argument("--scale", type=int, nargs="+", help="scales to export, of a network for several")
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
     parser.add_argument("-o", "--output", type=Path)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
@@ -268,27 +291,35 @@ def main() -> None:
     args = parser.parse_args()
 
     network, state = load(args.checkpoint)
-    scale = args.scale or getattr(network, "scale", None)
-    if scale is None:
-        raise SystemExit("this network serves several scales; choose one with --scale")
+    scales = args.scale or ([network.scale] if isinstance(network, MultiResolutionFusion) else [])
+    if not scales:
+        raise SystemExit("this network serves several scales; choose some with --scale")
     if args.measure_overlap:
         views = Folder(args.measure_overlap).split("validation")[:8]
-        for overlap, difference in measure_overlap(network, scale, views).items():
+        for overlap, difference in measure_overlap(network, scales[0], views).items():
             print(f"overlap {overlap}: {difference:.2g}")
-    if args.output:
-        contract = contract_of(network, scale, args.name, args.overlap, state)
-        if isinstance(network, JointFusion):
-            if not args.int8:
-                raise SystemExit("a joint network can only be exported with --int8")
-            prepare = with_denoised_mean(denoiser_for(network, contract.denoiser))
-            graph = joint_to_onnx(network, contract, joint.calibration_pairs(args.int8, scale, prepare))
-        else:
-            graph = to_onnx(network, contract, half=args.half)
-        save({args.output: whole_model(graph, contract, quantised_denoiser(contract.denoiser))})
+    if not args.output:
+        return
+    names = {scale: f"-x{scale}" if len(scales) > 1 else "" for scale in scales}
+    contracts = [contract_of(network, each, args.name + end, args.overlap, state) for each, end in names.items()]
+    files = [args.output.with_name(f"{args.output.name}{end}.onnx") if end else args.output for end in names.values()]
+    if isinstance(network, JointFusion):
+        if not args.int8:
+            raise SystemExit("a joint network can only be exported with --int8")
+        prepare = with_denoised_mean(denoiser_for(network, contracts[0].denoiser))
+        graphs = joint_to_onnx(network, contracts, joint.calibration_pairs(args.int8, scales, prepare))
+    else:
+        graphs = [to_onnx(network, each, half=args.half) for each in contracts]
+    models = {
+        file: whole_model(graph, each, quantised_denoiser(each.denoiser))
+        for file, graph, each in zip(files, graphs, contracts, strict=True)
+    }
+    save(models, args.name if len(scales) > 1 else "")
+    for file in files:
         if args.half:
-            _check_casts(args.output)
-        describe(args.output)
-        print(f"largest difference from PyTorch: {parity(network, args.output):.2g}")
+            _check_casts(file)
+        describe(file)
+        print(f"largest difference from PyTorch: {parity(network, file):.2g}")
 
 
 if __name__ == "__main__":

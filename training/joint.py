@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
 """The ``joint`` network: a network of Open Image Denoise for HDR colour, fine-tuned to read both renders.
 
-It has two sizes. ``usual`` starts from the base network, and denoises the mean of both renders by a fine-tuned large
-one. ``small`` starts from small networks for both.
+It has three sizes. ``usual`` starts from the base network, and denoises the mean of both renders by a fine-tuned large
+one. ``small`` starts from small networks for both. ``large`` starts from the large network for the HRLS, too. It reads
+albedo and normal that are denoised before, as Open Image Denoise's documentation recommends.
 
 1. Encode. At H the U-Net reads the HRLS's colour, albedo and normal, as in Open Image Denoise (OIDN). At H/2 it also
    reads the LRHS and the denoised mean of both renders at the LRHS's resolution (:mod:`training.mean_denoiser`). Their
    weights start at zero, so that training starts from OIDN. All weights are trained. The parameters are differences
    from OIDN's weights, so weight decay pulls towards OIDN.
-2. The U-Net, :data:`training.oidn.BASE`, returns the denoised HRLS.
+2. The U-Net, :data:`training.oidn.BASE` or :data:`training.oidn.LARGE`, returns the denoised HRLS.
 3. Heads predict logits for every level of the result from the features that denoise.
 4. Blend. At the LRHS's resolution, the logits choose between the denoised mean of both renders, the downsampled
    denoised HRLS, the downsampled HRLS and the LRHS. At every finer level, up to the HRLS's, they choose between the
@@ -32,10 +33,13 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, SPREAD
 from oiio_msspl.model.render_mean import lrhs_share
 from training.encoding import log_decode, log_encode, log_to_pu, pu_to_log
+from training.layer_denoisers import LayerDenoisers
 from training.mean_denoiser import MeanDenoiser
 from training.oidn import (
     BASE,
     BASE_HDR,
+    LARGE,
+    LARGE_HDR,
     SMALL_HDR,
     FineTunedConv,
     convolutions,
@@ -48,8 +52,8 @@ from training.render_mean import mean_of_renders
 
 #: Features of the HRLS that the network reads.
 FEATURES = (RGB, ALBEDO, NORMAL)
-#: By size: the network of Open Image Denoise from which the U-Net starts.
-SIZES = {"small": SMALL_HDR, "usual": BASE_HDR}
+#: By size: the network of Open Image Denoise from which the U-Net starts, and its shape.
+SIZES = {"small": (SMALL_HDR, BASE), "usual": (BASE_HDR, BASE), "large": (LARGE_HDR, LARGE)}
 #: Initial logits at the LRHS's resolution: the denoised mean of both renders, the denoised HRLS, the HRLS, the LRHS.
 COARSEST = (2.0, 0.0, -2.0, -2.0)
 #: Initial logits at finer levels: the denoised HRLS at the coarser level's brightness, the denoised HRLS, light times
@@ -63,9 +67,9 @@ FAR = 16
 MAX_RATIO = 8.0
 #: Added to both sides of that ratio, in exposed radiance, so that black pixels give a ratio of 1.
 RATIO_FLOOR = 1e-3
-#: Extra input channels at H/2, the denoised mean and the LRHS, and the convolutions that read them.
+#: Extra input channels at H/2, the denoised mean and the LRHS, and the convolutions that may read them.
 EXTRA = 6
-READERS = ("enc_conv2", "dec_conv2a")
+READERS = ("enc_conv2", "enc_conv2a", "dec_conv2a")
 #: Of each level that has logits, H, H/2, H/4, H/8: the last convolution, and the number of logits.
 DECODED = ("dec_conv1b", "dec_conv2b", "dec_conv3b", "dec_conv4b")
 OUTPUTS = (len(FINER) + 1, *[len(FINER) + len(COARSEST)] * 3)
@@ -95,8 +99,11 @@ class JointFusion(nn.Module):
         self.kept, self.size, self.spread = dict(kept or {}), size, spread
         self.config = {"kept": self.kept, "size": size, "spread": spread}
         self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, sum(HRLS_FEATURES[name] for name in FEATURES)
-        self.pretrained = pretrained_weights(SIZES[size])
-        self.mean_denoiser = MeanDenoiser(size)
+        network, self.shape = SIZES[size]
+        self.pretrained = pretrained_weights(network)
+        # The large size reads the mean that the usual one has denoised
+        self.mean_denoiser = None if size == "large" else MeanDenoiser(size)
+        self.layers = LayerDenoisers() if size == "large" else None
         self.convs = nn.ModuleDict()
         for name in convolutions(self.pretrained):
             rows, columns = self.pretrained_channels(name)
@@ -131,8 +138,9 @@ class JointFusion(nn.Module):
 
     def differences(self) -> Iterator[nn.Parameter]:
         """The parameters that are added to pretrained ones."""
-        for conv in (*self.convs.values(), *self.mean_denoiser.convs.values()):
-            yield from conv.differences()
+        for convs in (self.convs, *([self.mean_denoiser.convs] if self.mean_denoiser is not None else [])):
+            for conv in convs.values():
+                yield from conv.differences()
 
     def initial_state(self) -> dict[str, Tensor]:
         """The state of a new network without its random weights, and without the head of the expected error."""
@@ -155,8 +163,10 @@ class JointFusion(nn.Module):
             hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
 
         Returns:
-            As :meth:`fuse`.
+            As :meth:`fuse`. The size ``large`` has the arguments of :meth:`fuse_prepared`.
         """
+        if self.mean_denoiser is None:
+            return self.fuse_prepared(lrhs, hrls)
         return self.fuse(denoise_mean(self.mean_denoiser, lrhs, hrls), hrls)
 
     def fuse(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
@@ -169,6 +179,17 @@ class JointFusion(nn.Module):
             The fused image (N, 3, s*h, s*w), log-encoded, and the logarithm of its expected absolute error
             (N, 1, s*h, s*w), mean of the channels. The error has no gradient into the features.
         """
+        return self.fuse_prepared(lrhs, self.prepared(hrls))
+
+    def prepared(self, hrls: Tensor) -> Tensor:
+        """The HRLS (N, 9 or more, H, W) as the U-Net reads it: the size ``large`` denoises albedo and normal first."""
+        if self.layers is None:
+            return hrls
+        albedo, normal = self.layers(hrls[:, 3:6], hrls[:, 6:9])
+        return torch.cat([hrls[:, :3], albedo, 2 * normal - 1], dim=1)
+
+    def fuse_prepared(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
+        """As :meth:`fuse`, for an HRLS of :meth:`prepared`."""
         samples, albedo, normal = hrls[:, :3], hrls[:, 3:6], hrls[:, 6:9]
         full = torch.cat([log_to_pu(samples), albedo.clamp(0, 1), 0.5 * normal + 0.5], dim=1)
         half = log_to_pu(torch.cat([lrhs[:, LRHS_CHANNELS:], lrhs[:, :LRHS_CHANNELS]], dim=1))
@@ -180,7 +201,7 @@ class JointFusion(nn.Module):
             return features[name]
 
         inputs = [image.to(next(self.convs.parameters()).dtype) for image in (full, half)]
-        colour = run_unet_on_tensors(BASE, inputs, conv)
+        colour = run_unet_on_tensors(self.shape, inputs, conv)
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))

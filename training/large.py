@@ -22,20 +22,10 @@ from torch import Tensor, nn
 
 from training import checkpoints, losses
 from training.data import Batch
-from training.encoding import from_srgb, log_to_pu, pu_to_log, srgb
+from training.encoding import log_to_pu, pu_to_log
 from training.joint import JointFusion
-from training.oidn import (
-    ALBEDO_BASE,
-    BASE,
-    LARGE,
-    LARGE_HDR,
-    NORMAL_BASE,
-    FineTunedUNet,
-    Shape,
-    Start,
-    convolutions,
-    pretrained_weights,
-)
+from training.layer_denoisers import LayerDenoisers, untouched
+from training.oidn import LARGE, LARGE_HDR, FineTunedUNet, Start
 from training.pool import PooledBatches
 from training.train import lr_factor, warming_ema
 
@@ -44,30 +34,6 @@ BATCH, PATCH, LEARNING_RATE, DECAY = 8, 256, 1e-3, 1e-4
 FINE_TUNE = 0.1
 #: Steps between two lines of the log.
 REPORT = 250
-
-
-def _untouched(network: str, shape: Shape) -> Start:
-    """A network as it is in OIDN."""
-    return Start(network, shape, (), 0, tuple(convolutions(pretrained_weights(network))))
-
-
-class LayerDenoisers(nn.Module):
-    """OIDN's networks for albedo and normal."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.albedo, self.normal = (FineTunedUNet(_untouched(name, BASE)) for name in (ALBEDO_BASE, NORMAL_BASE))
-
-    def forward(self, albedo: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
-        """
-        Args:
-            albedo: (N, 3, H, W) in [0, 1].
-            normal: (N, 3, H, W) in [-1, 1].
-
-        Returns:
-            Both denoised, in [0, 1].
-        """
-        return from_srgb(self.albedo.run(srgb(albedo)).clamp(0, 1)), self.normal.run(0.5 * normal + 0.5).clamp(0, 1)
 
 
 class LargeDenoiser(FineTunedUNet):
@@ -79,11 +45,8 @@ class LargeDenoiser(FineTunedUNet):
 
     def __init__(self, *, reads_joint: bool = False) -> None:
         self.reads_joint = reads_joint
-        if reads_joint:
-            start = Start(LARGE_HDR, LARGE, ("enc_conv1a", "dec_conv1a"), 3)
-        else:
-            start = _untouched(LARGE_HDR, LARGE)
-        super().__init__(start)
+        readers = "enc_conv1a", "dec_conv1a"
+        super().__init__(Start(LARGE_HDR, LARGE, readers, 3) if reads_joint else untouched(LARGE_HDR, LARGE))
 
     def forward(self, samples: Tensor, albedo: Tensor, normal: Tensor, joint: Tensor) -> Tensor:
         """

@@ -3,11 +3,18 @@
 
     python -m training.pool VIEWS POOL --draws 6
     python -m training.train --network joint --spread --scale 2 4 8 --pool POOL --data VIEWS --out RUN --minutes 10
+    python -m training.pool VIEWS POOL_LARGE --draws 6 --denoise training/checkpoints/joint{,_spread}.pt
 
 A GPU takes a step in less time than :func:`training.data.draw` takes for one pair. So a process of its own draws whole
 views some times each: other samples, filters, light and missing layers at each draw. It writes the pairs of a view into
 a file of POOL, and goes on with the views that a renderer adds, until it is stopped. Training keeps all pairs on the
 GPU. Each batch has crops of some of them, mirrored, turned, and with permuted colours.
+
+With ``--denoise``, pairs are those that the size ``large`` of `joint` reads: albedo, normal and the mean of both
+renders are denoised. Every second pair then has noise that the pixel filter has spread.
+
+References that were stored with their noise (:mod:`datagen.mitsuba.render_samples`) become the mean of the rendered
+and of a denoised one: half of the noise is left, and half of what a denoiser gets wrong.
 """
 
 from __future__ import annotations
@@ -16,17 +23,23 @@ import argparse
 import logging
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
+from typing import TypeVar
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from datagen.views import Folder, SampleView, View
 from oiio_msspl.aovs.features import HRLS_FEATURES
+from training import checkpoints
 from training.data import Batch, SampleTensors, Sampling, ViewTensors, draw
-from training.joint import FEATURES, mean_and_noise
+from training.encoding import compress, exposure_of, log_decode, log_to_pu, pu_to_log
+from training.joint import FEATURES, JointFusion, denoise_mean, mean_and_noise
+from training.layer_denoisers import LayerDenoisers, untouched
+from training.oidn import LARGE, LARGE_HDR, FineTunedUNet
 
 log = logging.getLogger(__name__)
 
@@ -37,37 +50,95 @@ ALIGNMENT = 128
 #: Seconds between two looks for new files.
 RESCAN_SECONDS = 5.0
 
+#: Entry of a pair: whether the pixel filter has spread its noise.
+SPREAD_NOISE = "spread"
+
 Pair = dict[str, Tensor]
+M = TypeVar("M", bound=nn.Module)
 
 
 # Drawing
 
 
+class Denoisers:
+    """The networks that prepare pairs.
+
+    Args:
+        joints: two ``joint`` networks, for independent noise and for spread noise. Their denoisers of both renders'
+            mean prepare pairs for the size ``large``; none for pairs of the other sizes.
+    """
+
+    def __init__(self, joints: Sequence[JointFusion], device: torch.device) -> None:
+        self.means = [self._moved(joint.mean_denoiser, device) for joint in joints if joint.mean_denoiser is not None]
+        self.layers = self._moved(LayerDenoisers(), device)
+        self.large = self._moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)), device)
+
+    @staticmethod
+    def _moved(network: M, device: torch.device) -> M:
+        return network.requires_grad_(False).to(device, memory_format=torch.channels_last)
+
+    def reference(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """The mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
+        exposure = exposure_of(colour.movedim(1, -1))
+        encoded = compress(colour.movedim(1, -1), exposure).movedim(-1, 1)
+        output = self.large.run(torch.cat([log_to_pu(encoded), *self.layers(albedo, normal)], dim=1))
+        return 0.5 * (colour + log_decode(pu_to_log(output.float().clamp(0, 1))) / exposure)
+
+    def prepared(self, lrhs: Tensor, hrls: Tensor, kind: int) -> tuple[Tensor, Tensor]:
+        """The arguments of :meth:`JointFusion.fuse_prepared` for those of :meth:`JointFusion.forward`."""
+        albedo, normal = self.layers(hrls[:, 3:6], hrls[:, 6:9])
+        return denoise_mean(self.means[kind], lrhs, hrls), torch.cat([hrls[:, :3], albedo, 2 * normal - 1], dim=1)
+
+
 @torch.no_grad()
-def draw_pairs(view: View | SampleView, scales: tuple[int, ...], count: int, device: torch.device) -> list[Pair]:
+def draw_pairs(
+    view: View | SampleView,
+    scales: tuple[int, ...],
+    count: int,
+    device: torch.device,
+    denoisers: Denoisers | None = None,
+) -> list[Pair]:
     """Draw a view ``count`` times: ``lrhs`` (7, h, w), ``hrls`` (9, s*h, s*w), ``target`` (3, s*h, s*w), half floats.
 
-    The LRHS has the mean of both renders and its noise, see :func:`training.joint.with_mean`.
+    The LRHS has the mean of both renders and its noise, see :func:`training.joint.with_mean`. Or it is (6, h, w), with
+    the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread. Without
+    ``denoisers``, references that were stored with their noise keep it.
     """
-    kind = SampleTensors if isinstance(view, SampleView) else ViewTensors
-    tensors = kind.of(view, device)
     rng = np.random.default_rng([*view.path.name.encode(), count])
+    tensors: ViewTensors | SampleTensors
+    if isinstance(view, SampleView):
+        tensors = SampleTensors.of(view, device)
+        if denoisers is not None and (noisy := tensors.noisy_reference()) is not None:
+            tensors = replace(tensors, clean_reference=denoisers.reference(*noisy))
+    else:
+        tensors = ViewTensors.of(view, device)
     patch = min(tensors.size) // ALIGNMENT * ALIGNMENT
+    prepares = denoisers is not None and bool(denoisers.means)
     pairs = []
-    for _ in range(count):
-        batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, Sampling())
+    for index in range(count):
+        kind = index % 2 if prepares and isinstance(view, SampleView) else 0
+        sampling = Sampling(correlated=bool(kind) if prepares else None)
+        batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
         lrhs, hrls = batch["lrhs"], batch["hrls"]
-        batch = {"lrhs": torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), "hrls": hrls[:, :CHANNELS]} | {
-            "target": batch["target"]
-        }
+        lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :CHANNELS]
+        if denoisers is not None and prepares:
+            lrhs, hrls = denoisers.prepared(lrhs, hrls, kind)
+        batch = {"lrhs": lrhs, "hrls": hrls, "target": batch["target"]}
         pair = {name: image[0].half().contiguous().cpu() for name, image in batch.items()}
         if all(bool(image.isfinite().all()) for image in pair.values()):
-            pairs.append(pair)
+            pairs.append(pair | ({SPREAD_NOISE: torch.tensor(bool(kind))} if prepares else {}))
     return pairs
 
 
 def fill(
-    views: Path, pool: Path, scales: tuple[int, ...], draws: int, part: int, parts: int, device: torch.device
+    views: Path,
+    pool: Path,
+    scales: tuple[int, ...],
+    draws: int,
+    part: int,
+    parts: int,
+    device: torch.device,
+    denoisers: Denoisers,
 ) -> None:
     """Write the pairs of every ``parts``-th view of the training split, and wait for more."""
     folder = Folder(views)
@@ -80,7 +151,7 @@ def fill(
         ]
         for view in todo:
             file = pool / f"{view.path.name}.pt"
-            torch.save(draw_pairs(view, scales, draws, device), file.with_suffix(".partial"))
+            torch.save(draw_pairs(view, scales, draws, device, denoisers), file.with_suffix(".partial"))
             os.replace(file.with_suffix(".partial"), file)
             log.info("%s", file.name)
         time.sleep(0 if todo else 1)
@@ -98,11 +169,21 @@ class PooledBatches:
         scales: of each batch, one of these at random.
         patch: width and height of a patch in HRLS pixels.
         batch: pairs per batch.
+        spread: of pairs for the size ``large``, only those with spread noise, only the others, or all (None).
     """
 
     def __init__(
-        self, pool: Path, scales: tuple[int, ...], patch: int, batch: int, seed: int, device: torch.device
+        self,
+        pool: Path,
+        scales: tuple[int, ...],
+        patch: int,
+        batch: int,
+        seed: int,
+        device: torch.device,
+        *,
+        spread: bool | None = None,
     ) -> None:
+        self.spread = spread
         self.pool, self.scales, self.patch, self.batch, self.device = pool, scales, patch, batch, device
         self.rng = np.random.default_rng(seed)
         self.pairs: dict[int, list[Pair]] = {scale: [] for scale in scales}
@@ -113,6 +194,9 @@ class PooledBatches:
         for file in sorted(set(self.pool.glob("*.pt")) - self.loaded):
             self.loaded.add(file)
             for pair in torch.load(file, weights_only=True):
+                spread = pair.pop(SPREAD_NOISE, None)
+                if self.spread is not None and self.spread != bool(spread):
+                    continue
                 scale = pair["hrls"].shape[-1] // pair["lrhs"].shape[-1]
                 if scale in self.pairs and pair["hrls"].shape[-1] >= self.patch:
                     self.pairs[scale].append({name: image.to(self.device) for name, image in pair.items()})
@@ -166,9 +250,15 @@ def main() -> None:
     parser.add_argument("--draws", type=int, default=6, help="pairs per view (%(default)s)")
     parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("I", "N"), help="draw part I of N")
     parser.add_argument("--device", default="cuda")
+    parser.add_argument(
+        "--denoise", type=Path, nargs=2, default=(), metavar="JOINT", help="pairs for the size large, see above"
+    )
     args = parser.parse_args()
     torch.set_num_threads(1)
-    fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, torch.device(args.device))
+    device = torch.device(args.device)
+    joints = [checkpoints.load(path)[0] for path in args.denoise]
+    denoisers = Denoisers([each for each in joints if isinstance(each, JointFusion)], device)
+    fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, device, denoisers)
 
 
 if __name__ == "__main__":

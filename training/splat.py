@@ -123,10 +123,15 @@ SHARES: tuple[tuple[float, str, float, float, bool], ...] = (
 )
 
 
-def draw_filter(rng: np.random.Generator) -> PixelFilter:
-    """A filter in the shares of ``SHARES``."""
-    chosen = rng.choice(len(SHARES), p=[share for share, *_ in SHARES])
-    _, kind, least, greatest, spread = SHARES[chosen]
+def draw_filter(rng: np.random.Generator, *, correlated: bool | None = None) -> PixelFilter:
+    """A filter in the shares of ``SHARES``: only those that make neighbouring pixels share noise, only the others, or
+    any (None)."""
+    filters = [(share, PixelFilter(kind, greatest, spread)) for share, kind, _, greatest, spread in SHARES]
+    shares = [
+        share if correlated is None or (each.spread and each.reach > 0) is correlated else 0.0
+        for share, each in filters
+    ]
+    _, kind, least, greatest, spread = SHARES[rng.choice(len(SHARES), p=np.divide(shares, sum(shares)))]
     return PixelFilter(kind, float(rng.uniform(least, greatest)), spread)
 
 

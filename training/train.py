@@ -44,8 +44,8 @@ log = logging.getLogger(__name__)
 SPIKE = 4.0
 #: A run that falls this many dB behind its best checkpoint returns to it, with half the learning rate.
 COLLAPSE = 2.0
-#: Share of the run in which the learning rate rises, and the share of its peak at which it ends.
-WARM_UP, FINAL = 0.03, 0.01
+#: Share of the run in which the learning rate rises.
+WARM_UP = 0.03
 #: Largest decay of the averaged weights.
 EMA_DECAY = 0.999
 
@@ -101,12 +101,13 @@ RECIPES = {
 # What a step needs
 
 
-def lr_factor(progress: float) -> float:
-    """Learning rate as a share of its peak after a share of the run in [0, 1]: linear warm-up, then half a cosine."""
+def lr_factor(progress: float, final: float = 0.01) -> float:
+    """Learning rate as a share of its peak after a share of the run in [0, 1]: linear warm-up, then half a cosine that
+    ends at ``final``."""
     if progress < WARM_UP:
         return max(progress / WARM_UP, 1e-3)
     done = min((progress - WARM_UP) / (1 - WARM_UP), 1.0)
-    return FINAL + (1 - FINAL) * 0.5 * (1 + math.cos(math.pi * done))
+    return final + (1 - final) * 0.5 * (1 + math.cos(math.pi * done))
 
 
 @torch.no_grad()
@@ -165,6 +166,7 @@ class Run:
         self.device = torch.device(
             args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
         )
+        torch.backends.cudnn.benchmark = True  # all batches have the same size
         self.checkpoint_path, self.best_path = args.out / "checkpoint.pt", args.out / "best.pt"
         self.step, self.elapsed, self.best_gain = 0, 0.0, -math.inf
 
@@ -193,7 +195,10 @@ class Run:
         seed = args.seed + self.step
         self.pairs: Batches | PooledBatches
         if args.pool:
-            self.pairs = PooledBatches(args.pool, self.scales, self.patch, self.batch, seed, self.device)
+            spread = None if args.noise is None else args.noise == "spread"
+            self.pairs = PooledBatches(
+                args.pool, self.scales, self.patch, self.batch, seed, self.device, spread=spread
+            )  # fmt: skip
         else:
             self.pairs = Batches(
                 args.data, self.scales, self.patch, self.batch, self.recipe.sampling, seed, self.device,
@@ -206,7 +211,11 @@ class Run:
         for group in self.optimizer.param_groups:
             group["initial_lr"] = self.peak_lr * group["share"]
         budget = max(self.args.minutes * 60, 1e-9)
-        return LambdaLR(self.optimizer, lambda _: lr_factor(self.elapsed / budget) if self.recipe.schedule else 1.0)
+
+        def factor(_: int) -> float:
+            return lr_factor(self.elapsed / budget, self.args.final_lr) if self.recipe.schedule else 1.0
+
+        return LambdaLR(self.optimizer, factor)
 
     def restore(self, state: checkpoints.State) -> None:
         """Return to the weights and the optimiser of a checkpoint."""
@@ -408,6 +417,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
         default=0.06,
         help="joint: share of the learning rate for pretrained weights",
     )
+    parser.add_argument(
+        "--final-lr", type=float, default=0.01, help="share of the learning rate at the end (default: %(default)s)"
+    )
+    parser.add_argument("--noise", choices=("independent", "spread"), help="only such pairs of --pool (default: all)")
     parser.add_argument("--loss", choices=losses.LOSSES, help="(default: the preset's)")
     parser.add_argument(
         "--precision",

@@ -5,8 +5,9 @@
 
 Scenes are those of :mod:`datagen.mitsuba.scenes`; with ``--rooms``, every third is a variation of a room that somebody
 else built (:mod:`datagen.mitsuba.rooms`). References for training and validation are denoised at once, at the
-resolution of their cells. Those for testing stay as rendered, because a denoiser must not be scored against its own
-results.
+resolution of their cells. With ``--keep-noise``, they stay as rendered, with their albedo and normal, and
+:mod:`training.pool` denoises them on a GPU. References for testing always stay as rendered, because a denoiser must not
+be scored against its own results.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from oiio_msspl.arrays import box_downsample
 _RENDERS = 2  # cameras that are rendered, at most, until a reference is clean enough
 _LIT = 0.3  # share of pixels that have light at 16 spp: less than for other views, because light may be rare
 _GOOD_REFERENCE, _WORST_REFERENCE = 26.0, 18.0  # dB, of the rendered reference's own noise
-_BATCH = 2  # samples a reference cell per wavefront: bounds the memory
+_BATCH = 4  # samples a reference cell per wavefront: bounds the memory
 
 
 def _reference(scene, camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray], int, float] | None:
@@ -35,21 +36,19 @@ def _reference(scene, camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray
         The images, the spp and the sRGB PSNR at the view's resolution, estimated from two halves; None if the first
         samples show that it would stay too noisy.
     """
-    from datagen.mitsuba.trace import render_samples
+    from datagen.mitsuba.trace import render_sum
 
-    cells, per_step = views.REF_CELLS, 2 * _BATCH * views.REF_CELLS**2
+    cells = views.REF_CELLS
+    batch = min(_BATCH, max(spp // (2 * cells**2), 1))
     names = ("color", "albedo", "normal")
     halves = {name: np.zeros((2, *[cells * samples.SIZE] * 2, 3)) for name in names}
-    done = 0
+    done, per_step = 0, 2 * batch * cells**2
     while True:
         for half in range(2):
-            drawn = render_samples(scene, camera, cells * samples.SIZE, _BATCH, seed + done + half, names)
-            for name in names:
-                halves[name][half] += drawn[name].sum(axis=0, dtype=np.float64)
+            for name, sums in render_sum(scene, camera, cells * samples.SIZE, batch, seed + done + half, names).items():
+                halves[name][half] += sums
         done += per_step
-        pixels = [
-            box_downsample(half.astype(np.float32), cells) * (per_step / _BATCH / done) for half in halves["color"]
-        ]
+        pixels = [box_downsample(half.astype(np.float32), cells) * (2 * cells**2 / done) for half in halves["color"]]
         psnr = quality.psnr_of_mean(*pixels)
         if done == per_step and psnr + 10 * np.log10(2 * spp / done) < _WORST_REFERENCE:
             return None
@@ -65,7 +64,9 @@ def _denoised(images: dict[str, np.ndarray]) -> np.ndarray:
     return pyoidn.denoise(color, albedo=albedo.clip(0, 1), normal=normal, hdr=True, quality="high")
 
 
-def render_view(scene, plan, camera, seed: int, view: int, split: str, ref_spp: int) -> dict[str, np.ndarray] | None:
+def render_view(
+    scene, plan, camera, seed: int, view: int, split: str, ref_spp: int, *, keep_noise: bool
+) -> dict[str, np.ndarray] | None:
     """Render all arrays of one view; None if the reference stays too noisy."""
     import mitsuba as mi
 
@@ -90,9 +91,13 @@ def render_view(scene, plan, camera, seed: int, view: int, split: str, ref_spp: 
         "seed": f"{plan.kind}-{seed}" if split == "room" else seed, "view": view,
         "split": "train" if split == "room" else split, "generator": VERSION, "kind": plan.kind,
         "renderer": f"Mitsuba {mi.__version__}, variant {mi.variant()}, own path tracer, {MAX_DEPTH} bounces",
-        "sampler": "independent", "ref_spp": ref_spp, "ref_psnr": psnr, "ref_denoised": split != "test",
+        "sampler": "independent", "ref_spp": ref_spp, "ref_psnr": psnr,
+        "ref_denoised": split != "test" and not keep_noise,
         "assets": sorted(plan.sources), "camera": camera.__dict__,
     }  # fmt: skip
+    if keep_noise:
+        layers = {name: images[name] for name in ("albedo", "normal")}
+        return samples.pack(hr, lr, images["color"], rng, meta, layers)
     return samples.pack(hr, lr, images["color"] if split == "test" else _denoised(images), rng, meta)
 
 
@@ -111,7 +116,9 @@ def render_scene(args: argparse.Namespace, assets, seed: int) -> tuple[int, str]
         cameras = find_cameras(scene, plan, seed, view, _LIT)
         # Rooms of other people are for training only: all seeds share their walls
         split = "room" if is_room else views.split_of(seed)
-        renders = (render_view(scene, plan, c, seed, view, split, args.ref_spp) for c in cameras)
+        renders = (
+            render_view(scene, plan, c, seed, view, split, args.ref_spp, keep_noise=args.keep_noise) for c in cameras
+        )
         arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
         if arrays is not None:
             views.save(samples.path_of(args.out, "mitsuba", seed, view), arrays)
@@ -125,6 +132,9 @@ def main() -> int:
     )
     parser.add_argument("--rooms", type=Path, help="folder with bathroom2/ and living-room-3/, Mitsuba scenes")
     parser.add_argument("--max-gib", type=float, default=6.0, help="start no new scene above this size (%(default)s)")
+    parser.add_argument(
+        "--keep-noise", action="store_true", help="references as rendered, for training.pool to denoise"
+    )
     parser.add_argument("--variant", default=VARIANT, help="of Mitsuba; cuda_ad_rgb for a GPU (%(default)s)")
     args = parser.parse_args()
     start(args.threads, args.variant)

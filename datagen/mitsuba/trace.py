@@ -201,12 +201,50 @@ def render_samples(
     Samples with a non-finite value are zero.
     """
     columns, rows = (size, size) if isinstance(size, int) else size
-    n = columns * rows
+    pixel = dr.arange(mi.UInt32, columns * rows * spp) % dr.opaque(mi.UInt32, columns * rows)
+    wanted = _trace(scene, camera, columns, rows, pixel, seed, layers, integrator, pixel_filter)
+    dr.eval([channel for channels in wanted.values() for channel in channels])
+    out = {name: np.stack([c.numpy() for c in channels], axis=-1) for name, channels in wanted.items()}
+    finite = np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in out.values()])
+    for name in layers:
+        out[name][~finite] = 0
+    return {name: values.reshape(spp, rows, columns, -1) for name, values in out.items()}
+
+
+def render_sum(
+    scene: mi.Scene, camera: Camera, size: int, spp: int, seed: int, layers: tuple[str, ...]
+) -> dict[str, np.ndarray]:
+    """Sum `spp` samples of every pixel on the device: float32 (size, size, C) by name, see `LAYERS`.
+
+    Samples with a non-finite value count as zero.
+    """
+    pixel = dr.arange(mi.UInt32, size * size * spp) // dr.opaque(mi.UInt32, spp)
+    traced = _trace(scene, camera, size, size, pixel, seed, layers, None, box)
+    channels = [channel for name in layers for channel in traced[name]]
+    finite = mi.Bool(True)
+    for channel in channels:
+        finite &= dr.isfinite(channel)
+    sums = [dr.block_sum(dr.select(finite, channel, 0), spp) for channel in channels]
+    dr.eval(sums)
+    images = iter(each.numpy().reshape(size, size) for each in sums)
+    return {name: np.stack([next(images) for _ in traced[name]], axis=-1) for name in layers}
+
+
+def _trace(
+    scene: mi.Scene,
+    camera: Camera,
+    columns: int,
+    rows: int,
+    pixel: mi.UInt32,
+    seed: int,
+    layers: tuple[str, ...],
+    integrator,
+    pixel_filter: PixelFilter,
+) -> dict[str, list[mi.Float]]:
+    """Trace one sample of each of these pixels, not evaluated yet: its channels by name, see :func:`render_samples`."""
     sampler = mi.load_dict({"type": "independent"})
-    sampler.seed(seed, n * spp)
-    index = dr.arange(mi.UInt32, n * spp)
-    width, height, pixels = (dr.opaque(mi.UInt32, v) for v in (columns, rows, n))
-    pixel = index % pixels
+    sampler.seed(seed, len(pixel))
+    width, height = (dr.opaque(mi.UInt32, v) for v in (columns, rows))
     row = pixel // width
     jitter, lens = sampler.next_2d(), sampler.next_2d()
     place = [pixel_filter(jitter.x), pixel_filter(jitter.y)]
@@ -218,13 +256,7 @@ def render_samples(
     else:
         *vectors, distance = sample_layers(scene, sampler, ray)
         traced = dict(zip(LAYERS, [*map(list, vectors), [distance]], strict=True))
-    wanted = {"place": place} | {name: traced[name] for name in layers}
-    dr.eval([channel for channels in wanted.values() for channel in channels])
-    out = {name: np.stack([c.numpy() for c in channels], axis=-1) for name, channels in wanted.items()}
-    finite = np.logical_and.reduce([np.isfinite(values).all(axis=-1) for values in out.values()])
-    for name in layers:
-        out[name][~finite] = 0
-    return {name: values.reshape(spp, rows, columns, -1) for name, values in out.items()}
+    return {"place": place} | {name: traced[name] for name in layers}
 
 
 def render_passes(

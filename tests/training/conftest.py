@@ -14,6 +14,11 @@ from datagen import samples, views
 @pytest.fixture
 def sample_folder(tmp_path: Path) -> Path:
     """A view with samples that all show a grey wall of radiance 0.5, and its file."""
+    return write_wall(tmp_path)
+
+
+def write_wall(folder: Path, ref: np.ndarray | None = None, ref_layers: dict[str, np.ndarray] | None = None) -> Path:
+    """The view of :func:`sample_folder`, with another reference."""
     rng = np.random.default_rng(0)
     size = samples.SIZE
 
@@ -29,9 +34,10 @@ def sample_folder(tmp_path: Path) -> Path:
     arrays = samples.pack(
         layers(samples.HR_SAMPLES, ("color", "albedo", "normal", "diffuse", "specular", "depth")),
         layers(samples.LR_SAMPLES, ("color", "albedo", "normal")),
-        np.full((cells, cells, 3), 0.5, np.float32),
+        np.full((cells, cells, 3), 0.5, np.float32) if ref is None else ref,
         rng,
         {"seed": 3, "split": "train", "renderer": "none", "generator": 0},
+        ref_layers,
     )
-    views.save(samples.path_of(tmp_path, "mitsuba", 3, 0), arrays)
-    return tmp_path
+    views.save(samples.path_of(folder, "mitsuba", 3, 0), arrays)
+    return folder

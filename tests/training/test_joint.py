@@ -28,7 +28,7 @@ from training.quantise.codes import denoiser_codes  # noqa: E402
 from training.whole_model import CHECKPOINTS, denoiser_file  # noqa: E402
 
 #: Open Image Denoise's quality whose networks each size starts from.
-QUALITY = {"small": "fast", "usual": "high"}
+QUALITY = {"small": "fast", "usual": "high", "large": "high"}
 
 
 def pairs(scale, prepare, count=2, size=64):
@@ -73,24 +73,27 @@ def test_a_new_network_is_open_image_denoise(size, denoised_mean):
     ((lrhs, hrls),) = pairs(2, denoised_mean, count=1)
     with torch.inference_mode():
         fused = network.fuse(lrhs, hrls)[0][0].permute(1, 2, 0).numpy()
-    expected = open_image_denoise(*hrls.split(3, dim=1), quality=QUALITY[size])
+    images = network.prepared(hrls).split(3, dim=1)
+    expected = open_image_denoise(*images[:3], quality=QUALITY[size], cleanAux=size == "large")
     assert np.abs(fused - expected).mean() < 1e-3
     assert not any(parameter.any() for parameter in network.differences())
 
 
-@pytest.mark.parametrize(("scale", "size"), [(8, "usual"), (2, "small")])
+@pytest.mark.parametrize(("scale", "size"), [(8, "usual"), (2, "small"), (4, "large")])
 def test_the_graph_computes_what_the_network_does(scale, size, tmp_path, denoised_mean):
     """With random differences and pruned channels."""
     torch.manual_seed(0)
     ups = [name for level in BASE.up for name in level]
-    network = JointFusion(kept={name: list(range(i, 16 + i)) for i, name in enumerate(ups)}, size=size).eval()
+    kept = {name: list(range(i, 16 + i)) for i, name in enumerate(ups)} if size != "large" else {}
+    network = JointFusion(kept, size).eval()
     for name, parameter in network.named_parameters():
         parameter.data += (0.003 if name.startswith("convs") else 0.02) * torch.randn_like(parameter)
     state = {"architecture": "joint", "training_spp": {str(scale): {}}, "provenance": {}}
-    contract = export.contract_of(network, scale, f"joint-x{scale}", 128 // scale, state)
+    name = {"usual": "joint"}.get(size, f"joint-{size}")
+    contract = export.contract_of(network, scale, f"{name}-x{scale}", 128 // scale, state)
     drawn = pairs(scale, denoised_mean, size=16 * scale)
     path = tmp_path / "joint.onnx"
-    onnx.save(export.joint_to_onnx(network, contract, drawn), path)
+    onnx.save(export.joint_to_onnx(network, [contract], drawn)[0], path)
     assert (contract.denoiser, contract.alignment) == (network.denoiser(scale), 16)
     assert "Open Image Denoise" in contract.provenance["initial_weights"]
     model = load_network(path)
@@ -137,7 +140,7 @@ def test_the_mean_may_include_the_initial_state():
         average.mean([state | {"architecture": "paper", "config": {}, "provenance": {}}], initial=(0.25, 0))
 
 
-@pytest.mark.parametrize("size", QUALITY)
+@pytest.mark.parametrize("size", STARTS)
 def test_a_new_mean_denoiser_is_open_image_denoise(size):
     """The weights of the estimated noise start at zero."""
     colour, noise, albedo, normal = means(48)

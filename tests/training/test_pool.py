@@ -5,13 +5,19 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 torch = pytest.importorskip("torch", reason="training is an extra")
 
 from datagen.samples import SIZE  # noqa: E402
-from datagen.views import Folder  # noqa: E402
-from training.pool import PooledBatches, draw_pairs  # noqa: E402
+from datagen.views import REF_CELLS, Folder  # noqa: E402
+from tests.training.conftest import write_wall  # noqa: E402
+from training import checkpoints  # noqa: E402
+from training.data import SampleTensors  # noqa: E402
+from training.joint import JointFusion  # noqa: E402
+from training.pool import Denoisers, PooledBatches, draw_pairs  # noqa: E402
+from training.whole_model import CHECKPOINTS  # noqa: E402
 
 CPU = torch.device("cpu")
 
@@ -27,6 +33,40 @@ def test_views_are_drawn_whole(sample_folder: Path) -> None:
     for image in (pair["hrls"][:3], pair["lrhs"][:3], pair["lrhs"][3:6]):
         torch.testing.assert_close(image.mean(dim=(1, 2)), colours, atol=0.01, rtol=0)
     assert pair["lrhs"][6].max() < 0.01
+
+
+def test_a_reference_with_noise_is_the_mean_of_itself_and_of_a_denoised_one(tmp_path: Path) -> None:
+    """Half of the noise is left. Brightness stays."""
+    pytest.importorskip("pyoidn")
+    side = SIZE * REF_CELLS
+    noise = np.random.default_rng(1).exponential(0.5, (side, side, 3)).astype(np.float32)
+    layers = {"albedo": np.full((side, side, 3), 0.6, np.float32), "normal": np.full((side, side, 3), 0.5, np.float32)}
+    (view,) = Folder(write_wall(tmp_path, noise, layers)).sample_views("train")
+    noisy = SampleTensors.of(view, CPU).noisy_reference()
+    assert noisy is not None
+    found = Denoisers([], CPU).reference(*noisy)
+    assert float(found.std() / noisy[0].std()) == pytest.approx(0.5, abs=0.02)
+    assert float(found.mean() / noisy[0].mean()) == pytest.approx(1.0, abs=0.02)
+
+
+def test_pairs_for_the_large_size_are_denoised_before(sample_folder: Path) -> None:
+    """Every second one has noise that the filter has spread. Batches may have one kind only."""
+    pytest.importorskip("pyoidn")
+    joints = [checkpoints.load(CHECKPOINTS / name)[0] for name in ("joint.pt", "joint_spread.pt")]
+    (view,) = Folder(sample_folder).sample_views("train")
+    drawn = draw_pairs(view, (4,), 2, CPU, Denoisers(joints, CPU))
+    assert [bool(pair["spread"]) for pair in drawn] == [False, True]
+    assert all(
+        pair["lrhs"].shape == (6, SIZE // 4, SIZE // 4) and pair["hrls"].shape == (9, SIZE, SIZE) for pair in drawn
+    )
+    torch.save(drawn, sample_folder / "wall.pt")
+    for spread, count in ((None, 2), (True, 1), (False, 1)):
+        batches = PooledBatches(sample_folder, (4,), 128, 1, 0, CPU, spread=spread)
+        batches.load()
+        assert len(batches.pairs[4]) == count
+    lrhs, hrls = next(batches.loader())["lrhs"], next(batches.loader())["hrls"]
+    fused, _ = JointFusion(size="large")(lrhs, hrls)
+    assert fused.shape == (1, 3, 128, 128)
 
 
 def write_pool(folder: Path, scale: int) -> Path:

@@ -179,7 +179,7 @@ def test_training_draws_filters_from_sample_views(sample_folder: Path, monkeypat
     tensors = data.view_tensors(found, "train", torch.device("cpu"))
     plain = data.Sampling(drop_each=0, drop_lobes=0, drop_all=0, exposure_stops=0, gain_stops=0, grey=0)
     for pixel_filter in (BOX, *INDEPENDENT, *LOBED):
-        monkeypatch.setattr(data, "draw_filter", lambda rng, f=pixel_filter: f)
+        monkeypatch.setattr(data, "draw_filter", lambda rng, f=pixel_filter, **_: f)
         for scale in (2, 8):
             batch = data.draw(tensors, scale, 64, 2, np.random.default_rng(0), plain)
             assert batch["hrls"].shape == (2, 16, 64, 64)
@@ -198,3 +198,6 @@ def test_shares_of_filters() -> None:
     independent = np.mean([f.reach == 0 or not f.spread for f in drawn])
     assert independent == pytest.approx(0.5, abs=0.04)
     assert all(0.5 <= f.radius <= 2 for f in drawn)
+    for correlated in (True, False):
+        drawn = [splat.draw_filter(rng, correlated=correlated) for _ in range(200)]
+        assert all((f.reach > 0 and f.spread) is correlated for f in drawn)

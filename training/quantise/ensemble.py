@@ -34,25 +34,23 @@ from oiio_msspl.model.contract import SCALES, SPREAD, Contract
 from oiio_msspl.model.runtime import load_network
 from training import checkpoints
 from training.data import Sampling, draw, fixed_batches, view_tensors
-from training.encoding import from_srgb, log_to_pu, srgb
+from training.encoding import log_to_pu
 from training.ensemble import BandWeights, EnsembleFusion, load
 from training.export import MEMORY
 from training.joint import JointFusion, with_denoised_mean
 from training.large import LargeDenoiser
-from training.oidn import ALBEDO_BASE, LARGE_HDR, NORMAL_BASE, FineTunedUNet
+from training.oidn import ALBEDO_BASE, LARGE_HDR, NORMAL_BASE
 from training.quantise.codes import log_encoded_of_code, sliced
-from training.quantise.gptq import Activations, CodeLayout, Fit, run_unet_on_activations
-from training.quantise.graph import ENTRIES, Graph, Nodes
-from training.quantise.joint import concatenated, sliced_layout
+from training.quantise.gptq import Activations, CodeLayout, concatenated, sliced_layout
+from training.quantise.graph import Graph, Nodes
+from training.quantise.layers import Networks, add_layers, brightened, fitted, quantised
 from training.tracing import shuffle, traced, unshuffle
 from training.whole_model import CHECKPOINTS, network_of, quantised_denoiser, save, whole_model
 
 #: Calibration images of each network, and their width.
 IMAGES, PATCH = 36, 256
-#: Bounds of the powers of brighter albedos.
-BRIGHTER = (0.1, 1.0)
-#: Slices of albedo and normal before and after they are denoised, of the colour, and of the denoised colour.
-AUXILIARY_SLICES, COLOUR_SLICES, COLOUR_SLICES_OUT = 5, 3, 10
+#: Slices of the colour, and of the denoised colour.
+COLOUR_SLICES, COLOUR_SLICES_OUT = 3, 10
 #: Stored pairs for training and validation.
 PAIRS = {"train": 480, "validation": 36}
 #: The models' name; all scales share the weights of the networks.
@@ -65,13 +63,6 @@ RESULTS = ("joint", "large", "albedo", "normal", "joint_error")
 # Open Image Denoise's networks in 8 bits
 
 
-def auxiliary_codes(image: Tensor) -> Activations:
-    """An albedo, sRGB-encoded, or a normal, both (1, 3, H, W) in [0, 1], as the network's input."""
-    layout = concatenated(sliced_layout(AUXILIARY_SLICES, 0))
-    codes = F.pad(sliced(image, AUXILIARY_SLICES), (0, 0, 0, 0, 0, 1))
-    return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
-
-
 def colour_codes(colour: Tensor, *layers: Tensor) -> Activations:
     """A log-encoded colour and layers in [0, 1], (1, 3, H, W), as the input of the large network."""
     plain = CodeLayout(torch.full((3 * len(layers),), 1 / 255), torch.arange(3, 3 + 3 * len(layers)))
@@ -82,28 +73,15 @@ def colour_codes(colour: Tensor, *layers: Tensor) -> Activations:
     return Activations([layout.dequantise(codes[0])[None]], [codes], layout)
 
 
-def fitted(network: FineTunedUNet, slices_out: int, images: Sequence[Activations]) -> tuple[Fit, list[Tensor]]:
-    """Quantise a network; also return its exact outputs (1, 3, H, W)."""
-    shape = network.start.shape
-    fit = Fit(shape, network.weights(), slices_out)
-    exact, codes = ([getattr(image, kind)[0] for image in images] for kind in ("exact", "codes"))
-    result = run_unet_on_activations(shape, [Activations(exact, codes, images[0].layout)], fit.conv)
-    return fit, [image[:, :3].clamp(0, 1) for image in result.exact]
-
-
-def fit_networks(ensemble: EnsembleFusion, pairs: Sequence[tuple[Tensor, Tensor]]) -> dict[str, Fit]:
+def fit_networks(ensemble: EnsembleFusion, pairs: Sequence[tuple[Tensor, Tensor]]) -> Networks:
     """Quantise the three networks on encoded pairs, the arguments of the ensemble."""
-    layers, large, hrls = ensemble.layers, ensemble.large, [pair[1] for pair in pairs]
-    albedo, albedos = fitted(layers.albedo, AUXILIARY_SLICES, [auxiliary_codes(srgb(image[:, 3:6])) for image in hrls])
-    normal, normals = fitted(
-        layers.normal, AUXILIARY_SLICES, [auxiliary_codes(0.5 * image[:, 6:9] + 0.5) for image in hrls]
-    )
-    inputs = [[h[:, :3], from_srgb(a), n] for h, a, n in zip(hrls, albedos, normals, strict=True)]
-    if large.reads_joint:
+    networks, clean = quantised(ensemble.layers, [pair[1] for pair in pairs])
+    inputs = [[pair[1][:, :3], *layers] for pair, layers in zip(pairs, clean, strict=True)]
+    if ensemble.large.reads_joint:
         for images, pair in zip(inputs, pairs, strict=True):
             images.append(log_to_pu(ensemble.joint.fuse(*pair)[0]))
-    colour, _ = fitted(large, COLOUR_SLICES_OUT, [colour_codes(*images) for images in inputs])
-    return {"albedo": albedo, "normal": normal, "colour": colour}
+    colour, _ = fitted(ensemble.large, COLOUR_SLICES_OUT, [colour_codes(*images) for images in inputs])
+    return networks | {"colour": Graph(colour).model()}
 
 
 # The graphs
@@ -118,30 +96,17 @@ class Results(Nodes):
         self.initializers["unseen"] = log_encoded_of_code(COLOUR_SLICES_OUT)
         joint = network_of(onnx.load(find_model(scale, f"joint{noise}")))
         self.embed(joint, "first.", {"fused": "joint", "log_error": "joint_error"})
-        # OIDN denoises an albedo in sRGB, and reads it linear beside the colour.
-        self.constant("srgb", srgb(torch.linspace(0, 1, ENTRIES)).numpy())
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
         zeros = self.zeros(colour)
-        albedo = self._denoised(networks["albedo"], "albedo", self.table(albedo, 1.0, "srgb"), zeros)
-        half = self.constant("half", np.float32(0.5))
-        scaled = self.add("Mul", [normal, half], "normal.scaled")
-        normal = self._denoised(networks["normal"], "normal", self.add("Add", [scaled, half], "normal.shifted"), zeros)
+        add_layers(self, networks, albedo, normal, zeros)
         slices = self.slices(self.log_to_pu(colour), COLOUR_SLICES)
         step = self.constant("step", np.float32(1 / 255))
-        layers = [albedo, normal, *([self.log_to_pu("joint")] if noise else [])]
+        layers = ["albedo", "normal", *([self.log_to_pu("joint")] if noise else [])]
         rounded = [self.add("QuantizeLinear", [image, step, "zero"], f"{image}.rounded") for image in layers]
         # As many as :func:`training.quantise.joint.concatenated` appends
         packed = self.packed([*slices, *rounded, *[zeros] * (2 if noise else 1)], "colour.layers")
         pixels = self.look_up("unseen", self._run(networks["colour"], "colour", packed), "large.pixels")
         self.add("Transpose", [pixels], "large", perm=[0, 3, 1, 2])
-
-    def _denoised(self, network: onnx.ModelProto, name: str, noisy: str, zeros: str) -> str:
-        """Add the network of an albedo or a normal; return the denoised image, (1, 3, H, W) in [0, 1]."""
-        packed = self.packed([*self.slices(noisy, AUXILIARY_SLICES), zeros], f"{name}.layers")
-        values = torch.linspace(0, 1, 255 * AUXILIARY_SLICES + 1)
-        table = self.constant(f"{name}.table", (from_srgb(values) if name == "albedo" else values).numpy())
-        pixels = self.look_up(table, self._run(network, name, packed), f"{name}.pixels")
-        return self.add("Transpose", [pixels], name, perm=[0, 3, 1, 2])
 
     def _run(self, network: onnx.ModelProto, name: str, layers: str) -> str:
         """Add a network that reads the codes ``layers``; return its sums of codes."""
@@ -188,17 +153,10 @@ def store_pairs(views: Path, out: Path, joint: JointFusion) -> None:
 
 
 def calibration_pairs(views: Path, joint: JointFusion, count: int = IMAGES) -> list[tuple[Tensor, Tensor]]:
-    """Encoded pairs of training views. Every second one has a brighter albedo, up to white, in some channels.
-
-    Codes only cover the range that calibration has seen.
-    """
+    """Encoded pairs of training views, some with brighter albedos."""
     batches = islice(fixed_batches(views, "train", [2], PATCH, 1, with_denoised_mean(joint.mean_denoiser)), count)
     pairs = [(batch["lrhs"].contiguous(), batch["hrls"][:, :9].contiguous()) for batch in batches]
-    generator = torch.Generator().manual_seed(0)
-    for _, image in pairs[1::2]:
-        power = BRIGHTER[0] + (BRIGHTER[1] - BRIGHTER[0]) * torch.rand(1, 3, 1, 1, generator=generator)
-        image[:, 3:6] = image[:, 3:6].clamp(0, 1) ** power
-    return pairs
+    return list(zip((lrhs for lrhs, _ in pairs), brightened([hrls for _, hrls in pairs]), strict=True))
 
 
 # The files that ship
@@ -257,8 +215,8 @@ def main() -> None:
     if not all(file.exists() for file in files.values()):
         with torch.no_grad():
             fits = fit_networks(ensemble, calibration_pairs(args.views, joint))
-        for name, fit in fits.items():
-            onnx.save(Graph(fit).model(), files[name])
+        for name, network in fits.items():
+            onnx.save(network, files[name])
     networks = {name: onnx.load(file) for name, file in files.items()}
     if args.export:
         export(ensemble, networks, noise, trained)

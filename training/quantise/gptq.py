@@ -101,6 +101,25 @@ class QuantisedConv:
         return in_codes.round_().clamp_(0, 255)
 
 
+# Layouts
+
+
+def sliced_layout(count: int, first: int) -> CodeLayout:
+    """The layout of :func:`sliced` colours, which are the value channels from ``first`` on."""
+    return CodeLayout(torch.full((3 * count,), 1 / count / 255), torch.arange(first, first + 3).repeat(count))
+
+
+def concatenated(*parts: CodeLayout) -> CodeLayout:
+    """Concatenate layouts, and code channels of zeros up to a multiple of four channels.
+
+    For other numbers, ONNX Runtime's convolutions take more than twice the memory.
+    """
+    count = -sum(len(part.scale) for part in parts) % 4
+    parts = (*parts, CodeLayout(torch.zeros(count), torch.zeros(count, dtype=torch.long)))
+    scale, source = ([getattr(part, name) for part in parts] for name in ("scale", "source_channel"))
+    return CodeLayout(torch.cat(scale), torch.cat(source))
+
+
 # The inputs of the denoiser of both renders' mean
 
 

@@ -14,11 +14,11 @@ from onnx import TensorProto, helper
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from oiio_msspl.aovs.features import HRLS_FEATURES
 from training.data import Prepare, fixed_batches
 from training.encoding import log_to_pu
-from training.joint import DECODED, OUTPUTS, JointFusion, blend
-from training.oidn import BASE
-from training.ops import upsample
+from training.joint import DECODED, FEATURES, OUTPUTS, JointFusion, blend
+from training.ops import log2_scale, upsample
 from training.paper import LRHS_CHANNELS
 from training.quantise.codes import log_encoded_of_code, sliced
 from training.quantise.gptq import (
@@ -28,9 +28,12 @@ from training.quantise.gptq import (
     Activations,
     CodeLayout,
     Fit,
+    concatenated,
     run_unet_on_activations,
+    sliced_layout,
 )
 from training.quantise.graph import Graph
+from training.quantise.layers import Networks, add_layers
 
 #: Calibration pairs, and their width in HRLS pixels.
 PAIRS, PATCH = 64, 256
@@ -53,23 +56,7 @@ class Blend(nn.Module):
 # The U-Net's inputs as codes
 
 
-def sliced_layout(count: int, first: int) -> CodeLayout:
-    """The layout of :func:`sliced` colours, which are the value channels from ``first`` on."""
-    return CodeLayout(torch.full((3 * count,), 1 / count / 255), torch.arange(first, first + 3).repeat(count))
-
-
-def concatenated(*parts: CodeLayout) -> CodeLayout:
-    """Concatenate layouts, and code channels of zeros up to a multiple of four channels.
-
-    For other numbers, ONNX Runtime's convolutions take more than twice the memory.
-    """
-    count = -sum(len(part.scale) for part in parts) % 4
-    parts = (*parts, CodeLayout(torch.zeros(count), torch.zeros(count, dtype=torch.long)))
-    scale, source = ([getattr(part, name) for part in parts] for name in ("scale", "source_channel"))
-    return CodeLayout(torch.cat(scale), torch.cat(source))
-
-
-def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Activations]:
+def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
     """The U-Net's inputs at H and at H/2, for pairs of the network's inputs."""
     plain = CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
     layouts = [
@@ -86,7 +73,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Acti
             sliced(log_to_pu(image), count)
             for image, count in zip(lrhs.split(LRHS_CHANNELS, dim=1), (LRHS_SLICES, MEAN_SLICES), strict=True)
         )
-        half = upsample(torch.cat([mean, low], dim=1), scale // 2)
+        half = upsample(torch.cat([mean, low], dim=1), 2 ** (log2_scale(lrhs, hrls) - 1))
         for images, image in zip(codes, (full, half), strict=True):
             images.append(F.pad(image, (0, 0, 0, 0, 0, 1)))
 
@@ -96,13 +83,16 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]], scale: int) -> list[Acti
     ]
 
 
-def calibration_pairs(views: Path, scale: int, prepare: Prepare, count: int = PAIRS) -> list[tuple[Tensor, Tensor]]:
+def calibration_pairs(
+    views: Path, scales: Sequence[int], prepare: Prepare, count: int = PAIRS
+) -> list[tuple[Tensor, Tensor]]:
     """Inputs of the network, from views as training draws them.
 
     Args:
+        scales: of each pair, one of these at random.
         prepare: see :func:`training.joint.with_denoised_mean`.
     """
-    batches = fixed_batches(views, "train", [scale], PATCH, 1, prepare)
+    batches = fixed_batches(views, "train", scales, PATCH, 1, prepare)
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 
@@ -110,13 +100,13 @@ def calibration_pairs(views: Path, scale: int, prepare: Prepare, count: int = PA
 
 
 def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> Fit:
-    """Quantise the U-Net and its heads."""
+    """Quantise the U-Net and its heads, those that ``scale`` and smaller ones need."""
     weights = {}
     for name, conv in network.convs.items():
         weights[f"{name}.weight"], weights[f"{name}.bias"] = conv.total()
     for kind in ("weight", "bias"):
         heads = [getattr(head, kind) for head in network.heads]
-        last = f"{BASE.last}.{kind}"
+        last = f"{network.shape.last}.{kind}"
         weights[last] = torch.cat([weights[last], heads[0]])
         # The expected error, four pixels for each pixel of H/2, is predicted with that level's logits
         heads[1] = torch.cat([heads[1], getattr(network.error, kind)])
@@ -124,7 +114,7 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
     weights = {name: value.detach() for name, value in weights.items()}
     # Without further slices, the small network's finest level reads a third fewer channels. 8 bits cost it 0.05 to
     # 0.07 dB at x2
-    fit = Fit(BASE, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
+    fit = Fit(network.shape, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
     def conv(name: str, values: Activations) -> Activations:
@@ -134,7 +124,7 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
         return result
 
     with torch.no_grad():
-        run_unet_on_activations(BASE, unet_inputs(pairs, scale), conv)
+        run_unet_on_activations(network.shape, unet_inputs(pairs), conv)
     return fit
 
 
@@ -142,11 +132,17 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
 
 
 class JointGraph(Graph):
-    """The whole graph: tensors are (1, C, H, W) outside the U-Net, (1, H, W, C) within."""
+    """The whole graph: tensors are (1, C, H, W) outside the U-Net, (1, H, W, C) within.
 
-    def __init__(self, fit: Fit, scale: int) -> None:
+    Args:
+        fit: see :func:`fitted`.
+        scale: of the model.
+        layers: denoise albedo and normal first, see :mod:`training.quantise.layers`.
+    """
+
+    def __init__(self, fit: Fit, scale: int, layers: Networks | None = None) -> None:
         super().__init__(fit)
-        self._scale = scale
+        self._scale, self._layers = scale, layers
         self.initializers["unseen"] = log_encoded_of_code(SLICES_OUT)
 
     def whole(
@@ -155,16 +151,19 @@ class JointGraph(Graph):
         """The model with the graph of :class:`Blend`, whose inputs have the names of tensors that are made here."""
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
         step, half_step = self.constant("step", np.float32(1 / 255)), self.constant("half_step", np.float32(1 / 127.5))
-        middle = self.constant("middle", np.uint8(SIGNED_ZERO))
-        full = self.packed(
-            [
-                *self.slices(self.log_to_pu(colour), HRLS_SLICES),
-                self.add("QuantizeLinear", [albedo, step, "zero"], "albedo"),
-                self.add("QuantizeLinear", [normal, half_step, middle], "normal"),
-                self.zeros(albedo),
-            ],
-            "full",
-        )
+        zeros = self.zeros(albedo)
+        clean = {}
+        if self._layers:
+            add_layers(self, self._layers, albedo, normal, zeros)
+            clean = {albedo: "albedo"}
+            normal_codes = self.add("QuantizeLinear", ["normal", step, "zero"], "normal.rounded")
+        else:
+            middle = self.constant("middle", np.uint8(SIGNED_ZERO))
+            normal_codes = self.add("QuantizeLinear", [normal, half_step, middle], "normal.rounded")
+        albedo = clean.get(albedo, albedo)
+        albedo_codes = self.add("QuantizeLinear", [albedo, step, "zero"], "albedo.rounded")
+        colours = self.slices(self.log_to_pu(colour), HRLS_SLICES)
+        full = self.packed([*colours, albedo_codes, normal_codes, zeros], "full")
         low, mean = self.split("lrhs", {"colour": LRHS_CHANNELS, "mean": LRHS_CHANNELS})
         half = self.packed(
             [
@@ -179,8 +178,9 @@ class JointGraph(Graph):
         sums = self.colours([full, half], "sums")
         pixels = self.look_up("unseen", sums, "denoised.pixels")
         self.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
-        count = len(self.fit.layers[BASE.last].step) - COLOURS
-        self.add("Identity", [self._planes(BASE.last, COLOURS * SLICES_OUT, count)], "logits0")
+        last = self.fit.shape.last
+        count = len(self.fit.layers[last].step) - COLOURS
+        self.add("Identity", [self._planes(last, COLOURS * SLICES_OUT, count)], "logits0")
         for level in range(1, self._scale.bit_length()):
             name = self.conv(f"head{level}", DECODED[level])
             planes = self._planes(name, 0, len(self.fit.layers[name].step))
@@ -188,7 +188,7 @@ class JointGraph(Graph):
             if level == 1:
                 phases = self.cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
                 self.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
-        self.embed(mixing, "mix.", {})
+        self.embed(mixing, "mix.", clean)
         return self.finished("joint", inputs, outputs)
 
     def _planes(self, layer: str, start: int, count: int) -> str:
@@ -201,22 +201,19 @@ class JointGraph(Graph):
         return self.add("DequantizeLinear", [part, step, middle], f"{layer}.values")
 
 
-def to_onnx(
-    network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]], mixing: onnx.ModelProto
-) -> onnx.ModelProto:
-    """Graph with inputs ``lrhs`` and ``hrls``, outputs ``fused`` and ``log_error``.
+def to_onnx(fit: Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
+    """Graph with inputs ``lrhs`` and ``hrls``, outputs ``fused`` and ``log_error``, and with ``layers`` the denoised
+    ``albedo`` and ``normal``.
 
     Args:
-        pairs: calibration pairs, see :func:`calibration_pairs`.
+        fit: see :func:`fitted`.
+        scale: at most that of the fit.
         mixing: the graph of :class:`Blend` with its ``inputs``, ``logits0`` ... and the output ``fused``.
+        layers: see :class:`JointGraph`.
     """
-    info = helper.make_tensor_value_info
-    inputs = [
-        info("lrhs", TensorProto.FLOAT, [1, network.lrhs_channels, "h", "w"]),
-        info("hrls", TensorProto.FLOAT, [1, network.hrls_channels, "H", "W"]),
-    ]
-    outputs = [
-        info("fused", TensorProto.FLOAT, [1, COLOURS, "H", "W"]),
-        info("log_error", TensorProto.FLOAT, [1, 1, "H", "W"]),
-    ]
-    return JointGraph(fitted(network, scale, pairs), scale).whole(mixing, inputs, outputs)
+    info, kind = helper.make_tensor_value_info, TensorProto.FLOAT
+    channels = sum(HRLS_FEATURES[name] for name in FEATURES)
+    inputs = [info("lrhs", kind, [1, 2 * LRHS_CHANNELS, "h", "w"]), info("hrls", kind, [1, channels, "H", "W"])]
+    results = {"fused": COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
+    outputs = [info(name, kind, [1, count, "H", "W"]) for name, count in results.items()]
+    return JointGraph(fit, scale, layers).whole(mixing, inputs, outputs)

@@ -10,7 +10,7 @@ calls OIDN like this.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
 
@@ -23,6 +23,12 @@ STRIDE = 2
 SIMILAR = 0.07
 
 
+def places() -> Iterator[tuple[slice, slice]]:
+    """The rows and columns of each of the four pictures."""
+    for y, x in itertools.product(range(STRIDE), repeat=2):
+        yield slice(y, None, STRIDE), slice(x, None, STRIDE)
+
+
 def on_every_second_pixel(denoise: Callable[..., Array], images: dict[str, Array]) -> Array:
     """Call ``denoise`` with every second pixel of the images (h, w, c), four times; put the results (h, w, 3) together.
 
@@ -30,8 +36,7 @@ def on_every_second_pixel(denoise: Callable[..., Array], images: dict[str, Array
     """
     height, width = next(iter(images.values())).shape[:2]
     result = np.empty((height, width, 3), np.float32)
-    for y, x in itertools.product(range(STRIDE), repeat=2):
-        place = (slice(y, None, STRIDE), slice(x, None, STRIDE))
+    for place in places():
         result[place] = denoise(**{name: np.ascontiguousarray(image[place]) for name, image in images.items()})
     return result
 

@@ -2,6 +2,7 @@
 """Accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m benchmarks.passes PASSES --table benchmarks/results/passes.csv
+    python -m benchmarks.passes PASSES --spread --table benchmarks/results/passes_spread.csv
     python -m benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
 
 PASSES is made by :mod:`benchmarks.render.passes` and ``datagen.cycles.passes``. The methods, all but the first two with
@@ -16,9 +17,13 @@ the albedo and the normal:
   colour is black, because no file can hold it. The layers are then scaled to the sum.
 - "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
   so that they sum to the beauty that OIDN makes of this render.
+- "OIDN, every second pixel, rescaled": with ``--spread``, the recommended call on every second pixel, see
+  :mod:`benchmarks.every_second_pixel`.
 - "msspl": :mod:`oiio_msspl.fusion.passes`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
+
+``--spread`` is for renders whose pixel filter has spread the noise. It takes the models for such noise.
 
 Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
 
@@ -43,6 +48,7 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks import results
+from benchmarks.every_second_pixel import places, without_grid
 from benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
 from benchmarks.results import MEAN, Row
 from benchmarks.versus import cell, with_interval
@@ -61,6 +67,8 @@ from oiio_msspl.fusion.passes import DARKEST_COLOUR, fuse_passes
 from oiio_msspl.fusion.sums import layer_keys, with_layers
 from oiio_msspl.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.contract import SPREAD
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 
 SCALES, SPP = (2, 4), (1, 2)
 KEYS = ("scene", "set", "spp", "method")
@@ -74,14 +82,18 @@ FAINT = 0.01
 BALANCED, BEST = "joint", "ensemble"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
+#: The same for noise that a pixel filter has spread.
+SPLIT_PEER = "OIDN, every second pixel, rescaled"
 #: The same as a file can hold it.
 STORED_PEER = "OIDN, prefiltered, stored"
 #: The set whose layers are products of light and colour in some renderers.
 COMPONENTS = "components"
 #: Column of the gain -> over which method.
-GAINS = {"gain": PEER, "gain_stored": STORED_PEER}
+GAINS = {"gain": PEER, "gain_split": SPLIT_PEER, "gain_stored": STORED_PEER}
 #: Methods in the table of single layers.
 IN_LAYERS = ("HRLS", "ratio", "OIDN", "OIDN, rescaled", PEER, "msspl-x2", "msspl-x2, best", "msspl-x4, best")
+#: Methods in the table of renders whose pixel filter has spread the noise.
+WITH_SPREAD_NOISE = ("HRLS", PEER, SPLIT_PEER, "msspl-x2", "msspl-x2, best", "msspl-x4", "msspl-x4, best")
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
@@ -110,12 +122,15 @@ def methods(
     fused: Mapping[str, tuple[FusedFrame, Session]],
     layers: AdditiveSet,
     ordinary: MappedRender | None = None,
+    *,
+    spread: bool = False,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
     """The name of each method, and a function that computes the layers.
 
     Args:
         fused: the fused frame of each model, and the model.
         ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
+        spread: a pixel filter has spread the noise.
     """
     noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
@@ -127,6 +142,14 @@ def methods(
     def recommended(noisy: Array, guides: Mapping[str, Array]) -> Array:
         clean = prefiltered({name: guides[name] for name in (ALBEDO, NORMAL)})
         return np.maximum([denoise_with_clean(layer, clean) for layer in noisy], np.float32(0))
+
+    def on_every_second_pixel() -> Array:
+        joined = np.empty_like(noisy)
+        for place in places():
+            joined[:, *place] = recommended(noisy[:, *place], {name: image[place] for name, image in guides.items()})
+        exposure = find_exposure(beauty)
+        encoded = (encode_radiance(layer, exposure) for layer in joined)
+        return np.stack([decode_radiance(without_grid(layer), exposure) for layer in encoded])
 
     def ours(low: MappedRender, model: str) -> Array:
         frame, session = fused[model]
@@ -149,6 +172,8 @@ def methods(
     yield "OIDN", plain
     yield "OIDN, rescaled", lambda: rescaled(plain(), beauty)
     yield PEER, lambda: rescaled(recommended(noisy, guides), beauty)
+    if spread:
+        yield SPLIT_PEER, lambda: rescaled(on_every_second_pixel(), beauty)
     if layers.name == COMPONENTS:
         yield STORED_PEER, lambda: rescaled(recommended(noisy, guides) * (colours >= DARKEST_COLOUR), beauty)
     if ordinary is not None:
@@ -174,9 +199,15 @@ def regraded(layers: Array) -> Array:
     return np.einsum("i,ihwc->hwc", grades, layers)
 
 
-def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tuple[FusedFrame, Session]]:
-    """The fused frame of each model, and the model. That of single layers is loaded, too."""
-    sessions = {model: load_model(scale, model) for model in (BALANCED, BEST)}
+def fused_frames(
+    lr: MappedRender, hr: MappedRender, scale: int, noise: str = ""
+) -> dict[str, tuple[FusedFrame, Session]]:
+    """The fused frame of each model, and the model. That of single layers is loaded, too.
+
+    Args:
+        noise: the ending of the models' names.
+    """
+    sessions = {model: load_model(scale, model + noise) for model in (BALANCED, BEST)}
     sessions[BEST].layer_session  # noqa: B018 - loads it
     return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
 
@@ -219,20 +250,22 @@ def timed(function: Callable[[], Array]) -> tuple[Array, float]:
     return result, time.perf_counter() - start
 
 
-def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
+def measure(
+    folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = (), *, spread: bool = False
+) -> list[Row]:
     """One scene: rows for each set and method, without those whose `KEYS` are known."""
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     other = folder / f"hr_{2 * spp}spp.exr"
     ordinary = map_render(open_exr(other)) if other.exists() else None
-    fused = fused_frames(lr, hr, scale)
+    fused = fused_frames(lr, hr, scale, SPREAD if spread else "")
     pixels = hr.load().layers
     plain = [timed(lambda: denoise(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]))[1] for _ in range(WARM_UP + 1)]
     oidn_seconds = plain[-1]
     rows = []
     for layers in hr.additive_sets:
         clean = layers_of(reference, layers_like(reference, layers))
-        for name, function in methods(lr, hr, fused, layers, ordinary):
+        for name, function in methods(lr, hr, fused, layers, ordinary, spread=spread):
             title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
@@ -282,6 +315,8 @@ def layout(rows: list[Row]) -> str:
     ]
     head = ["set", "spp", "method", *titles.values()]
     for column, peer in GAINS.items():
+        if not any(column in row for row in shown):
+            continue
         head.append(f"gain over {peer}, dB")
         for line, row in zip(body, shown, strict=True):
             gain = tuple(row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
@@ -312,6 +347,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
+    parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     results.add_option(parser)
     args = parser.parse_args()
@@ -325,7 +361,7 @@ def main() -> None:
             for scale in SCALES:
                 known = {tuple(row[k] for k in KEYS) for row in rows}
                 # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += measure(args.passes / scene, scale, spp, known)
+                rows += measure(args.passes / scene, scale, spp, known, spread=args.spread)
                 print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
         if args.table:
             add(args.table, rows)

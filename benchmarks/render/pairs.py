@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.render.film import CROP, frame_size, set_crop, write_exr
+from benchmarks.render.generated_frames import splat
 from datagen.mitsuba.start import start as start_mitsuba
 from datagen.views import FILTERS
 from oiio_msspl.model.contract import SCALES
@@ -73,7 +74,15 @@ def render(file: Path, folder: Path, pixel_filter: str, reference: int) -> None:
 
 
 def mean_of_samples(
-    scene: Any, camera: SensorCamera, size: tuple[int, int], spp: int, title: str, placing: Any, *, layers: bool
+    scene: Any,
+    camera: SensorCamera,
+    size: tuple[int, int],
+    spp: int,
+    title: str,
+    placing: Any,
+    *,
+    layers: bool,
+    spread: bool = False,
 ) -> NDArray[np.float64]:
     """Render samples in launches that fit into memory and average them: (h, w, 15), or (h, w, 3) without layers.
 
@@ -81,16 +90,21 @@ def mean_of_samples(
         size: width and height.
         title: the random numbers follow from it.
         placing: pixel filter of :mod:`datagen.mitsuba.trace`.
+        spread: each sample also counts in the pixels around, as with Mitsuba's default filter.
     """
-    from datagen.mitsuba.trace import render_passes
+    from datagen.mitsuba.trace import LAYERS as SAMPLED
+    from datagen.mitsuba.trace import render_samples
 
     per_launch = max(1, LAUNCH // (size[0] * size[1]))
-    total = np.zeros((size[1], size[0], 15 if layers else 3))
+    names = SAMPLED[:5] if layers else SAMPLED[:1]
+    total, weight = np.zeros((size[1], size[0], 3 * len(names))), np.zeros((size[1], size[0], 1))
     for done in range(0, spp, per_launch):
         count, seed = min(per_launch, spp - done), zlib.crc32(f"{title} {done}".encode())
-        passes = render_passes(scene, camera, size, count, seed, layers, pixel_filter=placing)  # type: ignore[arg-type]
-        total += passes.sum(axis=0, dtype=np.float64)
-    return total / spp
+        samples = render_samples(scene, camera, size, count, seed, names, pixel_filter=placing)  # type: ignore[arg-type]
+        values = np.concatenate([samples[name] for name in names], axis=-1)
+        sums = splat(values, samples["place"]) if spread else (values.sum(axis=0, dtype=np.float64), count)
+        total, weight = total + sums[0], weight + sums[1]
+    return total / np.maximum(weight, 1e-6)
 
 
 def main() -> None:

@@ -43,6 +43,7 @@ class FrameReport:
     """The same of values that were negative and set to 0."""
     warnings: list[str]
     tiles: int
+    """Of all views that were fused."""
     seconds: dict[str, float]
     """Wall time in seconds: ``read`` opens both files and loads the model, ``fuse`` reads pixels and fuses them,
     ``network`` is the part of ``fuse`` that the model's network took, and ``write`` writes EXR and preview."""
@@ -76,6 +77,12 @@ class FrameReport:
     def fused_views(self) -> list[FrameReport]:
         """The reports of all views that were fused, the first one in front; empty for a file with only one view."""
         return [self, *self.other_views] if self.hr.other_views else []
+
+    @property
+    def tiles_of_views(self) -> list[int]:
+        """Tiles of each view that was fused, the first one in front."""
+        others = [each.tiles for each in self.other_views]
+        return [self.tiles - sum(others), *others]
 
     def found_lrhs_aovs(self) -> dict[str, str]:
         """The features of ``lrhs_aovs`` that the LRHS has, with the layer of each."""

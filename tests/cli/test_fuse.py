@@ -11,6 +11,7 @@ import time
 import numpy as np
 import OpenImageIO as oiio
 import pytest
+from msspl_cli.commands.fuse import tiles_in_words
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
@@ -210,6 +211,27 @@ def test_a_stereo_pair_says_whose_layers_are_read(tmp_path, bilinear_models):
     done = fuse(tmp_path / "lr.exr", tmp_path / "hr.exr", *options, "--overwrite", "--view-layer", "left")
     assert done.stdout.startswith("Pair at x4, view left (also there: right)\n"), done.stderr
     assert "view right" not in done.stdout
+
+
+def test_views_are_not_counted_as_tiles(tmp_path, bilinear_models):
+    """Two view layers for each eye, each of which is one tile."""
+    for name, size in (("lr", (24, 32)), ("hr", (96, 128))):
+        channels = {}
+        for prefix in ("fg.Combined.", "bg.Combined.", "fg.Combined.right.", "bg.Combined.right."):
+            channels |= rgb(picture(*size), prefix)
+        write_exr(tmp_path / f"{name}.exr", channels, multiView=["left", "right"])
+    options = ("--model", bilinear_models[4], "--no-preview", "-o", tmp_path / "out.exr")
+    done = fuse(tmp_path / "lr.exr", tmp_path / "hr.exr", *options)
+    assert "views left/bg, right/bg, left/fg, right/fg\n" in done.stdout, done.stderr
+    assert re.search(r"\nFused with bilinear-x4 on the CPU in \d+\.\d s", done.stdout), done.stdout
+
+
+@pytest.mark.parametrize(
+    ("tiles", "text"),
+    [([1], ""), ([6], " in 6 tiles"), ([3, 3], " in 3 tiles a view"), ([3, 1], " in 1 to 3 tiles a view")],
+)
+def test_tiles_are_those_of_a_view(tiles, text):
+    assert tiles_in_words(tiles) == text
 
 
 @pytest.mark.parametrize("pattern", ["crypto*", "CRYPTO*", "viewlayer.crypto*", "*Crypto*"])

@@ -17,6 +17,7 @@ from msspl_cli.shot_printer import ShotPrinter
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
     from dask.distributed import Client
@@ -331,8 +332,16 @@ def _print(report: FrameReport, seconds: float) -> None:
     on_cpu = report.convolutions.get("CPUExecutionProvider", 0)
     if provider != "CPU" and on_cpu:
         where += f", {on_cpu} of {sum(report.convolutions.values())} convolutions on the CPU,"
-    tiles = f" in {report.tiles} tiles" if report.tiles > 1 else ""
+    tiles = tiles_in_words(report.tiles_of_views)
     steps = {"read": "loading", "fuse": "fusing", "write": "writing"}
     times = ", ".join(f"{report.seconds[key]:.1f} s {step}" for key, step in steps.items())
     console.say(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
     console.say(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))
+
+
+def tiles_in_words(tiles: Sequence[int]) -> str:
+    """In how many tiles each view was fused, from their numbers by view; empty if each view is one tile."""
+    least, most = min(tiles), max(tiles)
+    if most == 1:
+        return ""
+    return f" in {most if least == most else f'{least} to {most}'} tiles{' a view' if len(tiles) > 1 else ''}"

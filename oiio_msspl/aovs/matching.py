@@ -112,7 +112,7 @@ def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
 
 
 def _find_beauties(file: ExrFile, layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty]:
-    beauties = find_beauties(layers, candidates)
+    beauties = find_beauties(file, layers, candidates)
     if not beauties:
         names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
         raise InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 from oiio_msspl.aovs.renderers import view_layer_of
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.layers import Layer
+from oiio_msspl.exr.layers import Layer, views_of
 from oiio_msspl.exr.reader import ExrFile
 
 
@@ -32,8 +32,13 @@ def name_of(view: str) -> str:
     return view or "(unnamed)"
 
 
-def find_beauties(layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty]:
-    """The beauties of all views and view layers: the layers that match the first candidate that matches any."""
+def find_beauties(file: ExrFile, layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty]:
+    """The beauties of all views and view layers: the layers that match the first candidate that matches any.
+
+    They are in the order of the file. In a file with views, that order depends on whether views have parts of their
+    own, as a part keeps its channels sorted by name. So view layers are sorted by name there, and each one has its
+    default view in front: the first one of ``multiView``, or of the parts.
+    """
     for candidate in candidates:
         alias = candidate if isinstance(candidate, str) else candidate.get("layer", "")
         found = [
@@ -42,8 +47,13 @@ def find_beauties(layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty
             if (view_layer := view_layer_of(layer.name, alias)) is not None and layer.triple()
         ]
         if found:
-            return found
+            return _sorted_by_view_layer(file, found) if any(beauty.view for beauty in found) else found
     return []
+
+
+def _sorted_by_view_layer(file: ExrFile, beauties: list[Beauty]) -> list[Beauty]:
+    order = list(dict.fromkeys([*views_of(file), *(beauty.view for beauty in beauties)]))
+    return sorted(beauties, key=lambda each: (each.view_layer, order.index(each.view)))
 
 
 def choose_beauty(file: ExrFile, beauties: list[Beauty], wanted: str | None) -> Beauty:

@@ -48,7 +48,7 @@ def layers_of(file: ExrFile) -> list[Layer]:
 
     If two channels have the same view, layer and component (``foo.R`` and ``foo.red``), the layer holds the first.
     """
-    views = _views(file)
+    views = views_of(file)
     layers: dict[tuple[str, str], Layer] = {}
     for part in file.parts:
         for channel in part.channels:
@@ -79,7 +79,7 @@ def matches_layer(pattern: str, name: str, component: str = "") -> bool:
     return any(fnmatchcase(end, wanted) or fnmatchcase(f"{end}.{same_spelling(component)}", wanted) for end in ends)
 
 
-def _views(file: ExrFile) -> list[str]:
+def views_of(file: ExrFile) -> list[str]:
     """Views of OpenEXR's ``multiView`` attribute, the default view first."""
     views = file.metadata.get("multiView") or ()
     return [views] if isinstance(views, str) else [str(view) for view in views]

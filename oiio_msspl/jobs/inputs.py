@@ -32,7 +32,7 @@ class InputOptions:
     mapping: Mapping[str, Any] = field(default_factory=dict)
     """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
     view: str | None = None
-    """The only view or view layer to use; None for all, each file's first one in front."""
+    """The only view or view layer to use; None for all, the HRLS's first one in front."""
     lr_spp: float | None = None
     """Samples per pixel of the LRHS; None to read them from its header."""
     hr_spp: float | None = None
@@ -68,7 +68,8 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
         inputs: mapping, view and spp.
 
     Returns:
-        LRHS and HRLS. The LRHS has albedo and normal only if its file does.
+        LRHS and HRLS. The LRHS has albedo and normal only if its file does. It is mapped for the view of the HRLS, or
+        for its own first one if it lacks that.
 
     Raises:
         InputError: one of the files can't be used, both are the same, or their headers declare two colour spaces.
@@ -78,6 +79,8 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
         raise InputError(f"{lr_path}: given twice; give the low-resolution render, then the high-resolution one")
     lr_file, hr_file = open_exr(lr_path), open_exr(hr_path)
     lr, hr = _map_lrhs(lr_file, inputs), map_hrls(hr_file, inputs)
+    if hr.view in lr.other_views:
+        lr = _map_lrhs(lr_file, replace(inputs, view=hr.view))
     lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
     return lr, hr
 

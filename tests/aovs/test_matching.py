@@ -112,6 +112,36 @@ def test_stereo_views_of_one_part(tmp_path):
     assert left.read(left.data_window)["rgb"][0, 0, 0] == 2
 
 
+@pytest.mark.parametrize("views", [("left", "right"), ("right", "left")])
+@pytest.mark.parametrize("layers", [("fg", "bg"), ("bg", "fg")])
+@pytest.mark.parametrize("stored", ["one part", "one part, all named", "part by view", "part by layer"])
+def test_the_first_view_layer_is_the_same_however_views_are_stored(tmp_path, stored, layers, views):
+    """The first by name, as one part keeps no other order, in the default view."""
+    pairs = [(name, view) for name in layers for view in views]
+    path = tmp_path / "stereo.exr"
+    if stored.startswith("one part"):
+        default = "" if stored == "one part" else f".{views[0]}"
+        infix = {view: default if view == views[0] else f".{view}" for view in views}
+        channels = {}
+        for name, view in pairs:
+            channels |= layer(f"{name}.Combined{infix[view]}", 1)
+        write_exr(path, channels, multiView=list(views))
+    else:
+        if stored == "part by view":
+            pairs.sort(key=lambda pair: views.index(pair[1]))
+        header = {"type": OpenEXR.scanlineimage}
+        parts = [
+            OpenEXR.Part(header | {"view": view}, layer(f"{name}.Combined", 1), f"{name}.Combined.{view}")
+            for name, view in pairs
+        ]
+        with OpenEXR.File(parts) as file:
+            file.write(str(path))
+    render = map_render(open_exr(path))
+    first, second = views
+    assert render.view == f"{first}/bg"
+    assert render.other_views == [f"{second}/bg", f"{first}/fg", f"{second}/fg"]
+
+
 @pytest.mark.parametrize("samples", ["inf", "nan", "0", "-4", "1e999", "many"])
 def test_a_header_without_a_number_of_samples_says_nothing(tmp_path, samples):
     attributes = {"cycles.ViewLayer.samples": samples}

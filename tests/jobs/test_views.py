@@ -146,6 +146,14 @@ def test_a_view_without_partner_is_passed_on_with_one_sentence(tmp_path, bilinea
         fused(pair, tmp_path / "out.exr", bilinear_models, "bg")
 
 
+def test_the_first_view_is_that_of_the_hrls_in_both_renders(tmp_path, bilinear_models):
+    """Whatever the order in the LRHS."""
+    report, out = fused(write_layers(tmp_path), tmp_path / "out.exr", bilinear_models)
+    report, other = fused(write_layers(tmp_path, low=("bg", "fg")), tmp_path / "other.exr", bilinear_models)
+    assert (report.lr.view, report.hr.view) == ("fg", "fg")
+    assert all(same_bits(other[name], pixels) for name, pixels in out.items())
+
+
 def test_a_plain_lrhs_is_the_partner_of_the_first_view_alone(tmp_path, bilinear_models):
     _, hr = write_layers(tmp_path)
     clean = downsample(sum(beauty("fg").values()), 4).astype(np.float32)

@@ -76,6 +76,8 @@ class HrlsAverages:
         albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
         normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
             none.
+        normal_noise: how long that difference would be, root mean square, by the noise of the normals alone; None as
+            above.
         blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
             difference of luminance, and how large it would be by the noise of the HRLS alone.
         noisy_pixels, equal_pixels: LRHS pixels over which the HRLS is noisy, and those of them that equal one of its
@@ -91,6 +93,7 @@ class HrlsAverages:
         self._centre = Window(columns.start, rows.start, columns.stop, rows.stop).shift(grid.x0, grid.y0)
         self.albedo: Array | None = None
         self.normal_edges: Array | None = None
+        self.normal_noise: Array | None = None
         self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
         self.noisy_pixels = self.equal_pixels = 0
         self.is_lost = True
@@ -117,9 +120,13 @@ class HrlsAverages:
                 self.albedo = np.zeros(size, np.float32)
             self.albedo[target] = luminance(box_downsample(_hrls_pixels(pair, ALBEDO, window), pair.scale))
         if NORMAL in pair.hrls:
-            if self.normal_edges is None:
-                self.normal_edges = np.zeros(size, np.float32)
-            normal = box_downsample(_hrls_pixels(pair, NORMAL, window), pair.scale)
+            if self.normal_edges is None or self.normal_noise is None:
+                self.normal_edges, self.normal_noise = np.zeros(size, np.float32), np.zeros(size, np.float32)
+            pixels = _hrls_pixels(pair, NORMAL, window)
+            variance = box_downsample(_noise_variance(pixels).sum(axis=-1), pair.scale // 2)
+            # Means over scale x scale pixels, in two differences of two of them each.
+            self.normal_noise[target] = np.sqrt(variance) * np.float32(2 / pair.scale)
+            normal = box_downsample(pixels, pair.scale)
             steps = [np.diff(normal, axis=axis, append=normal.take([-1], axis)) for axis in (0, 1)]
             self.normal_edges[target] = np.sqrt(sum(np.square(step).sum(axis=-1) for step in steps))
 
@@ -127,10 +134,7 @@ class HrlsAverages:
         """Sum ``blocks`` over a tile whose first pixel is (x, y). ``mean``: the HRLS over the LRHS's pixels."""
         scale = self.alignment.scale
         pixels, grey = luminance(high), luminance(low)
-        quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
-        # Gradients and straight edges cancel out of a diagonal difference, and the variance of noise is a quarter.
-        variance = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
-        expected = box_downsample(variance, scale // 2) / np.float32(scale**2)
+        expected = box_downsample(_noise_variance(pixels), scale // 2) / np.float32(scale**2)
         # Black pixels are equal in any two renders where light is rare.
         noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
         phases = itertools.product(range(scale), repeat=2)
@@ -145,6 +149,16 @@ class HrlsAverages:
             values = np.add.reduceat(values, first, axis).astype(np.float64)
         top, left = y // BLOCK, x // BLOCK
         self.blocks[top : top + values.shape[0], left : left + values.shape[1]] += values
+
+
+def _noise_variance(pixels: Array) -> Array:
+    """Variance by noise (h / 2, w / 2, ...) of the pixels (h, w, ...), over 2 x 2 of them each.
+
+    Gradients and straight edges cancel out of a diagonal difference, and the variance of noise is a quarter.
+    """
+    quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+    variance: Array = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
+    return variance
 
 
 def _hrls_pixels(pair: TilePair, feature: str, window: Window) -> Array:
@@ -212,7 +226,7 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
                 f"the {name} is black outside of a rectangle, where the {other} is lit: was a render region on?"
             )
     framing = in_background(lambda: find_framing(low, high))
-    foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges))
+    foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
     if _shares_noise(hrls):
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "

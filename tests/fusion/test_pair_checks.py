@@ -245,3 +245,40 @@ def test_an_albedo_of_another_frame_is_noticed_under_noise():
     high = Render.from_arrays("hr", rgb=noisy(colour, 0.2, seed=200), albedo=scene(2, seed=60)[1], normal=normal)
     (warning,) = check_renders(low, high)
     assert "the albedo's edges are not in the picture" in warning
+
+
+def moving_pair(scale, seed, spp, reach):
+    """A grey relief in front of a wall with pictures on it. It moves sideways by so many HRLS pixels during exposure,
+    and each sample shows it at a time of its own: the HRLS's normal is noise there, and the LRHS is blurred."""
+    rng = np.random.default_rng(seed)
+    albedo, relief = scene(scale, seed)[1], scene(scale, seed + 500)[2]
+    height, width = albedo.shape[:2]
+    y, x = np.mgrid[:height, :width]
+    shaded = 0.65 * (0.5 + 0.5 * np.maximum(relief @ (0.5, 0.5, 0.7), 0))[..., None].repeat(3, -1)
+
+    def sample():
+        moved = x - np.round((rng.random((height, width)) - 0.5) * reach).astype(int)
+        covered = ((np.abs(moved - width / 2) < 0.15 * width) & (np.abs(y - height / 2) < 0.15 * height))[..., None]
+        moved = np.clip(moved, 0, width - 1)
+        colour, normal = (
+            np.where(covered, shaded[y, moved], 1.3 * albedo),
+            np.where(covered, relief[y, moved], (0, 0, 1)),
+        )
+        return np.stack([colour * rng.gamma(4, 0.25, (height, width, 1)), normal])
+
+    (high, normal), (low, _) = (sum(sample() for _ in range(n)) / n for n in (spp, 4 * spp))
+    low = Render.from_arrays("lr", rgb=downsample(low, scale).astype(np.float32))
+    return low, Render.from_arrays("hr", rgb=high.astype(np.float32), normal=normal.astype(np.float32))
+
+
+@pytest.mark.parametrize(("scale", "spp", "seed"), [(2, 1, 2), (2, 1, 5), (2, 3, 2), (4, 1, 2), (4, 1, 5)])
+def test_normals_under_motion_blur_are_not_judged(scale, spp, seed):
+    assert check_renders(*moving_pair(scale, seed, spp, reach=24 * scale)) == []
+
+
+def test_normals_of_another_frame_are_noticed_beside_a_little_motion_blur():
+    """Most of their edges stand still."""
+    high = moving_pair(2, 0, 1, 16)[1].layers["normal"]
+    other = scene(2, seed=50)[2]
+    other[40:88, 70:120] = high[40:88, 70:120]
+    assert [w for w in warnings(2, normal=other) if "the normal's edges are not in the picture" in w]

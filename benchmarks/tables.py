@@ -37,7 +37,7 @@ from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
 from benchmarks.temporal import report as temporal_report
-from benchmarks.temporal.methods import ALONE, NEIGHBOURS, QUALITIES
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, OIDN_SPLIT, QUALITIES
 from benchmarks.temporal.methods import SCALES as TEMPORAL_SCALES
 from benchmarks.temporal.sequence import MASKS
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
@@ -437,6 +437,29 @@ def over_time() -> str:
     return temporal_report.layout(results.read("temporal"))
 
 
+def over_time_spread() -> str:
+    """The same where the pixel filter has spread the noise, beside OIDN on every second pixel."""
+    rows = results.read("temporal_spread")
+    found = results.index(rows, "sequence", "scale", "method")
+    body = []
+    for (name, prefix), row in itertools.product(QUALITIES.items(), rows):
+        if row["method"] != prefix + NEIGHBOURS:
+            continue
+        sequence, scale = row["sequence"], row["scale"]
+        alone, peer, usual = (
+            found[key]
+            for key in ((sequence, scale, prefix + ALONE), (sequence, 1, OIDN_SPLIT), (sequence, 1, OIDN_BEST))
+        )
+        gains = [row["psnr"] - other["psnr"] for other in (alone, peer, usual)]
+        flicker = [row["flicker"] / other["flicker"] for other in (alone, peer)]
+        least = min((row[mask] - alone[mask], mask) for mask in MASKS if mask in row)
+        cells = [f"`{name}`", sequence, f"x{scale}", f"{row['psnr']:.2f}", *(f"{gain:+.2f}" for gain in gains)]
+        body.append([*cells, *(f"{ratio:.2f}" for ratio in flicker), f"{least[0]:+.2f} ({least[1]})"])
+    head = ["quality", "sequence", "scale", "PSNR", "over single frames, dB", "over OIDN on every second pixel, dB"]
+    head += ["over OIDN prefiltered, dB", "flicker, of single frames'", "of OIDN's on every second pixel"]
+    return results.markdown([*head, "least gain in a mask, dB"], body)
+
+
 def without_vectors() -> str:
     """What averaging gains if the HRLS has no motion vectors, beside what it gains with them."""
     tables = [results.read(name) for name in ("temporal_without_vectors", "temporal")]
@@ -552,6 +575,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         division,
         errors,
         over_time,
+        over_time_spread,
         without_vectors,
         stability,
         pair_checks,

@@ -2,6 +2,7 @@
 """Renders short sequences for `benchmarks.temporal`, with Mitsuba 3.
 
     python -m benchmarks.render.sequences SEQUENCES --scenes SCENES
+    python -m benchmarks.render.sequences SPREAD --scenes SCENES --spread
 
 Two scenes from files get two sequences each. In ``static`` the frames differ only by their noise. In ``moving`` the
 camera pans and trucks, so that near surfaces move faster. A room of our own gets the animations of
@@ -16,7 +17,8 @@ camera pans and trucks, so that near surfaces move faster. A room of our own get
 
 ``motionBack`` and ``motionFore`` say where the surface of a pixel was in the frame before, and will be in the next
 one, in HRLS pixels from here, x to the right and y downwards. They are exact: the positions that rays hit, moved with
-their object and projected. The name of a file gives its seed. Files that exist are kept.
+their object and projected. The name of a file gives its seed. Files that exist are kept. With ``--spread``, each sample
+counts in the pixels around it, too, in layers as in the beauty.
 """
 
 from __future__ import annotations
@@ -183,7 +185,7 @@ def motion(shown: Array, scene: Any, at: float, other: float) -> Array:
     return np.asarray(there - scene.camera(at).project(positions))
 
 
-def render_sequence(mi: Any, scene: Any, folder: Path) -> None:
+def render_sequence(mi: Any, scene: Any, folder: Path, pixel_filter: str) -> None:
     """Render the files of a sequence that do not exist yet."""
     path_tracer = {"type": "path", "max_depth": MAX_DEPTH, "rr_depth": 4}
     integrator = mi.load_dict(path_tracer)
@@ -207,14 +209,24 @@ def render_sequence(mi: Any, scene: Any, folder: Path) -> None:
                 continue
             seed = zlib.crc32(f"{folder.parent.name}/{folder.name}/{paths[kind].name}".encode())
             tracer = integrator if kind.startswith("ref") else with_aovs
-            image = _shoot(mi, room.scene, tracer, scene, camera, spp, scale, seed)
+            image = _shoot(mi, room.scene, tracer, scene, camera, spp, scale, seed, pixel_filter)
             if kind == "hr":
                 write_exr(paths[kind], np.concatenate([image, vectors], axis=-1), (*CHANNELS, *MOTION), "float")
             else:
                 write_exr(paths[kind], image[..., :9], CHANNELS)
 
 
-def _shoot(mi: Any, loaded: Any, integrator: Any, scene: Any, camera: Camera, spp: int, scale: int, seed: int) -> Array:
+def _shoot(
+    mi: Any,
+    loaded: Any,
+    integrator: Any,
+    scene: Any,
+    camera: Camera,
+    spp: int,
+    scale: int,
+    seed: int,
+    pixel_filter: str,
+) -> Array:
     """A frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
     angle = np.degrees(2 * np.arctan(scene.size[0] / 2 / camera.focal))
     lens = {"type": "perspective"}
@@ -222,7 +234,7 @@ def _shoot(mi: Any, loaded: Any, integrator: Any, scene: Any, camera: Camera, sp
         lens = {"type": "thinlens", "aperture_radius": camera.aperture, "focus_distance": camera.focus}
     sensor = mi.load_dict({
         **lens, "fov": angle, "fov_axis": "x", "to_world": mi.ScalarTransform4f(camera.to_world),
-        "film": {"type": "hdrfilm", "rfilter": {"type": "box"}, "pixel_format": "rgb"},
+        "film": {"type": "hdrfilm", "rfilter": {"type": pixel_filter}, "pixel_format": "rgb"},
         "sampler": {"type": "independent"},
     })  # fmt: skip
     size, offset = ([v // scale for v in values] for values in (scene.size, scene.offset))
@@ -246,6 +258,7 @@ def main() -> int:
     parser.add_argument("folder", type=Path)
     parser.add_argument("--scenes", type=Path, required=True, help="a folder with a scene.xml for each scene")
     parser.add_argument("--sequence", action="append", default=[], help=f"default: all of {', '.join(names)}")
+    parser.add_argument("--spread", action="store_true", help="with Mitsuba's default filter, which spreads samples")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     try:
@@ -257,7 +270,7 @@ def main() -> int:
                 raise InputError(f"{name}: no such sequence, or no {file}; --sequence takes {', '.join(names)}")
             start = time.perf_counter()
             made = _AnimatedRoom(kind) if scene == "room" else _FileScene(mi, file, moving=kind == "moving")
-            render_sequence(mi, made, args.folder / scene / kind)
+            render_sequence(mi, made, args.folder / scene / kind, "gaussian" if args.spread else "box")
             print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
     except ImportError:
         print("rendering needs Mitsuba 3: pip install '.[train]'", file=sys.stderr)

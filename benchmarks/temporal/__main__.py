@@ -4,6 +4,7 @@
     python -m benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m datagen.cycles.sequence SEQUENCES
     python -m benchmarks.temporal SEQUENCES --table benchmarks/results/temporal.csv
+    python -m benchmarks.temporal SPREAD --spread --table benchmarks/results/temporal_spread.csv
 
 The things in ``cycles/slide`` move to the side alone, so its pixels don't tell which way y points. If the benchmark
 says so, give that sequence Blender's format, in one line::
@@ -69,6 +70,7 @@ def main() -> int:
     parser.add_argument(
         "--without-vectors", action="store_true", help="leave the motion vectors of Mitsuba's sequences out"
     )
+    parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
     parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
@@ -104,7 +106,7 @@ def run(args: argparse.Namespace) -> None:
         options = TemporalOptions(args.temporal, args.motion_format)
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
-            made = list(all_methods(judged, options, args.methods))
+            made = list(all_methods(judged, options, args.methods, spread=args.spread))
         of_sequence = list(measure(sequence, made, with_jod=args.jod))
         print(layout(of_sequence) if args.methods == "*" else details(of_sequence), flush=True)
         rows += of_sequence

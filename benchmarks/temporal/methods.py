@@ -10,7 +10,7 @@ from functools import partial
 
 import numpy as np
 
-from benchmarks.peers import oidn, oidn_prefiltered
+from benchmarks.peers import oidn, oidn_prefiltered, oidn_split
 from benchmarks.temporal.sequence import Sequence
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.arrays import Array
@@ -20,10 +20,12 @@ from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Frame, find_shot
+from oiio_msspl.jobs.shot_checks import model_of_shot
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, plan_temporal
 
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
+OIDN_SPLIT = "OIDN on every second pixel"
 OIDN, OIDN_BEST, OIDN_NEIGHBOURS = "OIDN", "OIDN prefiltered", "OIDN prefiltered, with neighbours"
 SCALES = (2, 4)
 #: The qualities that are measured: what the names of their methods begin with.
@@ -43,15 +45,18 @@ class Made:
     """How the motion is known; empty for single frames."""
 
 
-def all_methods(sequence: Sequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*") -> Iterator[Made]:
+def all_methods(
+    sequence: Sequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*", *, spread: bool = False
+) -> Iterator[Made]:
     """Each method on a sequence whose name matches the pattern.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
     are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``options`` say which
-    neighbours are averaged.
+    neighbours are averaged. If a pixel filter has ``spread`` the noise, OIDN also reads every second pixel.
     """
     full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
-    for name, denoised in ((OIDN, oidn), (OIDN_BEST, oidn_prefiltered)):
+    peers = {OIDN: oidn, OIDN_BEST: oidn_prefiltered} | ({OIDN_SPLIT: oidn_split} if spread else {})
+    for name, denoised in peers.items():
         if fnmatchcase(name, pattern):
             yield Made(name, 1, np.stack([denoised(render) for render in full]))
     for scale in SCALES:
@@ -67,9 +72,10 @@ def _by_scale(
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     # More threads only wait for each other: the pictures are small.
+    models = {quality: model_of_shot(shot, InputOptions(), quality) for quality in QUALITIES}
     by_quality = {
-        quality: Stages(model=quality, threads=1, temporal=plan_temporal(shot, InputOptions(), options, quality))
-        for quality in QUALITIES
+        quality: Stages(model=model, threads=1, temporal=plan_temporal(shot, InputOptions(), options, model))
+        for quality, model in models.items()
     }
     stages = by_quality["best"]
 

@@ -36,6 +36,7 @@ from training.checkpoints import load
 from training.ensemble import EnsembleFusion
 from training.export import denoiser_for, network_example
 from training.joint import JointFusion
+from training.layer_denoisers import LayerDenoisers
 from training.mean_denoiser import ALIGNMENT, MeanDenoiser
 from training.oidn import FineTunedUNet
 from training.tracing import traced
@@ -46,14 +47,17 @@ PRECISION = {"precision": "convolutions in half floats, their weights stored in 
 
 
 class Fuse(nn.Module):
-    """:meth:`JointFusion.fuse` as a module for the exporter."""
+    """:meth:`JointFusion.fuse` as a module for the exporter; the size ``large`` also returns the denoised albedo and
+    normal, in [0, 1]."""
 
     def __init__(self, network: JointFusion) -> None:
         super().__init__()
         self.network = network
 
-    def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-        return self.network.fuse(lrhs, hrls)
+    def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, ...]:
+        prepared = self.network.prepared(hrls)
+        fused = self.network.fuse_prepared(lrhs, prepared)
+        return fused if self.network.layers is None else (*fused, prepared[:, 3:6], 0.5 * prepared[:, 6:9] + 0.5)
 
 
 P = TypeVar("P", JointFusion, FineTunedUNet)
@@ -71,16 +75,23 @@ def joint_in_half_floats(network: JointFusion) -> JointFusion:
     network = in_half_floats(network)
     network.heads.half()
     network.error.half()
+    if network.layers is not None:
+        network.layers = layers_in_half_floats(network.layers)
     return network
+
+
+def layers_in_half_floats(layers: LayerDenoisers) -> LayerDenoisers:
+    """A copy of the denoisers of albedo and normal."""
+    layers = copy.deepcopy(layers)
+    layers.albedo, layers.normal = in_half_floats(layers.albedo), in_half_floats(layers.normal)
+    return layers
 
 
 def ensemble_in_half_floats(ensemble: EnsembleFusion) -> EnsembleFusion:
     """A copy of an ensemble whose convolutions compute in half floats."""
-    layers = copy.deepcopy(ensemble.layers)
-    layers.albedo, layers.normal = in_half_floats(layers.albedo), in_half_floats(layers.normal)
     weights = copy.deepcopy(ensemble.weights).half()
     result = EnsembleFusion(joint_in_half_floats(ensemble.joint), in_half_floats(ensemble.large), weights)
-    result.layers = layers
+    result.layers = layers_in_half_floats(ensemble.layers)
     return result.eval()
 
 
@@ -89,7 +100,8 @@ def to_onnx(network: JointFusion | EnsembleFusion, contract: Contract, denoiser:
     """The whole model of a network in half floats, with a denoiser in half floats."""
     joint, module = (network, Fuse(network)) if isinstance(network, JointFusion) else (network.joint, network)
     inputs = network_example(joint, contract.scale, contract.alignment)
-    outputs = ["fused", "log_error", *(["albedo", "normal"] if isinstance(network, EnsembleFusion) else [])]
+    denoises_layers = isinstance(network, EnsembleFusion) or network.layers is not None
+    outputs = ["fused", "log_error", *(["albedo", "normal"] if denoises_layers else [])]
     graph = traced(module, inputs, ["lrhs", "hrls"], outputs, contract.alignment)
     _store_kernels_in_8_bits(graph.graph)
     contract = replace(contract, provenance=contract.provenance | PRECISION)

@@ -8,7 +8,7 @@
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
 computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`). Files of several scales share their
-weights; ``-x2.onnx`` and so on are added to ``--name`` and to the output.
+weights, in ``NAME.weights``. ``-x2`` and so on are then added to ``--name``, and ``-x2.onnx`` to the output.
 """
 
 from __future__ import annotations
@@ -306,6 +306,8 @@ def main() -> None:
     if isinstance(network, JointFusion):
         if not args.int8:
             raise SystemExit("a joint network can only be exported with --int8")
+        if len({each.denoiser for each in contracts}) > 1:
+            raise SystemExit("--scale: these scales have other denoisers of both renders' mean; export each alone")
         prepare = with_denoised_mean(denoiser_for(network, contracts[0].denoiser))
         graphs = joint_to_onnx(network, contracts, joint.calibration_pairs(args.int8, scales, prepare))
     else:

@@ -183,10 +183,7 @@ class JointFusion(nn.Module):
 
     def prepared(self, hrls: Tensor) -> Tensor:
         """The HRLS (N, 9 or more, H, W) as the U-Net reads it: the size ``large`` denoises albedo and normal first."""
-        if self.layers is None:
-            return hrls
-        albedo, normal = self.layers(hrls[:, 3:6], hrls[:, 6:9])
-        return torch.cat([hrls[:, :3], albedo, 2 * normal - 1], dim=1)
+        return hrls if self.layers is None else self.layers.applied(hrls)
 
     def fuse_prepared(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
         """As :meth:`fuse`, for an HRLS of :meth:`prepared`."""

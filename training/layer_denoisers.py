@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor, nn
 
 from training.encoding import from_srgb, srgb
@@ -31,3 +32,8 @@ class LayerDenoisers(nn.Module):
             Both denoised, in [0, 1].
         """
         return from_srgb(self.albedo.run(srgb(albedo)).clamp(0, 1)), self.normal.run(0.5 * normal + 0.5).clamp(0, 1)
+
+    def applied(self, hrls: Tensor) -> Tensor:
+        """An encoded HRLS (N, 9 or more, H, W) with denoised albedo and normal, (N, 9, H, W)."""
+        albedo, normal = self(hrls[:, 3:6], hrls[:, 6:9])
+        return torch.cat([hrls[:, :3], albedo, 2 * normal - 1], dim=1)

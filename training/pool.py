@@ -11,7 +11,7 @@ a file of POOL, and goes on with the views that a renderer adds, until it is sto
 GPU. Each batch has crops of some of them, mirrored, turned, and with permuted colours.
 
 With ``--denoise``, pairs are those that the size ``large`` of `joint` reads: albedo, normal and the mean of both
-renders are denoised. Every second pair then has noise that the pixel filter has spread.
+renders are denoised. Of views with single samples, every second pair then has noise that the pixel filter has spread.
 
 References that were stored with their noise (:mod:`datagen.mitsuba.render_samples`) become the mean of the rendered
 and of a denoised one: half of the noise is left, and half of what a denoiser gets wrong.
@@ -20,6 +20,7 @@ and of a denoised one: half of the noise is left, and half of what a denoiser ge
 from __future__ import annotations
 
 import argparse
+import functools
 import logging
 import os
 import time
@@ -66,16 +67,29 @@ class Denoisers:
     Args:
         joints: two ``joint`` networks, for independent noise and for spread noise. Their denoisers of both renders'
             mean prepare pairs for the size ``large``; none for pairs of the other sizes.
+
+    Raises:
+        SystemExit: the networks are others.
     """
 
     def __init__(self, joints: Sequence[JointFusion], device: torch.device) -> None:
-        self.means = [self._moved(joint.mean_denoiser, device) for joint in joints if joint.mean_denoiser is not None]
-        self.layers = self._moved(LayerDenoisers(), device)
-        self.large = self._moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)), device)
+        self.device = device
+        self.means = [self._moved(joint.mean_denoiser) for joint in joints if joint.mean_denoiser is not None]
+        if joints and (len(self.means) != 2 or [joint.spread for joint in joints] != [False, True]):
+            raise SystemExit("--denoise: give a joint network for independent noise, then one for spread noise")
 
-    @staticmethod
-    def _moved(network: M, device: torch.device) -> M:
-        return network.requires_grad_(False).to(device, memory_format=torch.channels_last)
+    @functools.cached_property
+    def layers(self) -> LayerDenoisers:
+        """The networks for albedo and normal."""
+        return self._moved(LayerDenoisers())
+
+    @functools.cached_property
+    def large(self) -> FineTunedUNet:
+        """OIDN's large network."""
+        return self._moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)))
+
+    def _moved(self, network: M) -> M:
+        return network.requires_grad_(False).to(self.device, memory_format=torch.channels_last)
 
     def reference(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         """The mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
@@ -86,8 +100,7 @@ class Denoisers:
 
     def prepared(self, lrhs: Tensor, hrls: Tensor, kind: int) -> tuple[Tensor, Tensor]:
         """The arguments of :meth:`JointFusion.fuse_prepared` for those of :meth:`JointFusion.forward`."""
-        albedo, normal = self.layers(hrls[:, 3:6], hrls[:, 6:9])
-        return denoise_mean(self.means[kind], lrhs, hrls), torch.cat([hrls[:, :3], albedo, 2 * normal - 1], dim=1)
+        return denoise_mean(self.means[kind], lrhs, hrls), self.layers.applied(hrls)
 
 
 @torch.no_grad()
@@ -195,8 +208,11 @@ class PooledBatches:
             self.loaded.add(file)
             for pair in torch.load(file, weights_only=True):
                 spread = pair.pop(SPREAD_NOISE, None)
-                if self.spread is not None and self.spread != bool(spread):
-                    continue
+                if self.spread is not None:
+                    if spread is None:
+                        raise SystemExit(f"{file}: does not tell spread noise apart; draw pairs with --denoise")
+                    if self.spread != bool(spread):
+                        continue
                 scale = pair["hrls"].shape[-1] // pair["lrhs"].shape[-1]
                 if scale in self.pairs and pair["hrls"].shape[-1] >= self.patch:
                     self.pairs[scale].append({name: image.to(self.device) for name, image in pair.items()})
@@ -257,6 +273,8 @@ def main() -> None:
     torch.set_num_threads(1)
     device = torch.device(args.device)
     joints = [checkpoints.load(path)[0] for path in args.denoise]
+    if not all(isinstance(each, JointFusion) for each in joints):
+        raise SystemExit("--denoise: give checkpoints of joint networks")
     denoisers = Denoisers([each for each in joints if isinstance(each, JointFusion)], device)
     fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, device, denoisers)
 

@@ -166,7 +166,7 @@ class Run:
         self.device = torch.device(
             args.device if args.device != "auto" else "cuda" if torch.cuda.is_available() else "cpu"
         )
-        torch.backends.cudnn.benchmark = True  # all batches have the same size
+        torch.backends.cudnn.benchmark = True  # batches of a scale have one size
         self.checkpoint_path, self.best_path = args.out / "checkpoint.pt", args.out / "best.pt"
         self.step, self.elapsed, self.best_gain = 0, 0.0, -math.inf
 
@@ -178,6 +178,10 @@ class Run:
 
         # Network: from the last checkpoint, from another run, or new
         self.network = new_network(args)
+        #: It reads pairs that only a pool has.
+        self.large = isinstance(self.network, JointFusion) and self.network.mean_denoiser is None
+        if self.large and not args.pool:
+            raise SystemExit("--size large: needs a --pool of pairs that training.pool has drawn with --denoise")
         state = checkpoints.read(self.checkpoint_path) if self.checkpoint_path.exists() else None
         if state is None and args.init:
             checkpoints.warm_start(self.network, args.init)
@@ -300,6 +304,8 @@ class Run:
 
     def evaluate(self) -> dict[str, float]:
         """Scores of the averaged weights on the validation views of the run's start."""
+        if self.large:
+            return {}
         if not self.validation:  # views that are added later would make scores incomparable
             prepare = preparation(self.args.network)
             for view in self.folder.split("validation")[: self.args.val_views]:

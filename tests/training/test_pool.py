@@ -69,6 +69,18 @@ def test_pairs_for_the_large_size_are_denoised_before(sample_folder: Path) -> No
     assert fused.shape == (1, 3, 128, 128)
 
 
+def test_networks_in_the_wrong_order_are_refused() -> None:
+    pytest.importorskip("pyoidn")
+    joints = [checkpoints.load(CHECKPOINTS / name)[0] for name in ("joint_spread.pt", "joint.pt")]
+    with pytest.raises(SystemExit, match="independent noise, then one for spread noise"):
+        Denoisers(joints, CPU)
+
+
+def test_pairs_that_do_not_tell_their_noise_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(SystemExit, match="draw pairs with --denoise"):
+        PooledBatches(write_pool(tmp_path, 2), (2,), 64, 1, 0, CPU, spread=True).load()
+
+
 def write_pool(folder: Path, scale: int) -> Path:
     """A pair whose images are one gradient, with another offset for each channel."""
     place = torch.arange(160 * 160).reshape(1, 160, 160) / 160**2 + torch.arange(3).reshape(3, 1, 1)

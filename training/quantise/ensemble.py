@@ -103,7 +103,7 @@ class Results(Nodes):
         step = self.constant("step", np.float32(1 / 255))
         layers = ["albedo", "normal", *([self.log_to_pu("joint")] if noise else [])]
         rounded = [self.add("QuantizeLinear", [image, step, "zero"], f"{image}.rounded") for image in layers]
-        # As many as :func:`training.quantise.joint.concatenated` appends
+        # As many as :func:`training.quantise.gptq.concatenated` appends
         packed = self.packed([*slices, *rounded, *[zeros] * (2 if noise else 1)], "colour.layers")
         pixels = self.look_up("unseen", self._run(networks["colour"], "colour", packed), "large.pixels")
         self.add("Transpose", [pixels], "large", perm=[0, 3, 1, 2])

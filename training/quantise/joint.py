@@ -152,15 +152,13 @@ class JointGraph(Graph):
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
         step, half_step = self.constant("step", np.float32(1 / 255)), self.constant("half_step", np.float32(1 / 127.5))
         zeros = self.zeros(albedo)
-        clean = {}
         if self._layers:
             add_layers(self, self._layers, albedo, normal, zeros)
-            clean = {albedo: "albedo"}
+            albedo = "albedo"
             normal_codes = self.add("QuantizeLinear", ["normal", step, "zero"], "normal.rounded")
         else:
             middle = self.constant("middle", np.uint8(SIGNED_ZERO))
             normal_codes = self.add("QuantizeLinear", [normal, half_step, middle], "normal.rounded")
-        albedo = clean.get(albedo, albedo)
         albedo_codes = self.add("QuantizeLinear", [albedo, step, "zero"], "albedo.rounded")
         colours = self.slices(self.log_to_pu(colour), HRLS_SLICES)
         full = self.packed([*colours, albedo_codes, normal_codes, zeros], "full")
@@ -188,7 +186,7 @@ class JointGraph(Graph):
             if level == 1:
                 phases = self.cut(planes, OUTPUTS[level], len(self.fit.layers[name].step), "log_error.phases")
                 self.add("DepthToSpace", [phases], "log_error", blocksize=2, mode="CRD")
-        self.embed(mixing, "mix.", clean)
+        self.embed(mixing, "mix.", {"hrls.albedo": albedo})
         return self.finished("joint", inputs, outputs)
 
     def _planes(self, layer: str, start: int, count: int) -> str:

@@ -37,7 +37,7 @@ from benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
 from benchmarks.stability import report as stability_report
 from benchmarks.temporal import report as temporal_report
-from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, OIDN_SPLIT, QUALITIES
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, OIDN_SPLIT, OIDN_SPLIT_NEIGHBOURS, QUALITIES
 from benchmarks.temporal.methods import SCALES as TEMPORAL_SCALES
 from benchmarks.temporal.sequence import MASKS
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
@@ -446,17 +446,16 @@ def over_time_spread() -> str:
         if row["method"] != prefix + NEIGHBOURS:
             continue
         sequence, scale = row["sequence"], row["scale"]
-        alone, peer, usual = (
-            found[key]
-            for key in ((sequence, scale, prefix + ALONE), (sequence, 1, OIDN_SPLIT), (sequence, 1, OIDN_BEST))
-        )
-        gains = [row["psnr"] - other["psnr"] for other in (alone, peer, usual)]
-        flicker = [row["flicker"] / other["flicker"] for other in (alone, peer)]
+        alone, averaged_peer = (found[sequence, scale, method] for method in (prefix + ALONE, OIDN_SPLIT_NEIGHBOURS))
+        usual, peer = (found[sequence, 1, method] for method in (OIDN_BEST, OIDN_SPLIT))
+        gains = [row["psnr"] - other["psnr"] for other in (alone, usual, peer, averaged_peer)]
+        flicker = [row["flicker"] / other["flicker"] for other in (alone, peer, averaged_peer)]
         least = min((row[mask] - alone[mask], mask) for mask in MASKS if mask in row)
         cells = [f"`{name}`", sequence, f"x{scale}", f"{row['psnr']:.2f}", *(f"{gain:+.2f}" for gain in gains)]
         body.append([*cells, *(f"{ratio:.2f}" for ratio in flicker), f"{least[0]:+.2f} ({least[1]})"])
-    head = ["quality", "sequence", "scale", "PSNR", "over single frames, dB", "over OIDN on every second pixel, dB"]
-    head += ["over OIDN prefiltered, dB", "flicker, of single frames'", "of OIDN's on every second pixel"]
+    head = ["quality", "sequence", "scale", "PSNR", "over single frames, dB", "over OIDN prefiltered, dB"]
+    head += ["over OIDN on every second pixel, dB", "over that with neighbours, dB", "flicker, of single frames'"]
+    head += ["of OIDN's on every second pixel", "of that with neighbours"]
     return results.markdown([*head, "least gain in a mask, dB"], body)
 
 

@@ -15,6 +15,7 @@ from benchmarks.temporal.sequence import Sequence
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.render_average import RenderPair, average_renders
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
@@ -25,8 +26,8 @@ from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, plan_temporal
 
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
-OIDN_SPLIT = "OIDN on every second pixel"
-OIDN, OIDN_BEST, OIDN_NEIGHBOURS = "OIDN", "OIDN prefiltered", "OIDN prefiltered, with neighbours"
+OIDN, OIDN_BEST, OIDN_SPLIT = "OIDN", "OIDN prefiltered", "OIDN on every second pixel"
+OIDN_NEIGHBOURS, OIDN_SPLIT_NEIGHBOURS = f"{OIDN_BEST}, {NEIGHBOURS}", f"{OIDN_SPLIT}, {NEIGHBOURS}"
 SCALES = (2, 4)
 #: The qualities that are measured: what the names of their methods begin with.
 QUALITIES = {"balanced": "", "best": "best, "}
@@ -60,13 +61,13 @@ def all_methods(
         if fnmatchcase(name, pattern):
             yield Made(name, 1, np.stack([denoised(render) for render in full]))
     for scale in SCALES:
-        for name, temporal, frames in _by_scale(sequence, scale, options):
+        for name, temporal, frames in _by_scale(sequence, scale, options, spread):
             if fnmatchcase(name, pattern):
                 yield Made(name, scale, frames(), _motion(temporal) if temporal.count else "")
 
 
 def _by_scale(
-    sequence: Sequence, scale: int, options: TemporalOptions
+    sequence: Sequence, scale: int, options: TemporalOptions, spread: bool
 ) -> Iterator[tuple[str, Temporal, Callable[[], Array]]]:
     """Our frames alone and with neighbours, and OIDN's with neighbours: the method, and how to compute its frames."""
     folder = sequence.folder
@@ -87,17 +88,20 @@ def _by_scale(
         full = map_render(open_exr(folder / f"full.{frame.number:04d}.exr"))
         return replace(stages.read(frame), hr_pixels=full.load())
 
-    def theirs(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
+    def theirs(denoised: Callable[[ReadableRender], Array], loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
         averaged = average_renders(RenderPair(loaded.lr_pixels, loaded.hr_pixels), *neighbours)
         pair = RenderPair(averaged.lr, averaged.hr)
-        fused = FusedFrame(oidn_prefiltered(averaged.hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
+        fused = FusedFrame(denoised(averaged.hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
         return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
 
     for quality, prefix in QUALITIES.items():
         own = by_quality[quality]
         for name, temporal in ((ALONE, Temporal()), (NEIGHBOURS, own.temporal)):
             yield prefix + name, temporal, partial(_frames, own.read, temporal, shot.frames, partial(ours, own))
-    yield OIDN_NEIGHBOURS, stages.temporal, partial(_frames, with_full, stages.temporal, shot.frames, theirs)
+    peers = {OIDN_NEIGHBOURS: oidn_prefiltered} | ({OIDN_SPLIT_NEIGHBOURS: oidn_split} if spread else {})
+    for name, denoised in peers.items():
+        fused = partial(theirs, denoised)
+        yield name, stages.temporal, partial(_frames, with_full, stages.temporal, shot.frames, fused)
 
 
 def _motion(temporal: Temporal) -> str:

@@ -137,15 +137,19 @@ def _rare_light(rgb: Array, top: int, left: int) -> Array:
     """
     height, width, channels = rgb.shape
     rows, columns = (-(-side // _SQUARE) for side in (top + height, left + width))
-    margins = [(top, rows * _SQUARE - top - height), (left, columns * _SQUARE - left - width), (0, 0)]
-    squares = np.pad(rgb, margins).reshape(rows, _SQUARE, columns, _SQUARE, channels)
-    brightest = squares.max(axis=(1, 3))
-    reached = (squares > brightest[:, None, :, None] / np.float32(FIREFLY_FACTOR)).mean(axis=(1, 3))
-    brightest[reached > _RARE] = 0
-    around = np.pad(brightest, ((1, 1), (1, 1), (0, 0)), mode="edge")
-    nine = np.stack([around[y : y + rows, x : x + columns] for y in range(3) for x in range(3)])
-    light = np.median(nine, axis=0)
-    return light.repeat(_SQUARE, axis=0).repeat(_SQUARE, axis=1)[top : top + height, left : left + width]
+    lines = np.zeros((channels, rows, _SQUARE, columns * _SQUARE), np.float32)
+    inside = (slice(None), slice(top, top + height), slice(left, left + width))
+    lines.reshape(channels, -1, columns * _SQUARE)[inside] = rgb.transpose(2, 0, 1)
+    # Rows first: NumPy is slow to reduce an axis as short as the side of a square, but for whole rows at a time.
+    sides = channels, rows, columns, _SQUARE
+    brightest = lines.max(axis=2).reshape(sides).max(axis=3)
+    least = (brightest / np.float32(FIREFLY_FACTOR)).repeat(_SQUARE, axis=2)[:, :, None]
+    reached = (lines > least).sum(axis=2, dtype=np.uint8).reshape(sides).sum(axis=3)
+    brightest[reached > _RARE * _SQUARE**2] = 0
+    around = np.pad(brightest, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    nine = np.stack([around[:, y : y + rows, x : x + columns] for y in range(3) for x in range(3)])
+    light = np.median(nine, axis=0).repeat(_SQUARE, axis=1).repeat(_SQUARE, axis=2)
+    return light[inside].transpose(1, 2, 0)
 
 
 def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:

@@ -41,7 +41,7 @@ def grown(mask: Mask, reach: int = 1) -> Mask:
 
 def max_3x3(values: Array) -> Array:
     """The largest of the 3 x 3 pixels around each, (h, w, ...)."""
-    largest = values.copy()
+    largest = values.copy(order="K")
     for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns
         lines = largest.swapaxes(0, axis)
         before = lines.copy(order="K")

@@ -52,7 +52,7 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
     """The same for one quality, whose methods begin with ``prefix``."""
     found = results.index(rows, "sequence", "scale", "method")
     peers = results.index((row for row in rows if row["method"] == OIDN_BEST), "sequence")
-    body, missed = [], []
+    body = []
     compared = [row for row in rows if row["method"] == prefix + NEIGHBOURS]
     for row in compared:
         alone, peer = found[row["sequence"], row["scale"], prefix + ALONE], peers[row["sequence"]]
@@ -61,15 +61,15 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
         steadier += [math.sqrt(row["ewarp"] / other["ewarp"]) for other in (alone, peer)]
         masks = {name: row[name] - alone[name] for name in MASKS if name in row}
         worst = min(masks, key=lambda name: masks[name], default="")
+        missed = _missed(row["sequence"], gain, over_peer, max(steadier[:2]), masks.get(worst, 0.0))
         body.append([
             row["sequence"], _role(row["sequence"]), f"x{row['scale']}", f"{gain:+.2f}", f"{over_peer:+.2f}",
             *(f"{ratio:.2f}" for ratio in steadier), f"{masks[worst]:+.2f} ({worst})" if worst else "",
+            ", ".join(missed),
         ])  # fmt: skip
-        least = masks.get(worst, 0.0)
-        missed += [f"{row['sequence']} x{row['scale']}: {text}" for text in _missed(row, alone, peer, least)]
     head = [f"`{quality}`", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
     head += ["flicker, of single frames'", "of OIDN's", "along the motion, of single frames'", "of OIDN's"]
-    head += ["least gain in a mask, dB"]
+    head += ["least gain in a mask, dB", "targets missed"]
     lines = [results.markdown(head, body)]
     for unit in ("psnr", "jod"):
         for scale in SCALES:
@@ -83,8 +83,7 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
                 f"{_mean(gains)} over single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over "
                 f"prefiltered OIDN (better on {sum(gain > 0 for gain in over)})."
             )
-    lines.append(f"- `{quality}`, targets missed: {'; '.join(missed) or 'none'}.\n")
-    return "\n".join(lines)
+    return "\n".join(lines) + "\n"
 
 
 def _mean(gains: Rows[float]) -> str:
@@ -95,22 +94,23 @@ def _role(sequence: str) -> str:
     return "chosen by" if sequence in DEVELOPMENT else "fresh"
 
 
-def _missed(row: Row, alone: Row, peer: Row, worst: float) -> list[str]:
-    """Which targets a sequence misses."""
-    gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
-    name, missed = row["sequence"], []
-    least = GAIN if name in MOVING_CAMERA else STATIC_GAIN if name in STATIC_CAMERA else 0.0
-    if gain < least:
-        missed.append(f"{gain:+.2f} dB over single frames, not {least:+.1f}")
-    if name in MOVING_CAMERA:
-        if over_peer < PEER_GAIN:
-            missed.append(f"{over_peer:+.2f} dB over OIDN, not {PEER_GAIN:+.1f}")
-        shares = [row["flicker"] / other["flicker"] for other in (alone, peer)]
-        if max(shares) > FLICKER:
-            missed.append(f"{shares[0]:.2f} of single frames' and {shares[1]:.2f} of OIDN's flicker, not {FLICKER}")
-    if worst < -LOSS:
-        missed.append(f"{worst:+.2f} dB in a mask")
-    return missed
+def _missed(sequence: str, gain: float, over_peer: float, flicker: float, worst: float) -> list[str]:
+    """Which targets a sequence misses.
+
+    Args:
+        gain, over_peer: over single frames and over OIDN at its best, in dB.
+        flicker: the larger one of its shares of their flicker.
+        worst: least gain in a mask, in dB.
+    """
+    moves = sequence in MOVING_CAMERA
+    least = GAIN if moves else STATIC_GAIN if sequence in STATIC_CAMERA else 0.0
+    missed = {
+        "single frames": gain < least,
+        "OIDN": moves and over_peer < PEER_GAIN,
+        "flicker": moves and flicker > FLICKER,
+        "mask": worst < -LOSS,
+    }
+    return [name for name, is_missed in missed.items() if is_missed]
 
 
 def details(rows: Rows[Row]) -> str:

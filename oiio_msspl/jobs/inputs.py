@@ -21,7 +21,7 @@ from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of
+from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise
 from oiio_msspl.model.contract import SPREAD
 
 
@@ -190,7 +190,8 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     """The model that is meant: a quality, ``auto`` and None are a family that suits the pair.
 
     ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
-    filter has spread needs the family that was trained for it. Notes of the HRLS tell.
+    filter has spread needs the family that was trained for it. Notes of the HRLS tell, also if a model that is named
+    does not suit the noise.
 
     Raises:
         InputError: the pair does not fit together.
@@ -198,6 +199,12 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     family = family_of(model)
     if family is None:
         assert model is not None
+        suited = for_spread_noise(model)
+        if suited is not None and is_noise_spread(lr, hr, align(lr, hr)):
+            hr.notes.append(
+                f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
+                f"--model {suited}"
+            )
         return model
     suited = family_for_layers(hr, family)
     if suited != family:

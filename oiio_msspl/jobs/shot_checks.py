@@ -20,7 +20,7 @@ from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.views import find_other_views
-from oiio_msspl.model.catalogue import family_of, load_model
+from oiio_msspl.model.catalogue import family_of, for_spread_noise, load_model
 
 log = logging.getLogger(__name__)
 
@@ -45,16 +45,17 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
-    """The model of all frames: a quality, ``auto`` and None are a family that suits the shot's first pair.
+    """The model of all frames: a quality, ``auto`` and None are a family that suits the shot's first pair. A warning is
+    logged if a model that is named does not suit its noise.
 
     All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and
     not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
     turn comes.
     """
-    family = family_of(model)
-    if family is None:
-        assert model is not None
-        return model
+    family = family_of(model) or model
+    assert family is not None
+    if family_of(model) is None and for_spread_noise(family) is None:
+        return family
     for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)

@@ -43,6 +43,14 @@ def family_of(name: str | None) -> str | None:
     return QUALITIES.get(DEFAULT_QUALITY if name in (None, AUTO) else name)
 
 
+def for_spread_noise(name: str) -> str | None:
+    """The family that was trained for noise that a pixel filter has spread, and is otherwise as a family or a shipped
+    model; None if there is none, or if the model itself was."""
+    models = shipped_models()
+    family = name.rpartition("-x")[0] if name in models else name
+    return family + SPREAD if any(known.startswith(f"{family}{SPREAD}-x") for known in models) else None
+
+
 def find_model(scale: int, name: str | None = None) -> Path:
     """The ONNX file of a model.
 

@@ -130,12 +130,22 @@ def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
     if isinstance(values, tuple) and len(values) == 8 and all(isinstance(v, float) and np.isfinite(v) for v in values):
         found: tuple[float, ...] = values
         for space in SPACES:
-            if np.allclose(found, space.chromaticities, rtol=0, atol=_SAME):
+            if _alike(found, space.chromaticities):
                 return space
         degenerate = min(abs(v) for v in found[1::2]) < 1e-6 or abs(np.linalg.det(_edges(found))) < 1e-4
-        return None if degenerate else ColourSpace("chromaticities of the header", found)
+        name = f"the space with the chromaticities {', '.join(f'{value:.4g}' for value in found)}"
+        return None if degenerate else ColourSpace(name, found)
     name = str(metadata.get("oiio:ColorSpace") or "")
     return None if name.lower() in _INDEFINITE else named_space(name)
+
+
+def same_space(one: ColourSpace, other: ColourSpace) -> bool:
+    """Whether two spaces are the same, but for the rounding of headers."""
+    return _alike(one.chromaticities, other.chromaticities)
+
+
+def _alike(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    return bool(np.allclose(one, other, rtol=0, atol=_SAME))
 
 
 def _edges(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:

@@ -15,6 +15,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import Array, repair
+from oiio_msspl.colour import conversion, same_space, space_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
 from oiio_msspl.exr.preview import write_png
@@ -64,8 +65,10 @@ class Comparison:
         return image if image.shape == self.truth.shape else upsample_bicubic(image, width, height)
 
     def _read(self, position: int) -> Array:
-        """The beauty of a render without NaN and infinities."""
-        return repair(self.renders[position].read(self.windows[position], [RGB])[RGB])[0]
+        """The beauty of a render without NaN and infinities, in the linear RGB space of the largest one."""
+        render = self.renders[position]
+        rgb = repair(render.read(self.windows[position], [RGB])[RGB])[0]
+        return in_space_of(rgb, render, self.renders[self.largest])
 
 
 def open_comparison(images: Sequence[Path], reference: Path | None = None) -> Comparison:
@@ -96,6 +99,28 @@ def score_images(comparison: Comparison) -> list[dict[str, float]]:
         what = "is" if window == render.data_window else "the part that all files show is"
         raise InputError(f"{render.name}: {what} {window.size}; SSIM needs at least {SSIM_WINDOW} pixels each way")
     return [scores(comparison.image(i), comparison.truth) for i in range(len(comparison.renders) - 1)]
+
+
+def in_space_of(rgb: Array, render: MappedRender, other: MappedRender) -> Array:
+    """Colours (h, w, 3) of a render in the linear RGB space of another one. They stay as they are unless both headers
+    declare a space."""
+    source, target = space_of(render.metadata), space_of(other.metadata)
+    if source is None or target is None or same_space(source, target):
+        return rgb
+    return rgb @ conversion(source, target).T.astype(np.float32)
+
+
+def note_on_spaces(comparison: Comparison) -> str:
+    """A sentence for the user if pictures are converted to another linear RGB space; empty if none is."""
+    largest = comparison.renders[comparison.largest]
+    target = space_of(largest.metadata)
+    spaces = {each.name: space_of(each.metadata) for each in comparison.renders}
+    if target is None:
+        return ""
+    others = [f"{name} ({space.name})" for name, space in spaces.items() if space and not same_space(space, target)]
+    if not others:
+        return ""
+    return f"Compared in the colour space of {largest.name}, {target.name}: converted are {', '.join(others)}"
 
 
 def note_on_windows(comparison: Comparison) -> str:

@@ -35,7 +35,7 @@ from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX, Array, repair
 from oiio_msspl.colour import REC709, conversion, space_of
-from oiio_msspl.compare import Comparison, error_colours, error_levels, upsample_bicubic
+from oiio_msspl.compare import Comparison, error_colours, error_levels, in_space_of, upsample_bicubic
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate, check_target, replacing
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
@@ -247,9 +247,10 @@ def _write_layer(
         else:
             shown = _to_rec709(values, picture, pictures)
         images[place] = _write_codes(out, f"image-{index}-{place}", to_codes(shown))
-        if truth is not None and picture is not reference and picture.layers[key].is_colour:
+        if truth is not None and reference is not None and picture is not reference and picture.layers[key].is_colour:
             height, width = truth.shape[:2]
-            image = values if values.shape == truth.shape else upsample_bicubic(values, width, height)
+            image = in_space_of(values, picture.render, reference.render)
+            image = image if image.shape == truth.shape else upsample_bicubic(image, width, height)
             decibels = psnr(image, truth)
             images[place] |= {"psnr": decibels if math.isfinite(decibels) else None, "relmse": relmse(image, truth)}
             levels = np.round(error_levels(image, truth) * (ERROR_LEVELS - 1)).astype(np.int16)

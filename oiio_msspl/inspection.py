@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +13,6 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
@@ -26,6 +24,7 @@ from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
 from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
+from oiio_msspl.jobs.sequence import frame_in_name
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -151,6 +150,8 @@ def inspect_file(
         _inspect_motion(result, render, inputs, motion_format)
     except InputError as error:
         result.problems.append(str(error).removeprefix(f"{path}: "))
+    if result.file is not None:
+        result.file.close()  # there may be thousands of files
     return result
 
 
@@ -195,7 +196,7 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
             user_fields(render.motion, wanted, render.name)
         following = None
         try:
-            following = map_render(open_exr(path), inputs.mapping, view=inputs.view, spp=inputs.hr_spp)
+            following = map_hrls(open_exr(path), inputs)
             result.motion = find_motion(render, following, wanted)
         except InputError as error:
             files = (path, *following.file.siblings) if following else ()
@@ -211,11 +212,12 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
 
 
 def _next_frame(path: Path) -> Path | None:
-    """The file beside this one whose number, the last one in the name, is one higher."""
-    match = re.fullmatch(r"(.*?)(\d+)(\D*)", path.stem, re.DOTALL)
-    if match is None:
+    """The file beside this one whose frame number is one higher, if it has a number and there is such a file."""
+    found = frame_in_name(path)
+    if found is None:
         return None
-    following = path.with_name(f"{match[1]}{int(match[2]) + 1:0{len(match[2])}d}{match[3]}{path.suffix}")
+    pattern, number = found
+    following = pattern.path(number + 1)
     return following if following.is_file() else None
 
 

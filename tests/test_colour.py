@@ -4,7 +4,18 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.colour import ACES2065, ACESCG, REC709, REC2020, SPACES, conversion, luminance, named_space, space_of
+from oiio_msspl.colour import (
+    ACES2065,
+    ACESCG,
+    REC709,
+    REC2020,
+    SPACES,
+    conversion,
+    luminance,
+    named_space,
+    same_space,
+    space_of,
+)
 
 #: Published matrices: of the ACES project's CTL and OpenColorIO's configurations (Bradford), and of ITU-R BT.2087.
 PUBLISHED = {
@@ -85,3 +96,9 @@ def test_names_of_the_users_configuration_are_understood(tmp_path, monkeypatch):
     )
     monkeypatch.setenv("OCIO", str(config))
     assert named_space("house_space") == ACESCG
+
+
+def test_spaces_whose_headers_were_rounded_are_the_same():
+    own = (0.7, 0.3, 0.2, 0.7, 0.1, 0.05, 0.3127, 0.329)
+    one, other = (space_of({"chromaticities": tuple(v + delta for v in own)}) for delta in (0, 1e-6))
+    assert one != other and same_space(one, other) and not same_space(one, ACESCG)

@@ -5,8 +5,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
+from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.compare import (
     error_map,
+    note_on_spaces,
     note_on_windows,
     open_comparison,
     score_images,
@@ -47,6 +49,19 @@ def test_pictures_are_compared_where_they_lie(tmp_path):
     assert found[2]["relmse"] == pytest.approx(relmse(shown, truth[4:44, 8:]), rel=1e-4)
     assert note_on_windows(comparison).endswith(" is compared: 56x40+8+4")
     assert note_on_windows(open_comparison([low], reference)) == ""
+
+
+def test_pictures_are_compared_in_the_space_of_the_reference(tmp_path):
+    truth = picture(48, 64)
+    reference = write_exr(tmp_path / "ref.exr", rgb(truth), chromaticities=REC709.chromaticities)
+    in_aces = (truth @ conversion(REC709, ACESCG).T).astype(np.float32)
+    image = write_exr(tmp_path / "aces.exr", rgb(in_aces), chromaticities=ACESCG.chromaticities)
+    plain = write_exr(tmp_path / "plain.exr", rgb(in_aces))
+    comparison = open_comparison([image, plain], reference)
+    same, other = (each["psnr"] for each in score_images(comparison))
+    assert same > 80 and other < 40
+    assert note_on_spaces(comparison).endswith(f"lin_rec709: converted are {image} (acescg)")
+    assert note_on_spaces(open_comparison([plain], reference)) == ""
 
 
 def test_pictures_of_two_parts_of_the_frame_are_refused(tmp_path):

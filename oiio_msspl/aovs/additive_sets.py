@@ -14,10 +14,10 @@ from fnmatch import fnmatchcase
 from typing import Any
 
 from oiio_msspl.aovs.formula import FeatureFormula
-from oiio_msspl.aovs.renderers import view_layer_of
+from oiio_msspl.aovs.renderers import renderers, view_layer_of
 from oiio_msspl.aovs.views import Beauty
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.layers import Layer, matches_layer, same_spelling
+from oiio_msspl.exr.layers import Layer, matches_layer
 from oiio_msspl.exr.reader import Channel
 
 #: The words of a layer's name, also where a renderer writes them together (``directdiffuse``).
@@ -71,15 +71,14 @@ class AdditiveSet:
 
     def matches(self, pattern: str) -> bool:
         """Whether a pattern such as ``light*`` means this set or one of its layers."""
-        return fnmatchcase(same_spelling(self.name), same_spelling(pattern)) or any(
-            matches_layer(pattern, layer.name) for layer in self.layers
-        )
+        return any(matches_layer(pattern, name) for name in (self.name, *(layer.name for layer in self.layers)))
 
 
 def find_additive_sets(
     renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty, sums: Sequence[str] = (), path: str = ""
 ) -> list[AdditiveSet]:
-    """The candidates of a file, those of the user first. A set of the user replaces one of the same name.
+    """The candidates of a file: those of the user, of its renderer, and then of names that any program may use. The
+    first set of a name counts.
 
     Args:
         renderer: entry of the table.
@@ -96,8 +95,9 @@ def find_additive_sets(
     names = [each.name for each in sets]
     if twice := [name for name in names if names.count(name) > 1]:
         raise InputError(f"--sum: two sets are called {twice[0]!r}; give each a name of its own")
-    for entry in renderer.get("sets", ()):
-        if entry["name"] in names:
+    generic = renderers()[-1]
+    for entry in [*renderer.get("sets", ()), *(generic["sets"] if renderer is not generic else ())]:
+        if any(entry["name"] == each.name for each in sets):
             continue
         found = tuple(dict.fromkeys(layer for candidate in entry["layers"] for layer in finder.find(candidate)))
         unwanted = entry.get("except", ())
@@ -122,6 +122,12 @@ class _Finder:
             for layer in layers
             if layer.view in (beauty.view, "") and layer.triple() and layer is not beauty.layer
         ]
+
+    @property
+    def known(self) -> str:
+        """What :meth:`find` looks for, for messages."""
+        names = ", ".join(layer.name for layer in self._layers[:12] if layer.name)
+        return f"; it has {names}" if names else ""
 
     def find(self, candidate: str | Mapping[str, str]) -> Iterator[AdditiveLayer]:
         """The layers that an entry of the table means; none if a factor is missing."""
@@ -151,15 +157,17 @@ class _Finder:
 
 
 def _user_set(finder: _Finder, text: str, path: str) -> AdditiveSet:
-    """The set that ``NAME=a+b+c*d`` describes."""
+    """The set that ``NAME=a+b+c*d`` describes. A term that ends with ``*`` is a pattern: ``light_*``."""
     name, equals, terms = text.partition("=")
-    if not equals or not name.strip() or "+" not in terms:
-        raise InputError(f"--sum {text!r}: write NAME=LAYER+LAYER, or LAYER*COLOUR for a product")
     found: list[AdditiveLayer] = []
-    for term in terms.split("+"):
+    for term in map(str.strip, terms.split("+")):
         layer, times, factor = (part.strip() for part in term.partition("*"))
-        one = list(finder.find({"layer": layer, "times": factor} if times else layer))
-        if len(one) != 1:
-            raise InputError(f"--sum {text!r}: {path} has {'several layers' if one else 'no layer'} {term.strip()!r}")
-        found += one
-    return AdditiveSet(name.strip(), tuple(found), by_user=True)
+        is_pattern = term.endswith("*")
+        some = list(finder.find(term if is_pattern or not times else {"layer": layer, "times": factor})) if term else []
+        if not some or (len(some) > 1 and not is_pattern):
+            found_here = f"several layers {term!r}" if some else f"no layer {term!r} of three channels{finder.known}"
+            raise InputError(f"--sum {text!r}: {path} has {found_here}")
+        found += some
+    if not equals or not name.strip() or len(found) < 2:
+        raise InputError(f"--sum {text!r}: write NAME=LAYER+LAYER, LAYER* for several, or LAYER*COLOUR for a product")
+    return AdditiveSet(name.strip(), tuple(dict.fromkeys(found)), by_user=True)

@@ -60,6 +60,8 @@ def map_render(
     renderer = detect_renderer(file, layers)
     if RGB not in mapping:
         _check_holds_beauty(renderer, file)
+    if RGB in mapping and not find_beauties(file, layers, [mapping[RGB]]):
+        raise InputError(f"{file.path}: {missing(RGB, mapping[RGB])}, and a mapping of rgb applies to both renders")
     beauties = _find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else renderer["rgb"])
     beauty = choose_beauty(file, beauties, view)
     notes: list[str] = []
@@ -94,12 +96,11 @@ def map_render(
 
 def _flat_layers(file: ExrFile) -> list[Layer]:
     """The layers that are not deep."""
-    deep = {part.index for part in file.parts if part.deep}
-    if len(deep) == len(file.parts):
+    if all(part.deep for part in file.parts):
         raise InputError(
             f"{file.path}: holds deep data only; flatten it first (a deep pixel has no single colour to fuse)"
         )
-    return [layer for layer in layers_of(file) if not any(c.part in deep for c in layer.channels.values())]
+    return layers_of(file, flat=True)
 
 
 def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:

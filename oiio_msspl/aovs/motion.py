@@ -7,6 +7,7 @@ too much open to believe that format: :mod:`oiio_msspl.fusion.motion` verifies i
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -196,11 +197,14 @@ def _words(part: str, text: str) -> dict[str, Any]:
             try:
                 words[key] = float(value)
             except ValueError:
-                problem = f"{key} is a number"
+                words[key] = math.nan
+            if not math.isfinite(words[key]) or (key, words[key]) == ("scale", 0):
+                problem = f"{key} is a number" + (", but not 0" if key == "scale" else "")
         elif key == "channels" and len(value) != 2:
             problem = "channels are two letters, such as XY"
         elif key == "premultiplied":
             words[key] = True
+            problem = "premultiplied stands alone; leave it out if they are not" if equals else ""
         elif not equals or not value:
             problem = f"write {key}=..."
         else:

@@ -39,8 +39,8 @@ class Layer:
         return tuple(self.channels.values()) if len(self.channels) == 1 else None
 
 
-def layers_of(file: ExrFile) -> list[Layer]:
-    """Group a file's channels into layers, in file order.
+def layers_of(file: ExrFile, *, flat: bool = False) -> list[Layer]:
+    """Group a file's channels into layers, in file order: all, or only those of ``flat`` parts, which are not deep.
 
     Renderers name layers in three ways. OpenEXR's rule puts the layer in front of the channel's name
     (``diffuse.R``). Karma and Nuke put it in the part's name only. Blender 5 does both. So the prefix of the channel
@@ -51,7 +51,7 @@ def layers_of(file: ExrFile) -> list[Layer]:
     views = views_of(file)
     layers: dict[tuple[str, str], Layer] = {}
     for part in file.parts:
-        for channel in part.channels:
+        for channel in () if flat and part.deep else part.channels:
             view, name, component = _split_name(channel.name, part, views, several=len(file.parts) > 1)
             layer = layers.setdefault((view, name), Layer(name, view))
             layer.channels.setdefault(component, channel)
@@ -70,11 +70,11 @@ def matches_layer(pattern: str, name: str, component: str = "") -> bool:
     name: ``crypto*`` means ``ViewLayer.CryptoObject00``.
 
     Args:
-        pattern: text with ``*`` for any text, ``?`` for any character.
+        pattern: text with ``*`` for any text, ``?`` for any character. A bracket is one, as in ``lights[0]``.
         name: the layer's name, perhaps with a part's or a view layer's in front.
         component: the channel's own name, such as ``R``; the pattern may name it behind the layer.
     """
-    wanted, words = same_spelling(pattern), same_spelling(name).split(".")
+    wanted, words = same_spelling(pattern).replace("[", "[[]"), same_spelling(name).split(".")
     ends = [".".join(words[start:]) for start in range(len(words))]
     return any(fnmatchcase(end, wanted) or fnmatchcase(f"{end}.{same_spelling(component)}", wanted) for end in ends)
 

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
@@ -28,6 +29,9 @@ OCIO_INPUT = "lin_rec709"
 
 #: The PNG's "Software" entry. It tells our pictures from other pictures of the same name.
 SOFTWARE = "oiio_msspl"
+
+#: The last bytes of every PNG: its chunk IEND.
+PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 
 #: PNG filter "Sub": each byte minus that of the pixel to the left. To try all filters for each row would take longer
 #: than to compress the row.
@@ -164,6 +168,11 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], P
         ok = writer.close() and ok
         if not ok:
             raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
+        # OpenImageIO does not tell if the last bytes can't be written, as on a full disk.
+        with open(temporary, "rb") as file:
+            file.seek(-min(len(PNG_END), temporary.stat().st_size), os.SEEK_END)
+            if file.read() != PNG_END:
+                raise MssplError(f"{path}: can't be written (its end is missing); is the disk full?")
 
 
 def _through_ocio(linear: Array, view: str) -> Array:

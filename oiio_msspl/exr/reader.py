@@ -115,6 +115,12 @@ class ExrFile:
             raise InputError(f"{self.path}: can't be opened ({reason_of(oiio)})")
         return handle
 
+    def close(self) -> None:
+        """Close the file, and those beside it. The next :meth:`read` opens it again."""
+        self.__dict__.pop("_input", None)
+        for sibling in self.siblings.values():
+            sibling.close()
+
     def read(self, channels: Sequence[Channel], window: Window) -> Array:
         """Channels over a rectangle, as float32 (height, width, len(channels)); each channel is contiguous in memory.
 

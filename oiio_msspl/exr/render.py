@@ -12,6 +12,9 @@ import numpy as np
 
 from oiio_msspl.arrays import Array, unload
 
+#: The layers that a render in memory may have, with their channels. :mod:`oiio_msspl.aovs.features` states their units.
+CHANNELS = {"rgb": 3, "albedo": 3, "normal": 3, "diffuse": 3, "specular": 3, "variance": 1, "alpha": 1}
+
 
 @dataclass(frozen=True)
 class Window:
@@ -78,19 +81,24 @@ class Render:
 
         Args:
             name: what messages call it.
-            layers: float (height, width, channels) by feature; ``rgb`` is required.
+            layers: float (height, width, channels), of those in ``CHANNELS``; ``rgb`` is required.
 
         Raises:
-            ValueError: the shapes differ, or ``rgb`` is missing.
+            ValueError: ``rgb`` is missing, there is another name, sizes differ or are 0, a layer has another number of
+                channels, or values are no floats.
         """
         if "rgb" not in layers:
             raise ValueError(f"{name}: no 'rgb' among the layers {sorted(layers)}")
         height, width = layers["rgb"].shape[:2]
         for key, value in layers.items():
-            if value.ndim != 3 or value.shape[:2] != (height, width):
+            if key not in CHANNELS:
+                raise ValueError(f"{name}: layer {key!r} is none of {', '.join(CHANNELS)}")
+            if value.shape != (height, width, CHANNELS[key]) or not value.size:
                 raise ValueError(
-                    f"{name}: layer {key!r} has shape {value.shape}, expected ({height}, {width}, channels)"
+                    f"{name}: layer {key!r} has shape {value.shape}, expected ({height}, {width}, {CHANNELS[key]})"
                 )
+            if not np.issubdtype(value.dtype, np.floating):
+                raise ValueError(f"{name}: layer {key!r} holds {value.dtype}, expected floats")
         window = Window(0, 0, width, height)
         return cls({k: np.asarray(v, dtype=np.float32) for k, v in layers.items()}, window, window, name=name)
 

@@ -45,12 +45,17 @@ class ReplacedChannels:
     def __contains__(self, channel: Channel) -> bool:
         return channel in self._places
 
-    def put(self, channel: Channel, start: int, rows: Array) -> None:
-        """Store rows (n, width) of a channel from row ``start`` on; what is too bright for its type is clipped."""
+    def put(self, channel: Channel, start: int, rows: Array) -> int:
+        """Store rows (n, width) of a channel from row ``start`` on; what is too bright for its type is clipped.
+
+        Returns:
+            The number of values that were too bright.
+        """
         largest = HALF_MAX if channel.type == "half" else FLOAT_MAX
         stored = np.clip(rows, -largest, largest).astype(DTYPES[channel.type])
         self._seek(channel, start)
         self._file.write(stored.tobytes())
+        return int(np.count_nonzero(rows > largest)) if rows.size and rows.max() > largest else 0
 
     def get(self, channel: Channel, start: int, stop: int) -> NDArray[Any]:
         """Rows of a channel, (stop - start, width)."""

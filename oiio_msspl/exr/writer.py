@@ -18,11 +18,12 @@ import OpenImageIO as oiio
 from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array
-from oiio_msspl.errors import MssplError
+from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
 from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, extra_spec, is_held_whole, passed_on_parts
-from oiio_msspl.exr.reader import Channel, ExrFile, reason_of, unreadable
+from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of, unreadable
+from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import check_single_part, write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
@@ -77,6 +78,7 @@ def write_fused(
             write_single_part(temporary, contents)
         else:
             _write_parts(temporary, contents, cache_bytes)
+        _check_whole(temporary, path)
     return [
         f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
         for part in source.parts
@@ -149,6 +151,23 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
         raise MssplError(
             f"{path.parent}: the result can't be written ({reason}); the target is as it was; is the disk full?"
         )
+
+
+def _check_whole(temporary: Path, path: Path) -> None:
+    """Read the first and the last row of each part. If the last bytes of a file can't be written, as on a full disk,
+    OpenImageIO does not tell."""
+    try:
+        file = open_exr(temporary)
+        for part in file.parts:
+            window = part.data_window
+            for y in (window.y0, window.y1 - 1):
+                file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
+        file.close()
+    except InputError as error:
+        raise MssplError(
+            f"{path.parent}: the result can't be written (its end is missing); the target is as it was; is the disk "
+            "full?"
+        ) from error
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:

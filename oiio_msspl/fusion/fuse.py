@@ -123,7 +123,7 @@ def fuse(
         MssplError: the network failed, or returned NaN or infinite values.
     """
     alignment = align(lr, hr)
-    _check_model(session, alignment.scale, error)
+    check_model(session, alignment.scale, error=error)
     require_memory(memory_to_fuse(alignment, session, error=error) + held, session.contract, max_memory)
     seconds = session.seconds
     with limit_threads(session.threads):
@@ -222,11 +222,17 @@ def result_bytes(alignment: Alignment, *, error: bool) -> int:
     return alignment.hr_data_window.width * alignment.hr_data_window.height * (5 if error else 4) * 4
 
 
-def _check_model(session: Session, scale: int, error: bool) -> None:
+def check_model(session: Session, scale: int, *, error: bool) -> None:
+    """Raise InputError if a model is for another scale than a pair, or does not predict the ``error`` if that is asked
+    for."""
     if error:
         session.require_error()
     if session.contract.scale != scale:
-        raise InputError(f"model {session.contract.name} is for x{session.contract.scale}, but this pair is x{scale}")
+        family = session.contract.name.rpartition("-x")[0]
+        hint = f"; --model {family} takes the one for the pair" if family else ""
+        raise InputError(
+            f"model {session.contract.name} is for x{session.contract.scale}, but this pair is x{scale}{hint}"
+        )
 
 
 def _blank_frame(alignment: Alignment, exposure: float, *, error: bool, half: bool) -> FusedFrame:

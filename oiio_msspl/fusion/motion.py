@@ -289,7 +289,9 @@ def _without_vectors(pair: FramePair, checks: Sequence[FieldCheck]) -> MotionSou
         return MotionSource(FLOW, f"{seen}optical flow is computed on the fused pictures, which is less exact")
     if not pair.guides:
         seen += "no albedo, world-space normal or position that shows whether anything moves; "
-    return MotionSource(NONE, f"{seen}render motion vectors, or install opencv-python-headless for optical flow")
+    return MotionSource(
+        NONE, f"{seen}render motion vectors, or install opencv-python-headless and use --temporal 2 for optical flow"
+    )
 
 
 def _camera_stands(still: Mask, moved: Mask) -> bool:

@@ -27,7 +27,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import Array, blank, box_downsample, planes_of, repair, unload, upsample_linear
+from oiio_msspl.arrays import HALF_MAX, Array, blank, box_downsample, planes_of, repair, unload, upsample_linear
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -93,7 +93,8 @@ class FusedPasses:
     lacking: dict[str, float] = field(default_factory=dict)
     """By name of a fused set: the share of the beauty's light that is in no layer, for those that lack some."""
     warnings: list[str] = field(default_factory=list)
-    """A sentence for each set of which the LRHS has some layers only, or layers that do not sum to its beauty."""
+    """A sentence for each set of which the LRHS has some layers only, or layers that do not sum to its beauty, or of
+    which values were too bright for half."""
 
 
 def fuse_passes(
@@ -144,6 +145,7 @@ def fuse_passes(
     done = steps - len(_bands(alignment)) * sum(1 + by_network * len(job.fitted) for job in jobs)
     tell(done, steps)
     fused_light: dict[AdditiveLayer, Array] = {}
+    clipped = dict.fromkeys((job.layers.name for job in jobs), 0)
     colours = _colour_names(jobs)
     low_layers = {key: each for job in jobs for key, each in job.lrhs.items()}
     high_layers = {key: layer for job in jobs for layer, key in job.keys.items()}
@@ -179,7 +181,8 @@ def fuse_passes(
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
                 with half_of_the_threads():
-                    made = band.fuse(job, pixels, lights)
+                    made, too_bright = band.fuse(job, pixels, lights)
+                clipped[job.layers.name] += too_bright
                 # Copies, because a layer alone would keep the memory of its whole set.
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1
@@ -188,6 +191,12 @@ def fuse_passes(
                 unload(image)
             for render in (low, high):
                 render.unload()
+    fused.warnings += [
+        f"{name}: {count} values are too bright for half and were clipped to {HALF_MAX:.0f}, so the layers do not sum "
+        "to the beauty there; render them as float"
+        for name, count in clipped.items()
+        if count
+    ]
     return fused
 
 
@@ -407,7 +416,7 @@ class _Band:
         job: PassJob,
         pixels: ReplacedChannels,
         earlier: Mapping[AdditiveLayer, Array],
-    ) -> dict[AdditiveLayer, Array]:
+    ) -> tuple[dict[AdditiveLayer, Array], int]:
         """Fuse the layers of one set and store them.
 
         Args:
@@ -416,7 +425,7 @@ class _Band:
             earlier: light (3, h, w) of layers of earlier sets.
 
         Returns:
-            The light of each layer.
+            The light of each layer, and the number of values that were too bright for half.
         """
         rows = self._hrls_rows
         lights = {layer: _total(earlier, parts) for layer, parts in job.known.items()}
@@ -431,14 +440,15 @@ class _Band:
         window = self._alignment.hr_data_window
         core = in_hrls_pixels(self._core, self._scale)
         inside = core.intersect(window)
+        clipped = 0
         for layer, light in lights.items():
             if layer in earlier:
                 continue  # an earlier set has stored it
             if layer in colours:
                 light = np.divide(light, np.maximum(colours[layer], DARKEST_COLOUR), dtype=np.float32)
             for channel, plane in zip(layer.channels, light, strict=True):
-                pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
-        return lights
+                clipped += pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
+        return lights, clipped
 
     def _fitted(self, job: PassJob, light: Array, colours: Mapping[AdditiveLayer, Array]) -> dict[AdditiveLayer, Array]:
         """Divide ``light`` (3, h, w) among the layers of a set that earlier sets do not know."""

@@ -18,7 +18,7 @@ from oiio_msspl.jobs.frame_checks import check_frame_memory, memory_to_write
 from oiio_msspl.jobs.frame_passes import Progress, steps_of
 from oiio_msspl.jobs.inputs import InputOptions, resolve_auto
 from oiio_msspl.jobs.report import FrameReport
-from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs.sequence import Frame, is_sequence
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.parallel import limit_threads
 
@@ -67,6 +67,8 @@ def fuse_files(
     output = check_target(output, overwrite=overwrite)
     if output.suffix.lower() != ".exr":
         raise InputError(f"{output}: the result is an EXR; name it .exr")
+    if is_sequence(output):
+        raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
     if preview_path is not None:
         preview_path = check_target(preview_path, overwrite=overwrite)
         if view_transform is not None:

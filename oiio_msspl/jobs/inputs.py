@@ -15,7 +15,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
-from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, space_of
+from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, same_space, space_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
@@ -127,7 +127,7 @@ def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> Colou
             raise InputError(f"--colorspace {name!r}: use one of {', '.join(space.name for space in SPACES)}")
         return space
     low, high = space_of(lr.metadata), space_of(hr.metadata)
-    if low is not None and high is not None and low != high:
+    if low is not None and high is not None and not same_space(low, high):
         raise InputError(
             f"by their headers {lr.name} is in {low.name} and {hr.name} in {high.name}; write both in the same colour "
             "space (or name it with --colorspace if a header is wrong)"
@@ -143,6 +143,10 @@ def map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
         InputError: see :func:`oiio_msspl.aovs.matching.map_render`.
     """
     render = _map_hrls(file, inputs)
+    if inputs.view is not None and not render.view:
+        raise InputError(
+            f"{file.path}: no view or view layer {inputs.view!r}; the file names none, so leave --view-layer out"
+        )
     return _without_entries(render, inputs, _features_of_others(render)) if inputs.view is None else render
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, replacing
+from oiio_msspl.exr.atomic import check_encodable, check_folder, replacing
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
@@ -93,6 +93,8 @@ def make_job(
     Raises:
         InputError: a path, a file or an option can't be used, no frame has both renders, or a job can't contain it.
     """
+    for path in (lr, hr, output, *([map_file] if map_file else [])):
+        check_encodable(path)
     if not (is_sequence(lr) or is_sequence(hr)):
         raise InputError(f"{lr}: a job is for a shot: give folders, or patterns such as lr.####.exr")
     if device not in PROVIDERS:
@@ -159,7 +161,7 @@ def _describe(
     # Open Job Description writes ranges in rising order, and their step with a colon.
     numbers = format_frames(sorted(frame.number for frame in shot.frames)).replace("x", ":")
     frame_range = add("Frames", numbers, "Frames of the shot: 1001-1100 or 1001-1099:2,1200", type="STRING")
-    size = add("FramesPerTask", chunk, "Frames per task", type="INT", minValue=1)
+    size = add("FramesPerTask", chunk, "Frames per task", type="INT", minValue=1, maxValue=chunk)  # or time is up
     for option, path in files.items():
         name = option.removeprefix("--").title().replace("-", "")
         file = add(name, str(path.absolute()), f"{option} of msspl-fuse", type="PATH", objectType="FILE", dataFlow="IN")

@@ -164,7 +164,8 @@ class RenderedShot:
                 loaded = self._read(frame)
                 for ready, outcome in self._window.add(frame.number, loaded):
                     self._at_work = ready.number
-                    assert isinstance(outcome, FusedAlone)
+                    if isinstance(outcome, Exception):
+                        raise outcome
                     self._write(ready, outcome)
         except Exception as error:
             said, code = explain(error)

@@ -30,6 +30,9 @@ _SHORT_FIELD = re.compile(r"(?<![^._ -])@(?![^._ -])|%d(?![^\W_])")
 #: letter is none: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
 _NUMBER_INSIDE = re.compile(r"(|.*[._ -])(\d+)([_ -]\D*\.exr)", re.IGNORECASE)
 
+#: A name whose number is at its end. Here it may follow a letter (``hr0001.exr``), but not a ``v``: that is a version.
+_NUMBER_LAST = re.compile(r"(|.*?[^vV\d])(\d+)(\.exr)", re.IGNORECASE)
+
 #: One digit for each ``#``, as in Nuke, Katana and RV. fileseq's default is four digits for each.
 _PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
 
@@ -112,6 +115,13 @@ def is_sequence(path: Path) -> bool:
     return path.is_dir() or (bool(_number_fields(path.name)) and not path.exists())
 
 
+def check_exists(path: Path) -> None:
+    """Raise InputError if a path is neither a file, nor a folder, nor a pattern."""
+    if not (path.exists() or is_sequence(path)):
+        hint = "; write the place of the frame number as ####" if "*" in path.name else ""
+        raise InputError(f"{path}: no such file or folder{hint}")
+
+
 def _number_fields(name: str) -> list[re.Match[str]]:
     """Where a name marks the frame number; empty if it is no pattern."""
     return list(_NUMBER_FIELD.finditer(name)) or list(_SHORT_FIELD.finditer(name))
@@ -181,6 +191,15 @@ def parse_pattern(path: Path) -> Pattern:
     return Pattern(path.parent, path.name[:start], number, path.name[end:])
 
 
+def frame_in_name(path: Path) -> tuple[Pattern, int] | None:
+    """The pattern and the frame number of a file that stands for itself; None if its name has no frame number."""
+    match = _NUMBER_INSIDE.fullmatch(path.name) or _NUMBER_LAST.fullmatch(path.name)
+    if match is None:
+        return None
+    head, digits, tail = match.groups()
+    return Pattern.padded(path.parent, head, len(digits), tail), int(digits)
+
+
 def _sequences(path: Path) -> list[Sequence]:
     """The sequence that a pattern names, or all sequences of a folder."""
     if path.is_dir():
@@ -190,6 +209,7 @@ def _sequences(path: Path) -> list[Sequence]:
                 f"{path}: no numbered EXRs in this folder (a pattern such as name####_lr.exr finds others)"
             )
         return found
+    check_exists(path)
     if not is_sequence(path):
         raise InputError(f"{path}: is a single file, the other one is a folder or a pattern; give two of a kind")
     pattern = parse_pattern(path)

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """A shot: the main job on every frame of two sequences, in this process or on a Dask cluster.
 
-A bad frame is reported and does not stop the others. A frame's EXR gets its name last, after its preview: an EXR that
-exists is a frame that is complete, whenever a run was ended.
+A bad frame is reported and does not stop the others. A new EXR gets its name last, after its preview: an EXR that
+exists is a frame that is complete, whenever a run was ended. An EXR that is replaced comes before its preview, so a run
+that is killed between the two leaves the new frame without one.
 """
 
 from __future__ import annotations

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import logging
-import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -12,7 +11,8 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
-from oiio_msspl.jobs.frame_checks import check_written_layers, require_outputs
+from oiio_msspl.fusion.fuse import check_model
+from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
 from oiio_msspl.jobs.frame_passes import check_passes
 from oiio_msspl.jobs.inputs import InputOptions, map_pair, resolve_auto
 from oiio_msspl.jobs.pair_check import check_files
@@ -94,26 +94,37 @@ def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]
     return []
 
 
-def check_wanted_outputs(frames: Sequence[Frame], inputs: InputOptions, write: WriteOptions, model: str | None) -> None:
+def check_wanted_outputs(
+    frames: Sequence[Frame], inputs: InputOptions, write: WriteOptions, model: str | None, max_memory: int
+) -> None:
     """Check on the first pair that can be read whether what is to be written can be, before a farm is asked for it.
 
     Raises:
-        InputError: a layer or a set of passes that an option names is not there, the layout can't hold the layers, or
-            the model does not make a layer.
+        InputError: no pair can be read, a layer or a set of passes that an option names is not there, the layout can't
+            hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are too
+            few.
     """
+    problem: InputError | None = None
     for frame in frames:
         if frame.lr is None or frame.hr is None:
             continue
         try:
             lr, hr = map_pair(frame.lr, frame.hr, inputs)
+            scale = align(lr, hr).scale
             others = find_other_views(lr, hr, inputs, write)
-        except InputError:  # files that an option names may exist on the workers only
+        except InputError as error:
+            if all(path.exists() for path in inputs.files(frame.hr, None)):  # or they may exist on the workers only
+                problem = problem or error
             continue
         check_written_layers(hr, write)
         check_passes([hr, *others.hrls], write)
-        if write.error_layer or write.data_passes:
-            require_outputs(load_model(align(lr, hr).scale, model), write)
+        session = load_model(scale, model)
+        check_model(session, scale, error=write.error_layer)
+        require_outputs(session, write)
+        check_frame_memory(lr, hr, session, write, max_memory)
         return
+    if problem is not None:
+        raise problem
 
 
 def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None:
@@ -133,7 +144,9 @@ def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None
     if lacking:
         return result_of(frame, MISSING, f"no {' and no '.join(lacking)} of this number", 2)
     overwrite = stages.replaces(frame.lr, frame.hr, frame.output)
-    if os.path.lexists(frame.output) and not frame.output.is_dir() and not overwrite:
+    if frame.output.is_symlink() and not frame.output.exists() and not overwrite:
+        return result_of(frame, FAILED, "the output is a link to a file that does not exist; delete the link", 2)
+    if frame.output.exists() and not frame.output.is_dir() and not overwrite:
         return result_of(frame, FAILED, "the output exists; pass --skip-existing or --overwrite", 2)
     try:
         check_target(frame.output, overwrite=overwrite)

@@ -34,6 +34,21 @@ def test_light_groups_are_found_in_the_view_layer_of_the_beauty(tmp_path):
     assert names(found) == {"light groups": ["Combined_fill", "Combined_key"]}
 
 
+@pytest.mark.parametrize(
+    ("attributes", "prefix"),
+    [({"rman/version": "26"}, "lg_"), ({"vrayInfo/vraycore": "6"}, "VRayLightSelect_"), ({}, "RGBA_"), ({}, "Beauty_")],
+)
+def test_names_that_any_program_may_use_are_found_for_every_renderer(tmp_path, attributes, prefix):
+    found = render(tmp_path, {f"{prefix}key": 1, f"{prefix}fill": 2}, **attributes)
+    assert names(found) == {"light groups": [f"{prefix}fill", f"{prefix}key"]}
+    assert check_sum(found, found.additive_sets[0]).residual < 1e-6
+
+
+def test_a_sum_may_be_a_pattern(tmp_path):
+    found = render(tmp_path, {"my_key": 1, "my_fill": 2, "albedo": 1}, sums=["lamps=my_*"])
+    assert names(found)["lamps"] == ["my_fill", "my_key"]
+
+
 def test_a_pattern_takes_underscores_as_they_are(tmp_path):
     found = render(tmp_path, {"C_key": 1, "C_fill": 2, "combineddiffuse": 3}, renderTime_s="1")
     assert names(found)["light groups"] == ["C_fill", "C_key"]

@@ -16,7 +16,7 @@ from msspl_cli.commands.fuse import tiles_in_words
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import EXAMPLES, picture, rgb, write_exr
-from tests.programs import fuse
+from tests.programs import fuse, run
 
 
 def test_the_main_job(files, bilinear_models):
@@ -341,3 +341,20 @@ def test_nohup_is_respected(files):
     code = "import os, signal; from msspl_cli.errors import _exit_on_signals as on\n"
     code += "signal.signal(signal.SIGHUP, signal.SIG_IGN); on(); os.kill(os.getpid(), signal.SIGHUP); print('lives')"
     assert subprocess.run([sys.executable, "-c", code], capture_output=True, text=True).stdout == "lives\n"
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["lrr/", "hrr/", "-o", "newout/"], "lrr: no such file or folder"),
+        (["lrr", "hrr", "-o", "out", "--frames", "1-3"], "lrr: no such file or folder"),
+        (
+            ["lr*.exr", "hr*.exr", "-o", "out"],
+            "lr*.exr: no such file or folder; write the place of the frame number as #",
+        ),
+    ],
+)
+def test_mistyped_names_are_said_first(tmp_path, monkeypatch, arguments, message):
+    monkeypatch.chdir(tmp_path)
+    done = run("msspl_fuse", *arguments)
+    assert done.returncode == 2 and message in done.stderr and not list(tmp_path.iterdir())

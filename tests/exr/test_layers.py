@@ -2,6 +2,7 @@
 """Channels are grouped into layers by OpenEXR's naming rule, by part names and by views."""
 
 import numpy as np
+import OpenEXR
 import pytest
 
 from oiio_msspl.exr.layers import layers_of, matches_layer
@@ -105,3 +106,23 @@ def test_the_only_part_names_no_layer(tmp_path):
 )
 def test_a_pattern_means_a_layer_whatever_the_case_and_without_the_view_layer(pattern, matches):
     assert matches_layer(pattern, "ViewLayer.CryptoObject00", "R") == matches
+
+
+def test_a_bracket_in_a_pattern_is_one():
+    assert matches_layer("lights[0]", "lights[0]") and matches_layer("lights[*", "lights[1]")
+    assert not matches_layer("lights[01]", "lights0")
+
+
+def test_a_deep_part_takes_no_layer_from_a_flat_one(tmp_path):
+    """Even if its name means the same layer."""
+    samples = np.empty((4, 4), dtype=object)
+    for index in np.ndindex(4, 4):
+        samples[index] = np.ones(2, np.float32)
+    flat = OpenEXR.Part({"type": OpenEXR.scanlineimage}, dict.fromkeys("RGBA", np.ones((4, 4), np.float32)), "rgba")
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    with OpenEXR.File([OpenEXR.Part(header, {c: samples.copy() for c in "AZ"}, "default"), flat]) as file:
+        file.write(str(tmp_path / "a.exr"))
+    file = open_exr(tmp_path / "a.exr")
+    (layer,) = layers_of(file, flat=True)
+    assert sorted(layer.channels) == ["A", "B", "G", "R"]
+    assert all(not file.parts[channel.part].deep for channel in layer.channels.values())

@@ -2,7 +2,8 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from oiio_msspl.exr.render import CHANNELS, Render, Window
 
 
 def test_a_window_counts_rows_downwards_and_its_end_does_not_belong_to_it():
@@ -35,5 +36,24 @@ def test_a_render_reads_the_layers_that_it_has():
 def test_a_render_needs_a_beauty_and_layers_of_one_size():
     with pytest.raises(ValueError, match="no 'rgb' among the layers"):
         Render.from_arrays(albedo=np.ones((2, 2, 3)))
-    with pytest.raises(ValueError, match=r"layer 'alpha' has shape \(2, 2\), expected \(2, 2, channels\)"):
+    with pytest.raises(ValueError, match=r"layer 'alpha' has shape \(2, 2\), expected \(2, 2, 1\)"):
         Render.from_arrays(rgb=np.ones((2, 2, 3)), alpha=np.ones((2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("layers", "message"),
+    [
+        ({"rgb": np.ones((2, 2, 4))}, r"layer 'rgb' has shape \(2, 2, 4\), expected \(2, 2, 3\)"),
+        ({"albedo": np.ones((2, 2, 1))}, r"layer 'albedo' has shape \(2, 2, 1\), expected \(2, 2, 3\)"),
+        ({"rgb": np.ones((0, 2, 3))}, r"layer 'rgb' has shape \(0, 2, 3\)"),
+        ({"Albedo": np.ones((2, 2, 3))}, "layer 'Albedo' is none of rgb, albedo, "),
+        ({"rgb": np.ones((2, 2, 3), np.uint8)}, "layer 'rgb' holds uint8, expected floats"),
+    ],
+)
+def test_layers_that_are_no_features_are_refused(layers, message):
+    with pytest.raises(ValueError, match=message):
+        Render.from_arrays("render", **{"rgb": np.ones((2, 2, 3))} | layers)
+
+
+def test_the_layers_of_a_render_are_the_features_of_the_models():
+    assert {name: count for name, count in CHANNELS.items() if name != "alpha"} == HRLS_FEATURES

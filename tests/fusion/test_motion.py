@@ -455,6 +455,13 @@ def test_a_format_takes_the_channels_that_lead_to_its_frame(tmp_path):
         assert ["".join(each.components) for each in found] == channels
 
 
+@pytest.mark.parametrize("word", ["premultiplied=false", "scale=nan", "scale=0", "offset=inf"])
+def test_a_word_that_would_mean_something_else_is_refused(tmp_path, word):
+    path = write_exr(tmp_path / "hr.exr", dict.fromkeys(["R", "G", "B", "v.X", "v.Y"], np.zeros((8, 8), np.float32)))
+    with pytest.raises(InputError, match=word.partition("=")[0]):
+        user_fields(map_render(open_exr(path)).motion, f"layer=v,{word}")
+
+
 def test_vectors_that_are_zero_where_they_are_tried_explain_nothing(tmp_path):
     """The first frame of an animation has none; the user's description stands, and nothing verifies it."""
     frames = []

@@ -507,6 +507,21 @@ def test_a_lamp_that_is_too_bright_for_half_is_left_out_of_the_sum(tmp_path):
     assert not check_sum(high, lamps).problem
 
 
+def test_layers_that_are_too_bright_for_half_are_counted(tmp_path, model):
+    """The beauty is float, so it has more light than they can hold."""
+    clean = lights()
+    clean["light_spot"][40:44, 72:76] = 9e4
+    pair = write_pair(tmp_path, clean, noise_free=clean)
+    for path in pair:
+        ((_, channels),) = read_bits(path)
+        with np.errstate(over="ignore"):
+            half = {name: v.astype(np.float16) for name, v in channels.items() if name.startswith("light")}
+        write_exr(path, channels | half)
+    report, out = fused(pair, tmp_path / "out.exr", model)
+    assert layer(out, "light_spot").max() <= 65504 < layer(out).max()
+    assert any("light groups: " in each and "too bright for half and were clipped" in each for each in report.warnings)
+
+
 @pytest.mark.filterwarnings("error::RuntimeWarning")
 def test_the_brightest_floats_are_compared_without_a_warning(tmp_path):
     clean = lights()

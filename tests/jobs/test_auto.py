@@ -80,14 +80,14 @@ def test_only_the_best_quality_has_a_network_for_single_layers(name, layers):
 def test_a_model_is_taken_as_it_is_named(tmp_path, caplog):
     """If it leaves spread noise, the user is told, for a frame and for a shot."""
     write_pair(tmp_path, "a.0001", 0.5)
-    note = "spread the noise over neighbouring pixels, and joint-small leaves such noise; use --model joint-small-spread"
+    note = "and joint-small leaves such noise; use --model joint-small-spread"
     pair = tmp_path / "lr/a.0001.exr", tmp_path / "hr/a.0001.exr"
     for model, told in (("joint-small", True), ("joint-small-spread", False), ("paper-x4", False)):
         report = fuse_files(*pair, tmp_path / f"{model}.exr", model=model)
         assert report.model == model.removesuffix("-x4") + "-x4"
         assert any(note in each for each in report.as_dict()["notes"]) == told
     assert fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", model="joint-small").exit_code == 0
-    assert f"frame 1: the pixel filter has {note}" in caplog.text
+    assert f"frame 1: the pixel filter has spread the noise over neighbouring pixels, {note}" in caplog.text
 
 
 def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path, caplog, monkeypatch):

@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The main job on one pair: what is refused before any work, and what does not stop it."""
 
+import os
 import re
 import subprocess
 import sys
@@ -12,6 +13,7 @@ import pytest
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
 from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.fusion.tiling import MAX_MEMORY
 from oiio_msspl.jobs import frame_writing, stages
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.sequence import Frame
@@ -25,6 +27,11 @@ from tests.shots import HEIGHT, WIDTH, layers, low_layers
 @pytest.fixture
 def pair(tmp_path):
     return write_exr(tmp_path / "lr.exr", low_layers(1)), write_exr(tmp_path / "hr.exr", layers(1))
+
+
+def test_a_pattern_is_no_name_for_one_frame(pair, tmp_path):
+    with pytest.raises(InputError, match=r"out\.####\.exr: is a pattern, but LR and HR are single files"):
+        fuse_files(*pair, tmp_path / "out.####.exr")
 
 
 def test_the_result_is_written_over_the_hrls_s_data_window(pair, tmp_path, bilinear_models):
@@ -67,7 +74,7 @@ def test_a_layout_that_can_not_hold_the_layers_is_refused_by_the_headers(tmp_pat
     for check in (
         lambda: fuse_files(lr, hr, out, write=write),
         lambda: Stages(write_options=write).read_views(of_shot),
-        lambda: check_wanted_outputs([of_shot], InputOptions(), write, None),
+        lambda: check_wanted_outputs([of_shot], InputOptions(), write, None, MAX_MEMORY),
     ):
         with pytest.raises(InputError, match=r"part 'mist' of .* one part can hold only one, use --layout spec"):
             check()
@@ -279,3 +286,38 @@ def test_writing_holds_no_more_than_is_planned_for(tmp_path, layout, largest, ho
     held, grown = map(int, subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
     assert grown < (held if holds else 0) + 64, (held, grown)
     assert (held > 100) == holds
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no limit for the size of files")
+@pytest.mark.parametrize("layout", ["spec", "nuke", "multilayer"])
+def test_a_file_whose_last_bytes_cannot_be_written_is_no_result(pair, tmp_path, bilinear_models, layout):
+    """OpenImageIO does not tell. The limit of a process stands for a full disk."""
+    whole = fuse_files(*pair, tmp_path / "whole.exr", model=str(bilinear_models[4]), write=WriteOptions(layout=layout))
+    limit = whole.output.stat().st_size - 100
+    code = (
+        "import resource, sys; from oiio_msspl import *; limit = int(sys.argv[5]);"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit));"
+        "fuse_files(*sys.argv[1:4], model=sys.argv[4], write=WriteOptions(layout=sys.argv[6]))"
+    )
+    arguments = [*pair, tmp_path / "cut.exr", bilinear_models[4], limit, layout]
+    done = subprocess.run([sys.executable, "-c", code, *map(str, arguments)], capture_output=True, text=True)
+    assert "MssplError" in done.stderr and "is the disk full?" in done.stderr
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr", "whole.exr"]
+
+
+def test_nothing_is_sent_and_nothing_is_left_in_the_home_folder(pair, tmp_path, bilinear_models):
+    """ONNX Runtime keeps a number of the device there, and what it is going to send."""
+    home = tmp_path / "home"
+    home.mkdir()
+    code = "import sys; from oiio_msspl import fuse_files; fuse_files(*sys.argv[1:4], model=sys.argv[4])"
+    arguments = [*pair, tmp_path / "out.exr", bilinear_models[4]]
+    environment = {k: v for k, v in os.environ.items() if k != "ORT_DISABLE_TELEMETRY" and not k.startswith("XDG")}
+    subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], check=True, env=environment | {"HOME": str(home)}
+    )
+    assert (tmp_path / "out.exr").exists() and not list(home.iterdir())
+
+
+def test_a_view_layer_that_a_file_does_not_name_is_refused(pair, tmp_path):
+    with pytest.raises(InputError, match=r"hr\.exr: no view or view layer 'fg'; the file names none"):
+        fuse_files(*pair, tmp_path / "out.exr", inputs=InputOptions(view="fg"))

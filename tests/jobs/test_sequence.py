@@ -4,7 +4,7 @@
 import pytest
 
 from oiio_msspl import InputError
-from oiio_msspl.jobs.sequence import find_shot, format_frames, is_sequence, parse_frames, parse_pattern
+from oiio_msspl.jobs.sequence import find_shot, format_frames, frame_in_name, is_sequence, parse_frames, parse_pattern
 
 
 def touch(folder, *names):
@@ -146,3 +146,19 @@ def test_a_hyphen_after_a_letter_is_a_separator_and_a_sign_elsewhere(tmp_path):
 def test_a_step_may_be_written_with_a_colon():
     """As Houdini and Open Job Description write it. To fileseq a colon means a staggered range."""
     assert parse_frames("1-9:4") == [1, 5, 9]
+
+
+@pytest.mark.parametrize(
+    ("name", "following"),
+    [
+        ("hr.1001.exr", "hr.1002.exr"),
+        ("hr0009.exr", "hr0010.exr"),
+        ("anim.0001_lr.exr", "anim.0002_lr.exr"),
+        ("anim.0001_v2.exr", None),
+        ("shot_v001.exr", None),
+        ("still.exr", None),
+    ],
+)
+def test_the_frame_number_in_a_name_is_no_version(tmp_path, name, following):
+    found = frame_in_name(tmp_path / name)
+    assert (found and found[0].path(found[1] + 1)) == (following and tmp_path / following)

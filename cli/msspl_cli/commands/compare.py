@@ -67,7 +67,14 @@ def compare(
     RelMSE has two columns, one for each convention in the paper. Images smaller
     than the reference by x2, x4 or x8 are upsampled bicubically first.
     """
-    from oiio_msspl.compare import check_error_map, note_on_windows, open_comparison, score_images, write_error_map
+    from oiio_msspl.compare import (
+        check_error_map,
+        note_on_spaces,
+        note_on_windows,
+        open_comparison,
+        score_images,
+        write_error_map,
+    )
     from oiio_msspl.compare_page import check_page
 
     if reference is None and (html is None or error_map is not None):
@@ -80,8 +87,9 @@ def compare(
     if html is not None:
         check_page(html, compared, overwrite=overwrite)
     comparison = open_comparison(images, reference)
-    if note := note_on_windows(comparison):
-        console.say(note, error=True)
+    for note in (note_on_windows(comparison), note_on_spaces(comparison)):
+        if note:
+            console.say(note, error=True)
     results = score_images(comparison) if reference else [{} for _ in images]
     if error_map is not None:
         write_error_map(error_map, comparison, overwrite=overwrite)

@@ -210,8 +210,10 @@ def fuse(
     options.set_up_logging(verbose, quiet)
     from oiio_msspl.exr.reader import use_threads
     from oiio_msspl.jobs.frame import fuse_files
-    from oiio_msspl.jobs.sequence import is_sequence
+    from oiio_msspl.jobs.sequence import check_exists, is_sequence
 
+    for path in (lr, hr):
+        check_exists(path)
     common: dict[str, Any] = {
         "inputs": options.make_inputs(mapping, map_file, view_layer, lr_spp, hr_spp, colorspace, sums),
         "write": options.make_write_options(

@@ -279,7 +279,7 @@ def render(
         if as_json:
             print(json.dumps(reports.written, indent=2))
         elif reports.written and not quiet:
-            _print(reports.written, alone=not over_time.count(model))
+            _print(reports.written, alone=not fuser.averages)
             if fuser.text:
                 print(f"Fused {fuser.text}")
     if not (targets or as_json or quiet):

@@ -67,10 +67,10 @@ def submit(
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
-    names = ("layout", "compression", "half", "layers", "error_layer", "passes", "data_passes")
-    write = options.make_write_options(**{name: given[name] for name in names})
+    named = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
+    write = options.make_write_options(**{name: given[name] for name in named})
     options.make_temporal_options(given["temporal"], given["motion_format"])
-    options.parse_bytes(given["max_memory"])
+    max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     job = make_job(
         given["lr"],
@@ -86,7 +86,7 @@ def submit(
         chunk=chunk,
         timeout=timeout,
     )
-    check_wanted_outputs(job.shot.frames, inputs, write, model)
+    check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     doubts = check_first_pair(job.shot.frames, inputs)
     write_bundle(bundle, job)
     for doubt in doubts:

@@ -288,19 +288,20 @@ def means(rows: list[Row]) -> list[Row]:
         numbers = {k: float(np.mean([row[k] for row in same])) for k, v in same[0].items() if isinstance(v, float)}
         mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
         for column, peer in GAINS.items():
-            peers = [row for row in totals if (row["set"], row["spp"], row["method"]) == (*key[:2], peer)]
-            if len(peers) == len(same):
-                gains = np.array([row["psnr"] - other["psnr"] for row, other in zip(same, peers, strict=True)])
+            peers = {r["scene"]: r for r in totals if (r["set"], r["spp"], r["method"]) == (*key[:2], peer)}
+            if peers.keys() == {row["scene"] for row in same}:
+                gains = np.array([row["psnr"] - peers[row["scene"]]["psnr"] for row in same])
                 mean |= dict(zip((column, f"{column}_low", f"{column}_high"), with_interval(gains), strict=True))
-        layers = [_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER)]
-        won = [row["psnr"] > other["psnr"] for row, other in zip(*layers, strict=True)]
+        ours, theirs = (_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER))
+        won = [row["psnr"] > theirs[layer]["psnr"] for layer, row in ours.items()]
         found.append(mean | {"wins": sum(won), "layers": len(won)})
     return found
 
 
-def _single_layers(rows: list[Row], key: tuple[object, ...]) -> list[Row]:
-    """The rows of single layers of a set, spp and method."""
-    return [row for row in rows if tuple(row[k] for k in KEYS[1:]) == key and row["layer"] != ALL]
+def _single_layers(rows: list[Row], key: tuple[object, ...]) -> dict[tuple[str, str], Row]:
+    """The rows of single layers of a set, spp and method, by scene and layer."""
+    same = (row for row in rows if tuple(row[k] for k in KEYS[1:]) == key and row["layer"] != ALL)
+    return {(row["scene"], row["layer"]): row for row in same}
 
 
 def layout(rows: list[Row]) -> str:

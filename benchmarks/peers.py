@@ -21,9 +21,10 @@ def oidn(source: ReadableRender, quality: str = "high") -> Array:
     return denoise(**_inputs(source), quality=quality)
 
 
-def oidn_prefiltered(source: ReadableRender) -> Array:
-    """OIDN as its documentation recommends it: the albedo and the normal are denoised first."""
-    return denoise_prefiltered(**_inputs(source))
+def oidn_prefiltered(source: ReadableRender, guides: str = "high") -> Array:
+    """OIDN as its documentation recommends it: the albedo and the normal are denoised first, in the quality
+    ``guides``."""
+    return denoise_prefiltered(**_inputs(source), guides=guides)
 
 
 def oidn_split(source: ReadableRender) -> Array:

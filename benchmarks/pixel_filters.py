@@ -44,7 +44,7 @@ FILTERS = (
     PixelFilter("lanczos", 2.0),
     PixelFilter("box", 1.0),
     PixelFilter("box", 0.5),
-    PixelFilter("blackman-harris", 0.75, spread=False),
+    PixelFilter("blackman-harris", 0.75, splatted=False),
 )
 SCALE, SPP = 2, (1, 4)
 MODELS = ("joint-x2", "joint-spread-x2", "ensemble-spread-x2")
@@ -59,7 +59,7 @@ def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: i
     rows, columns = (slice(0, side) for side in view.size)
     stored = len(view.arrays[f"{prefix}color"])
     # Importance sampling leaves pixels without enough samples, unless there are more to choose from
-    count = spp if pixel_filter.spread else 2 * spp + 4
+    count = spp if pixel_filter.splatted else 2 * spp + 4
     samples = torch.arange(min(count, stored))
     values = [view.read(prefix + STORED[name], samples, rows, columns) for name in FEATURES]
     place = view.read(f"{prefix}place", samples, rows, columns)
@@ -86,7 +86,7 @@ def measure(views: list[SampleView], models: list[str]) -> Iterator[Row]:
     """A row for each filter, spp and method."""
     sessions = {name: load_model(SCALE, name) for name in models}
     for pixel_filter in FILTERS:
-        way = "" if pixel_filter.spread else ", importance sampled"
+        way = "" if pixel_filter.splatted else ", importance sampled"
         kind = f"{pixel_filter.kind}, radius {pixel_filter.radius}{way}"
         for spp in SPP:
             pairs = [pair(view, pixel_filter, spp) for view in views]

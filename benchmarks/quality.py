@@ -12,11 +12,13 @@ Methods that get an LRHS and an HRLS, each with half of the samples as in the pa
 - the models of this project, by name. "joint-x2, 3:1" has three quarters of the samples in the HRLS.
   "joint-x2, nearest" has the paper's LRHS, which keeps one of s x s pixels; a renderer averages them.
 - "OIDN on both x2": OIDN on the HRLS, with the local means of OIDN on the LRHS.
-- "OIDN on both x2, together": the same with the local means of :func:`benchmarks.peers.oidn_on_average`.
+- "OIDN on both x2, together": the same with the local means of :func:`benchmarks.peers.oidn_on_average`. "OIDN
+  prefiltered on both x2, together" has prefiltered OIDN on the HRLS.
 
 Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), "full resolution" and
 "OIDN, same samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
-:func:`benchmarks.oidn.denoise_prefiltered`. "OIDN prefiltered and split" is that on every second pixel
+:func:`benchmarks.oidn.denoise_prefiltered`; "with base guides" has OIDN's base networks for albedo and normal, which
+saves a third of its time. "OIDN prefiltered and split" is that on every second pixel
 (:mod:`benchmarks.every_second_pixel`). All others are OIDN's plain call with the quality "high".
 """
 
@@ -71,10 +73,13 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
     yield "HRLS", lambda: beauty(hr)
     yield "OIDN on the HRLS", denoised
     yield "OIDN fast on the HRLS", lambda: oidn(hr, "fast")
-    yield "OIDN prefiltered on the HRLS", lambda: oidn_prefiltered(hr)
+    prefiltered = functools.cache(lambda: oidn_prefiltered(hr))
+    yield "OIDN prefiltered on the HRLS", prefiltered
+    yield "OIDN prefiltered with base guides on the HRLS", lambda: oidn_prefiltered(hr, "balanced")
     yield "full resolution", lambda: beauty(full)
     yield "OIDN, same samples", lambda: oidn(full)
     yield "OIDN prefiltered, same samples", lambda: oidn_prefiltered(full)
+    yield "OIDN prefiltered with base guides, same samples", lambda: oidn_prefiltered(full, "balanced")
     yield "OIDN prefiltered and split, same samples", lambda: oidn_split(full)
     for scale in SCALES:
         lr, nearest = scene.lrhs(scale, spp // 2), scene.nearest(scale, spp // 2)
@@ -86,10 +91,12 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
             lambda low=denoised_low: upsample_bicubic(low(), width, height),
         )
         yield f"OIDN on both x{scale}", lambda low=denoised_low: match_local_means(denoised(), low())
-        yield (
-            f"OIDN on both x{scale}, together",
-            lambda lr=lr: match_local_means(denoised(), oidn_on_average(lr, hr)),
-        )
+        average = functools.cache(functools.partial(oidn_on_average, lr, hr))
+        for call, picture in (("OIDN", denoised), ("OIDN prefiltered", prefiltered)):
+            yield (
+                f"{call} on both x{scale}, together",
+                lambda average=average, picture=picture: match_local_means(picture(), average()),
+            )
         for session in sessions:
             if session.contract.scale == scale:
                 name = session.name
@@ -102,6 +109,7 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
             continue
         hr_more, division = scene.hrls(share * more), f"{more}:{less}"
         yield f"OIDN on the HRLS, {division}", functools.partial(oidn, hr_more)
+        yield f"OIDN prefiltered on the HRLS, {division}", functools.partial(oidn_prefiltered, hr_more)
         for session in sessions:
             lr = scene.lrhs(session.contract.scale, share * less)
             yield f"{session.name}, {division}", functools.partial(fused, session, lr, hr_more)

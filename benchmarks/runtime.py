@@ -31,6 +31,8 @@ from benchmarks import results
 from benchmarks.results import Row
 
 OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
+#: See :func:`benchmarks.oidn.denoise_prefiltered`: with OIDN's base networks for albedo and normal.
+OIDN_BASE_GUIDES = "OIDN prefiltered with base guides"
 #: See :func:`benchmarks.peers.oidn_split`.
 OIDN_SPLIT = "OIDN prefiltered, on every second pixel"
 #: As :mod:`benchmarks.quality` calls them -> as they are called here, where it does not matter which render they get.
@@ -40,6 +42,8 @@ SAME_WORK = {
     "OIDN fast on the HRLS": OIDN_FAST,
     "OIDN prefiltered on the HRLS": OIDN_PREFILTERED,
     "OIDN prefiltered, same samples": OIDN_PREFILTERED,
+    "OIDN prefiltered with base guides on the HRLS": OIDN_BASE_GUIDES,
+    "OIDN prefiltered with base guides, same samples": OIDN_BASE_GUIDES,
     "OIDN prefiltered and split, same samples": OIDN_SPLIT,
 }
 
@@ -75,8 +79,9 @@ def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
     images = {"color": layers["rgb"], "albedo": layers["albedo"], "normal": layers["normal"]}
     if name == OIDN_SPLIT:
         return partial(peers.oidn_split, Render.from_arrays("full", **layers))
-    if name == OIDN_PREFILTERED:
-        return lambda: oidn.denoise_prefiltered(**images)
+    if name in (OIDN_PREFILTERED, OIDN_BASE_GUIDES):
+        guides = "high" if name == OIDN_PREFILTERED else "balanced"
+        return lambda: oidn.denoise_prefiltered(**images, guides=guides)
     return lambda: oidn.denoise(**images, quality="fast" if name == OIDN_FAST else "high")
 
 
@@ -134,7 +139,7 @@ def compare(args: argparse.Namespace) -> list[Row]:
     """A row for each method: median, fastest and slowest seconds, and peak memory."""
     from oiio_msspl.model.catalogue import shipped_models
 
-    cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_SPLIT]
+    cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_BASE_GUIDES, OIDN_SPLIT]
     cases = [case for case in cases if fnmatch.fnmatchcase(case, args.methods or "*")]
     measured: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
     settings = "--size", args.size, "--repeats", str(args.repeats), "--threads", str(args.threads)

@@ -50,6 +50,7 @@ PEERS = (
     "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS",
     "OIDN on both x2, together",
+    "OIDN prefiltered on both x2, together",
     "OIDN, same samples",
     "OIDN prefiltered, same samples",
 )
@@ -65,6 +66,8 @@ WHEN_IT_PAYS = {
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
     "OIDN fast on the HRLS": ("OIDN on the HRLS, its quality fast", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
+    "OIDN prefiltered with base guides on the HRLS": ("the same with base networks for albedo and normal", "HRLS"),
+    "OIDN prefiltered on both x2, together": ("OIDN on both renders, prefiltered, and joined", "LRHS and HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
 }

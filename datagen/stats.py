@@ -16,6 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from datagen.quality import log_mean
+from datagen.views import SAMPLES_SUFFIX
 from oiio_msspl.colour import luminance as luminance_of
 from oiio_msspl.metrics import psnr
 from oiio_msspl.model.encoding import KEY
@@ -50,8 +51,10 @@ def measure(noisy: np.ndarray, reference: np.ndarray, albedo: np.ndarray) -> dic
 
 
 def training_views(folder: Path) -> Iterator[tuple[str, dict[str, float]]]:
-    """(kind of scene, measures) of each view."""
+    """(kind of scene, measures) of each view with passes."""
     for path in sorted(folder.glob("[!.]*.npz")):
+        if path.name.endswith(SAMPLES_SUFFIX):
+            continue
         with np.load(path) as view:
             hr, meta = view["hr"].astype(np.float32), json.loads(str(view["meta"]))
             numbers = measure(hr[0, ..., :3], view["ref"].astype(np.float32), hr[..., 3:6].mean(0))

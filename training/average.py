@@ -22,9 +22,6 @@ from training.checkpoints import State
 from training.joint import JointFusion
 from training.networks import NETWORKS
 
-#: Parts of a checkpoint that only a continued run needs.
-RUN_STATE = ("network", "optimizer", "best_gain")
-
 
 def mean(states: list[State], initial: tuple[float, float] = (0, 0)) -> State:
     """A checkpoint with the mean of the averaged weights of several.
@@ -49,7 +46,7 @@ def mean(states: list[State], initial: tuple[float, float] = (0, 0)) -> State:
     if any(initial):
         for name, start in JointFusion(**last["config"]).initial_state().items():
             weights[name] = torch.lerp(weights[name], start, initial[name.startswith("mean_denoiser.")])
-    result = {name: value for name, value in last.items() if name not in RUN_STATE}
+    result = {name: value for name, value in last.items() if name not in checkpoints.RUN_STATE}
     if len(states) > 1:
         result["provenance"] = last["provenance"] | {"mean_of": [state["provenance"] for state in states]}
     if any(initial):

@@ -24,6 +24,8 @@ from training.paper import MultiResolutionFusion
 State = dict[str, Any]
 log = logging.getLogger(__name__)
 
+#: Parts of a checkpoint that only a continued run needs.
+RUN_STATE = ("network", "optimizer", "best_gain")
 #: Parts of a parameter's name that older checkpoints have, and what they are called now.
 RENAMED = {"together.": "mean_denoiser.", ".more": ".extra"}
 

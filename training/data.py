@@ -81,8 +81,8 @@ class Sampling:
     """Share without the variance, which few renderers write."""
     drop_all: float = 0.05
     """Share with colour only."""
-    correlated: bool | None = None
-    """Of views with single samples: only pixel filters that spread samples, only others, or all (None)."""
+    spread_noise: bool | None = None
+    """Of views with single samples: only pixel filters that spread noise, only others, or all (None)."""
 
 
 #: The paper's sampling, as far as its text describes it: crops only, all features, clipped, nearest-neighbour LRHS.
@@ -249,13 +249,13 @@ class SampleTensors:
 
         Both renders and the reference have the same filter, the LRHS in its own pixels.
         """
-        pixel_filter = draw_filter(rng, correlated=sampling.correlated)
+        pixel_filter = draw_filter(rng, spread_noise=sampling.spread_noise)
         lr_count = len(self.arrays["lr_color"])
         n, lr_samples = _draw_spp(np.ones(lr_count), sampling, False, rng)
         # Importance sampling leaves pixels without enough samples, unless there are more to choose from
         device = light.device
         drawn = torch.from_numpy(rng.permutation(len(self.arrays["color"]))).to(device)
-        drawn = drawn[: n if pixel_filter.spread else 2 * n + 4]
+        drawn = drawn[: n if pixel_filter.splatted else 2 * n + 4]
         generator = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
 
         # The crop with as much around it as the filter reaches
@@ -278,7 +278,7 @@ class SampleTensors:
         features = _split(filtered.mean[inner].movedim(0, -1))
         for name in RADIANCE_FEATURES:
             features[name] = features[name].clamp(0.0, sampling.clip)
-        has_variance = n > 1 or (pixel_filter.spread and pixel_filter.reach > 0)
+        has_variance = n > 1 or pixel_filter.spreads_noise
 
         whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
         chosen = torch.from_numpy(lr_samples).to(device)
@@ -375,6 +375,22 @@ def draw(
         name: torch.rot90(image.flip(2) if mirrored else image, turns, (1, 2)).contiguous().permute(0, 3, 1, 2)
         for name, image in pair.items()
     }
+
+
+def turned(pair: Batch, rng: np.random.Generator) -> Batch:
+    """Pictures (N, c, H, W) of one place, mirrored and transposed at random.
+
+    Normals are mirrored with their picture, in whatever space they are: those of ``hrls``, in the last of nine or more
+    channels from the sixth on, and ``normal``, in [0, 1].
+    """
+    flips = [axis for axis in (2, 3) if rng.random() < 0.5]
+    swaps = rng.random() < 0.5
+    result = {name: (each.flip(flips).transpose(2, 3) if swaps else each.flip(flips)) for name, each in pair.items()}
+    if (len(flips) + swaps) % 2:
+        for name, channel, middle in (("hrls", 6, 0.0), ("normal", 0, 0.5)):
+            if name in result:
+                result[name][:, channel] = 2 * middle - result[name][:, channel]
+    return {name: each.contiguous(memory_format=torch.channels_last) for name, each in result.items()}
 
 
 def _per_channel(values: dict[str, Any]) -> np.ndarray:

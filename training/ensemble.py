@@ -31,6 +31,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from oiio_msspl.metrics import psnr, relmse
 from training import losses
+from training.data import turned
 from training.encoding import log_decode
 from training.joint import JointFusion, within_renders
 from training.large import LargeDenoiser, LayerDenoisers
@@ -195,11 +196,9 @@ def batches(files: Sequence[Path], rng: np.random.Generator) -> Iterator[Pair]:
         chosen = by_scale[names[rng.choice(len(names), p=shares / shares.sum())]]
         pairs = [read_pair(chosen[i]) for i in rng.integers(len(chosen), size=BATCH)]
         batch = {name: torch.cat([pair[name] for pair in pairs]) for name in pairs[0]}
-        flips = [axis for axis in (2, 3) if rng.random() < 0.5]
-        swap = rng.random() < 0.5
+        batch = turned(batch, rng)
         order = torch.from_numpy(rng.permutation(3)) if rng.random() < 0.5 else torch.arange(3)
         for name, image in batch.items():
-            image = image.flip(flips).transpose(2, 3) if swap else image.flip(flips)
             if name not in ("joint_error", "normal"):
                 image = torch.cat([part[:, order] for part in image.split(3, dim=1)], dim=1)
             batch[name] = image.contiguous(memory_format=torch.channels_last)

@@ -36,7 +36,7 @@ from torch import Tensor, nn
 from datagen.views import Folder, SampleView, View
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from training import checkpoints
-from training.data import Batch, SampleTensors, Sampling, ViewTensors, draw
+from training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
 from training.encoding import compress, exposure_of, log_decode, log_to_pu, pu_to_log
 from training.joint import FEATURES, JointFusion, denoise_mean, mean_and_noise
 from training.layer_denoisers import LayerDenoisers, untouched
@@ -98,9 +98,9 @@ class Denoisers:
         output = self.large.run(torch.cat([log_to_pu(encoded), *self.layers(albedo, normal)], dim=1))
         return 0.5 * (colour + log_decode(pu_to_log(output.float().clamp(0, 1))) / exposure)
 
-    def prepared(self, lrhs: Tensor, hrls: Tensor, kind: int) -> tuple[Tensor, Tensor]:
+    def prepared(self, lrhs: Tensor, hrls: Tensor, spread: bool) -> tuple[Tensor, Tensor]:
         """The arguments of :meth:`JointFusion.fuse_prepared` for those of :meth:`JointFusion.forward`."""
-        return denoise_mean(self.means[kind], lrhs, hrls), self.layers.applied(hrls)
+        return denoise_mean(self.means[spread], lrhs, hrls), self.layers.applied(hrls)
 
 
 @torch.no_grad()
@@ -129,17 +129,17 @@ def draw_pairs(
     prepares = denoisers is not None and bool(denoisers.means)
     pairs = []
     for index in range(count):
-        kind = index % 2 if prepares and isinstance(view, SampleView) else 0
-        sampling = Sampling(correlated=bool(kind) if prepares else None)
+        spread = prepares and isinstance(view, SampleView) and index % 2 == 1
+        sampling = Sampling(spread_noise=spread if prepares else None)
         batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
         lrhs, hrls = batch["lrhs"], batch["hrls"]
         lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :CHANNELS]
         if denoisers is not None and prepares:
-            lrhs, hrls = denoisers.prepared(lrhs, hrls, kind)
+            lrhs, hrls = denoisers.prepared(lrhs, hrls, spread)
         batch = {"lrhs": lrhs, "hrls": hrls, "target": batch["target"]}
         pair = {name: image[0].half().contiguous().cpu() for name, image in batch.items()}
         if all(bool(image.isfinite().all()) for image in pair.values()):
-            pairs.append(pair | ({SPREAD_NOISE: torch.tensor(bool(kind))} if prepares else {}))
+            pairs.append(pair | ({SPREAD_NOISE: torch.tensor(spread)} if prepares else {}))
     return pairs
 
 
@@ -247,13 +247,7 @@ class PooledBatches:
                     left * step : left * step + self.patch // (scale // step),
                 ]  # fmt: skip
                 parts[name].append(crop[channels[: len(crop)]])
-        axes = [axis for axis in (2, 3) if rng.random() < 0.5]
-        swap = rng.random() < 0.5
-        batch = {}
-        for name, crops in parts.items():
-            image = torch.stack(crops).float().flip(axes)
-            batch[name] = (image.transpose(2, 3) if swap else image).contiguous(memory_format=torch.channels_last)
-        return batch
+        return turned({name: torch.stack(crops).float() for name, crops in parts.items()}, rng)
 
 
 def main() -> None:

@@ -58,7 +58,7 @@ def pruned(network: JointFusion, name: str, count: int, pairs: list[data.Batch])
     kept = importance.argsort(descending=True)[:count].sort().values
     removed = torch.tensor(sorted(set(range(len(mean))) - set(kept.tolist())))
     rows, _ = network.pretrained_channels(name)
-    result = JointFusion(network.kept | {name: [rows[i] for i in kept]}, network.size)
+    result = JointFusion(**network.config | {"kept": network.kept | {name: [rows[i] for i in kept]}})
     weights = network.state_dict()
     prefixes = {id(module): prefix for prefix, module in network.named_modules()}
     for kind in ("weight", "bias", "extra"):
@@ -82,14 +82,14 @@ def main() -> None:
     parser.add_argument("--keep", nargs="+", required=True, metavar="NAME=COUNT", help="best multiples of 16")
     args = parser.parse_args()
     network, state = checkpoints.load(args.checkpoint)
-    if not isinstance(network, JointFusion):
-        raise SystemExit(f"{args.checkpoint}: not a joint network")
+    if not isinstance(network, JointFusion) or network.size == "large":
+        raise SystemExit(f"{args.checkpoint}: not a joint network of the size usual or small")
     pairs = list(itertools.islice(data.fixed_batches(args.data, "train", [2], PATCH, 1, with_mean), PAIRS))
     for name, _, count in (part.partition("=") for part in args.keep):
         network = pruned(network, name, int(count), pairs)
     state["ema"] = network.state_dict()
     state["config"] = network.config
-    checkpoints.save({key: value for key, value in state.items() if key not in ("network", "optimizer")}, args.output)
+    checkpoints.save({key: value for key, value in state.items() if key not in checkpoints.RUN_STATE}, args.output)
 
 
 if __name__ == "__main__":

@@ -80,16 +80,21 @@ KINDS: dict[str, Callable[[Tensor], Tensor]] = {
 
 @dataclass(frozen=True)
 class PixelFilter:
-    """A pixel filter: its kind, its radius in pixels, and whether samples are spread over all pixels that it covers."""
+    """A pixel filter: its kind, its radius in pixels, and whether samples are splatted to all pixels that it covers."""
 
     kind: str = "box"
     radius: float = 0.5
-    spread: bool = True
+    splatted: bool = True
 
     @property
     def reach(self) -> int:
         """How many pixels away from its own a sample may count."""
         return math.ceil(self.radius - 0.5)
+
+    @property
+    def spreads_noise(self) -> bool:
+        """Whether neighbouring pixels share samples, and so their noise."""
+        return self.splatted and self.reach > 0
 
     def weights(self, place: Tensor) -> Tensor:
         """Weights of samples at ``place`` (0 to 1) in pixels -reach ... reach from their own: (2 * reach + 1, ...).
@@ -99,12 +104,12 @@ class PixelFilter:
         offsets = torch.arange(-self.reach, self.reach + 1, device=place.device, dtype=place.dtype)
         t = (place - 0.5 - offsets.reshape(-1, *[1] * place.ndim)).abs() / self.radius
         weights = torch.where(t <= 1, KINDS[self.kind](t), 0.0)
-        return weights if self.spread else weights / weights.sum(dim=0)
+        return weights if self.splatted else weights / weights.sum(dim=0)
 
 
 BOX = PixelFilter()
 
-#: Share of training pairs, kind of filter, least and greatest radius in pixels, spread. Half of the pairs have
+#: Share of training pairs, kind of filter, least and greatest radius in pixels, splatted. Half of the pairs have
 #: independent noise, as Cycles, RenderMan and pbrt make it and as every renderer does with a box of one pixel. The rest
 #: is led by the Gaussian, the default of Mitsuba, Arnold, Redshift, Karma and Mantra.
 SHARES: tuple[tuple[float, str, float, float, bool], ...] = (
@@ -123,16 +128,12 @@ SHARES: tuple[tuple[float, str, float, float, bool], ...] = (
 )
 
 
-def draw_filter(rng: np.random.Generator, *, correlated: bool | None = None) -> PixelFilter:
-    """A filter in the shares of ``SHARES``: only those that make neighbouring pixels share noise, only the others, or
-    any (None)."""
-    filters = [(share, PixelFilter(kind, greatest, spread)) for share, kind, _, greatest, spread in SHARES]
-    shares = [
-        share if correlated is None or (each.spread and each.reach > 0) is correlated else 0.0
-        for share, each in filters
-    ]
-    _, kind, least, greatest, spread = SHARES[rng.choice(len(SHARES), p=np.divide(shares, sum(shares)))]
-    return PixelFilter(kind, float(rng.uniform(least, greatest)), spread)
+def draw_filter(rng: np.random.Generator, *, spread_noise: bool | None = None) -> PixelFilter:
+    """A filter in the shares of ``SHARES``: only those that spread noise, only the others, or any (None)."""
+    filters = [(share, PixelFilter(kind, greatest, splatted)) for share, kind, _, greatest, splatted in SHARES]
+    shares = [share if spread_noise in (None, each.spreads_noise) else 0.0 for share, each in filters]
+    _, kind, least, greatest, splatted = SHARES[rng.choice(len(SHARES), p=np.divide(shares, sum(shares)))]
+    return PixelFilter(kind, float(rng.uniform(least, greatest)), splatted)
 
 
 # Samples to pixels
@@ -186,7 +187,7 @@ def apply(
     if measure is not None:
         stacked = torch.cat([stacked, blocks(measure)[:, None]], dim=1)
     has_measure = measure is not None
-    if pixel_filter.spread:
+    if pixel_filter.splatted:
         return _splat(pixel_filter, x, y, stacked, has_measure)
     return _distribute(pixel_filter, x, y, stacked, has_measure, count, generator)
 

@@ -131,7 +131,9 @@ def new_network(args: argparse.Namespace) -> Network:
     if args.network == "joint":
         started = args.out / "checkpoint.pt"
         earlier = started if started.exists() else args.init
-        config = checkpoints.read(earlier)["config"] if earlier else {"size": args.size}
+        config = checkpoints.read(earlier)["config"] if earlier else {"size": args.size or "usual"}
+        if args.size not in (None, config.get("size", "usual")):
+            raise SystemExit(f"--size {args.size}: {earlier} has the size {config['size']}")
         return JointFusion(**config | ({"spread": True} if args.spread else {}))
     if len(args.scale) > 1:
         raise SystemExit("--network paper: a network has one --scale")
@@ -286,15 +288,15 @@ class Run:
         scores = self.evaluate()
         self.log_row(scores)
         gain = scores["psnr"] - scores["bicubic_psnr"] if scores else math.nan
-        if gain < self.best_gain - COLLAPSE:
+        if scores and self.best_path.exists() and not gain >= self.best_gain - COLLAPSE:  # or it is NaN
             self.peak_lr /= 2
             self.restore(checkpoints.read(self.best_path))
             self.schedule = self.new_schedule()
             message = "collapsed to %+.1f dB, back to %+.1f dB, peak learning rate %.2g"
             log.warning(message, gain, self.best_gain, self.peak_lr)
         else:
-            better = not gain <= self.best_gain  # without validation views the newest is the best
-            if better:
+            better = not scores or gain > self.best_gain  # without validation views the newest is the best
+            if better and scores:
                 self.best_gain = gain
             state = self.state(scores)
             if better:
@@ -385,13 +387,20 @@ def train(args: argparse.Namespace) -> None:
 
 
 def write_row(path: Path, row: dict[str, float]) -> None:
-    """Append a line to a CSV file; a new file gets a header first."""
-    new = not path.exists()
-    with path.open("a", newline="") as file:
-        writer = csv.writer(file)
-        if new:
-            writer.writerow(row)
-        writer.writerow(f"{value:.5g}" if isinstance(value, float) else value for value in row.values())
+    """Append a line to a CSV file. A new file gets a header first, and an older one the columns that it lacks."""
+    written = {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in row.items()}
+    with path.open("a+", newline="") as file:
+        file.seek(0)
+        reader = csv.DictReader(file)
+        columns = list(dict.fromkeys([*(reader.fieldnames or ()), *row]))
+        earlier = [] if columns == reader.fieldnames else list(reader)
+        if columns != reader.fieldnames:
+            file.truncate(0)
+        writer = csv.DictWriter(file, columns)
+        if columns != reader.fieldnames:
+            writer.writeheader()
+            writer.writerows(earlier)
+        writer.writerow(written)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:
@@ -409,7 +418,7 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--out", type=Path, required=True, help="folder of the run; continued if it has a checkpoint")
     parser.add_argument("--minutes", type=float, required=True, help="length of the whole run, continuations included")
     parser.add_argument("--network", choices=NETWORKS, default="paper", help="(default: %(default)s)")
-    parser.add_argument("--size", choices=SIZES, default="usual", help="joint: (default: %(default)s)")
+    parser.add_argument("--size", choices=SIZES, help="joint: (default: usual, or that of --init)")
     parser.add_argument("--spread", action="store_true", help="joint: for noise that a pixel filter has spread")
     parser.add_argument("--preset", choices=RECIPES, default="ours")
     parser.add_argument("--init", type=Path, help="checkpoint of another run, of any scale, to start from")
@@ -442,7 +451,10 @@ def parse(arguments: list[str] | None = None) -> argparse.Namespace:
     parser.add_argument("--val-views", type=int, default=24, help="validation views, at most")
     parser.add_argument("--val-patch", type=int, default=128, help="width of the validation crops in HRLS pixels")
     parser.add_argument("--checkpoint-seconds", type=float, default=120)
-    return parser.parse_args(arguments)
+    args = parser.parse_args(arguments)
+    if args.noise and not args.pool:
+        parser.error("--noise chooses pairs of --pool")
+    return args
 
 
 if __name__ == "__main__":

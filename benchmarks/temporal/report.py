@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import io
+import itertools
 import math
 from collections.abc import Sequence as Rows
 from pathlib import Path
@@ -12,7 +13,7 @@ import numpy as np
 
 from benchmarks import results
 from benchmarks.results import Row
-from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, QUALITIES, SCALES
+from benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, OIDN_NEIGHBOURS, QUALITIES, SCALES
 from benchmarks.temporal.sequence import MASKS
 from benchmarks.versus import cell, with_interval
 from oiio_msspl.arrays import Array
@@ -56,6 +57,7 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
     compared = [row for row in rows if row["method"] == prefix + NEIGHBOURS]
     for row in compared:
         alone, peer = found[row["sequence"], row["scale"], prefix + ALONE], peers[row["sequence"]]
+        averaged = found.get((row["sequence"], row["scale"], OIDN_NEIGHBOURS))
         gain, over_peer = (row["psnr"] - other["psnr"] for other in (alone, peer))
         steadier = [row["flicker"] / other["flicker"] for other in (alone, peer)]
         steadier += [math.sqrt(row["ewarp"] / other["ewarp"]) for other in (alone, peer)]
@@ -64,30 +66,39 @@ def _summary_of(rows: Rows[Row], quality: str, prefix: str) -> str:
         missed = _missed(row["sequence"], gain, over_peer, max(steadier[:2]), masks.get(worst, 0.0))
         body.append([
             row["sequence"], _role(row["sequence"]), f"x{row['scale']}", f"{gain:+.2f}", f"{over_peer:+.2f}",
+            f"{row['psnr'] - averaged['psnr']:+.2f}" if averaged else "",
             *(f"{ratio:.2f}" for ratio in steadier), f"{masks[worst]:+.2f} ({worst})" if worst else "",
             ", ".join(missed),
         ])  # fmt: skip
     head = [f"`{quality}`", "part", "scale", "gained over single frames, dB", "over OIDN prefiltered, dB"]
-    head += ["flicker, of single frames'", "of OIDN's", "along the motion, of single frames'", "of OIDN's"]
+    head += ["over that with neighbours, dB", "flicker, of single frames'", "of OIDN's"]
+    head += ["along the motion, of single frames'", "of OIDN's"]
     head += ["least gain in a mask, dB", "targets missed"]
     lines = [results.markdown(head, body)]
-    for unit in ("psnr", "jod"):
-        for scale in SCALES:
-            rows_of = [row for row in compared if row["scale"] == scale and unit in row]
-            if not rows_of:
-                continue
-            gains = [row[unit] - found[row["sequence"], scale, prefix + ALONE][unit] for row in rows_of]
-            over = [row[unit] - peers[row["sequence"]][unit] for row in rows_of]
-            lines.append(
-                f"- `{quality}`, {unit.upper()} at x{scale}, {len(rows_of)} sequences, mean with a 95 % interval: "
-                f"{_mean(gains)} over single frames (better on {sum(gain > 0 for gain in gains)}), {_mean(over)} over "
-                f"prefiltered OIDN (better on {sum(gain > 0 for gain in over)})."
-            )
+    means = []
+    for unit, scale, fresh in itertools.product(("psnr", "jod"), SCALES, (False, True)):
+        rows_of = [row for row in compared if row["scale"] == scale and unit in row]
+        rows_of = [row for row in rows_of if not fresh or row["sequence"] not in DEVELOPMENT]
+        if len(rows_of) < 2:
+            continue
+        others = [
+            [found.get((row["sequence"], scale, prefix + ALONE)) for row in rows_of],
+            [peers[row["sequence"]] for row in rows_of],
+            [found.get((row["sequence"], scale, OIDN_NEIGHBOURS)) for row in rows_of],
+        ]
+        which = f"{len(rows_of)}{' fresh' if fresh else ''}"
+        means.append([unit.upper(), f"x{scale}", which, *(_gain(unit, rows_of, each) for each in others)])
+    head = [f"`{quality}`: mean gain", "scale", "sequences", "over single frames", "over OIDN prefiltered"]
+    lines.append(results.markdown([*head, "over that with neighbours"], means))
     return "\n".join(lines) + "\n"
 
 
-def _mean(gains: Rows[float]) -> str:
-    return cell(with_interval(np.array(gains)), "+.2f")
+def _gain(unit: str, rows: Rows[Row], others: Rows[Row | None]) -> str:
+    """The mean gain of rows over others with a 95 % interval, and on how many they are better; empty if one lacks."""
+    gains = [row[unit] - other[unit] for row, other in zip(rows, others, strict=True) if other and unit in other]
+    if len(gains) < len(rows):
+        return ""
+    return f"{cell(with_interval(np.array(gains)), '+.2f')}, better on {sum(gain > 0 for gain in gains)}"
 
 
 def _role(sequence: str) -> str:

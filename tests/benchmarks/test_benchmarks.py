@@ -236,7 +236,6 @@ def test_a_page_has_its_tables_replaced():
         tables.laid_out("", [table])
 
 
-@pytest.mark.skipif(not all(path.exists() for path in tables.TABLES), reason="the pages are not there yet")
 @pytest.mark.parametrize("path", tables.TABLES, ids=lambda path: path.name)
 def test_pages_have_the_figures_that_were_measured(path):
     """`python -m benchmarks.tables` brings the pages up to date."""

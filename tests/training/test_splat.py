@@ -20,7 +20,7 @@ LOBED = [PixelFilter(kind, 2.0) for kind in ("mitchell", "catmull-rom", "lanczos
 SPREAD = LOBED + [
     PixelFilter(kind, radius) for kind in sorted(KINDS.keys() - {f.kind for f in LOBED}) for radius in (0.75, 1.5, 2.0)
 ]
-INDEPENDENT = [PixelFilter("blackman-harris", 0.75, spread=False), PixelFilter("gaussian", 2.0, spread=False)]
+INDEPENDENT = [PixelFilter("blackman-harris", 0.75, splatted=False), PixelFilter("gaussian", 2.0, splatted=False)]
 
 
 def _noise(k: int = 4, size: int = 48, channels: int = 2, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -102,7 +102,7 @@ def test_spread_noise_is_correlated_and_distributed_noise_is_not() -> None:
 @pytest.mark.parametrize("pixel_filter", [BOX, *INDEPENDENT, PixelFilter("gaussian", 2.0), PixelFilter("tent", 1.5)])
 def test_variance_is_that_of_the_filtered_pixel(pixel_filter: PixelFilter) -> None:
     """Its mean over pixels is the variance of pixels."""
-    place, values = _noise(k=4 if pixel_filter.spread else 12, size=160)
+    place, values = _noise(k=4 if pixel_filter.splatted else 12, size=160)
     filtered = apply(pixel_filter, place, values, values[:, 0], 1, 4, torch.Generator().manual_seed(1))
     assert filtered.variance.mean().item() == pytest.approx(filtered.mean[0].var().item(), rel=0.1)
 
@@ -195,9 +195,9 @@ def test_shares_of_filters() -> None:
     assert sum(share for share, *_ in splat.SHARES) == pytest.approx(1)
     rng = np.random.default_rng(0)
     drawn = [splat.draw_filter(rng) for _ in range(2000)]
-    independent = np.mean([f.reach == 0 or not f.spread for f in drawn])
+    independent = np.mean([not f.spreads_noise for f in drawn])
     assert independent == pytest.approx(0.5, abs=0.04)
     assert all(0.5 <= f.radius <= 2 for f in drawn)
-    for correlated in (True, False):
-        drawn = [splat.draw_filter(rng, correlated=correlated) for _ in range(200)]
-        assert all((f.reach > 0 and f.spread) is correlated for f in drawn)
+    for spread_noise in (True, False):
+        drawn = [splat.draw_filter(rng, spread_noise=spread_noise) for _ in range(200)]
+        assert all(f.spreads_noise is spread_noise for f in drawn)

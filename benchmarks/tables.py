@@ -67,6 +67,7 @@ WHEN_IT_PAYS = {
     "OIDN fast on the HRLS": ("OIDN on the HRLS, its quality fast", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN prefiltered with base guides on the HRLS": ("the same with base networks for albedo and normal", "HRLS"),
+    "OIDN prefiltered on the HRLS, 7:1": ("the HRLS with 7/8 of the samples, prefiltered", "HRLS"),
     "OIDN prefiltered on both x2, together": ("OIDN on both renders, prefiltered, and joined", "LRHS and HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
@@ -147,7 +148,8 @@ def share_of_oidn(times: Found, method: str) -> str:
     Args:
         times: rows of :mod:`benchmarks.runtime` by method.
     """
-    time = times.get(SAME_WORK.get(method, method.partition(", ")[0]))
+    name = method if method in SAME_WORK else method.partition(", ")[0]
+    time = times.get(SAME_WORK.get(name, name))
     return f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else ""
 
 
@@ -171,8 +173,9 @@ def how_sure() -> str:
     rows = results.read("quality")
     body = []
     for (peer, render), model, spp in itertools.product(AT_ITS_BEST.items(), BETTER, (2, 8)):
-        if "," in model and peer.endswith("on the HRLS"):
-            continue  # its HRLS has more samples
+        _, comma, division = model.partition(", ")
+        if peer.endswith("on the HRLS"):  # the same one
+            peer += comma + division
         if found := versus.compare(rows, model, peer, spp):
             cells = [versus.cell(found.psnr, "+.2f"), f"{found.without_too_easy:+.2f}", found.wins]
             body.append([render, title(model), str(spp), *cells, ", ".join(found.verdicts)])

@@ -115,6 +115,11 @@ def make_folder(folder: Path) -> None:
         raise InputError(f"{folder}: the folder can't be made ({error.strerror})") from error
 
 
+def not_written(folder: Path, reason: str) -> MssplError:
+    """The error for a result that could not be written into a folder."""
+    return MssplError(f"{folder}: the result can't be written ({reason}); the target is as it was; is the disk full?")
+
+
 @contextmanager
 def replacing(
     path: Path, *, overwrite: bool = False, before_rename: Callable[[], object] | None = None
@@ -238,12 +243,13 @@ def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:
 
 
 def _name_if_free(temporary: Path, target: Path) -> None:
-    """Rename a file in one step that fails if the target exists: two jobs must not overwrite each other."""
+    """Rename a file if there is no target yet: two jobs must not overwrite each other. It is one step, but on a file
+    system without hard links, where two jobs that end in the same moment may."""
     try:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except OSError:  # a file system without hard links
+    except OSError:
         if target.exists():
             raise FileExistsError from None
         os.replace(temporary, target)

@@ -154,7 +154,8 @@ class ExrFile:
         channels of its part that are read are half, otherwise 4.
 
         Args:
-            max_bytes: the cache never holds more. Rows that do not fit are decoded again for each window.
+            max_bytes: what the cache holds at most, but for small parts of strips. Rows that do not fit are decoded
+                again for each window.
         """
         self._cache.max_bytes = max_bytes
         try:

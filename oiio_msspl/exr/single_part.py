@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.atomic import not_written
 from oiio_msspl.exr.contents import FileContents
 from oiio_msspl.exr.part_specs import runs
 from oiio_msspl.exr.reader import Channel, Part
@@ -50,9 +51,7 @@ def write_single_part(path: Path, contents: FileContents) -> None:
         with OpenEXR.File(header, channels) as file:
             file.write(str(path))
     except Exception as error:
-        raise MssplError(
-            f"{path.parent}: the result can't be written ({error}); the target is as it was; is the disk full?"
-        ) from error
+        raise not_written(path.parent, str(error)) from error
 
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:

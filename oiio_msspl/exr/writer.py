@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import replacing
+from oiio_msspl.exr.atomic import not_written, replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
 from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, extra_spec, is_held_whole, passed_on_parts
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of, unreadable
@@ -148,9 +148,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     ok = writer.close() and ok
     if not ok or writer.has_error:
         reason = reason_of(writer) if writer.has_error else "no reason given"
-        raise MssplError(
-            f"{path.parent}: the result can't be written ({reason}); the target is as it was; is the disk full?"
-        )
+        raise not_written(path.parent, reason)
 
 
 def _check_whole(temporary: Path, path: Path) -> None:
@@ -164,10 +162,7 @@ def _check_whole(temporary: Path, path: Path) -> None:
                 file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
         file.close()
     except InputError as error:
-        raise MssplError(
-            f"{path.parent}: the result can't be written (its end is missing); the target is as it was; is the disk "
-            "full?"
-        ) from error
+        raise not_written(path.parent, "its end is missing") from error
 
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:

@@ -7,7 +7,7 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.arrays import Array
-from oiio_msspl.fusion.guards import check_finite, enlarge
+from oiio_msspl.fusion.guards import check_finite, repeated
 from oiio_msspl.fusion.neighbourhood import all_within
 from oiio_msspl.fusion.tile_features import TilePair
 from oiio_msspl.model.render_mean import Images, Shares
@@ -28,7 +28,7 @@ def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
     if "alpha" not in pair.lrhs:
         return hrls_alpha
     lrhs_alpha = np.clip(pair.lrhs["alpha"], 0.0, 1.0)
-    solid, empty = (enlarge(lrhs_alpha == value, pair.scale) & all_within(hrls_alpha == value, 1) for value in (1, 0))
+    solid, empty = (repeated(lrhs_alpha == value, pair.scale) & all_within(hrls_alpha == value, 1) for value in (1, 0))
     if (solid | empty).all():
         return solid.astype(np.float32)
     grey = session.run(*alpha_as_colour(pair), 1.0, shares)["fused"]

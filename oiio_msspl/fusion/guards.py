@@ -106,8 +106,8 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
 
     def work(rows: slice) -> None:
         part, place = hrls_rgb[rows], slice(rows.start // scale, rows.stop // scale)
-        in_proportion = least + (part - least) * enlarge(factor[place], scale)
-        bound = np.minimum(np.maximum(enlarge(limit[place], scale), in_proportion), enlarge(most[place], scale))
+        in_proportion = least + (part - least) * repeated(factor[place], scale)
+        bound = np.minimum(np.maximum(repeated(limit[place], scale), in_proportion), repeated(most[place], scale))
         np.minimum(part, bound, out=agreed[rows])
 
     for_row_blocks(work, len(hrls_rgb), hrls_rgb[0].size, multiple=scale)
@@ -224,8 +224,8 @@ class EmptyRegions:
         if not self._black[window].any():
             return None
         empty = _holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
-        no_surface = _shows_no_surface(pair.hrls) & ~enlarge(self._has_rare_light[window], pair.scale)
-        empty &= no_surface | enlarge(self._black_far_around[window], pair.scale)
+        no_surface = _shows_no_surface(pair.hrls) & ~repeated(self._has_rare_light[window], pair.scale)
+        empty &= no_surface | repeated(self._black_far_around[window], pair.scale)
         return empty
 
 
@@ -246,10 +246,10 @@ def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
 
 def _holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
     """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
-    return enlarge(reduce(np.logical_and, neighbours(lrhs)), scale) & hrls
+    return repeated(reduce(np.logical_and, neighbours(lrhs)), scale) & hrls
 
 
-def enlarge(lrhs: NDArray[T], scale: int) -> NDArray[T]:
+def repeated(lrhs: NDArray[T], scale: int) -> NDArray[T]:
     """(h, w, c) to (s*h, s*w, c): each pixel becomes s x s equal ones."""
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 

@@ -17,7 +17,7 @@ from oiio_msspl.arrays import Array, box_downsample
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment
-from oiio_msspl.fusion.tile_features import RepairCounts, read_features, read_lrhs
+from oiio_msspl.fusion.tile_features import RepairCounts, in_hrls_pixels, read_features, read_lrhs
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
 
 #: Side of the blocks in which neighbouring pixels are compared; and of a sample of the frame, in LRHS pixels.
@@ -42,7 +42,7 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
     with hr.cache_strips(CACHE_BYTES):
         for window in _samples(alignment.grid):
             low = read_lrhs(lr, alignment, window, [RGB], RepairCounts())[RGB]
-            area = Window(window.x0 * scale, window.y0 * scale, window.x1 * scale, window.y1 * scale)
+            area = in_hrls_pixels(window, scale)
             high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
             exposure = find_exposure(low)
             mean, low, high = (

@@ -81,7 +81,7 @@ def fuse_frames(
     from dask.distributed import CancelledError, KilledWorker, as_completed
     from distributed.comm import CommClosedError
 
-    neighbours = _most_workers_on_a_machine(client)
+    workers = _most_workers_on_a_machine(client)
     if stages.model is not None and Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))
     find_model(2, stages.model)  # refuses an unknown model before any task is submitted
@@ -94,7 +94,7 @@ def fuse_frames(
     def submit(chunk: list[Frame], tries: int) -> Future:
         key = f"msspl-fuse-{chunk[0].number}-{tries}-{run}"
         task = [frame.absolute() for frame in chunk]
-        future = client.submit(_fuse_chunk, run, stages, task, neighbours, key=key, retries=RETRIES)
+        future = client.submit(_fuse_chunk, run, stages, task, workers, key=key, retries=RETRIES)
         futures[future] = chunk, tries
         return future
 
@@ -159,15 +159,13 @@ def _sessions(run: str) -> dict[tuple[int, str | None], Session]:
     return {}
 
 
-def _fuse_chunk(
-    run: str, stages: Stages, frames: list[Frame], neighbours: int
-) -> list[dict[str, Any] | Exception | None]:
+def _fuse_chunk(run: str, stages: Stages, frames: list[Frame], workers: int) -> list[dict[str, Any] | Exception | None]:
     """Take frames through the three stages, in a worker.
 
     Args:
         run: identifies the run.
         stages, frames: what to do, with absolute paths.
-        neighbours: workers on this machine, which share its cores.
+        workers: those on this machine, which share its cores.
 
     Returns:
         For each frame its report as a dict, the reason for its failure, or None if the EXR exists.
@@ -182,7 +180,7 @@ def _fuse_chunk(
             missing.append(frame)
         else:
             outcomes[frame.number] = None
-    threads = stages.threads or (max(1, CPU_COUNT // neighbours) if neighbours > 1 else 0)
+    threads = stages.threads or (max(1, CPU_COUNT // workers) if workers > 1 else 0)
     # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
     use_threads(threads)
     stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))

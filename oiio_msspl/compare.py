@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import astuple, dataclass, field
 from functools import cached_property
 from pathlib import Path
 
@@ -14,7 +14,7 @@ import OpenImageIO as oiio
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.arrays import Array, repair
+from oiio_msspl.arrays import HALF_MAX, Array, repair
 from oiio_msspl.colour import conversion, same_space, space_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
@@ -53,6 +53,9 @@ class Comparison:
     """Position of the render at whose size all are compared: the reference, or else the largest image."""
     windows: list[Window]
     """What is compared of each render, see :func:`common_windows`."""
+    broken: dict[str, int] = field(default_factory=dict)
+    """Numbers of values that were NaN or infinite, by the name of the render, as far as it was read. NaN counts as
+    black, infinity as the largest half float."""
 
     @cached_property
     def truth(self) -> Array:
@@ -67,7 +70,9 @@ class Comparison:
     def _read(self, position: int) -> Array:
         """The beauty of a render without NaN and infinities, in the linear RGB space of the largest one."""
         render = self.renders[position]
-        rgb = repair(render.read(self.windows[position], [RGB])[RGB])[0]
+        rgb, changed = repair(pixels := render.read(self.windows[position], [RGB])[RGB])
+        if changed is not None and (count := int(np.count_nonzero(~np.isfinite(pixels)))):
+            self.broken[render.name] = count
         return in_space_of(rgb, render, self.renders[self.largest])
 
 
@@ -121,6 +126,14 @@ def note_on_spaces(comparison: Comparison) -> str:
     if not others:
         return ""
     return f"Compared in the colour space of {largest.name}, {target.name}: converted are {', '.join(others)}"
+
+
+def notes_on_broken(comparison: Comparison) -> list[str]:
+    """A sentence for the user for each render that was read and has values that are NaN or infinite."""
+    return [
+        f"{name}: {count} values are NaN or infinite; NaN counts as black here, infinity as {HALF_MAX:.0f}"
+        for name, count in comparison.broken.items()
+    ]
 
 
 def note_on_windows(comparison: Comparison) -> str:

@@ -10,6 +10,7 @@ from oiio_msspl.compare import (
     error_map,
     note_on_spaces,
     note_on_windows,
+    notes_on_broken,
     open_comparison,
     score_images,
     scores,
@@ -62,6 +63,19 @@ def test_pictures_are_compared_in_the_space_of_the_reference(tmp_path):
     assert same > 80 and other < 40
     assert note_on_spaces(comparison).endswith(f"lin_rec709: converted are {image} (acescg)")
     assert note_on_spaces(open_comparison([plain], reference)) == ""
+
+
+def test_pixels_that_are_no_numbers_are_counted(tmp_path):
+    truth = picture(32, 32)
+    broken = truth.copy()
+    broken[3, 4], broken[5, 6, 0] = np.nan, np.inf
+    reference = write_exr(tmp_path / "ref.exr", rgb(truth))
+    image = write_exr(tmp_path / "image.exr", rgb(broken))
+    comparison = open_comparison([image], reference)
+    score_images(comparison)
+    assert notes_on_broken(comparison) == [
+        f"{image}: 4 values are NaN or infinite; NaN counts as black here, infinity as 65504"
+    ]
 
 
 def test_pictures_of_two_parts_of_the_frame_are_refused(tmp_path):

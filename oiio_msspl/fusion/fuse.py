@@ -144,10 +144,22 @@ def fuse(
         frame.lrhs_luminance, frame.hrls_luminance = pair.luminances()
         frame.warnings += pair.check()
     frame.repaired, frame.negative = pair.counts("repaired"), pair.counts("negative")
+    frame.warnings += _lost_aovs(frame)
     frame.seconds = session.seconds - seconds
     if frame.alpha is not None and not pair.lrhs_has_alpha:
         frame.warnings.append("the LRHS has no alpha, so the noisy alpha of the HRLS is kept")
     return frame
+
+
+def _lost_aovs(frame: FusedFrame) -> list[str]:
+    """A sentence for each AOV of the HRLS that is broken in most of its values."""
+    pixels = frame.rgb.shape[0] * frame.rgb.shape[1]
+    shares = {name: frame.repaired.get(f"hrls.{name}", 0) / (3 * pixels) for name in (ALBEDO, NORMAL)}
+    return [
+        f"{share:.0%} of the HRLS's {name} is NaN or infinite, so it tells little of the surfaces; render it again"
+        for name, share in shares.items()
+        if share > 0.5
+    ]
 
 
 def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame: FusedFrame) -> Iterator[Array]:

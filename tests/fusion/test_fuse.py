@@ -129,6 +129,14 @@ def test_bad_values_are_repaired_and_counted_once(session, scale, bad, monkeypat
     assert (fused.rgb >= 0).all()
 
 
+def test_an_albedo_that_is_broken_nearly_everywhere_is_told(session, scale):
+    side = 40 * scale
+    low, high, _ = pair_of(scale, side, side, albedo=np.full((side, side, 3), np.nan, np.float32))
+    high.layers["albedo"][:4] = 0.5
+    (warning,) = (text for text in fuse(low, high, session).warnings if "albedo is NaN" in text)
+    assert warning.startswith("9") and "% of the HRLS's albedo is NaN or infinite" in warning
+
+
 def test_a_bucket_that_failed_is_filled_from_the_lrhs():
     """All layers of the HRLS are NaN there. Black instead would leave a dark square."""
     session, side, bucket = Session(find_model(4, "joint")), 256, slice(96, 128)

@@ -71,6 +71,7 @@ def compare(
         check_error_map,
         note_on_spaces,
         note_on_windows,
+        notes_on_broken,
         open_comparison,
         score_images,
         write_error_map,
@@ -93,6 +94,8 @@ def compare(
     results = score_images(comparison) if reference else [{} for _ in images]
     if error_map is not None:
         write_error_map(error_map, comparison, overwrite=overwrite)
+    for note in notes_on_broken(comparison):
+        console.say(f"warning: {note}", error=True)
     wrote = _write_page(html, comparison, layers, overwrite) if html else ""
     if as_json:
         # The PSNR of equal pictures is infinite, which JSON can't express.

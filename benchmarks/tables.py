@@ -203,6 +203,19 @@ def goals_of_time() -> str:
     return goals.time({title: results.read(table) for title, (table, _) in MACHINES.items()})
 
 
+def size_large() -> str:
+    """The size ``large`` of ``joint``, which does not ship yet, beside the models that do."""
+    films = {"box": ("quality", "quality_large", ""), "Gaussian": ("quality_gauss", "quality_large_gauss", SPREAD)}
+    body = []
+    for film, (shipped, new, noise) in films.items():
+        means = {**means_of(results.read(shipped)), **means_of(results.read(new))}
+        for scale, spp in itertools.product((2, 4), quality.AVERAGES):
+            names = (f"{family}{noise}-x{scale}" for family in ("joint", "ensemble", "joint-large"))
+            cells = [quality.cell(means.get((spp, name)), "psnr", "relmse") for name in names]
+            body.append([film, f"x{scale}", str(spp), *cells])
+    return results.markdown(["PSNR / RelMSE: filter", "scale", "spp", "`joint`", "`ensemble`", "`joint-large`"], body)
+
+
 def spread_noise() -> str:
     """Accuracy on renders whose pixel filter has spread the noise, on how many scenes that is best, and time."""
     rows = results.read("quality_gauss")
@@ -529,14 +542,20 @@ def single_passes() -> str:
 
 
 def passes_time() -> str:
-    """Time of fused passes on a frame of real size: light everywhere, at x2 and x4, and a rendered frame."""
-    tables = ("runtime_passes", "runtime_passes_x4", "runtime_passes_cycles")
+    """Time of fused passes on a frame of real size: light everywhere, at x2 on two processors and at x4, and a rendered
+    frame."""
+    tables = ("runtime_passes", "runtime_passes_vnni", "runtime_passes_x4", "runtime_passes_cycles")
     return "\n".join(runtime_passes.layout(results.read(table)) for table in tables)
 
 
 def temporal_time() -> str:
     """Time of shots whose frames are averaged with their neighbours."""
     return runtime_temporal.layout(results.read("runtime_temporal"))
+
+
+def temporal_time_of_passes() -> str:
+    """The same with passes."""
+    return runtime_temporal.layout(results.read("runtime_temporal_passes"))
 
 
 def temporal_passes() -> str:
@@ -567,6 +586,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "docs/design/results.md": (
         goals_of_accuracy,
         goals_of_time,
+        size_large,
         against_oidn,
         scenes,
         runtime,
@@ -587,7 +607,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ),
     ROOT / "docs/guide/gpu.md": (gpu_times,),
     ROOT / "docs/design/passes.md": (passes, single_passes, passes_spread, passes_time),
-    ROOT / "docs/design/temporal.md": (temporal_passes, temporal_time, temporal_counts),
+    ROOT / "docs/design/temporal.md": (temporal_passes, temporal_time, temporal_time_of_passes, temporal_counts),
 }
 
 

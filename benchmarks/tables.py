@@ -62,12 +62,9 @@ WHEN_IT_PAYS = {
     "joint-small-x2": ("`--quality fast` (`joint-small-x2`)", "LRHS and HRLS"),
     "joint-x2": ("`--quality balanced` (`joint-x2`)", "LRHS and HRLS"),
     "ensemble-x2": ("`--quality best` (`ensemble-x2`)", "LRHS and HRLS"),
-    "ensemble-x2, 7:1": ("the same, HRLS with 7/8 of the samples", "LRHS and HRLS"),
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
-    "OIDN fast on the HRLS": ("OIDN on the HRLS, its quality fast", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN prefiltered with base guides on the HRLS": ("the same with base networks for albedo and normal", "HRLS"),
-    "OIDN prefiltered on the HRLS, 7:1": ("the HRLS with 7/8 of the samples, prefiltered", "HRLS"),
     "OIDN prefiltered on both x2, together": ("OIDN on both renders, prefiltered, and joined", "LRHS and HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
@@ -148,8 +145,7 @@ def share_of_oidn(times: Found, method: str) -> str:
     Args:
         times: rows of :mod:`benchmarks.runtime` by method.
     """
-    name = method if method in SAME_WORK else method.partition(", ")[0]
-    time = times.get(SAME_WORK.get(name, name))
+    time = times.get(SAME_WORK.get(method, method))
     return f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else ""
 
 

@@ -52,7 +52,7 @@ def explain(error: Exception) -> tuple[str, int]:
     if isinstance(error, MssplError):
         return str(error), error.exit_code
     if isinstance(error, MemoryError):
-        return "out of memory; close other programs, or fuse with a smaller --max-memory", 1
+        return "out of memory; try a smaller --max-memory", 1
     if isinstance(error, OSError):
         path = error.filename2 or error.filename
         name = os.fsdecode(path) if isinstance(path, str | bytes | os.PathLike) else ""

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """The preview shows the frame in display values."""
 
+import subprocess
+import sys
 import zlib
 
 import numpy as np
@@ -78,3 +80,15 @@ def test_a_picture_is_not_overwritten_without_being_told(tmp_path):
     with pytest.raises(InputError, match="pass --overwrite"):
         write_png(tmp_path / "a.png", np.zeros((4, 4, 3), np.float32))
     assert (tmp_path / "a.png").read_text() == "old"
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="has no limit for the size of files")
+def test_a_picture_whose_last_bytes_cannot_be_written_is_none(tmp_path):
+    """OpenImageIO does not tell. The limit of a process stands for a full disk."""
+    code = (
+        "import resource, sys, numpy as np; from pathlib import Path; from oiio_msspl.exr.preview import write_png;"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000));"
+        "write_png(Path(sys.argv[1]), np.random.default_rng(0).random((256, 256, 3), np.float32))"
+    )
+    done = subprocess.run([sys.executable, "-c", code, str(tmp_path / "a.png")], capture_output=True, text=True)
+    assert "MssplError" in done.stderr and "is the disk full?" in done.stderr and not list(tmp_path.iterdir())

@@ -58,9 +58,7 @@ def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: i
     """The layers of a render with ``spp`` samples for each HRLS pixel, (h, w, 3) by name."""
     rows, columns = (slice(0, side) for side in view.size)
     stored = len(view.arrays[f"{prefix}color"])
-    # Importance sampling leaves pixels without enough samples, unless there are more to choose from
-    count = spp if pixel_filter.splatted else 2 * spp + 4
-    samples = torch.arange(min(count, stored))
+    samples = torch.arange(min(pixel_filter.samples_for(spp), stored))
     values = [view.read(prefix + STORED[name], samples, rows, columns) for name in FEATURES]
     place = view.read(f"{prefix}place", samples, rows, columns)
     generator = torch.Generator().manual_seed(scale)

@@ -45,12 +45,14 @@ from oiio_msspl.model.contract import SCALES, SPREAD
 
 ROOT = Path(__file__).parents[1]
 FAMILIES = ("paper", "joint-small", "joint", "ensemble")
+#: OIDN on both renders at its best: see :func:`benchmarks.peers.match_local_means`.
+JOINED = "OIDN prefiltered on both x2, together"
 #: Methods of :mod:`benchmarks.quality` that most tables compare the models with.
 PEERS = (
     "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS",
     "OIDN on both x2, together",
-    "OIDN prefiltered on both x2, together",
+    JOINED,
     "OIDN, same samples",
     "OIDN prefiltered, same samples",
 )
@@ -65,7 +67,7 @@ WHEN_IT_PAYS = {
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN prefiltered with base guides on the HRLS": ("the same with base networks for albedo and normal", "HRLS"),
-    "OIDN prefiltered on both x2, together": ("OIDN on both renders, prefiltered, and joined", "LRHS and HRLS"),
+    JOINED: ("OIDN on both renders, prefiltered, and joined", "LRHS and HRLS"),
     "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
     "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
 }
@@ -167,11 +169,11 @@ def when_it_pays() -> str:
 def how_sure() -> str:
     """The qualities "balanced" and "best" against OIDN at its best, by scene."""
     rows = results.read("quality")
+    peers = AT_ITS_BEST | {JOINED: "on both renders, joined"}
     body = []
-    for (peer, render), model, spp in itertools.product(AT_ITS_BEST.items(), BETTER, (2, 8)):
-        _, comma, division = model.partition(", ")
-        if peer.endswith("on the HRLS"):  # the same one
-            peer += comma + division
+    for (peer, render), model, spp in itertools.product(peers.items(), BETTER, (2, 8)):
+        if peer != goals.SAME_SAMPLES:  # it reads the HRLS that the model reads, which may have most of the samples
+            peer = ", ".join([peer, *model.split(", ")[1:]])
         if found := versus.compare(rows, model, peer, spp):
             cells = [versus.cell(found.psnr, "+.2f"), f"{found.without_too_easy:+.2f}", found.wins]
             body.append([render, title(model), str(spp), *cells, ", ".join(found.verdicts)])

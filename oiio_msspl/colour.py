@@ -86,6 +86,11 @@ def srgb(linear: Array) -> Array:
     )
 
 
+def converted(rgb: Array, source: ColourSpace, target: ColourSpace) -> Array:
+    """Linear colours (..., 3) of one space in another one; the same array if the two are the same."""
+    return rgb if same_space(source, target) else rgb @ conversion(source, target).T.astype(np.float32)
+
+
 def conversion(source: ColourSpace, target: ColourSpace) -> NDArray[np.float64]:
     """The matrix (3, 3) that converts linear RGB: ``rgb @ matrix.T``. White stays white (Bradford adaptation)."""
     to_cones = []

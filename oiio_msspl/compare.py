@@ -15,7 +15,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.arrays import HALF_MAX, Array, repair
-from oiio_msspl.colour import conversion, same_space, space_of
+from oiio_msspl.colour import converted, same_space, space_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
 from oiio_msspl.exr.preview import write_png
@@ -110,9 +110,7 @@ def in_space_of(rgb: Array, render: MappedRender, other: MappedRender) -> Array:
     """Colours (h, w, 3) of a render in the linear RGB space of another one. They stay as they are unless both headers
     declare a space."""
     source, target = space_of(render.metadata), space_of(other.metadata)
-    if source is None or target is None or same_space(source, target):
-        return rgb
-    return rgb @ conversion(source, target).T.astype(np.float32)
+    return rgb if source is None or target is None else converted(rgb, source, target)
 
 
 def note_on_spaces(comparison: Comparison) -> str:
@@ -125,7 +123,7 @@ def note_on_spaces(comparison: Comparison) -> str:
     others = [f"{name} ({space.name})" for name, space in spaces.items() if space and not same_space(space, target)]
     if not others:
         return ""
-    return f"Compared in the colour space of {largest.name}, {target.name}: converted are {', '.join(others)}"
+    return f"Converted to {target.name}, the colour space of {largest.name}: {', '.join(others)}"
 
 
 def notes_on_broken(comparison: Comparison) -> list[str]:

@@ -34,7 +34,7 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.arrays import HALF_MAX, Array, repair
-from oiio_msspl.colour import REC709, conversion, space_of
+from oiio_msspl.colour import REC709, converted, space_of
 from oiio_msspl.compare import Comparison, error_colours, error_levels, in_space_of, upsample_bicubic
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate, check_target, replacing
@@ -271,9 +271,7 @@ def _to_rec709(values: Array, picture: _Picture, pictures: Sequence[_Picture]) -
     """Colours in Rec. 709 primaries, those of sRGB. A file that declares no space has that of another picture."""
     spaces = [space_of(each.render.metadata) for each in (picture, *pictures)]
     space = next(filter(None, spaces), REC709)
-    if space == REC709 or values.shape[-1] == 1:
-        return values
-    return values @ conversion(space, REC709).T.astype(np.float32)
+    return values if values.shape[-1] == 1 else converted(values, space, REC709)
 
 
 def to_codes(values: Array) -> Codes:

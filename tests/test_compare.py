@@ -61,7 +61,7 @@ def test_pictures_are_compared_in_the_space_of_the_reference(tmp_path):
     comparison = open_comparison([image, plain], reference)
     same, other = (each["psnr"] for each in score_images(comparison))
     assert same > 80 and other < 40
-    assert note_on_spaces(comparison).endswith(f"lin_rec709: converted are {image} (acescg)")
+    assert note_on_spaces(comparison) == f"Converted to lin_rec709, the colour space of {reference}: {image} (acescg)"
     assert note_on_spaces(open_comparison([plain], reference)) == ""
 
 

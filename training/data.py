@@ -252,10 +252,9 @@ class SampleTensors:
         pixel_filter = draw_filter(rng, spread_noise=sampling.spread_noise)
         lr_count = len(self.arrays["lr_color"])
         n, lr_samples = _draw_spp(np.ones(lr_count), sampling, False, rng)
-        # Importance sampling leaves pixels without enough samples, unless there are more to choose from
         device = light.device
         drawn = torch.from_numpy(rng.permutation(len(self.arrays["color"]))).to(device)
-        drawn = drawn[: n if pixel_filter.splatted else 2 * n + 4]
+        drawn = drawn[: pixel_filter.samples_for(n)]
         generator = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
 
         # The crop with as much around it as the filter reaches
@@ -380,8 +379,8 @@ def draw(
 def turned(pair: Batch, rng: np.random.Generator) -> Batch:
     """Pictures (N, c, H, W) of one place, mirrored and transposed at random.
 
-    Normals are mirrored with their picture, in whatever space they are: those of ``hrls``, in the last of nine or more
-    channels from the sixth on, and ``normal``, in [0, 1].
+    If the picture is mirrored, so are its normals: those in ``hrls``, which are channels 6 to 8 in [-1, 1], and the
+    picture ``normal``, in [0, 1]. They may be in any space, so it does not matter along which axis.
     """
     flips = [axis for axis in (2, 3) if rng.random() < 0.5]
     swaps = rng.random() < 0.5

@@ -195,13 +195,11 @@ def batches(files: Sequence[Path], rng: np.random.Generator) -> Iterator[Pair]:
     while True:
         chosen = by_scale[names[rng.choice(len(names), p=shares / shares.sum())]]
         pairs = [read_pair(chosen[i]) for i in rng.integers(len(chosen), size=BATCH)]
-        batch = {name: torch.cat([pair[name] for pair in pairs]) for name in pairs[0]}
-        batch = turned(batch, rng)
+        batch = turned({name: torch.cat([pair[name] for pair in pairs]) for name in pairs[0]}, rng)
         order = torch.from_numpy(rng.permutation(3)) if rng.random() < 0.5 else torch.arange(3)
-        for name, image in batch.items():
-            if name not in ("joint_error", "normal"):
-                image = torch.cat([part[:, order] for part in image.split(3, dim=1)], dim=1)
-            batch[name] = image.contiguous(memory_format=torch.channels_last)
+        for name in batch.keys() - {"joint_error", "normal"}:
+            permuted = torch.cat([part[:, order] for part in batch[name].split(3, dim=1)], dim=1)
+            batch[name] = permuted.contiguous(memory_format=torch.channels_last)
         yield batch
 
 

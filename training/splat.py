@@ -96,6 +96,11 @@ class PixelFilter:
         """Whether neighbouring pixels share samples, and so their noise."""
         return self.splatted and self.reach > 0
 
+    def samples_for(self, count: int) -> int:
+        """How many stored samples of a pixel give it ``count``. Importance sampling moves some to other pixels, so it
+        needs more to choose from."""
+        return count if self.splatted else 2 * count + 4
+
     def weights(self, place: Tensor) -> Tensor:
         """Weights of samples at ``place`` (0 to 1) in pixels -reach ... reach from their own: (2 * reach + 1, ...).
 

@@ -29,6 +29,7 @@ from torch.optim.lr_scheduler import LambdaLR
 from torch.optim.swa_utils import AveragedModel
 
 from datagen.views import Folder, SampleView, View
+from oiio_msspl.exr.atomic import replacing
 from training import checkpoints, losses
 from training.data import PAPER_PATCH, PAPER_SAMPLING, Batches, Sampling, spp_range
 from training.joint import SIZES, JointFusion
@@ -387,20 +388,16 @@ def train(args: argparse.Namespace) -> None:
 
 
 def write_row(path: Path, row: dict[str, float]) -> None:
-    """Append a line to a CSV file. A new file gets a header first, and an older one the columns that it lacks."""
-    written = {name: f"{value:.5g}" if isinstance(value, float) else value for name, value in row.items()}
-    with path.open("a+", newline="") as file:
-        file.seek(0)
-        reader = csv.DictReader(file)
-        columns = list(dict.fromkeys([*(reader.fieldnames or ()), *row]))
-        earlier = [] if columns == reader.fieldnames else list(reader)
-        if columns != reader.fieldnames:
-            file.truncate(0)
-        writer = csv.DictWriter(file, columns)
-        if columns != reader.fieldnames:
-            writer.writeheader()
-            writer.writerows(earlier)
-        writer.writerow(written)
+    """Add a line to a CSV file, and the columns that it lacks."""
+    rows: list[dict[str, object]] = []
+    if path.exists():
+        with path.open(newline="") as file:
+            rows += csv.DictReader(file)
+    rows.append({name: f"{value:.5g}" if isinstance(value, float) else value for name, value in row.items()})
+    with replacing(path, overwrite=True) as temporary, temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(dict.fromkeys(name for each in rows for name in each)))
+        writer.writeheader()
+        writer.writerows(rows)
 
 
 def parse(arguments: list[str] | None = None) -> argparse.Namespace:

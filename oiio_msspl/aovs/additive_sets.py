@@ -158,16 +158,20 @@ class _Finder:
 
 def _user_set(finder: _Finder, text: str, path: str) -> AdditiveSet:
     """The set that ``NAME=a+b+c*d`` describes. A term that ends with ``*`` is a pattern: ``light_*``."""
-    name, equals, terms = text.partition("=")
-    found: list[AdditiveLayer] = []
-    for term in map(str.strip, terms.split("+")):
+    name, _, sum_of = (part.strip() for part in text.partition("="))
+    terms = [term.strip() for term in sum_of.split("+")]
+    no_sum = InputError(f"--sum {text!r}: write NAME=LAYER+LAYER, LAYER* for several, or LAYER*COLOUR for a product")
+    if not name or not all(terms):
+        raise no_sum
+    found: dict[AdditiveLayer, None] = {}
+    for term in terms:
         layer, times, factor = (part.strip() for part in term.partition("*"))
         is_pattern = term.endswith("*")
-        some = list(finder.find(term if is_pattern or not times else {"layer": layer, "times": factor})) if term else []
+        some = list(finder.find({"layer": layer, "times": factor} if times and not is_pattern else term))
         if not some or (len(some) > 1 and not is_pattern):
             found_here = f"several layers {term!r}" if some else f"no layer {term!r} of three channels{finder.known}"
             raise InputError(f"--sum {text!r}: {path} has {found_here}")
-        found += some
-    if not equals or not name.strip() or len(found) < 2:
-        raise InputError(f"--sum {text!r}: write NAME=LAYER+LAYER, LAYER* for several, or LAYER*COLOUR for a product")
-    return AdditiveSet(name.strip(), tuple(dict.fromkeys(found)), by_user=True)
+        found |= dict.fromkeys(some)
+    if len(found) < 2:
+        raise no_sum
+    return AdditiveSet(name, tuple(found), by_user=True)

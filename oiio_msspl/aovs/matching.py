@@ -60,9 +60,9 @@ def map_render(
     renderer = detect_renderer(file, layers)
     if RGB not in mapping:
         _check_holds_beauty(renderer, file)
-    if RGB in mapping and not find_beauties(file, layers, [mapping[RGB]]):
-        raise InputError(f"{file.path}: {missing(RGB, mapping[RGB])}, and a mapping of rgb applies to both renders")
-    beauties = _find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else renderer["rgb"])
+    beauties = find_beauties(file, layers, [mapping[RGB]] if RGB in mapping else renderer["rgb"])
+    if not beauties:
+        raise _no_beauty(file, layers, mapping.get(RGB))
     beauty = choose_beauty(file, beauties, view)
     notes: list[str] = []
     found = {RGB: _beauty_formula(beauty)}
@@ -112,12 +112,12 @@ def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
         )
 
 
-def _find_beauties(file: ExrFile, layers: list[Layer], candidates: Sequence[Any]) -> list[Beauty]:
-    beauties = find_beauties(file, layers, candidates)
-    if not beauties:
-        names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
-        raise InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
-    return beauties
+def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
+    """The error for a file without the beauty of the table, or without the one that the user has ``mapped``."""
+    if mapped is not None:
+        return InputError(f"{file.path}: {missing(RGB, mapped)}, and a mapping of rgb applies to both renders")
+    names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
+    return InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
 
 
 def _beauty_formula(beauty: Beauty) -> FeatureFormula:

@@ -117,7 +117,8 @@ class ExrFile:
 
     def close(self) -> None:
         """Close the file, and those beside it. The next :meth:`read` opens it again."""
-        self.__dict__.pop("_input", None)
+        if (handle := self.__dict__.pop("_input", None)) is not None:
+            handle.close()
         for sibling in self.siblings.values():
             sibling.close()
 

@@ -8,6 +8,7 @@ are copied strip by strip in their own type.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextlib import closing
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -155,12 +156,11 @@ def _check_whole(temporary: Path, path: Path) -> None:
     """Read the first and the last row of each part. If the last bytes of a file can't be written, as on a full disk,
     OpenImageIO does not tell."""
     try:
-        file = open_exr(temporary)
-        for part in file.parts:
-            window = part.data_window
-            for y in (window.y0, window.y1 - 1):
-                file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
-        file.close()
+        with closing(open_exr(temporary)) as file:
+            for part in file.parts:
+                window = part.data_window
+                for y in (window.y0, window.y1 - 1):
+                    file.read(part.channels[:1], Window(window.x0, y, window.x1, y + 1))
     except InputError as error:
         raise not_written(path.parent, "its end is missing") from error
 

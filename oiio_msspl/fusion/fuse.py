@@ -41,6 +41,7 @@ from oiio_msspl.fusion.tiling import (
     sample_bands,
     strips_memory,
 )
+from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
 from oiio_msspl.model.session import Session
@@ -240,11 +241,9 @@ def check_model(session: Session, scale: int, *, error: bool) -> None:
     if error:
         session.require_error()
     if session.contract.scale != scale:
-        family = session.contract.name.rpartition("-x")[0]
-        hint = f"; --model {family} takes the one for the pair" if family else ""
-        raise InputError(
-            f"model {session.contract.name} is for x{session.contract.scale}, but this pair is x{scale}{hint}"
-        )
+        name = session.contract.name
+        hint = f"; --model {name.rpartition('-x')[0]} takes the one for the pair" if name in shipped_models() else ""
+        raise InputError(f"model {name} is for x{session.contract.scale}, but this pair is x{scale}{hint}")
 
 
 def _blank_frame(alignment: Alignment, exposure: float, *, error: bool, half: bool) -> FusedFrame:

@@ -140,7 +140,7 @@ def _rare_light(rgb: Array, top: int, left: int) -> Array:
     lines = np.zeros((channels, rows, _SQUARE, columns * _SQUARE), np.float32)
     inside = (slice(None), slice(top, top + height), slice(left, left + width))
     lines.reshape(channels, -1, columns * _SQUARE)[inside] = rgb.transpose(2, 0, 1)
-    # Rows first: NumPy is slow to reduce an axis as short as the side of a square, but for whole rows at a time.
+    # The rows of a square are reduced before its columns: NumPy then works on whole rows of the picture.
     sides = channels, rows, columns, _SQUARE
     brightest = lines.max(axis=2).reshape(sides).max(axis=3)
     least = (brightest / np.float32(FIREFLY_FACTOR)).repeat(_SQUARE, axis=2)[:, :, None]

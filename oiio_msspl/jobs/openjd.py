@@ -161,7 +161,8 @@ def _describe(
     # Open Job Description writes ranges in rising order, and their step with a colon.
     numbers = format_frames(sorted(frame.number for frame in shot.frames)).replace("x", ":")
     frame_range = add("Frames", numbers, "Frames of the shot: 1001-1100 or 1001-1099:2,1200", type="STRING")
-    size = add("FramesPerTask", chunk, "Frames per task", type="INT", minValue=1, maxValue=chunk)  # or time is up
+    # The time limit of a task is written for so many frames.
+    size = add("FramesPerTask", chunk, "Frames per task", type="INT", minValue=1, maxValue=chunk)
     for option, path in files.items():
         name = option.removeprefix("--").title().replace("-", "")
         file = add(name, str(path.absolute()), f"{option} of msspl-fuse", type="PATH", objectType="FILE", dataFlow="IN")

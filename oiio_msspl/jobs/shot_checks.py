@@ -52,10 +52,12 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
     not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
     turn comes.
     """
-    family = family_of(model) or model
-    assert family is not None
-    if family_of(model) is None and for_spread_noise(family) is None:
-        return family
+    family = family_of(model)
+    if family is None:
+        assert model is not None
+        family = model
+        if for_spread_noise(model) is None:
+            return model  # it suits any noise, or is no model of ours
     for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)

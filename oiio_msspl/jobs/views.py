@@ -13,14 +13,12 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
-import numpy as np
-
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.contents import dropped_channels, widest_type
+from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.alignment import align
@@ -163,11 +161,11 @@ def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> N
     channels = hr.beauty_channels
     height, width = fused.rgb.shape[:2]
     replaced.add(channels, width, height)
+    clipped = 0
     for start in range(0, height, ROWS_PER_PUT):
         rows = slice(start, start + ROWS_PER_PUT)
         for i, channel in enumerate(channels):
             values = fused.rgb[rows, :, i] if i < 3 or fused.alpha is None else fused.alpha[rows, :, 0]
-            replaced.put(channel, start, values)
-    clipped = int(np.count_nonzero(fused.rgb > HALF_MAX)) if widest_type(channels) == "half" else 0
+            clipped += replaced.put(channel, start, values)
     if clipped:
         fused.warnings.append(f"{clipped} values are too bright for half and were clipped to {HALF_MAX:.0f}")

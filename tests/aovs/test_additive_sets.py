@@ -118,10 +118,20 @@ def test_the_user_s_sum_comes_first_and_replaces_the_same_set(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "text", ["mine", "mine=light_key", "=light_key+light_fill", "mine=light_key+none", "mine=light_key+light_fill*none"]
+    "text",
+    [
+        "mine",
+        "mine=light_key",
+        "=light_key+light_fill",
+        "mine=light_key+none",
+        "mine=light_key+light_fill*none",
+        "mine=light_key+light_key",
+    ],
 )
 def test_a_sum_that_cannot_be_read_is_refused(tmp_path, text):
-    with pytest.raises(InputError, match="--sum"):
+    """With how to write one, or with the layers that there are."""
+    said = "it has light_key, light_fill|it has light_fill, light_key" if "none" in text else "write NAME=LAYER"
+    with pytest.raises(InputError, match=f"--sum .*({said})"):
         render(tmp_path, {"light_key": 1, "light_fill": 2}, sums=(text,))
 
 

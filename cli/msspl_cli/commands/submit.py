@@ -67,8 +67,8 @@ def submit(
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
-    named = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
-    write = options.make_write_options(**{name: given[name] for name in named})
+    written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
+    write = options.make_write_options(**{name: given[name] for name in written})
     options.make_temporal_options(given["temporal"], given["motion_format"])
     max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])

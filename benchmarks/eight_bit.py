@@ -24,10 +24,9 @@ import torch
 
 from benchmarks import results, scenes
 from benchmarks.results import Row
-from benchmarks.runtime import frame
+from benchmarks.runtime import pair
 from datagen.views import Folder
-from oiio_msspl import Render, Session, find_model, fuse
-from oiio_msspl.aovs.features import RGB
+from oiio_msspl import Session, find_model, fuse
 from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import psnr
 from oiio_msspl.model.contract import SCALES
@@ -94,13 +93,11 @@ class InPyTorch(Session):
 
 def measure(views: list[scenes.Scene], models: list[str], *, timed: bool) -> Iterator[Row]:
     """A row for each model and number of spp."""
-    layers = frame(SIZE, SIZE)
-    hr = Render.from_arrays("hr", **layers)
     for name in models:
         path = find_model(0, name)
         sessions = [InPyTorch(path, name.rpartition("-x")[0]), Session(path), Session(gpu_file(path) or path)]
         scale = sessions[0].contract.scale
-        lr = Render.from_arrays("lr", rgb=layers[RGB][::scale, ::scale].copy())
+        lr, hr = pair(SIZE, SIZE, scale)
         seconds: Row = {}
         if timed:
             took = medians([partial(fuse, lr, hr, session) for session in sessions[:2]])

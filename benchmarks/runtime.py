@@ -30,6 +30,8 @@ from typing import Any
 from benchmarks import results
 from benchmarks.results import Row
 
+#: Width of the squares of :func:`frame` in pixels.
+SQUARE = 24
 OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
 #: See :func:`benchmarks.oidn.denoise_prefiltered`: with OIDN's base networks for albedo and normal.
 OIDN_BASE_GUIDES = "OIDN prefiltered with base guides"
@@ -49,24 +51,33 @@ SAME_WORK = {
 
 
 def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
-    """Random layers (height, width, 3): the time does not depend on what the pixels show."""
+    """Layers (height, width, 3) of lit squares. The light has the noise of 1 spp, which depends on ``seed``."""
     import numpy as np
 
-    rng = np.random.default_rng(seed)
-    return {name: rng.random((height, width, 3), dtype=np.float32) for name in ("rgb", "albedo", "normal")}
+    squares = np.random.default_rng(0).random((2, -(-height // SQUARE), -(-width // SQUARE), 3), np.float32)
+    albedo, normal = squares.repeat(SQUARE, axis=1).repeat(SQUARE, axis=2)[:, :height, :width]
+    normal = 2 * normal - 1
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    noise = np.random.default_rng(seed).standard_exponential((height, width, 1), np.float32)
+    light = np.float32(0.2) + np.maximum(normal[..., :1], 0)
+    return {"rgb": albedo * light * noise, "albedo": albedo, "normal": normal}
+
+
+def pair(height: int, width: int, scale: int) -> tuple[Any, Any]:
+    """Both renders of such a frame, with as many samples in each."""
+    from oiio_msspl import Render
+    from oiio_msspl.arrays import box_downsample
+
+    low = {name: box_downsample(values, scale) for name, values in frame(height, width, 1).items()}
+    return Render.from_arrays("lr", **low), Render.from_arrays("hr", **frame(height, width))
 
 
 def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[[], Any]:
     """A call of :func:`oiio_msspl.fuse` on arrays."""
-    from oiio_msspl import Render, Session, find_model, fuse
-    from oiio_msspl.arrays import box_downsample
+    from oiio_msspl import Session, find_model, fuse
 
     session = Session(find_model(0, name), threads=threads)
-    scale = session.contract.scale
-    layers = frame(height, width)
-    high = Render.from_arrays("hr", **layers)
-    aovs = {name: box_downsample(layers[name], scale) for name in ("albedo", "normal")}
-    low = Render.from_arrays("lr", rgb=layers["rgb"][::scale, ::scale].copy(), **aovs)
+    low, high = pair(height, width, session.contract.scale)
     return lambda: fuse(low, high, session)
 
 

@@ -26,7 +26,7 @@ LAYERS = {"rgb": "RGB", "albedo": "RGB", "normal": "XYZ", "diffuse": "RGB", "spe
 
 
 def write_frame(path: Path, width: int, height: int, groups: int = 0) -> None:
-    """Write an EXR file with random `LAYERS`, and light groups that sum to the beauty."""
+    """Write an EXR file with `LAYERS`, and light groups that sum to the beauty."""
     import numpy as np
     import OpenEXR
 

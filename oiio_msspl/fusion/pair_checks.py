@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.arrays import Array, box_downsample, quantile
+from oiio_msspl.arrays import Array, box_downsample, planes_of, quantile
 from oiio_msspl.colour import luminance
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Window
@@ -104,10 +104,7 @@ class HrlsAverages:
         rows, columns = pair.core
         area, grid = pair.lrhs_area, self.alignment.grid
         core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
-        low, high = (np.minimum(v, BRIGHTEST) for v in (pair.lrhs[RGB][pair.core], _hrls_pixels(pair, RGB, core)))
-        mean = box_downsample(high, pair.scale)
-        self.rgb[core.slices(grid)] = luminance(mean)
-        self._add_noise(low, high, mean, core.y0 - grid.y0, core.x0 - grid.x0)
+        self._add_beauty(pair.lrhs[RGB][pair.core], _hrls_pixels(pair, RGB, core), core.shift(-grid.x0, -grid.y0))
         centre = core.intersect(self._centre)
         if centre.width and centre.height:
             self._add_aovs(pair, centre)
@@ -123,32 +120,70 @@ class HrlsAverages:
             if self.normal_edges is None or self.normal_noise is None:
                 self.normal_edges, self.normal_noise = np.zeros(size, np.float32), np.zeros(size, np.float32)
             pixels = _hrls_pixels(pair, NORMAL, window)
-            variance = box_downsample(_noise_variance(pixels).sum(axis=-1), pair.scale // 2)
-            # Means over scale x scale pixels, in two differences of two of them each.
-            self.normal_noise[target] = np.sqrt(variance) * np.float32(2 / pair.scale)
-            normal = box_downsample(pixels, pair.scale)
-            steps = [np.diff(normal, axis=axis, append=normal.take([-1], axis)) for axis in (0, 1)]
-            self.normal_edges[target] = np.sqrt(sum(np.square(step).sum(axis=-1) for step in steps))
+            self.normal_noise[target] = _noise_of_edges(pixels, pair.scale)
+            self.normal_edges[target] = _edge_lengths(box_downsample(pixels, pair.scale))
 
-    def _add_noise(self, low: Array, high: Array, mean: Array, y: int, x: int) -> None:
-        """Sum ``blocks`` over a tile whose first pixel is (x, y). ``mean``: the HRLS over the LRHS's pixels."""
+    def _add_beauty(self, low: Array, high: Array, place: Window) -> None:
+        """Fill ``rgb``, and sum ``blocks``.
+
+        Args:
+            low, high: colours of both renders (h, w, 3) and (s*h, s*w, 3).
+            place: of the LRHS's pixels in the grid.
+        """
         scale = self.alignment.scale
-        pixels, grey = luminance(high), luminance(low)
-        expected = box_downsample(_noise_variance(pixels), scale // 2) / np.float32(scale**2)
-        # Black pixels are equal in any two renders where light is rare.
-        noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
-        phases = itertools.product(range(scale), repeat=2)
-        nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
-        self.noisy_pixels += int(np.count_nonzero(noisy))
-        self.equal_pixels += int(np.count_nonzero(noisy & (nearest <= 1e-3 * grey)))
-        difference = np.square(luminance(mean) - grey)
-        values: NDArray[Any] = np.dstack([low, mean, difference, expected])
-        for axis, start in ((0, y), (1, x)):
-            stop = start + values.shape[axis]
+        phases = list(itertools.product(range(scale), repeat=2))
+        averages = self.rgb[place.y0 : place.y1, place.x0 : place.x1]
+        values = np.empty((8, *low.shape[:2]), np.float32)
+        counts: list[tuple[int, int]] = []
+
+        def work(rows: slice) -> None:
+            colour = np.minimum(low[rows], BRIGHTEST)
+            samples = np.minimum(high[rows.start * scale : rows.stop * scale], BRIGHTEST)
+            mean = box_downsample(samples, scale)
+            averages[rows] = luminance(mean)
+            pixels, grey = luminance(samples), luminance(colour)
+            expected = box_downsample(_noise_variance(pixels), scale // 2) / np.float32(scale**2)
+            # Black pixels are equal in any two renders where light is rare.
+            noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
+            nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
+            equal = noisy & (nearest <= 1e-3 * grey)
+            counts.append((int(np.count_nonzero(noisy)), int(np.count_nonzero(equal))))
+            values[:3, rows], values[3:6, rows] = planes_of(colour), planes_of(mean)
+            values[6, rows], values[7, rows] = np.square(averages[rows] - grey), expected
+
+        for_row_blocks(work, len(low), high[0].size * scale)
+        self.noisy_pixels += sum(noisy for noisy, _ in counts)
+        self.equal_pixels += sum(equal for _, equal in counts)
+        sums: NDArray[Any] = values
+        for axis, (start, stop) in ((1, (place.y0, place.y1)), (2, (place.x0, place.x1))):
             first = np.maximum(np.arange(start // BLOCK * BLOCK, stop, BLOCK) - start, 0)
-            values = np.add.reduceat(values, first, axis).astype(np.float64)
-        top, left = y // BLOCK, x // BLOCK
-        self.blocks[top : top + values.shape[0], left : left + values.shape[1]] += values
+            sums = np.add.reduceat(sums, first, axis).astype(np.float64)
+        top, left = place.y0 // BLOCK, place.x0 // BLOCK
+        self.blocks[top : top + sums.shape[1], left : left + sums.shape[2]] += sums.transpose(1, 2, 0)
+
+
+def _edge_lengths(normal: Array) -> Array:
+    """Length of the difference of normals (h, w, 3) to the next pixels, to the right and down, (h, w)."""
+    squares = np.zeros(normal.shape[:2], np.float32)
+    for plane in planes_of(normal):
+        squares[:-1] += np.square(np.diff(plane, axis=0))
+        squares[:, :-1] += np.square(np.diff(plane, axis=1))
+    return np.sqrt(squares)
+
+
+def _noise_of_edges(pixels: Array, scale: int) -> Array:
+    """How long :func:`_edge_lengths` would be by the noise of the HRLS's normals (s*h, s*w, 3) alone, root mean square,
+    (h, w)."""
+    result = np.empty([side // scale for side in pixels.shape[:2]], np.float32)
+
+    def work(rows: slice) -> None:
+        block = pixels[rows.start * scale : rows.stop * scale]
+        variance = reduce(np.add, planes_of(_noise_variance(block)))
+        # Means over scale x scale pixels, in two differences of two of them each.
+        result[rows] = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
+
+    for_row_blocks(work, len(result), pixels[0].size * scale)
+    return result
 
 
 def _noise_variance(pixels: Array) -> Array:

@@ -76,18 +76,20 @@ class Comparison:
         return in_space_of(rgb, render, self.renders[self.largest])
 
 
-def open_comparison(images: Sequence[Path], reference: Path | None = None) -> Comparison:
+def open_comparison(images: Sequence[Path], reference: Path | None = None, layer: str | None = None) -> Comparison:
     """Read the headers of the files to compare.
 
     Args:
         images: EXR files. One may be smaller than the largest by x2, x4 or x8.
         reference: EXR file of what the images should be.
+        layer: of all files, in place of their beauty.
 
     Raises:
-        InputError: a file can't be read or has no beauty, or see :func:`common_windows`.
+        InputError: a file can't be read or lacks what is compared, or see :func:`common_windows`.
     """
     paths = [*images, *([reference] if reference else [])]
-    renders = [map_render(open_exr(path), features=()) for path in paths]
+    mapping = {RGB: layer} if layer else {}
+    renders = [map_render(open_exr(path), mapping, features=()) for path in paths]
     sizes = [each.data_window.width * each.data_window.height for each in renders]
     largest = len(renders) - 1 if reference else sizes.index(max(sizes))
     return Comparison(renders, reference is not None, largest, common_windows(renders, renders[largest]))

@@ -20,7 +20,7 @@ PROGRESS = ("openjd", "json")
 class ShotPrinter:
     """The ``progress`` of :func:`oiio_msspl.jobs.shot.fuse_shot`: prints errors and warnings as frames end.
 
-    A sentence that was printed for one frame is not printed for another one; the table counts its frames.
+    Of sentences that differ only in their numbers, the first is printed; the table counts the frames of all.
 
     Raises:
         InputError: an unknown form of progress, or one that would mix with ``--json``.
@@ -65,9 +65,14 @@ class ShotPrinter:
             print_table(self._report)
 
     def _print_once(self, kind: str, frame: int, text: str) -> None:
-        if text not in self._printed:
-            self._printed.add(text)
+        if (key := _without_numbers(text)) not in self._printed:
+            self._printed.add(key)
             console.say(f"{kind}: frame {frame}: {text}", error=True)
+
+
+def _without_numbers(text: str) -> str:
+    """A sentence without what differs between the frames of a shot, such as the number in a file's name."""
+    return re.sub(r"-?[\d.]+", "0", text)
 
 
 def _print_openjd(result: FrameResult, report: ShotReport) -> None:
@@ -107,7 +112,7 @@ def print_table(report: ShotReport) -> None:
         rows = [(result.status, result.message)] if result else [("not done", "run again with --skip-existing")]
         rows += [("warning", text) for text in (result.warnings if result else ())]
         for kind, text in rows:
-            numbers, _ = groups.setdefault((kind, re.sub(r"-?[\d.]+", "0", text)), ([], text))
+            numbers, _ = groups.setdefault((kind, _without_numbers(text)), ([], text))
             if frame.number not in numbers[-1:]:
                 numbers.append(frame.number)
     order = ("fused", "skipped", "failed", "missing", "not done", "warning")

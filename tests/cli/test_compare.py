@@ -41,6 +41,18 @@ def test_compare_does_not_overwrite_its_reference(files):
     assert (files / "ref.exr").read_bytes() == before
 
 
+def test_compare_scores_the_layer_that_map_names(tmp_path):
+    """Two files of one beauty, whose lamps differ."""
+    image = picture(48, 64)
+    for name, lamp in (("image", image), ("ref", 0.5 * image)):
+        write_exr(tmp_path / f"{name}.exr", rgb(image) | rgb(lamp, "lamp."))
+    arguments = ["msspl", "compare", tmp_path / "image.exr", "-r", tmp_path / "ref.exr", "--json"]
+    assert json.loads(run(*arguments).stdout)[0]["psnr"] is None
+    assert json.loads(run(*arguments, "--map", "rgb=lamp").stdout)[0]["psnr"] < 30
+    done = run(*arguments, "--map", "rgb=gone")
+    assert done.returncode == 2 and "image.exr" in done.stderr and "gone" in done.stderr
+
+
 def test_compare_of_equal_pictures_is_valid_json(files):
     done = run("msspl", "compare", files / "ref.exr", "-r", files / "ref.exr", "--json")
     assert json.loads(done.stdout, parse_constant=pytest.fail)[0]["psnr"] is None
@@ -83,6 +95,7 @@ def test_compare_writes_a_page(files):
         ([], "scores and error maps need --reference"),
         (["--html", "page.html", "--error-map", "e.png"], "scores and error maps need --reference"),
         (["-r", "ref.exr", "--layers", "albedo"], "add --html PAGE"),
+        (["-r", "ref.exr", "--map", "albedo=N"], "only rgb is compared; write --map rgb=LAYER"),
         (["--html", "page.png"], "the page is HTML; name it .html"),
         (
             ["--html", "page.html", "--layers", "nothing"],

@@ -75,13 +75,14 @@ def test_progress_for_programs(tmp_path, bilinear_models):
 
 def test_what_a_person_reads(tmp_path, bilinear_models):
     folder = make_shot(tmp_path, 4)
-    (folder / "hr/beauty.1003.exr").write_text("no EXR")
+    for number in (1002, 1003):
+        (folder / f"hr/beauty.{number}.exr").write_text("no EXR")
     given = folder / "lr", folder / "hr", "-o", folder / "out", "--model", bilinear_models[4], "-v", "--no-preview"
     done = fuse(*given, "--temporal", "off")
     assert done.returncode == 2
     assert "  albedo    found: albedo\n" in done.stdout
-    assert "  fused   3  1001-1002,1004\n  failed  1  1003 " in done.stdout
-    assert done.stderr.count("error: frame 1003:") == 1
+    assert "  fused   2  1001,1004\n  failed  2  1002-1003 " in done.stdout
+    assert done.stderr.count("error: frame 100") == 1  # one sentence, but for the number
     assert "frame 1004: fused (read " in done.stderr
 
 

@@ -22,6 +22,8 @@ EXAMPLES = """[bold]Examples[/bold]
 
   msspl compare out.exr -r ref.exr --error-map error.png
 
+  msspl compare out.exr hr.exr -r ref.exr --map rgb=light_key
+
   msspl compare out.exr hr.exr lr.exr -r ref.exr --html page.html --layers 'light*'
 """
 
@@ -57,6 +59,10 @@ def compare(
             "\\[default: those that sum to the beauty]",
         ),
     ] = [],  # noqa: B006
+    mapping: Annotated[
+        list[str],
+        typer.Option("--map", metavar="rgb=LAYER", help="Compare this layer of all files instead of their beauty."),
+    ] = [],  # noqa: B006
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     debug: options.Debug = False,
@@ -87,7 +93,7 @@ def compare(
         check_error_map(error_map, compared, overwrite=overwrite)
     if html is not None:
         check_page(html, compared, overwrite=overwrite)
-    comparison = open_comparison(images, reference)
+    comparison = open_comparison(images, reference, _layer(mapping))
     for note in (note_on_windows(comparison), note_on_spaces(comparison)):
         if note:
             console.say(note, error=True)
@@ -105,6 +111,17 @@ def compare(
         _print(images, results)
     if wrote:
         console.say(wrote, error=as_json)
+
+
+def _layer(mapping: list[str]) -> str | None:
+    """The layer that ``--map`` names; None for the beauty."""
+    from oiio_msspl.aovs.features import RGB
+    from oiio_msspl.aovs.mapping import parse_map_options
+
+    layers = parse_map_options(mapping)
+    if layers.keys() - {RGB}:
+        raise InputError("--map: only rgb is compared; write --map rgb=LAYER")
+    return layers.get(RGB)
 
 
 def _print(images: list[Path], results: list[dict[str, float]]) -> None:

@@ -16,7 +16,8 @@ from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.tiling import MAX_MEMORY
 from oiio_msspl.jobs.frame_checks import check_frame_memory, memory_to_write
 from oiio_msspl.jobs.frame_passes import Progress, steps_of
-from oiio_msspl.jobs.inputs import InputOptions, resolve_auto
+from oiio_msspl.jobs.inputs import InputOptions
+from oiio_msspl.jobs.model_choice import resolve_auto
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame, is_sequence
 from oiio_msspl.jobs.stages import Stages

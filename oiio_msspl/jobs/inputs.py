@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Opens a pair of files, maps their layers, and finds out what else a run must know of them."""
+"""Opens a pair of files, maps their layers, and names the files that a frame is made from."""
 
 from __future__ import annotations
 
@@ -19,10 +19,6 @@ from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, same_spa
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise
-from oiio_msspl.model.contract import SPREAD
 
 
 @dataclass(frozen=True)
@@ -188,43 +184,6 @@ def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
         with contextlib.suppress(InputError):
             return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features, sums=inputs.sums)
     return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
-
-
-def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
-    """The model that is meant: a quality, ``auto`` and None are a family that suits the pair.
-
-    ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
-    filter has spread needs the family that was trained for it. Notes of the HRLS tell, also if a model that is named
-    does not suit the noise.
-
-    Raises:
-        InputError: the pair does not fit together.
-    """
-    family = family_of(model)
-    if family is None:
-        assert model is not None
-        suited = for_spread_noise(model)
-        if suited is not None and is_noise_spread(lr, hr, align(lr, hr)):
-            hr.notes.append(
-                f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
-                f"--model {suited}"
-            )
-        return model
-    suited = family_for_layers(hr, family)
-    if suited != family:
-        family = suited
-        hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
-    if not is_noise_spread(lr, hr, align(lr, hr)):
-        return family
-    hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
-    return family + SPREAD
-
-
-def family_for_layers(hr: MappedRender, family: str) -> str:
-    """A family of models, or the default quality's in place of that of ``best`` for an HRLS without the layers that
-    this one needs."""
-    lacks = family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL))
-    return QUALITIES[DEFAULT_QUALITY] if lacks else family
 
 
 def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:

@@ -21,7 +21,8 @@ from oiio_msspl.fusion.motion import VECTORS, MotionSource
 from oiio_msspl.fusion.render_average import USUAL_CHANNELS
 from oiio_msspl.jobs.frame_checks import require_frame_memory
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
-from oiio_msspl.jobs.inputs import map_pair, resolve_auto
+from oiio_msspl.jobs.inputs import map_pair
+from oiio_msspl.jobs.model_choice import resolve_auto
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import AUTO, Temporal, TemporalOptions, shares

@@ -14,7 +14,8 @@ from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
 from oiio_msspl.jobs.frame_passes import check_passes
-from oiio_msspl.jobs.inputs import InputOptions, map_pair, resolve_auto
+from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.model_choice import resolve_auto
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of

@@ -23,7 +23,8 @@ from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
 from oiio_msspl.fusion.render_average import memory_to_average
 from oiio_msspl.fusion.temporal import memory_to_accumulate
-from oiio_msspl.jobs.inputs import InputOptions, family_for_layers, map_other_hrls, map_pair
+from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
+from oiio_msspl.jobs.model_choice import family_for_layers
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of

@@ -1,0 +1,48 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Which family of models suits a pair: by its layers, and by how its noise is correlated."""
+
+from __future__ import annotations
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.fusion.alignment import align
+from oiio_msspl.fusion.noise import is_noise_spread
+from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise
+from oiio_msspl.model.contract import SPREAD
+
+
+def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
+    """The model that is meant: a quality, ``auto`` and None are a family that suits the pair.
+
+    ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
+    filter has spread needs the family that was trained for it. Notes of the HRLS tell, also if a model that is named
+    does not suit the noise.
+
+    Raises:
+        InputError: the pair does not fit together.
+    """
+    family = family_of(model)
+    if family is None:
+        assert model is not None
+        suited = for_spread_noise(model)
+        if suited is not None and is_noise_spread(lr, hr, align(lr, hr)):
+            hr.notes.append(
+                f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
+                f"--model {suited}"
+            )
+        return model
+    suited = family_for_layers(hr, family)
+    if suited != family:
+        family = suited
+        hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
+    if not is_noise_spread(lr, hr, align(lr, hr)):
+        return family
+    hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
+    return family + SPREAD
+
+
+def family_for_layers(hr: MappedRender, family: str) -> str:
+    """A family of models, or the default quality's in place of that of ``best`` for an HRLS without the layers that
+    this one needs."""
+    lacks = family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL))
+    return QUALITIES[DEFAULT_QUALITY] if lacks else family

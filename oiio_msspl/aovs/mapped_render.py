@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
@@ -198,8 +198,7 @@ class MappedRender:
         whole = self.data_window
         layers: dict[str, Array] = {}
         stored = np.empty((len(channels), whole.height, whole.width), np.float32).transpose(1, 2, 0)
-        for y0 in range(whole.y0, whole.y1, ROWS_PER_LOAD):
-            window = Window(whole.x0, y0, whole.x1, min(y0 + ROWS_PER_LOAD, whole.y1))
+        for window in self._bands():
             strips, stored[window.slices(whole)] = self._read_with(window, features, channels)
             for name, rows in strips.items():
                 if name not in layers:
@@ -208,6 +207,21 @@ class MappedRender:
                 layers[name][window.slices(whole)] = rows
                 unload(layers[name])
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored
+
+    def check_pixels(self, channels: Sequence[Channel], features: Iterable[str]) -> None:
+        """Decode what :meth:`load_with` would keep, and keep nothing.
+
+        Raises:
+            InputError: as there.
+        """
+        for window in self._bands():
+            self._read_with(window, features, channels)
+
+    def _bands(self) -> Iterator[Window]:
+        """The data window in bands of rows that are read together."""
+        whole = self.data_window
+        for y0 in range(whole.y0, whole.y1, ROWS_PER_LOAD):
+            yield Window(whole.x0, y0, whole.x1, min(y0 + ROWS_PER_LOAD, whole.y1))
 
 
 def _row(feature: str, status: str, source: str = "", note: str = "") -> dict[str, str]:

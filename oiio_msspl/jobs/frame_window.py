@@ -203,26 +203,30 @@ class FrameWindow:
             MssplError: a neighbour has failed, and not for its files.
         """
         steps: list[Step[F]] = []
-        own = outcomes[number]
-        assert not isinstance(own, Exception)
-        here = placed(own)
+        outcome = outcomes[number]
+        assert not isinstance(outcome, Exception)
+        here = placed(outcome)
         count = self._temporal.renders if outcomes is self._loaded else self._temporal.results
         neighbours = [n for n in self._temporal.neighbours(number, count) if (n - number) * step > 0]
         for n in neighbours[::step]:
             try:
                 there = placed(_usable(n, outcomes[n]))
                 _check_alike(here, there)
-                if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
-                    _ = there[1].luminances  # reads all pixels, so a damaged file is found before it is averaged
-                    if abs(n - number) == 1 and shared_noise(here[1], there[1]) > SAME_NOISE:
-                        warnings.append(f"frames {min(number, n)} and {max(number, n)} {SAME_SEED}")
+                own, its = here[1], there[1]
+                if (
+                    isinstance(own, RenderPair)
+                    and isinstance(its, RenderPair)
+                    and abs(n - number) == 1
+                    and shared_noise(own, its) > SAME_NOISE
+                ):
+                    warnings.append(f"frames {min(number, n)} and {max(number, n)} {SAME_SEED}")
                 way, back = self._read_both_ways(n - step, n)
             except InputError as error:
                 warnings.append(f"frame {n} is not averaged: {error}")
                 break
             steps.append(_step(there[1], way, back, self._tolerance))
-            if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
-                names = " and ".join(lacking_passes(here[1], there[1]))
+            if isinstance(own, RenderPair) and isinstance(its, RenderPair):
+                names = " and ".join(lacking_passes(own, its))
                 if names:
                     warnings.append(f"frame {n} has no set of passes with {names}, so passes are not averaged")
         return steps

@@ -14,7 +14,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.bands import REACH, grid_rows
-from oiio_msspl.fusion.neighbourhood import mean_around
+from oiio_msspl.fusion.neighbourhood import grown, max_3x3, mean_around, sum_3x3
 
 #: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
 #: shadow, the large one a faint change of all the light.
@@ -29,6 +29,9 @@ LARGEST_DIFFERENCE = 3.0
 DARKEST = 0.02
 #: Relative squared difference below which two frames are equal.
 EQUAL = 1e-4
+#: A lamp shines in one frame alone where the mean of 3 x 3 LRHS pixels is so many times as bright as the brightest of
+#: them in the other frame.
+LAMP = 3.0
 
 
 class Light:
@@ -46,6 +49,7 @@ class Light:
         """Luminance that is added to the local brightness."""
         self._brightness = mean_around(picture, 1) + np.float32(self.darkest)
         self._renders = lrhs, hrls
+        self._least, self._most = _bounds(lrhs, hrls)
         low, high = (render / self._brightness for render in self._renders)
         noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
         scale = alignment.scale
@@ -73,7 +77,22 @@ class Light:
             uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
             change = np.maximum(mean_around(product, reach) - uncertainty - own_error, 0)
             np.minimum(trust, own_error / (own_error + change), out=trust)
+        least, most = _bounds(lrhs, hrls)
+        lamps = self._least[rows] > np.float32(LAMP) * (most + np.float32(self.darkest))
+        lamps |= least > np.float32(LAMP) * (self._most[rows] + np.float32(self.darkest))
+        # Weights are interpolated between LRHS pixels, so those beside a lamp are 0, too.
+        trust[grown(lamps)] = 0
         return trust
+
+
+def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+    """How bright each 3 x 3 pixels (h, w) are at least, on average, and their brightest pixel at most.
+
+    A firefly is in one render alone. What is bright in both is a lamp, however small it is. Means over many pixels do
+    not notice it, and a thousandth of its light is seen on a dark wall.
+    """
+    least = np.minimum(*(sum_3x3(render) for render in (lrhs, hrls))) * np.float32(1 / 9)
+    return least, max_3x3(np.maximum(lrhs, hrls))
 
 
 def relative_difference(own: Array, other: Array, darkest: float) -> Array:

@@ -101,7 +101,8 @@ class MotionSource:
                 if channels := frame.hr.motion.channels(each.layer, each.components):
                     stored = frame.hr.file.read(channels, frame.hr.data_window)
                     known &= (np.abs(stored - np.float32(each.format.offset)) <= 1e-3).all(axis=-1)
-            if not self.fields and not _camera_stands(*still_and_moved(open_pair(frame.hr, neighbour.hr, LOOK))):
+            # Vectors that are 0 everywhere may be missing ones: Cycles writes them if motion blur is on.
+            if known.all() and not _camera_stands(*still_and_moved(open_pair(frame.hr, neighbour.hr, LOOK))):
                 known[:] = False
         return vectors, known
 

@@ -27,6 +27,9 @@ FITS = {ALBEDO: 3.5, NORMAL: 1.5}
 SAME_FRAME = 4.0
 #: Both renders show the same edges if these fit this well. In a picture with fewer edges, normals can't be judged.
 VISIBLE = 3.0
+#: A pattern is the same in two pictures if its correlations with both, by shift, correlate this much. Boards, tiles and
+#: blinds reach 0.99, albedos and normals of other scenes 0.36.
+SAME_PATTERN = 0.6
 #: An AOV with edges at fewer pixels says nothing.
 MIN_EDGES = 200
 #: Normals are noise if, at this share of their edges, noise makes up this share of what the normals differ by: under
@@ -71,6 +74,7 @@ def foreign_aovs(
     # Steps have a direction, too: what has the brighter albedo is brighter. A light may turn that around.
     if ALBEDO in foreign and abs(_fit_steps(_log_steps(surface, 0.05), steps)) >= FITS[ALBEDO]:
         foreign.remove(ALBEDO)
+    foreign = [name for name in foreign if not edges[name].repeat_in(picture)]
     if not foreign:
         return []
     # Where shapes are seen, so are colours. Even light shows colours without shapes.
@@ -124,6 +128,15 @@ class _Edges:
         """By how many standard deviations two pictures fit better than when one is shifted."""
         return _above_control(np.conj(self.spectrum) * other.spectrum, self.shape)
 
+    def repeat_in(self, other: _Edges) -> bool:
+        """Whether another picture has a pattern of these edges that repeats, as boards or tiles do.
+
+        Shifted by a period, the pattern fits as well. But if it is in both pictures, the fit depends on the shift as
+        that of the pattern with itself.
+        """
+        own, both = (_correlation(np.conj(self.spectrum) * each.spectrum, self.shape).ravel() for each in (self, other))
+        return bool(np.corrcoef(own, both)[0, 1] > SAME_PATTERN)
+
 
 def _fit_steps(a: list[Array], b: list[Array]) -> float:
     """The same as :meth:`_Edges.fit` for the directed steps of two pictures."""
@@ -132,10 +145,16 @@ def _fit_steps(a: list[Array], b: list[Array]) -> float:
     return _above_control(products[0] + products[1], a[0].shape)
 
 
+def _correlation(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> Array:
+    """The correlation of two pictures for all shifts up to the furthest of ``CONTROL``, no shift in the middle."""
+    furthest = CONTROL[1]
+    correlation: Array = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
+    return correlation[: 2 * furthest + 1, : 2 * furthest + 1]
+
+
 def _above_control(spectrum: NDArray[np.complexfloating], shape: tuple[int, ...]) -> float:
     nearest, furthest = CONTROL
-    correlation = np.roll(np.fft.irfft2(spectrum, shape), (furthest, furthest), (0, 1))
-    window = correlation[: 2 * furthest + 1, : 2 * furthest + 1]
+    window = _correlation(spectrum, shape)
     y, x = np.abs(np.mgrid[-furthest : furthest + 1, -furthest : furthest + 1])
     control = window[np.maximum(x, y) >= nearest]
     return float((window[furthest, furthest] - control.mean()) / max(float(control.std()), 1e-30))

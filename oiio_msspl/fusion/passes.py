@@ -27,7 +27,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import HALF_MAX, Array, blank, box_downsample, planes_of, repair, unload, upsample_linear
+from oiio_msspl.arrays import HALF_MAX, Array, Mask, blank, box_downsample, planes_of, repair, unload, upsample_linear
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -471,14 +471,26 @@ class _Band:
         # Where no layer is left, the beauty is divided as it is around.
         dark = (fitted.sum(axis=0) == 0) & (light > 0)
         if dark.any():
-            _, y, x = np.nonzero(dark)
-            core = in_hrls_pixels(self._core, self._scale)
-            fitted[:, dark] = self._shares.at(job, x + core.x0, y + core.y0)
+            fitted[:, dark] = self._shares_at(job, dark)
         for i, layer in enumerate(layers):
             if layer in colours:
                 fitted[i] *= colours[layer] >= DARKEST_COLOUR
+        # Light of a layer whose colour is black can't be stored. The layers without colour get it.
+        lost = (fitted.sum(axis=0) == 0) & (light > 0)
+        free = [i for i, layer in enumerate(layers) if layer not in colours]
+        if free and colours and lost.any():
+            shares = self._shares_at(job, lost)[free]
+            shares[:, shares.sum(axis=0) == 0] = 1
+            for i, share in zip(free, shares, strict=True):
+                fitted[i][lost] = share
         _make_sum(fitted, light, doubts)
         return dict(zip(layers, fitted, strict=False))
+
+    def _shares_at(self, job: PassJob, where: Mask) -> Array:
+        """The shares that layers have around some values of the core (3, h, w), (layers, values)."""
+        _, y, x = np.nonzero(where)
+        core = in_hrls_pixels(self._core, self._scale)
+        return self._shares.at(job, x + core.x0, y + core.y0)
 
     def _over_core(self, image: Array) -> Array:
         """An image (height, width, 3) over the HRLS's data window, mirrored beyond it, as planes over the core."""

@@ -59,6 +59,36 @@ def test_a_right_pair_fits(scale, seed):
     assert warnings(scale, seed) == []
 
 
+@pytest.mark.parametrize("period", [4, 8, 16])
+def test_boards_of_one_width_belong_to_the_picture(period):
+    """Their albedo fits as well when it is shifted by a board, or along the boards."""
+    assert warnings_of_boards(period, turned=False) == []
+
+
+def test_boards_that_run_the_other_way_do_not():
+    (warning,) = warnings_of_boards(16, turned=True)
+    assert "the albedo's edges are not in the picture" in warning
+
+
+def warnings_of_boards(period, *, turned):
+    """Those of a picture of boards, so many pixels wide, whose albedo may run the other way."""
+    colour, albedo, normal = scene(2)
+
+    def boards(axis):
+        dark = (np.arange(albedo.shape[axis]) % (2 * period) < period)[:, None]
+        stripes = np.where(dark, np.float32(0.8), np.float32([0.3, 0.2, 0.1]))
+        return np.ascontiguousarray(np.broadcast_to(np.expand_dims(stripes, 1 - axis), albedo.shape))
+
+    picture = boards(1) * colour / albedo
+    low, high = noisy(downsample(picture, 2), 16, 2), noisy(picture, 4, 1)
+    return check_renders(
+        Render.from_arrays("lr", rgb=np.ascontiguousarray(low, np.float32)),
+        Render.from_arrays(
+            "hr", rgb=np.ascontiguousarray(high, np.float32), albedo=boards(0 if turned else 1), normal=normal
+        ),
+    )
+
+
 def test_a_right_pair_fits_whatever_tiles_it_is_read_in(scale, monkeypatch):
     monkeypatch.setattr("oiio_msspl.fusion.pair_checks.PIXELS_PER_READ", 30 * 30 * scale**2)
     assert warnings(scale) == []

@@ -92,6 +92,26 @@ def test_light_that_changes_is_not_averaged(change):
     assert rms(made, truth, same) < 0.75 * rms(own, truth, same)
 
 
+def test_a_small_lamp_in_the_neighbour_leaves_no_ghost():
+    truth, lit = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32), np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    lit[40:43, 61:65] = 200
+    pairs = [pair_of(truth, 1), pair_of(lit, 2)]
+    result = average_renders(pairs[0], [still(pairs[1])], [])
+    assert result.hr.layers["rgb"].max() < 1.1 * pairs[0].hr.layers["rgb"].max()
+    assert result.lr.layers["rgb"].max() < 1.1 * pairs[0].lr.layers["rgb"].max()
+
+
+def test_a_firefly_is_no_lamp():
+    """It is in one render alone, so neighbours count as they do without it."""
+    pairs = [pair_of(texture(), 1), pair_of(texture(), 2)]
+    before = average_renders(pairs[0], [still(pairs[1])], [])
+    pairs[1].hr.layers["rgb"][41, 62] = 500
+    after = average_renders(RenderPair(pairs[0].lr, pairs[0].hr), [still(RenderPair(pairs[1].lr, pairs[1].hr))], [])
+    beside = np.s_[40:44, 64:68]
+    assert before.frames[beside].min() > 1.3
+    assert np.allclose(after.frames[beside], before.frames[beside], rtol=0.2)
+
+
 def test_a_lamp_that_is_wider_in_the_lrhs_leaves_no_ghost():
     """Its light reaches further than its vectors: the filter of the LRHS is as wide as the LRHS's pixels."""
     places = (slice(40, 52), slice(48, 60)), (slice(40, 52), slice(32, 44))

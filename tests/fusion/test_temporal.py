@@ -165,6 +165,20 @@ def test_light_that_changes_is_not_averaged(change):
     assert rms(result.rgb, truth, same) < 0.7 * rms(frames[0].rgb, truth, same)
 
 
+@pytest.mark.parametrize("on", [False, True])
+def test_a_small_lamp_that_is_on_in_one_frame_leaves_no_trace(on):
+    """It is 400 times as bright as the wall, so a thousandth of its light would be seen."""
+    wall, lit = np.full((HEIGHT, WIDTH, 3), 0.5, np.float32), np.full((HEIGHT, WIDTH, 3), 0.5, np.float32)
+    lamp = np.s_[40:43, 61:65]
+    lit[lamp] = 200
+    truth, other = (lit, wall) if on else (wall, lit)
+    frames = [frame_of(truth, 1), frame_of(other, 2), frame_of(other, 3)]
+    result = accumulate(frames[0], [still(frames[1])], [still(frames[2])])
+    around = np.s_[38:45, 59:67]
+    assert np.array_equal(result.rgb[around], frames[0].rgb[around])
+    assert np.median(result.frames) > 2
+
+
 def test_light_that_has_changed_in_the_nearer_frame_has_in_the_farther_one():
     truth, dark = texture(), texture() * 0.2
     frames = [frame_of(truth, 1), frame_of(dark, 2), frame_of(truth, 3)]

@@ -80,8 +80,9 @@ class Light:
         least, most = _bounds(lrhs, hrls)
         lamps = self._least[rows] > np.float32(LAMP) * (most + np.float32(self.darkest))
         lamps |= least > np.float32(LAMP) * (self._most[rows] + np.float32(self.darkest))
-        # Weights are interpolated between LRHS pixels, so those beside a lamp are 0, too.
-        trust[grown(lamps)] = 0
+        if lamps.any():
+            # Weights are interpolated between LRHS pixels, so those beside a lamp are 0, too.
+            trust[grown(lamps)] = 0
         return trust
 
 

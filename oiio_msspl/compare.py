@@ -14,15 +14,19 @@ import OpenImageIO as oiio
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import HALF_MAX, Array, repair
 from oiio_msspl.colour import converted, same_space, space_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
-from oiio_msspl.exr.preview import write_png
+from oiio_msspl.exr.preview import SOFTWARE, write_png
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
 from oiio_msspl.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, relmse_map, ssim
 from oiio_msspl.model.contract import SCALES
+
+#: The "Software" entry of error maps. It differs from that of previews, because fusing deletes old previews.
+ERROR_MAP_SOFTWARE = f"{SOFTWARE} compare"
 
 
 def scores(image: Array, reference: Array) -> dict[str, float]:
@@ -84,15 +88,31 @@ def open_comparison(images: Sequence[Path], reference: Path | None = None, layer
         reference: EXR file of what the images should be.
         layer: of all files, in place of their beauty.
 
+    Returns:
+        The files with the view, or view layer, that the first image has in front. A file that lacks it takes part with
+        its own first one, see :func:`note_on_views`.
+
     Raises:
         InputError: a file can't be read or lacks what is compared, or see :func:`common_windows`.
     """
     paths = [*images, *([reference] if reference else [])]
-    mapping = {RGB: layer} if layer else {}
-    renders = [map_render(open_exr(path), mapping, features=()) for path in paths]
+    renders = _renders_of_one_view(paths, {RGB: layer} if layer else {})
     sizes = [each.data_window.width * each.data_window.height for each in renders]
     largest = len(renders) - 1 if reference else sizes.index(max(sizes))
     return Comparison(renders, reference is not None, largest, common_windows(renders, renders[largest]))
+
+
+def _renders_of_one_view(paths: Sequence[Path], mapping: dict[str, str]) -> list[MappedRender]:
+    """Files with the view, or view layer, that the first one has in front; those that lack it with their own first."""
+    renders: list[MappedRender] = []
+    for path in paths:
+        file = open_exr(path)
+        render = map_render(file, mapping, features=())
+        wanted = renders[0].view if renders else ""
+        if wanted != render.view and any(wanted in (label, *label.split("/")) for label in render.other_views):
+            render = map_render(file, mapping, view=wanted, features=())
+        renders.append(render)
+    return renders
 
 
 def score_images(comparison: Comparison) -> list[dict[str, float]]:
@@ -126,6 +146,17 @@ def note_on_spaces(comparison: Comparison) -> str:
     if not others:
         return ""
     return f"Converted to {target.name}, the colour space of {largest.name}: {', '.join(others)}"
+
+
+def note_on_views(comparison: Comparison) -> str:
+    """A sentence for the user if a file lacks the view, or view layer, of the first image; empty if all have it, and
+    if no file has several."""
+    renders = comparison.renders
+    wanted = renders[0].view
+    same = all(wanted in (each.view, *each.view.split("/")) for each in renders)
+    if same or not any(each.other_views for each in renders):
+        return ""
+    return f"Different views are compared: {', '.join(f'{name_of(each.view)} of {each.name}' for each in renders)}"
 
 
 def notes_on_broken(comparison: Comparison) -> list[str]:
@@ -225,7 +256,8 @@ def write_error_map(path: Path, comparison: Comparison, *, overwrite: bool) -> N
         InputError: pixels can't be read, or ``path`` exists.
         MssplError: the PNG can't be written.
     """
-    write_png(path, error_map(comparison.image(0), comparison.truth), overwrite=overwrite)
+    picture = error_map(comparison.image(0), comparison.truth)
+    write_png(path, picture, software=ERROR_MAP_SOFTWARE, overwrite=overwrite)
 
 
 def error_map(image: Array, truth: Array) -> Array:

@@ -126,6 +126,15 @@ def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None
     check_separate(compared, [path])
 
 
+def check_layers(comparison: Comparison, layers: Sequence[str]) -> None:
+    """Check by the headers alone that :func:`write_page` finds the layers.
+
+    Raises:
+        InputError: no file has a layer of a pattern.
+    """
+    _chosen(list(map(_picture, comparison.renders, comparison.windows)), layers)
+
+
 def write_page(
     path: Path,
     comparison: Comparison,
@@ -180,13 +189,13 @@ def _picture(render: MappedRender, window: Window) -> _Picture:
             found.setdefault(same_spelling(name), layer)
             in_sets.add(each.channels)
     views = render.view.split("/")
-    for stored in layers_of(render.file):
+    for stored in layers_of(render.file, flat=True):
         # Cryptomattes hold numbers that stand for objects: their pictures tell nothing.
         if "crypto" in stored.name.lower() or (stored.view and stored.view not in views):
             continue
         name = next((stored.name.removeprefix(f"{v}.") for v in views if stored.name.startswith(f"{v}.")), stored.name)
         for channels, component in _groups(stored):
-            unusable = any(channel.type == "uint" or render.file.parts[channel.part].deep for channel in channels)
+            unusable = any(channel.type == "uint" for channel in channels)
             if not unusable and channels not in in_sets and channels not in beauty.terms:
                 label = ".".join(filter(None, (name, component))) or "RGB"
                 is_colour = len(channels) == 3 and channels[0] is stored.channels.get("R")

@@ -250,8 +250,7 @@ def _facts(file: ExrFile) -> list[str]:
 def _pixel_facts(render: MappedRender) -> list[str]:
     """Read every feature once: count what is not finite and what is negative, and name what is all zero.
 
-    Raises:
-        InputError: the beauty is black everywhere.
+    A beauty that is black everywhere is told in the notes of the render, too.
     """
     window = render.data_window
     brightest: dict[str, float] = {}
@@ -267,8 +266,8 @@ def _pixel_facts(render: MappedRender) -> list[str]:
             brightest[name] = max(brightest.get(name, 0.0), float(np.abs(values[finite]).max(initial=0.0)))
     if brightest[RGB] == 0:
         others = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
-        hint = f", though {others} are not; check which layer it is (--map rgb=LAYER)" if others else ""
-        raise InputError(f"the beauty is black everywhere{hint}")
+        hint = f", though others are not: {others}; check which layer it is (--map rgb=LAYER)" if others else ""
+        render.notes.append(f"the beauty is black everywhere{hint}")
     counts = [
         f"{name}: {count} values are NaN or infinite; fusing repairs them"
         for name, count in not_finite.items()

@@ -2,6 +2,7 @@
 """Scores, and the picture of the error."""
 
 import numpy as np
+import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
@@ -9,6 +10,7 @@ from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.compare import (
     error_map,
     note_on_spaces,
+    note_on_views,
     note_on_windows,
     notes_on_broken,
     open_comparison,
@@ -18,6 +20,7 @@ from oiio_msspl.compare import (
     write_error_map,
 )
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.preview import is_our_preview, old_preview
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.metrics import RELMSE_GHARBI, relmse
 from tests.conftest import downsample, picture, rgb, write_exr
@@ -93,6 +96,58 @@ def test_scores_and_error_map_read_the_reference_once(tmp_path, monkeypatch):
     score_images(comparison)
     write_error_map(tmp_path / "error.png", comparison, overwrite=False)
     assert read.count(paths[2]) == 1
+
+
+def test_an_error_map_is_no_preview(tmp_path):
+    """Fusing deletes the old preview beside a frame that it replaces."""
+    paths = [write_exr(tmp_path / f"{n}.exr", rgb(picture(32, 32, n))) for n in range(2)]
+    write_error_map(tmp_path / "0.png", open_comparison(paths[:1], paths[1]), overwrite=False)
+    assert not is_our_preview(tmp_path / "0.png") and old_preview(paths[0]) is None
+
+
+def views(path, image, names):
+    """A file with a view layer of each name, whose picture is as bright as the name says."""
+    parts = [(name, rgb(image * "_AB".index(name), f"{name}.Combined."), (0, 0)) for name in names]
+    return write_exr(path, parts)
+
+
+def test_all_files_are_compared_in_the_view_of_the_first_image(tmp_path):
+    """Whatever order the other files have them in. A plain one has only one."""
+    image = picture(32, 32)
+    fused = views(tmp_path / "fused.exr", image, "BA")
+    high, reference = (views(tmp_path / f"{name}.exr", image, "AB") for name in ("hr", "ref"))
+    comparison = open_comparison([fused, high], reference)
+    assert [render.view for render in comparison.renders] == ["B", "B", "B"]
+    assert [each["relmse"] for each in score_images(comparison)] == [0, 0]
+    assert note_on_views(comparison) == ""
+    plain = open_comparison([views(tmp_path / "a.exr", image, "A")], write_exr(tmp_path / "plain.exr", rgb(image)))
+    assert note_on_views(plain) == ""  # there is nothing to choose
+
+
+def test_views_that_a_file_lacks_are_told(tmp_path):
+    image = picture(32, 32)
+    fused = views(tmp_path / "fused.exr", image, "BA")
+    low, plain = views(tmp_path / "low.exr", image, "A"), write_exr(tmp_path / "ref.exr", rgb(image))
+    said = note_on_views(open_comparison([fused, low], plain))
+    assert said == f"Different views are compared: B of {fused}, A of {low}, (unnamed) of {plain}"
+
+
+def test_the_left_eyes_are_compared_with_the_left_eye(tmp_path):
+    """The eyes have parts of their own, in another order."""
+    left = picture(32, 32)
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    paths = []
+    for name, eyes in (("image", ("left", "right")), ("ref", ("right", "left"))):
+        parts = []
+        for eye in eyes:
+            planes = rgb(left * (1 if eye == "left" else 2))
+            planes = {component: np.ascontiguousarray(plane) for component, plane in planes.items()}
+            parts.append(OpenEXR.Part(header | {"view": eye}, planes, f"rgba.{eye}"))
+        with OpenEXR.File(parts) as file:
+            file.write(str(tmp_path / f"{name}.exr"))
+        paths.append(tmp_path / f"{name}.exr")
+    (found,) = score_images(open_comparison(paths[:1], paths[1]))
+    assert found["relmse"] == 0
 
 
 def test_an_enlarged_picture_has_no_negative_light():

@@ -19,6 +19,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.metrics import psnr, relmse
 from tests.browser import BROWSER, dump_dom
 from tests.conftest import downsample, noisy, picture, rgb, write_exr
+from tests.exr.sources import behind_a_deep_part
 
 needs_browser = pytest.mark.skipif(not BROWSER, reason="needs Chromium")
 
@@ -138,6 +139,12 @@ def test_by_default_the_page_shows_layers_that_sum_to_the_beauty(folder):
     assert write_page(folder / "sets.html", image, layers=["beauty"], overwrite=True).layers == ("beauty",)
     everything = write_page(folder / "sets.html", image, layers=["*"], overwrite=True)
     assert everything.layers == ("beauty", "light_1", "light_2", "Z")  # no numbers of objects
+
+
+def test_a_deep_part_hides_no_layer(tmp_path):
+    path = behind_a_deep_part(tmp_path / "a.exr", rgb(picture(16, 16)) | {"Z": picture(16, 16)[..., 0]})
+    found = write_page(tmp_path / "page.html", open_comparison([path]), layers=["*"])
+    assert found.layers == ("beauty", "Z")
 
 
 def test_colours_are_those_of_srgb(tmp_path):

@@ -71,7 +71,7 @@ class LayerFinder:
                 return None
             group = layer.triple() or (layer.scalar() if feature == VARIANCE else None)
             if group is None:
-                problems.append(_wrong_channels(feature, layer))
+                problems.append(wrong_channels(feature, layer))
                 return None
             groups.append(group)
             names.append(layer.name or " ".join(c.name for c in group))
@@ -91,7 +91,7 @@ class LayerFinder:
     def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
         """The feature of another render, found by the table of renderers; or its only layer, for a file of one AOV."""
         other = self._open(path)
-        layers = layers_of(other)
+        layers = layers_of(other, flat=True)
         renderer = detect_renderer(other, layers)
         found: dict[tuple[Channel, ...], FeatureFormula] = {}
         for candidate in renderer.get(feature, []):
@@ -135,12 +135,12 @@ class LayerFinder:
             sibling = sibling_of(file.path, name)
             if sibling is None:
                 return None
-            layers = layers_of(self._open(sibling))
+            layers = layers_of(self._open(sibling), flat=True)
             first = next((layer for layer in layers if layer.triple()), layers[0] if layers else None)
             return first and replace(first, name=sibling.name)
         path = Path(named)
         other = self._open(path)
-        layers = layers_of(other)
+        layers = layers_of(other, flat=True)
         renderer = detect_renderer(other, layers)
         if not wanted:
             return replace(_only_layer(path, layers, feature, renderer), name=path.name)
@@ -162,6 +162,11 @@ class LayerFinder:
             raise InputError(
                 f"{path}: is {other.display_window.size}, but {file.path} is {file.display_window.size}; "
                 "give layers of the same frame"
+            )
+        if other.display_window != file.display_window:  # pixels are read by their place, so all would be beside it
+            raise InputError(
+                f"{path}: its display window is {other.display_window}, but that of {file.path} is "
+                f"{file.display_window}; give layers of the same frame"
             )
         return other
 
@@ -227,7 +232,8 @@ def missing(feature: str, candidate: Any) -> str:
     return f"{feature} is mapped to {text}, which is not there"
 
 
-def _wrong_channels(feature: str, layer: Layer) -> str:
+def wrong_channels(feature: str, layer: Layer) -> str:
+    """The sentence for a layer that exists but can't be the feature."""
     wanted = "R, G, B (or X, Y, Z)" + (" or a single channel" if feature == VARIANCE else "")
     return f"{feature}: layer '{layer.name or 'R G B'}' has channels {', '.join(layer.channels)}, not {wanted}"
 

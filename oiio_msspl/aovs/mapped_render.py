@@ -97,14 +97,14 @@ class MappedRender:
         return rows
 
     def unused_layers(self, others: Sequence[MappedRender], fused: Iterable[AdditiveSet]) -> list[str]:
-        """Names of the layers, or of single channels, that no feature is read from, in this view or in one of
+        """Names of the flat layers, or of single channels, that no feature is read from, in this view or in one of
         ``others``, and that are in none of the ``fused`` sets. Those of another view than the chosen one are followed
         by the view in brackets."""
         used = {c for each in (self, *others) for formula in each.features.values() for c in formula.channels}
         used |= {channel for each in fused for layer in each.layers for channel in layer.channels}
         used |= {each.alpha for each in (self, *others) if each.alpha}
         names = []
-        for layer in layers_of(self.file):
+        for layer in layers_of(self.file, flat=True):
             rest = [c for c in layer.channels.values() if c not in used]
             whole = len(rest) == len(layer.channels) and layer.name
             view = f" ({layer.view})" if layer.view and layer.view not in self.view.split("/") else ""

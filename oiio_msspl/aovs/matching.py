@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import find_additive_sets
-from oiio_msspl.aovs.candidates import LayerFinder, missing
+from oiio_msspl.aovs.candidates import LayerFinder, missing, wrong_channels
 from oiio_msspl.aovs.features import NORMAL, OPTIONAL_FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import NEEDS_SPP, FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import check_mapping
 from oiio_msspl.aovs.motion import find_motion_layers
-from oiio_msspl.aovs.renderers import detect_renderer, samples_per_pixel
+from oiio_msspl.aovs.renderers import detect_renderer, samples_per_pixel, view_layer_of
 from oiio_msspl.aovs.views import Beauty, choose_beauty, find_beauties
 from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
@@ -75,6 +75,10 @@ def map_render(
         if formula is not None:
             found[feature] = formula
     _check_no_integers(found)
+    alpha = beauty.layer.channels.get("A")
+    if alpha is not None and alpha.type == "uint":
+        notes.append(f"alpha: {alpha.name} holds integers; the render counts as one without alpha")
+        alpha = None
     labels = dict.fromkeys(each.label for each in beauties)
     render = MappedRender(
         file=file,
@@ -82,7 +86,7 @@ def map_render(
         view=beauty.label,
         other_views=[label for label in labels if label != beauty.label],
         features=found,
-        alpha=beauty.layer.channels.get("A"),
+        alpha=alpha,
         spp=spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer),
         data_window=file.parts[found[RGB].terms[0][0].part].data_window,
         additive_sets=find_additive_sets(renderer, layers, beauty, sums, str(file.path)),
@@ -115,7 +119,11 @@ def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
 def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
     """The error for a file without the beauty of the table, or without the one that the user has ``mapped``."""
     if mapped is not None:
-        return InputError(f"{file.path}: {missing(RGB, mapped)}, and a mapping of rgb applies to both renders")
+        alias = mapped if isinstance(mapped, str) else mapped.get("layer", "")
+        for layer in layers:
+            if alias and view_layer_of(layer.name, alias) is not None:
+                return InputError(f"{file.path}: {wrong_channels(RGB, layer)}")
+        return InputError(f"{file.path}: {missing(RGB, mapped)}; a mapping of rgb applies to every file")
     names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
     return InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
 

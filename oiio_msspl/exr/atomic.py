@@ -91,12 +91,12 @@ def check_encodable(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Check the folder of ``path``.
+    """Check the folder of ``path``; if ``path`` is a link, the folder of the file that it points to.
 
     Raises:
         InputError: it is missing or read-only.
     """
-    folder = path.parent
+    folder = Path(os.path.realpath(path)).parent if path.is_symlink() else path.parent
     if not folder.is_dir():
         raise InputError(f"{path}: the folder {folder} does not exist; create it first")
     if not os.access(folder, os.W_OK):

@@ -76,8 +76,8 @@ class FileContents:
 
     @cached_property
     def layers(self) -> dict[Channel, Layer]:
-        """The layer of each channel of the HRLS. A channel may be in none."""
-        return {c: layer for layer in layers_of(self.source) for c in layer.channels.values()}
+        """The layer of each channel of the HRLS. A channel may be in none, and those of deep parts are."""
+        return {c: layer for layer in layers_of(self.source, flat=True) for c in layer.channels.values()}
 
     @property
     def view(self) -> str:
@@ -120,7 +120,9 @@ def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequenc
     """
     if not patterns:
         return frozenset()
-    layer_of = {c: layer for layer in layers_of(file) for c in layer.channels.values()}
+    # A deep part must not take the place of a flat one that has a layer of the same name.
+    layers = [*layers_of(file), *layers_of(file, flat=True)]
+    layer_of = {c: layer for layer in layers for c in layer.channels.values()}
     others = [c for part in file.parts for c in part.channels if c not in beauty]
     kept: set[Channel] = set()
     for pattern in patterns:

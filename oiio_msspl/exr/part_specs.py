@@ -6,14 +6,14 @@ Each starts as a copy of the HRLS's part, so that windows and metadata are kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import OpenImageIO as oiio
 
 from oiio_msspl.exr.contents import FileContents, lossless
-from oiio_msspl.exr.reader import Channel, Part
+from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Attributes that say how the source was stored. The writer sets them anew, or they have no meaning in the copy.
@@ -22,20 +22,29 @@ _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio
 _ACES_FLAG = "acesImageContainerFlag"
 #: Effort of ZIP, 1 to 9. OpenEXR's own is 4, which takes a third longer and makes files of renders 1 to 2 % smaller.
 ZIP_LEVEL = 1
-#: Attributes that must be the same in all parts of a file, and attributes that describe a single part.
-_KEPT_IN_EVERY_PART = (
-    "PixelAspectRatio",
-    "chromaticities",
-    "smpte:TimeCode",
-    "view",
-    "name",
-    "oiio:subimagename",
-    "compression",
-)
+#: Attributes that OpenEXR wants to be the same in all parts of a file. Only the first part may have one alone.
+_SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode")
+#: Attributes that every part keeps: the shared ones, and those that describe a single part.
+_KEPT_IN_EVERY_PART = (*_SHARED, "view", "name", "oiio:subimagename", "compression")
 
 
 #: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
 LARGEST_MIXED_PART = 256 << 20
+
+
+@dataclass(frozen=True)
+class _Piece:
+    """What becomes a part: a whole part of the HRLS, or its channels of one layer and pixel type."""
+
+    source: Part
+    view: str
+    channels: tuple[Channel, ...]
+    whole: bool
+    name: str
+    keeps_name: bool
+    """Whether ``name`` is that of the HRLS's part. Otherwise it is made up, and gives way to names that are kept."""
+    repeats_metadata: bool
+    """Whether another part that is written holds the metadata of ``source``."""
 
 
 @dataclass(frozen=True)
@@ -84,12 +93,22 @@ def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedO
         contents: what is written.
         taken: names of the parts so far; those of the new parts are added.
     """
+    pieces = list(_pieces(contents))
+    kept = {piece.name for piece in pieces if piece.keeps_name}
+    for piece in pieces:
+        name = _unique(piece.name, taken, kept - {piece.name} if piece.keeps_name else kept)
+        yield _whole_part(piece.source, name) if piece.whole else _layer_part(contents, piece, name)
+
+
+def _pieces(contents: FileContents) -> Iterator[_Piece]:
+    """What becomes a part, in file order."""
     layer_of = contents.layers
     for part in contents.source.parts:
         if part.deep:
             continue
         if _stays_whole(part, contents):
-            yield _whole_part(part, taken)
+            name = part.name or f"part{part.index}"
+            yield _Piece(part, part.view, part.channels, True, name, bool(part.name), repeats_metadata=False)
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
@@ -101,7 +120,8 @@ def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedO
         # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
         repeats_metadata = not set(contents.beauty).isdisjoint(part.channels)
         for (view, layer_name, _), channels in groups.items():
-            yield _layer_part(contents, part, view, layer_name, channels, taken, repeats_metadata)
+            name, keeps_name = _layer_name(contents, part, view, layer_name, channels)
+            yield _Piece(part, view, tuple(channels), False, name, keeps_name, repeats_metadata)
             repeats_metadata = True
 
 
@@ -127,42 +147,56 @@ def _has_one_type(part: Part) -> bool:
     return len({channel.type for channel in part.channels}) == 1
 
 
-def _whole_part(part: Part, taken: set[str]) -> PassedOnPart:
+def _whole_part(part: Part, name: str) -> PassedOnPart:
     spec = oiio.ImageSpec(part.spec)
     spec.channelnames = tuple(channel.name for channel in part.channels)
-    _name_and_compress(spec, _unique(part.name or f"part{part.index}", taken), lossless(part))
+    _name_and_compress(spec, name, lossless(part))
     if not _has_one_type(part):
         return PassedOnPart(spec, part, None)
     spec.tile_width = spec.tile_height = spec.tile_depth = 0
     return PassedOnPart(spec, part, (part.channels,))
 
 
-def _layer_part(
-    contents: FileContents,
-    part: Part,
-    view: str,
-    layer: str,
-    channels: list[Channel],
-    taken: set[str],
-    repeats_metadata: bool,
-) -> PassedOnPart:
-    """A part for the channels of one layer and pixel type."""
-    nuke = contents.options.layout == "nuke"
-    components = [c.name.rpartition(".")[2] for c in channels]
+def _layer_name(
+    contents: FileContents, part: Part, view: str, layer: str, channels: Sequence[Channel]
+) -> tuple[str, bool]:
+    """The name of the part for the channels of one layer and pixel type, and whether the HRLS's part has it."""
+    components = _components(channels)
     is_beauty = not layer and view and {"R", "G", "B"} <= {*components}  # of another view
     plain = layer or ("rgba" if is_beauty else "depth" if components == ["Z"] else "other")
-    if nuke:
-        plain = _nuke_name(plain, view)
-    elif is_beauty and part.name and len(contents.source.parts) > 1:
-        plain = part.name
-    elif view and view != contents.view:
-        plain = f"{plain}.{view}"
-    name = _unique(plain, taken)
-    names = components if nuke else [c.name for c in channels]
-    spec = _spec(part, name, names, channels[0].type, view)
-    if repeats_metadata:
+    if contents.options.layout == "nuke":
+        name = _nuke_name(plain, view)
+        return name, name in (_nuke_name(part.name, ""), _nuke_name(part.name.removesuffix(f".{view}"), view))
+    if is_beauty and part.name and len(contents.source.parts) > 1:
+        return part.name, True
+    name = f"{plain}.{view}" if view and view != contents.view else plain
+    return name, name == part.name
+
+
+def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPart:
+    """A part for the channels of one layer and pixel type."""
+    channels = piece.channels
+    nuke = contents.options.layout == "nuke"
+    names = _components(channels) if nuke else [c.name for c in channels]
+    spec = _spec(piece.source, name, names, channels[0].type, piece.view)
+    if piece.repeats_metadata:
         _drop_repeated_attributes(spec)
-    return PassedOnPart(spec, part, tuple(runs(channels)))
+    return PassedOnPart(spec, piece.source, tuple(runs(channels)))
+
+
+def _components(channels: Sequence[Channel]) -> list[str]:
+    """The channels' names without their layers."""
+    return [channel.name.rpartition(".")[2] for channel in channels]
+
+
+def share_attributes(specs: Sequence[Any], source: ExrFile) -> None:
+    """Give all parts that are written what OpenEXR wants to be the same in all of them, as far as a part of ``source``
+    has it. The beauty is written first, and ``source`` may have it in another part only."""
+    for name in _SHARED:
+        found = [a for part in source.parts for a in part.spec.extra_attribs if a.name == name]
+        for spec in specs if found else ():
+            if spec.getattribute(name) is None:
+                spec.attribute(name, found[0].type, found[0].value)
 
 
 def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
@@ -181,10 +215,10 @@ def _nuke_name(layer: str, view: str) -> str:
     return layer.replace(".", "_") + (f".{view}" if view else "")
 
 
-def _unique(name: str, taken: set[str]) -> str:
-    """Parts of one file need different names: add a number to ``name`` if it is taken."""
+def _unique(name: str, taken: set[str], kept: Collection[str] = ()) -> str:
+    """Parts of one file need different names: add a number to ``name`` if it is taken, or ``kept`` for another part."""
     candidate, number = name, 2
-    while candidate in taken:
+    while candidate in taken or candidate in kept:
         candidate, number = f"{name}{number}", number + 1
     taken.add(candidate)
     return candidate

@@ -27,7 +27,7 @@ OCIO_CONFIG = "ocio://cg-config-v2.2.0_aces-v1.3_ocio-v2.4"
 OCIO_DISPLAY = "sRGB - Display"
 OCIO_INPUT = "lin_rec709"
 
-#: The PNG's "Software" entry. It tells our pictures from other pictures of the same name.
+#: The "Software" entry of previews. It tells them from other pictures of the same name.
 SOFTWARE = "oiio_msspl"
 
 #: The last bytes of every PNG: its chunk IEND.
@@ -42,7 +42,7 @@ RUNS_ONLY = "rle"
 
 
 def is_our_preview(path: Path) -> bool:
-    """Whether the file is a picture that this module wrote."""
+    """Whether the file is a preview that this module wrote."""
     file = oiio.ImageInput.open(str(path))
     if file is None:
         oiio.geterror()  # OpenImageIO prints an error that nobody asked for when the process ends
@@ -111,22 +111,27 @@ def write_preview(
             linear = linear @ to_rec709
         return _srgb_pixels(linear) if view is None else _to_8_bits(_through_ocio(linear, view))
 
-    _write_png(path, display_window.width, display_window.height, rows, overwrite)
+    _write_png(path, display_window.width, display_window.height, rows, SOFTWARE, overwrite)
 
 
-def write_png(path: Path, display: Array, *, overwrite: bool = False) -> None:
+def write_png(path: Path, display: Array, *, software: str = SOFTWARE, overwrite: bool = False) -> None:
     """Write a PNG of display values, atomically.
 
     Args:
         path: the PNG to write.
         display: (height, width, 3), clipped to [0, 1].
+        software: the PNG's "Software" entry. :func:`is_our_preview` takes a picture for a preview by it.
         overwrite: replace an existing file.
 
     Raises:
         InputError: ``path`` exists.
         MssplError: the file can't be written.
     """
-    _write_png(path, display.shape[1], display.shape[0], lambda start, stop: _to_8_bits(display[start:stop]), overwrite)
+
+    def rows(start: int, stop: int) -> Pixels:
+        return _to_8_bits(display[start:stop])
+
+    _write_png(path, display.shape[1], display.shape[0], rows, software, overwrite)
 
 
 def _to_8_bits(display: Array) -> Pixels:
@@ -148,7 +153,9 @@ def _srgb_table() -> Pixels:
     return _to_8_bits(srgb(np.nan_to_num(halves, posinf=1, neginf=0)))
 
 
-def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], Pixels], overwrite: bool) -> None:
+def _write_png(
+    path: Path, width: int, height: int, rows: Callable[[int, int], Pixels], software: str, overwrite: bool
+) -> None:
     """Write the rows that ``rows(start, stop)`` gives, a strip at a time: a large frame needs no second copy."""
     with replacing(path, overwrite=overwrite) as temporary:
         writer = oiio.ImageOutput.create(str(temporary))
@@ -156,7 +163,7 @@ def _write_png(path: Path, width: int, height: int, rows: Callable[[int, int], P
             raise MssplError(f"{path}: OpenImageIO can't write it ({oiio.geterror()})")
         spec = oiio.ImageSpec(width, height, 3, "uint8")
         spec.attribute("oiio:ColorSpace", "sRGB")
-        spec.attribute("Software", SOFTWARE)
+        spec.attribute("Software", software)
         spec.attribute("png:compressionLevel", 1)
         spec.attribute("png:filter", SUB_FILTER)
         spec.attribute("compression", RUNS_ONLY)

@@ -271,7 +271,8 @@ def open_exr(path: str | Path) -> ExrFile:
     """Read the headers of an EXR file.
 
     Raises:
-        InputError: there is no such file, it is not an EXR, or its headers are corrupt.
+        InputError: there is no such file, it is not an EXR, its headers are corrupt, or one of its parts has
+            subsampled channels.
     """
     path = Path(path)
     check_encodable(path)
@@ -282,8 +283,10 @@ def open_exr(path: str | Path) -> ExrFile:
         parts.append(_part(path, len(parts), handle.spec()))
         for name, value in parts[-1].metadata.items():
             metadata.setdefault(name, value)
+    if handle.has_error:  # not behind the last part, but at one that OpenImageIO can't read
+        raise _refused(path, reason_of(handle))
     if not parts:
-        raise InputError(f"{path}: holds no image ({reason_of(handle)})")
+        raise InputError(f"{path}: holds no image")
     first = parts[0].spec
     x, y = first.full_x, first.full_y
     return ExrFile(
@@ -303,14 +306,18 @@ def _open(path: Path) -> Any:
         raise InputError(f"{path}: no such file")
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
-        reason = reason_of(oiio)
-        hint = "convert it to RGB" if "ubsampled" in reason else "render it again"
-        raise InputError(f"{path}: can't be opened as an EXR ({reason}); {hint}")
+        raise _refused(path, reason_of(oiio))
     if handle.format_name() != "openexr":
         raise InputError(
             f"{path}: is a {handle.format_name()} file; give an EXR, other formats lose what the network needs"
         )
     return handle
+
+
+def _refused(path: Path, reason: str) -> InputError:
+    """The error for a file that OpenImageIO can't read, or not all parts of it."""
+    hint = "convert it to RGB" if "ubsampled" in reason else "render it again"
+    return InputError(f"{path}: can't be opened as an EXR ({reason}); {hint}")
 
 
 def _part(path: Path, index: int, spec: Any) -> Part:

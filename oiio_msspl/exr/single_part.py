@@ -24,6 +24,8 @@ from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Header entries that say how the source was stored. The ACES flag is forbidden in a file with AOVs (ST 2065-4).
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
+#: Header entries that count for all parts of a file, whichever part holds them.
+_SHARED = ("chromaticities", "timeCode")
 
 
 def check_single_part(contents: FileContents) -> None:
@@ -142,6 +144,8 @@ def _header(contents: FileContents) -> dict[str, Any]:
             for part, _ in _passed_on(contents):
                 others = source.parts[part.index].header
                 header = {key: value for key, value in others.items() if key != "view"} | header
+            for each in source.parts:  # a part may hold it for all, and be left out itself
+                header = {key: each.header[key] for key in _SHARED if key in each.header} | header
     except UnicodeDecodeError as error:
         raise InputError(
             f"--layout multilayer: the header of {path} has names or texts that are not UTF-8; use --layout spec"

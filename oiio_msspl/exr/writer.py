@@ -22,7 +22,14 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import not_written, replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
-from oiio_msspl.exr.part_specs import PassedOnPart, beauty_spec, extra_spec, is_held_whole, passed_on_parts
+from oiio_msspl.exr.part_specs import (
+    PassedOnPart,
+    beauty_spec,
+    extra_spec,
+    is_held_whole,
+    passed_on_parts,
+    share_attributes,
+)
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of, unreadable
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
@@ -132,6 +139,7 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     passed_on = list(passed_on_parts(contents, taken))
     extra = {name: extra_spec(contents, name, taken) for name in contents.pixels.extra}
     specs = [beauty, *extra.values(), *(part.spec for part in passed_on)]
+    share_attributes(specs, contents.source)
 
     writer = oiio.ImageOutput.create(str(path))
     if writer is None:

@@ -9,6 +9,7 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
 from tests.aovs.renders import H, W, found, layer, mapped, plane
 from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
+from tests.exr.sources import behind_a_deep_part
 
 
 @pytest.mark.parametrize(
@@ -104,6 +105,12 @@ def test_layers_that_no_feature_is_read_from_are_named(tmp_path):
     """A layer that is read in part is named by its other channels."""
     channels = layer("", 1) | layer("albedo", 2, "RGBA") | layer("mask", 3) | {"Z": plane(1)}
     assert mapped(tmp_path, channels).unused_layers([], []) == ["Z", "albedo.A", "mask"]
+
+
+def test_a_deep_part_hides_no_layer_that_is_not_read(tmp_path):
+    """Nor does it show its own: it is not passed on."""
+    path = behind_a_deep_part(tmp_path / "hr.exr", layer("", 1, "RGBA") | {"Z": plane(1)})
+    assert map_render(open_exr(path)).unused_layers([], []) == ["Z"]
 
 
 def test_a_loaded_render_has_the_same_pixels_as_the_file(tmp_path):

@@ -9,12 +9,24 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from tests.aovs.renders import H, W, found, layer, mapped, plane
 from tests.conftest import SHARED, needs_shared, rgb, write_exr
+from tests.exr.sources import behind_a_deep_part
 
 
 def test_integers_are_no_light(tmp_path):
     ids = {c: np.full((H, W), 4000, np.uint32) for c in "RGB"}
     with pytest.raises(InputError, match="rgb: R, G, B hold integers"):
         mapped(tmp_path, ids)
+
+
+def test_an_alpha_of_integers_is_none(tmp_path):
+    render = mapped(tmp_path, layer("", 1) | {"A": np.ones((H, W), np.uint32)})
+    assert render.alpha is None and [c.name for c in render.beauty_channels] == ["R", "G", "B"]
+    assert render.notes == ["alpha: A holds integers; the render counts as one without alpha"]
+
+
+def test_a_beauty_of_the_wrong_channel_count_is_not_said_to_be_missing(tmp_path):
+    with pytest.raises(InputError, match=r"rgb: layer 'key' has channels Y, not R, G, B"):
+        mapped(tmp_path, layer("", 1) | layer("key", 2, "Y"), {"rgb": "key"})
 
 
 def test_integers_are_said_of_the_file_that_holds_them(tmp_path):
@@ -205,6 +217,21 @@ def test_a_feature_of_another_exr_is_found_by_the_table_of_renderers(tmp_path):
     values = render.read(render.data_window)
     assert (values["albedo"][0, 0, 0], values["diffuse"][0, 0, 0]) == (7, 20)
     assert found(render)["albedo"] == "other.exr: v.Denoising Albedo"
+
+
+def test_another_exr_must_show_the_same_frame(tmp_path):
+    """Of the same size is not enough: its pixels are read by their places."""
+    path = write_exr(tmp_path / "albedo.exr", [("", layer("albedo", 3), (10, 20))])
+    with pytest.raises(InputError, match=r"albedo\.exr: its display window is 8x8\+10\+20, but that of .* 8x8\+0\+0"):
+        mapped(tmp_path, layer("", 1), {"albedo": f"file:{path}"})
+
+
+@pytest.mark.parametrize("name", ["", ":albedo"])
+def test_a_deep_part_of_another_exr_is_not_read(tmp_path, name):
+    albedo = layer("albedo", 3)
+    path = behind_a_deep_part(tmp_path / "albedo.exr", albedo, deep=albedo)
+    render = mapped(tmp_path, layer("", 1), {"albedo": f"file:{path}{name}"})
+    np.testing.assert_array_equal(render.load().layers["albedo"][..., 0], plane(3))
 
 
 def test_a_layer_of_another_exr_can_be_named(tmp_path):

@@ -53,6 +53,26 @@ def test_compare_scores_the_layer_that_map_names(tmp_path):
     assert done.returncode == 2 and "image.exr" in done.stderr and "gone" in done.stderr
 
 
+def test_compare_says_what_is_wrong_with_the_layer_that_map_names(tmp_path):
+    for name in ("image", "ref"):
+        write_exr(tmp_path / f"{name}.exr", rgb(picture(16, 16)) | {"key.Y": picture(16, 16)[..., 0]})
+    arguments = ["msspl", "compare", tmp_path / "image.exr", "-r", tmp_path / "ref.exr"]
+    done = run(*arguments, "--map", "rgb=key")
+    assert done.returncode == 2 and "rgb: layer 'key' has channels Y, not R, G, B" in done.stderr
+    done = run(*arguments, "--map", "rgb=gone")
+    assert done.returncode == 2 and "gone, which is not there; a mapping of rgb applies to every file" in done.stderr
+
+
+def test_compare_says_which_views_are_compared(tmp_path):
+    """Only if not all files have that of the first image."""
+    for name, views in (("a", "AB"), ("b", "BA"), ("c", "C")):
+        write_exr(tmp_path / f"{name}.exr", [(v, rgb(picture(16, 16), f"{v}.Combined."), (0, 0)) for v in views])
+    done = run("msspl", "compare", "b.exr", "-r", "a.exr", cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr == ""
+    done = run("msspl", "compare", "b.exr", "-r", "c.exr", cwd=tmp_path)
+    assert done.returncode == 0 and done.stderr == "Different views are compared: B of b.exr, C of c.exr\n"
+
+
 def test_compare_of_equal_pictures_is_valid_json(files):
     done = run("msspl", "compare", files / "ref.exr", "-r", files / "ref.exr", "--json")
     assert json.loads(done.stdout, parse_constant=pytest.fail)[0]["psnr"] is None
@@ -99,6 +119,10 @@ def test_compare_writes_a_page(files):
         (["--html", "page.png"], "the page is HTML; name it .html"),
         (
             ["--html", "page.html", "--layers", "nothing"],
+            "no image has such a layer; they have: beauty, Z, ",
+        ),
+        (
+            ["-r", "ref.exr", "--html", "page.html", "--error-map", "e.png", "--layers", "nothing"],
             "no image has such a layer; they have: beauty, Z, ",
         ),
         (["--html", "gone/page.html"], "the folder gone does not exist"),

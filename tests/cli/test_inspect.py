@@ -58,11 +58,20 @@ def test_inspect_counts_negatives_apart(files):
     assert "normal: " not in done.stdout
 
 
-def test_inspect_explains_what_cannot_be_used(files):
+def test_inspect_notes_a_black_frame(files):
+    """Frames of a shot may be black, and are fused."""
     write_exr(files / "black.exr", rgb(np.zeros((8, 8, 3), np.float32)) | rgb(picture(8, 8), "albedo."))
     done = run("msspl", "inspect", files / "black.exr")
+    assert done.returncode == 0, done.stdout
+    assert "note: the beauty is black everywhere, though others are not: albedo; check which layer" in done.stdout
+    data = json.loads(run("msspl", "inspect", files / "black.exr", "--json").stdout)
+    assert data["usable"] and data["notes"][0].startswith("the beauty is black everywhere")
+
+
+def test_inspect_explains_what_cannot_be_used(files):
+    done = run("msspl", "inspect", files / "hr.exr", "--map", "rgb=mask")
     assert done.returncode == 2
-    assert "can't be used: the beauty is black everywhere, though albedo are not" in done.stdout
+    assert "can't be used: rgb: layer 'mask' has channels X, not R, G, B (or X, Y, Z)" in done.stdout
 
 
 @needs_shared("exr")

@@ -2,6 +2,7 @@
 """Renders with layers of all kinds, and the file that is written from each."""
 
 import numpy as np
+import OpenEXR
 
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
@@ -41,6 +42,21 @@ def written(tmp_path, parts, options=None, **attributes):
     options = options or WriteOptions()
     write_fused(out, hr.file, hr.beauty_channels, fused, alpha, {"msspl/model": "test"}, options, overwrite=True)
     return fused, out, read_bits(out)
+
+
+def behind_a_deep_part(path, channels, deep=("A", "Z")):
+    """Write a file whose first part has ``deep`` channels, and whose second one has flat ``channels``. Both have names
+    that name no layer."""
+    height, width = next(iter(channels.values())).shape
+    samples = np.empty((height, width), dtype=object)
+    for index in np.ndindex(height, width):
+        samples[index] = np.ones(2, np.float32)
+    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
+    first = OpenEXR.Part(header, {name: samples.copy() for name in deep}, "default")
+    planes = {name: np.ascontiguousarray(plane) for name, plane in channels.items()}
+    with OpenEXR.File([first, OpenEXR.Part({"type": OpenEXR.scanlineimage}, planes, "rgba")]) as file:
+        file.write(str(path))
+    return path
 
 
 def flat(parts):

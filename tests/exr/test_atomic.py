@@ -144,3 +144,14 @@ def test_a_folder_behind_a_link_that_leads_nowhere_is_refused(tmp_path):
     make_folder(tmp_path / "new")
     make_folder(tmp_path / "new")
     assert (tmp_path / "new").is_dir()
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX links")
+def test_the_folder_of_a_links_target_must_exist(tmp_path):
+    """It is where the file will be written."""
+    link = tmp_path / "link.exr"
+    link.symlink_to("gone/real.exr")
+    with pytest.raises(InputError, match=rf"link\.exr: the folder {tmp_path}/gone does not exist; create it first"):
+        check_target(link, overwrite=True)
+    (tmp_path / "gone").mkdir()
+    assert check_target(link, overwrite=True) == link

@@ -2,12 +2,12 @@
 """Channels are grouped into layers by OpenEXR's naming rule, by part names and by views."""
 
 import numpy as np
-import OpenEXR
 import pytest
 
 from oiio_msspl.exr.layers import layers_of, matches_layer
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import write_exr
+from tests.exr.sources import behind_a_deep_part
 
 
 def grouped(tmp_path, parts, **attributes):
@@ -115,14 +115,7 @@ def test_a_bracket_in_a_pattern_is_one():
 
 def test_a_deep_part_takes_no_layer_from_a_flat_one(tmp_path):
     """Even if its name means the same layer."""
-    samples = np.empty((4, 4), dtype=object)
-    for index in np.ndindex(4, 4):
-        samples[index] = np.ones(2, np.float32)
-    flat = OpenEXR.Part({"type": OpenEXR.scanlineimage}, dict.fromkeys("RGBA", np.ones((4, 4), np.float32)), "rgba")
-    header = {"compression": OpenEXR.ZIPS_COMPRESSION, "type": OpenEXR.deepscanline}
-    with OpenEXR.File([OpenEXR.Part(header, {c: samples.copy() for c in "AZ"}, "default"), flat]) as file:
-        file.write(str(tmp_path / "a.exr"))
-    file = open_exr(tmp_path / "a.exr")
+    file = open_exr(behind_a_deep_part(tmp_path / "a.exr", dict.fromkeys("RGBA", np.ones((4, 4), np.float32))))
     (layer,) = layers_of(file, flat=True)
     assert sorted(layer.channels) == ["A", "B", "G", "R"]
     assert all(not file.parts[channel.part].deep for channel in layer.channels.values())

@@ -11,7 +11,7 @@ import pytest
 
 from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.preview import check_view, is_our_preview, write_png, write_preview
+from oiio_msspl.exr.preview import SOFTWARE, check_view, is_our_preview, write_png, write_preview
 from oiio_msspl.exr.render import Window
 
 
@@ -62,9 +62,11 @@ def test_rows_are_stored_with_the_filter_that_is_fast(tmp_path):
 
 def test_our_previews_are_told_from_other_pictures(tmp_path):
     write_png(tmp_path / "ours.png", np.zeros((4, 4, 3), np.float32))
+    write_png(tmp_path / "tool.png", np.zeros((4, 4, 3), np.float32), software=f"{SOFTWARE} compare")
     oiio.ImageBuf(np.zeros((4, 4, 3), np.float32)).write(str(tmp_path / "other.png"))
     (tmp_path / "text.png").write_text("no picture")
     assert is_our_preview(tmp_path / "ours.png")
+    assert not is_our_preview(tmp_path / "tool.png")
     assert not is_our_preview(tmp_path / "other.png")
     assert not is_our_preview(tmp_path / "text.png")
 

@@ -108,6 +108,22 @@ def test_subsampled_channels_are_to_be_converted(tmp_path):
         open_exr(path)
 
 
+def test_a_part_that_cannot_be_read_is_not_taken_for_the_end(tmp_path):
+    """The parts behind it would be left out, too."""
+    small = np.ones((4, 4), np.float16)
+    display = (np.array([0, 0], np.int32), np.array([7, 7], np.int32))
+    header = {"type": OpenEXR.scanlineimage, "displayWindow": display, "dataWindow": display}
+    parts = [
+        OpenEXR.Part(dict(header), {k: np.ascontiguousarray(v) for k, v in rgb(picture(8, 8)).items()}, "rgba"),
+        OpenEXR.Part(dict(header), {"RY": OpenEXR.Channel("RY", small, 2, 2)}, "chroma"),
+        OpenEXR.Part(dict(header), {"Z": picture(8, 8)[..., 0].copy()}, "depth"),
+    ]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "a.exr"))
+    with pytest.raises(InputError, match=r"a\.exr: can't be opened .*ubsampled.*\"RY\".*; convert it to RGB"):
+        open_exr(tmp_path / "a.exr")
+
+
 def test_a_long_error_is_cut():
     class Source:
         def geterror(self):

@@ -19,7 +19,7 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.write_options import LAYOUTS, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, write_fused
 from tests.conftest import picture, read_bits, rgb, same_bits, write_exr
-from tests.exr.sources import SOURCES, H, W, everything, flat, plain, stereo, written
+from tests.exr.sources import SOURCES, H, W, behind_a_deep_part, everything, flat, plain, stereo, written
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
@@ -415,3 +415,59 @@ def test_an_unwritable_path_is_our_failure_not_a_traceback(tmp_path, monkeypatch
         write_fused(
             tmp_path / "out.exr", hr.file, hr.beauty_channels, np.ones((H, W, 3), np.float32), None, {}, WriteOptions()
         )
+
+
+@pytest.mark.parametrize("layers", [(), ("depth",)])
+def test_a_flat_layer_keeps_its_name_behind_a_deep_part(tmp_path, layers):
+    """The deep part's Z does not take the place of the flat one."""
+    channels = rgb(picture(8, 8)) | {"Z": picture(8, 8)[..., 0]}
+    hr = map_render(open_exr(behind_a_deep_part(tmp_path / "hr.exr", channels)))
+    image = np.ones((8, 8, 3), np.float32)
+    options = WriteOptions(layers=layers)
+    (said,) = write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, image, None, {}, options)
+    assert said == "part 0 (default) is deep and was not passed on"
+    assert [name for name, _ in read_bits(tmp_path / "out.exr")] == ["rgba", "depth"]
+
+
+@pytest.mark.parametrize("layers", [(), ("none",)])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_what_all_parts_share_may_be_said_by_one_of_them(tmp_path, layout, layers):
+    """OpenEXR lets the first part alone say it. The beauty, which is written first, is another one."""
+    chromaticities = (0.713, 0.293, 0.165, 0.83, 0.128, 0.044, 0.32168, 0.33767)
+    time = OpenEXR.TimeCode(1, 2, 3, 4, 0, 0, 0, 0, 0, 0, 1, 2, 3, 4, 5, 6, 7, 8)
+    header = {"type": OpenEXR.scanlineimage, "compression": OpenEXR.ZIP_COMPRESSION}
+    parts = [
+        OpenEXR.Part(header | {"chromaticities": chromaticities, "timeCode": time}, {"Z": plain(0)}, "depth"),
+        OpenEXR.Part(dict(header), {k: np.ascontiguousarray(v) for k, v in rgb(picture(H, W)).items()}, "rgba"),
+        OpenEXR.Part(dict(header), {"mask.X": plain(1), "id.X": np.ones((H, W), np.uint32)}, "mask"),
+    ]
+    with OpenEXR.File(parts) as file:
+        file.write(str(tmp_path / "hr.exr"))
+    hr = map_render(open_exr(tmp_path / "hr.exr"))
+    options = WriteOptions(layout, layers=layers)
+    image = np.ones((H, W, 3), np.float32)
+    write_fused(tmp_path / "out.exr", hr.file, hr.beauty_channels, image, None, {}, options)
+    with OpenEXR.File(str(tmp_path / "out.exr"), header_only=True) as out:
+        for part in out.parts:
+            np.testing.assert_allclose(part.header["chromaticities"], chromaticities, rtol=1e-6)
+            assert str(part.header["timeCode"]) == str(time)
+
+
+@pytest.mark.parametrize("layout", ["spec", "nuke"])
+def test_parts_keep_their_names_and_made_up_names_give_way(tmp_path, layout):
+    """The beauty's part holds a depth and a mask, for which no part is named."""
+    beauty = rgb(picture(H, W)) | {"Z": plain(0), "matte": plain(1).astype(np.float16)}
+    parts = [("rgba", beauty, (0, 0)), ("other", {"X": plain(2)}, (0, 0)), ("depth", {"Y": plain(3)}, (0, 0))]
+    _, _, after = written(tmp_path, parts, WriteOptions(layout))
+    channels = {name: list(planes) for name, planes in after}
+    assert (channels["other"], channels["depth"]) == (["X"], ["Y"])
+    assert (channels["depth2"], channels["other2"]) == (["Z"], ["matte"])
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_an_alpha_of_integers_is_passed_on(tmp_path, layout):
+    """It is no alpha, so the fused alpha does not take its place."""
+    ids = np.arange(H * W, dtype=np.uint32).reshape(H, W)
+    _, _, after = written(tmp_path, rgb(picture(H, W)) | {"A": ids}, WriteOptions(layout))
+    (found,) = [planes["A"] for _, planes in after if "A" in planes]
+    assert same_bits(found, ids)

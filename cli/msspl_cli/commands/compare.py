@@ -71,18 +71,20 @@ def compare(
     """Measure images against a reference: PSNR (sRGB), RelMSE, SSIM. Look at them in a browser.
 
     RelMSE has two columns, one for each convention in the paper. Images smaller
-    than the reference by x2, x4 or x8 are upsampled bicubically first.
+    than the reference by x2, x4 or x8 are upsampled bicubically first. Of files
+    with several views, the first view of the first image is compared.
     """
     from oiio_msspl.compare import (
         check_error_map,
         note_on_spaces,
+        note_on_views,
         note_on_windows,
         notes_on_broken,
         open_comparison,
         score_images,
         write_error_map,
     )
-    from oiio_msspl.compare_page import check_page
+    from oiio_msspl.compare_page import check_layers, check_page
 
     if reference is None and (html is None or error_map is not None):
         raise InputError("scores and error maps need --reference; without one, --html writes a page to look at")
@@ -94,7 +96,9 @@ def compare(
     if html is not None:
         check_page(html, compared, overwrite=overwrite)
     comparison = open_comparison(images, reference, _layer(mapping))
-    for note in (note_on_windows(comparison), note_on_spaces(comparison)):
+    if html is not None:
+        check_layers(comparison, layers)
+    for note in (note_on_views(comparison), note_on_windows(comparison), note_on_spaces(comparison)):
         if note:
             console.say(note, error=True)
     results = score_images(comparison) if reference else [{} for _ in images]

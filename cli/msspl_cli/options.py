@@ -20,6 +20,9 @@ if TYPE_CHECKING:
     from oiio_msspl.jobs.inputs import InputOptions
     from oiio_msspl.jobs.temporal import TemporalOptions
 
+#: Bytes above which a size is a slip. Larger numbers are infinite as floats.
+LARGEST_MEMORY = 1 << 62
+
 #: Groups of options in the help text.
 INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
 
@@ -317,9 +320,12 @@ def parse_bytes(text: str) -> int:
     """The number of bytes that ``3G``, ``800M`` or a plain number means.
 
     Raises:
-        InputError: the text can't be read.
+        InputError: the text can't be read, or no machine has so much memory.
     """
     match = re.fullmatch(r"(\d+(?:\.\d+)?)\s*([KMGT]?)i?B?", text.strip(), re.IGNORECASE)
     if not match:
         raise InputError(f"--max-memory {text!r}: write it as 3G or 800M")
-    return int(float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " "))
+    number = float(match[1]) * 1024 ** " KMGT".index(match[2].upper() or " ")
+    if number > LARGEST_MEMORY:
+        raise InputError("--max-memory: the number is too large; write it as 3G or 800M")
+    return int(number)

@@ -81,7 +81,7 @@ def _print_openjd(result: FrameResult, report: ShotReport) -> None:
     console.say(f"openjd_progress: {100 * done / count:.1f}")
     console.say(f"openjd_status: frame {result.frame} {result.status}, {done} of {count} done")
     if result.message:
-        console.say(f"openjd_fail: frame {result.frame}: {' '.join(result.message.split())}")
+        console.say(f"openjd_fail: frame {result.frame}: {result.message}")
 
 
 def _print_json(result: FrameResult, report: ShotReport) -> None:

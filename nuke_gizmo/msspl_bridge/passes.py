@@ -25,25 +25,30 @@ class FusedSet:
 
 
 def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
-    """The fused sets of a file.
+    """The fused sets of a file whose layers are all there.
 
     Args:
         attribute: value of :data:`ATTRIBUTE`; None in a file without it.
         channels: of the Read, such as ``ViewLayer_Emit.red``.
 
     Raises:
-        FuseError: the file has no fused layers, or one of them was left out.
+        FuseError: the file has no fused layers, or each set lacks one, because it was left out.
     """
     stored = json.loads(str(attribute or "[]"))
     if not stored:
         raise FuseError("the file has no fused passes; fuse it again with passes that sum to the beauty")
     layers = {_spelling(layer): layer for layer in (channel.rpartition(".")[0] for channel in channels)}
-    missing = [name for each in stored for term in each["layers"] for name in term if _spelling(name) not in layers]
-    if missing:
-        raise FuseError(f"the file has no layer {missing[0]}; fuse it again with all layers of {stored[0]['name']}")
-    return [
-        FusedSet(each["name"], [[layers[_spelling(n)] for n in term] for term in each["layers"]]) for each in stored
-    ]
+    found, missing = [], []
+    for each in stored:
+        lacking = [name for term in each["layers"] for name in term if _spelling(name) not in layers]
+        missing += [(name, each["name"]) for name in lacking]
+        if not lacking:
+            terms = [[layers[_spelling(name)] for name in term] for term in each["layers"]]
+            found.append(FusedSet(each["name"], terms))
+    if not found:
+        layer, name = missing[0]
+        raise FuseError(f"the file has no layer {layer}; fuse it again with all layers of {name}")
+    return found
 
 
 def _spelling(layer: str) -> str:

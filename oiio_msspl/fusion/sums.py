@@ -70,12 +70,18 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool =
     if other:
         return SumCheck(1.0, problem=f"{other[0]} has another data window")
     light = wrong = missing = surplus = 0.0
+    finite = np.zeros(len(additive_set.layers), np.bool_)
     alike = np.zeros((len(additive_set.layers), 2), np.int64)
     for layers, beauty, rest, usable in _strips_of(render, additive_set):
         light, wrong = light + np.abs(beauty[usable]).sum(), wrong + np.abs(rest[usable]).sum()
         missing += np.maximum(rest[usable], 0).sum()
         surplus += np.maximum(-rest[usable], 0).sum()
         alike += [_equal_pixels(pixels) for pixels in layers]
+        if not finite.all():
+            finite |= [bool(np.isfinite(pixels).any()) for pixels in layers]
+    if not finite.all():
+        broken = additive_set.layers[int(finite.argmin())].name
+        return SumCheck(1.0, problem=f"the layer {broken} is NaN or infinite")
     if light == 0:
         return SumCheck(0.0, problem="the beauty is black")
     residual = float(wrong / light)

@@ -153,7 +153,7 @@ def _map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
 
 def _features_of_others(render: MappedRender) -> set[str]:
     """The features that are read from layers of another view layer."""
-    names = {channel: layer.name for layer in layers_of(render.file) for channel in layer.channels.values()}
+    names = {channel: layer.name for layer in layers_of(render.file, flat=True) for channel in layer.channels.values()}
     own, *others = (f"{label.rpartition('/')[2]}." for label in (render.view, *render.other_views))
     others = [each for each in others if each not in (own, ".")]
     return {

@@ -19,7 +19,7 @@ from oiio_msspl.exr.atomic import check_encodable, check_folder, replacing
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
-from oiio_msspl.jobs.shot_checks import check_no_input, model_of_shot
+from oiio_msspl.jobs.shot_checks import check_no_file, check_no_input, model_of_shot
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS
@@ -115,6 +115,7 @@ def make_job(
     if not any(frame.lr and frame.hr for frame in shot.frames):
         raise InputError(f"no frame is in both {shot.lr.pattern} and {shot.hr.pattern}; nothing to submit")
     check_no_input(shot, InputOptions(map_file=map_file), model)
+    check_no_file(shot.output.folder)
     folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
     if not folder.is_dir():
         raise InputError(f"{output}: the folder {folder} does not exist; create it first")

@@ -13,7 +13,9 @@ from oiio_msspl._version import __version__
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.aovs.views import name_of
+from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.session import Session
@@ -62,6 +64,9 @@ class FrameReport:
     passes is about all of them, with the view in front where it is not the first one's."""
     fused_sets: list[AdditiveSet] = field(default_factory=list)
     """The additive sets that were fused."""
+    layers: list[str] = field(default_factory=list)
+    """The layers of the HRLS that are written beside the beauty, or their channels if they have no name, of all views.
+    In a file with views (``left``) they are ``VIEW: LAYER``."""
 
     @property
     def spp_avg(self) -> float | None:
@@ -107,6 +112,7 @@ class FrameReport:
             "aovs": self.aovs(),
             "lrhs_aovs": self.found_lrhs_aovs(),
             "passes": self.passes,
+            "layers": self.layers,
             "notes": self.hr.notes,
             "repaired": self.repaired,
             "negative": self.negative,
@@ -208,6 +214,18 @@ def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list
     return warnings
 
 
+def written_layers(hr: MappedRender, write: WriteOptions) -> list[str]:
+    """What is written beside the beauty, sorted by name, see :attr:`FrameReport.layers`."""
+    left_out = {*dropped_channels(hr.file, hr.beauty_channels, write.layers), *hr.beauty_channels}
+    names = {
+        (f"{layer.view}: " if layer.view else "") + (layer.name or component)
+        for layer in layers_of(hr.file, flat=True)
+        for component, channel in layer.channels.items()
+        if channel not in left_out
+    }
+    return sorted(names)
+
+
 def provenance(report: FrameReport) -> dict[str, str]:
     """Attributes of the fused part: model, inputs, spp and layers that the frame was made from.
 
@@ -232,7 +250,9 @@ def provenance(report: FrameReport) -> dict[str, str]:
 
 def _fused_layers(report: FrameReport) -> list[dict[str, Any]]:
     """The fused sets, with the layers' full names, as :func:`provenance` describes them."""
-    names = {channel: layer.name for layer in layers_of(report.hr.file) for channel in layer.channels.values()}
+    names = {
+        channel: layer.name for layer in layers_of(report.hr.file, flat=True) for channel in layer.channels.values()
+    }
     return [
         {
             "name": each.name,

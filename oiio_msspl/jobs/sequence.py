@@ -7,6 +7,7 @@ expect, a comment says so.
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from collections.abc import Iterable
@@ -280,9 +281,14 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         f"{path} has {', '.join(sequence.pattern.name for sequence in found[:6])}"
         for path, found in ((lr, lows), (hr, highs))
     )
-    example = f"{lows[0].pattern} {highs[0].pattern}"
+    # Both may be the same folder. A sequence is no partner of itself.
+    every = [(str(low.pattern), str(high.pattern)) for low, high in [*pairs, *itertools.product(lows, highs)]]
+    example = " ".join(next((names for names in every if len(set(names)) > 1), every[0]))
     why = f"{len(pairs)} sequences go by the same name in both" if pairs else "none has the same name in both"
-    raise InputError(f"which sequences belong together? {seen}, and {why}; name the two, such as {example}")
+    raise InputError(
+        f"which sequences belong together? {seen}, and {why}; "
+        f"name the two, the low-resolution one first, such as {example}"
+    )
 
 
 def _output_pattern(output: Path, hr: Pattern) -> Pattern:

@@ -18,8 +18,9 @@ from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.model_choice import resolve_auto
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
-from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, result_of
+from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
 from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import family_of, for_spread_noise, load_model
 
@@ -38,11 +39,19 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
         InputError: the folder can't be created or written to, or a result would replace an input.
     """
     folder = shot.output.folder
+    check_no_file(folder)
     if not folder.exists():
         check_folder(folder)
         make_folder(folder)
     check_folder(shot.output.path(0))
     check_no_input(shot, inputs, model, more_targets)
+
+
+def check_no_file(folder: Path) -> None:
+    """Raise InputError if an output folder, or the one that it is to be made in, is a file."""
+    for each in (folder, folder.parent):
+        if each.exists() and not each.is_dir():
+            raise InputError(f"{each}: is a file, and the results of a shot need a folder; name another output")
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
@@ -75,10 +84,13 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
 def check_no_input(
     shot: Shot, inputs: InputOptions, model: str | None = None, more_targets: Iterable[Path] = ()
 ) -> None:
-    """Raise InputError if a file that is written is read for any frame, or is written twice."""
-    pairs = {path for frame in shot.frames for path in (frame.lr, frame.hr) if path is not None}
-    # Without its path an HRLS can't have siblings either.
-    others = [inputs.files(frame.hr, model) for frame in shot.frames if frame.hr is not None]
+    """Raise InputError if a file that is written is one of the shot's inputs, or is written twice.
+
+    All files of both sequences are inputs, whichever frames are to be fused: their neighbours and the plan over time
+    are read from others, and no run may replace the render of another frame.
+    """
+    pairs = {*shot.lr.files.values(), *shot.hr.files.values()}
+    others = [inputs.files(path, model) for path in shot.hr.files.values()]
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 
@@ -130,6 +142,20 @@ def check_wanted_outputs(
         raise problem
 
 
+def check_temporal(
+    shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None, write: WriteOptions
+) -> None:
+    """Check whether the shot can be averaged over time as the user asks, before a farm is asked for it.
+
+    If files of the mapping are not here, nothing is checked: they may exist on the workers only.
+
+    Raises:
+        InputError: see :func:`oiio_msspl.jobs.temporal.plan_temporal`.
+    """
+    if all(path.exists() for hr in shot.hr.files.values() for path in inputs.files(hr, None)):
+        plan_temporal(shot, inputs, options, model, write)
+
+
 def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None:
     """The result of a frame that need not or can't be fused; None for a frame to fuse.
 
@@ -140,7 +166,7 @@ def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None
     """
     if stages.skips(frame):
         newer = stages.newer_inputs(frame.lr, frame.hr, frame.output)
-        warnings = [f"is older than {newer[0]}; --update fuses such frames again"] if newer else []
+        warnings = [older_than(newer[0])] if newer else []
         return result_of(frame, SKIPPED, warnings=warnings)
     sources = (("LRHS", frame.lr, shot.lr), ("HRLS", frame.hr, shot.hr))
     lacking = [f"{name} ({sequence.pattern})" for name, path, sequence in sources if path is None]

@@ -4,21 +4,29 @@
 from __future__ import annotations
 
 import json
+import os
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from oiio_msspl._version import __version__
+from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import Frame, Shot
 
 #: What is read of ``first_fused`` in an earlier report. A report of another version may lack some of it.
-FIRST_FUSED = {"frame", "renderer", "scale", "model", "aovs", "notes", "passes"}
+FIRST_FUSED = {"frame", "renderer", "view", "scale", "model", "aovs", "notes", "passes"}
+
+#: A warning about layers names so many of them.
+MOST_NAMES = 6
 
 #: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
 LARGEST_REPORT = 128 << 20
+
+#: Beginning and end of :func:`older_than`.
+_OLDER = "is older than ", "; --update fuses such frames again"
 
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
 
@@ -84,7 +92,7 @@ class ShotReport:
         return {
             "lrhs": str(self.shot.lr.pattern),
             "hrls": str(self.shot.hr.pattern),
-            "output": str(self.shot.output),
+            "output": os.path.abspath(str(self.shot.output)),  # a run that resumes may have another working directory
             "finished": len(self.results) == len(self.shot.frames),
             "exit_code": self.exit_code,
             "counts": {"all": count, **{status: counts[status] for status in STATUSES}},
@@ -117,25 +125,80 @@ def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport)
     Args:
         frame: the frame.
         frame_report: its :meth:`oiio_msspl.jobs.report.FrameReport.as_dict`.
-        report: of the shot. Another scale, model or source of a feature than in the first fused frame gives a warning.
+        report: of the shot. What differs from the first fused frame and may flicker gives a warning, see
+            :func:`_differences`.
     """
     first = report.first = report.first or {"frame": frame.number, **frame_report}
     warnings = list(frame_report["warnings"])
     if frame_report["repaired"]:
         warnings.append(f"repaired values that were NaN or infinite in {', '.join(frame_report['repaired'])}")
-    there = {row["feature"]: row["status"] for row in first["aovs"]}
-    changes = {row["feature"]: (row["status"], there[row["feature"]]) for row in frame_report["aovs"]}
-    changes["the scale"] = f"x{frame_report['scale']}", f"x{first['scale']}"
-    if frame_report["scale"] == first["scale"]:  # each scale has models of its own
-        changes["the model"] = frame_report["model"], first["model"]
-    words = {"default": "not found", "absent": "not found"}
-    for what, states in changes.items():
-        here, before = (words.get(state, state) for state in states)
-        if states[0] != states[1] and "unused" not in states:  # another model reads other features
-            warnings.append(f"{what} is {here} here and {before} in frame {first['frame']}: it may flicker")
+    warnings += [f"{text} in frame {first['frame']}: it may flicker" for text in _differences(frame_report, first)]
     return result_of(
         frame, FUSED, warnings=warnings, repaired=frame_report["repaired"], seconds=frame_report["seconds"]
     )
+
+
+def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
+    """What differs between the reports of two fused frames: "WHAT is X here and Y" for each feature, the scale, the
+    model, the layers, the views and the sets of passes."""
+    there = {row["feature"]: row["status"] for row in first["aovs"]}
+    changes = {row["feature"]: (row["status"], there[row["feature"]]) for row in here["aovs"]}
+    changes["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
+    if here["scale"] == first["scale"]:  # each scale has models of its own
+        changes["the model"] = here["model"], first["model"]
+    words = {"default": "not found", "absent": "not found"}
+    found = []
+    for what, states in changes.items():
+        own, its = (words.get(state, state) for state in states)
+        if states[0] != states[1] and "unused" not in states:  # another model reads other features
+            found.append(f"{what} is {own} here and {its}")
+    return [
+        *found,
+        *_changed_layers(here, first),
+        *_changed_views(here, first),
+        *_changed_sets(here["passes"], first["passes"]),
+    ]
+
+
+def _changed_layers(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
+    """The same for the layers that are written, but for those that are told as features."""
+    if "layers" not in first:
+        return []  # of an earlier version
+    features = {row["source"] for report in (here, first) for row in report["aovs"] if row["status"] == "found"}
+    found = []
+    for own, its, states in ((first, here, "missing here and present"), (here, first, "present here and missing")):
+        names = [name for name in own["layers"] if name not in its["layers"] and name not in features]
+        if names:
+            listed = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
+            found.append(f"the layer{'s' * (len(names) > 1)} {listed} {'are' if len(names) > 1 else 'is'} {states}")
+    return found
+
+
+def _changed_views(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
+    """The same for the views that are fused."""
+    # The report on a file with only one view has an empty list.
+    own, its = (
+        [name_of(each["view"] or "") for each in report.get("fused_views") or [report]] for report in (here, first)
+    )
+    if max(len(own), len(its)) == 1:
+        return []
+    lacking = [f"{view} is not fused here and fused" for view in its if view not in own]
+    return lacking + [f"{view} is fused here and not fused" for view in own if view not in its]
+
+
+def _changed_sets(here: dict[str, str], first: dict[str, str]) -> list[str]:
+    """The same for the sets of passes, with the reason if one is not fused.
+
+    Args:
+        here, first: what was done with each set, by its name.
+    """
+    found = []
+    for name in dict.fromkeys([*first, *here]):
+        (own, reason), (its, _) = (each.get(name, "missing").partition(": ")[::2] for each in (here, first))
+        if own != its:
+            because = f" ({reason})" if reason and own != "fused" else ""
+            found.append(f"{name}: {own} here{because} and {its}")
+    return found
 
 
 def read_earlier(
@@ -149,10 +212,11 @@ def read_earlier(
         overwrite, skip_existing: whether the file may exist.
 
     Returns:
-        ``warnings``, ``repaired`` and ``seconds`` of each frame in the earlier report.
+        ``warnings``, ``repaired`` and ``seconds`` of each frame in the earlier report, without warnings that each run
+        makes anew.
 
     Raises:
-        InputError: the file exists and may not be replaced, or it is no report of a shot. An option that names the
+        InputError: the file exists and may not be replaced, or it is no report of this shot. An option that names the
             wrong file must not turn a render into a report, with ``--overwrite`` neither.
     """
     if path is None:
@@ -167,8 +231,10 @@ def read_earlier(
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {
-            entry["frame"]: {k: entry[k] for k in ("warnings", "repaired", "seconds")} for entry in data["frames"]
+            entry["frame"]: {k: entry[k] for k in ("repaired", "seconds")} | {"warnings": _lasting(entry["warnings"])}
+            for entry in data["frames"]
         }
+        output = data.get("output")
         first = data["first_fused"]
         if skip_existing:
             numbers = {frame.number for frame in report.shot.frames}
@@ -177,4 +243,18 @@ def read_earlier(
                 report.first = first
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise InputError(f"{path}: exists and is no report of a shot; name another file") from error
-    return entries if skip_existing else {}
+    if not skip_existing:
+        return {}
+    if isinstance(output, str) and os.path.realpath(output) != os.path.realpath(str(report.shot.output)):
+        raise InputError(f"{path}: is the report of another shot, whose frames are {output}; name another file")
+    return entries
+
+
+def older_than(path: Path) -> str:
+    """The warning that a result is older than a file that it is made from."""
+    return f"{_OLDER[0]}{path}{_OLDER[1]}"
+
+
+def _lasting(warnings: list[str]) -> list[str]:
+    """Those of an earlier report that are still true: whether an input is newer is found out in each run."""
+    return [text for text in warnings if not (text.startswith(_OLDER[0]) and text.endswith(_OLDER[1]))]

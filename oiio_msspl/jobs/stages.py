@@ -35,7 +35,7 @@ from oiio_msspl.jobs.frame_passes import check_passes, fuse_frame_passes, sets_t
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.frame_writing import write_frame
 from oiio_msspl.jobs.inputs import InputOptions, files_by_name, files_read, map_pair
-from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on
+from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.jobs.views import FusedViews, OtherViews, View, find_other_views, fuse_other_views, store_view
@@ -97,7 +97,7 @@ class Stages:
 
     def skips(self, frame: Frame) -> bool:
         """Whether a frame counts as done: its EXR exists and is not to be replaced."""
-        return self.skip_existing and frame.output.exists() and not self.replaces(frame.lr, frame.hr, frame.output)
+        return self.skip_existing and frame.output.is_file() and not self.replaces(frame.lr, frame.hr, frame.output)
 
     def replaces(self, lr: Path | None, hr: Path | None, output: Path) -> bool:
         """Whether an EXR that exists is replaced: with ``overwrite`` always, with ``update`` if an input is newer."""
@@ -332,6 +332,7 @@ class Stages:
         reports.sort(key=lambda each: loaded.hr.other_views.index(each.hr.view))
         self._fuse_passes(alone, fused, progress)
         report = report_on(loaded.lr, loaded.hr, session, fused, loaded.frame.output, loaded.frame.preview)
+        report.layers = written_layers(loaded.hr, self.write_options)
         add_other_views(report, reports, [*loaded.others.passed_on, *self._not_planned(loaded.others)])
         busy += time.perf_counter() - start
         report.seconds = {"read": loaded.seconds, "fuse": busy, "network": report.network_seconds}

@@ -3,10 +3,12 @@
 
 import json
 
+import numpy as np
 import pytest
 
-from tests.programs import run
-from tests.shots import make_shot
+from tests.conftest import write_exr
+from tests.programs import fuse, run
+from tests.shots import HEIGHT, WIDTH, layers, make_shot
 
 
 @pytest.mark.parametrize(
@@ -20,10 +22,15 @@ from tests.shots import make_shot
         (["lr", "hr", "-o", "out", "--device", "abacus"], "--device 'abacus': use one of cpu"),
         (["lr", "hr", "-o", "hr"], "hr/beauty.1001.exr: is one of the inputs"),
         (["lr", "hr", "-o", "no/out"], "no/out: the folder no does not exist"),
-        (["lr", "hr", "-o", "text.onnx/out"], "the folder text.onnx does not exist"),
+        (["lr", "hr", "-o", "text.onnx/out"], "text.onnx: is a file, and the results of a shot need a folder"),
+        (["lr", "hr", "-o", "text.onnx"], "text.onnx: is a file, and the results of a shot need a folder"),
         (
             ["lr", "hr", "-o", "out", "--temporal", "9"],
             "give auto, off, or a number of frames from 1 to 8",
+        ),
+        (
+            ["lr", "hr", "-o", "out", "--temporal", "2"],
+            "--temporal 2: hr/beauty.####.exr has no two frames that follow",
         ),
         (["lr", "hr", "-o", "out", "--layers", "nonsense"], "nonsense"),
         (["lr", "hr", "-o", "out", "--passes", "nonsense"], "nonsense"),
@@ -71,10 +78,34 @@ def test_a_shipped_model_goes_by_its_name_and_is_the_same_for_all_tasks(tmp_path
 
 
 def test_every_task_gets_the_options_of_neighbouring_frames(tmp_path):
-    make_shot(tmp_path, 1)
+    make_shot(tmp_path, 2)
+    for number in (1001, 1002):
+        motion = {f"v.{axis}": np.zeros((HEIGHT, WIDTH), np.float32) for axis in "XY"}
+        write_exr(tmp_path / f"hr/beauty.{number}.exr", layers(number) | motion)
     paths = (tmp_path / "lr", tmp_path / "hr", "-o", tmp_path / "out", "--bundle", tmp_path / "job")
     given = ["--temporal", "3", "--motion-format", "layer=v,to=previous,x=left"]
     assert run("msspl", "submit", *paths, *given).returncode == 0
     action = json.loads((tmp_path / "job/template.json").read_text())["steps"][0]["script"]["actions"]["onRun"]
     pairs = set(zip(action["args"], action["args"][1:], strict=False))
     assert {("--temporal", "3"), ("--motion-format", "layer=v,to=previous,x=left")} <= pairs
+
+
+@pytest.mark.parametrize("arguments", [["--motion-format", "layer=nosuch"], ["--temporal", "2"]])
+def test_submission_refuses_what_a_task_would_refuse_over_time(tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(make_shot(tmp_path, 4))
+    if "--temporal" in arguments:
+        for number in (1002, 1004):
+            (tmp_path / f"hr/beauty.{number}.exr").unlink()
+    done = run("msspl", "submit", "lr", "hr", "-o", "out", "--bundle", "job", *arguments)
+    assert done.returncode == 2 and not (tmp_path / "job").exists()
+    task = fuse("lr", "hr", "-o", "out", *arguments)
+    assert (done.stderr, done.returncode) == (task.stderr, task.returncode)
+
+
+def test_an_output_may_follow_its_option_without_a_space(tmp_path, monkeypatch):
+    monkeypatch.chdir(make_shot(tmp_path, 1))
+    done = run("msspl", "submit", "lr", "hr", f"-qo{tmp_path}/outh", "--bundle", "job")
+    assert (done.returncode, done.stdout) == (0, ""), done.stderr
+    values = json.loads((tmp_path / "job/openjd_values.json").read_text())
+    assert values["OutFolder"] == f"{tmp_path}/outh"
+    assert "Usage: " in run("msspl", "submit", "-h").stdout

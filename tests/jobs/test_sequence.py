@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Which files are the frames of a shot."""
 
+import re
+
 import pytest
 
 from oiio_msspl import InputError
@@ -94,6 +96,13 @@ def test_folders_that_leave_a_doubt_are_explained(tmp_path, lr, hr, message):
     touch(tmp_path / "lr", *lr), touch(tmp_path / "hr", *hr)
     with pytest.raises(InputError, match=message):
         find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+
+
+def test_a_folder_with_both_sequences_is_explained_by_two_patterns(tmp_path):
+    folder = touch(tmp_path / "both", "beauty.1.exr", "lr.1.exr")
+    example = f"the low-resolution one first, such as {folder}/beauty.#.exr {folder}/lr.#.exr"
+    with pytest.raises(InputError, match=f"{re.escape(example)}$"):
+        find_shot(folder, folder, tmp_path / "out")
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,7 @@
 
 import json
 import os
+import re
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -17,12 +18,13 @@ from oiio_msspl import InputError, InputOptions, MssplError, fuse_files, fuse_sh
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
+from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.jobs import frame_memory, frame_writing, shot, shot_report, stages
 from oiio_msspl.jobs.shot_report import fused_result, read_earlier
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.session import Session
-from tests.conftest import downsample, picture, rgb, write_exr
+from tests.conftest import downsample, noisy, picture, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
 
 
@@ -407,6 +409,87 @@ def test_another_model_or_scale_than_that_of_the_first_frame_is_a_warning(tmp_pa
     assert other_scale == "the scale is x2 here and x4 in frame 1001: it may flicker"
 
 
+def layers_with_passes(seed):
+    """Channels of an HRLS with two light groups that sum to the beauty."""
+    light = (noisy(picture(HEIGHT, WIDTH), 1, seed) * 32).round() / 32
+    key = (light * 12).round() / 32
+    named = {"": light, "light_key.": key, "light_fill.": light - key, "albedo.": picture(HEIGHT, WIDTH)}
+    return {name: plane for prefix, each in named.items() for name, plane in rgb(each, prefix).items()} | {
+        "Z": light[..., 0]
+    }
+
+
+def make_shot_with_passes(folder, count):
+    """Pairs whose HRLS has light groups."""
+    make_shot(folder, count)
+    for number in range(1001, 1001 + count):
+        write_exr(folder / f"hr/beauty.{number}.exr", layers_with_passes(number))
+    return folder
+
+
+@pytest.mark.parametrize(
+    ("change", "warnings"),
+    [
+        (
+            lambda channels: channels | {name: 3 * channels[name] for name in channels if "light_key" in name},
+            [r"light groups: passed on here \(does not sum to the beauty: .* more light.*\) and fused in frame 1001: "],
+        ),
+        (
+            lambda channels: {name: plane for name, plane in channels.items() if "light_" not in name},
+            [
+                "the layers light_fill, light_key are missing here and present in frame 1001: ",
+                "light groups: missing here and fused in frame 1001: ",
+            ],
+        ),
+        (
+            lambda channels: {name: plane for name, plane in channels.items() if name != "Z"},
+            ["the layer Z is missing here and present in frame 1001: "],
+        ),
+        (
+            lambda channels: {name: plane for name, plane in channels.items() if "albedo" not in name},
+            ["albedo is not found here and found in frame 1001: "],
+        ),
+        (
+            lambda channels: channels | rgb(channels["Z"][..., None].repeat(3, -1), "glow."),
+            ["the layer glow is present here and missing in frame 1001: "],
+        ),
+        (
+            lambda channels: channels | {name: plane * np.nan for name, plane in channels.items() if "key" in name},
+            [r"light groups: passed on here \(.*: the layer light_key is NaN or infinite\) and fused in frame 1001: "],
+        ),
+    ],
+)
+def test_layers_and_passes_that_differ_from_the_first_frame_are_a_warning(tmp_path, bilinear_models, change, warnings):
+    folder = make_shot_with_passes(tmp_path, 3)
+    write_exr(folder / "hr/beauty.1002.exr", change(layers_with_passes(1002)))
+    report = run(folder, bilinear_models[4])
+    assert report.first["passes"]["light groups"].startswith("fused")
+    assert report.results[1003].warnings == []
+    found = report.results[1002].warnings
+    assert len(found) == len(warnings), found
+    for text, expected in zip(found, warnings, strict=True):
+        assert re.fullmatch(expected + "it may flicker", text)
+
+
+def test_layers_that_are_not_written_can_not_flicker(tmp_path, bilinear_models):
+    folder = make_shot_with_passes(tmp_path, 2)
+    write_exr(folder / "hr/beauty.1002.exr", {n: x for n, x in layers_with_passes(1002).items() if n != "Z"})
+    report = run(folder, bilinear_models[4], write=WriteOptions(layers=("light*",)))
+    assert report.results[1002].warnings == []
+
+
+def test_a_view_that_the_first_frame_lacks_is_a_warning(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 2)
+    for number, labels in ((1001, "AB"), (1002, "A")):
+        for name, make in (("lr/lr", low_layers), ("hr/beauty", layers)):
+            pixels = {n: x for n, x in make(number).items() if n in "RGB"}
+            channels = {f"{label}.Combined.{n}": x for label in labels for n, x in pixels.items()}
+            write_exr(folder / f"{name}.{number}.exr", channels)
+    report = run(folder, bilinear_models[4])
+    assert [each["view"] for each in report.first["fused_views"]] == ["A", "B"]
+    assert "B is not fused here and fused in frame 1001: it may flicker" in report.results[1002].warnings
+
+
 # ------------------------------------------------------------------------------------------------ runs that are ended
 
 
@@ -497,6 +580,34 @@ def test_a_report_replaces_nothing_but_a_report(tmp_path, bilinear_models, monke
             overwrite=True,
             report_path=folder / report,
         )
+    assert everything(folder) == before
+
+
+def test_the_report_of_another_shot_is_not_continued(tmp_path, bilinear_models, monkeypatch):
+    folder, other = make_shot(tmp_path / "a", 2), make_shot(tmp_path / "b", 1)
+    report_path = tmp_path / "r.json"
+    monkeypatch.chdir(folder)
+    pair = "lr", "hr", "out"
+    more = {"model": str(bilinear_models[4]), "report_path": report_path, "skip_existing": True}
+    fuse_shot(*pair, frames="1001", **more)
+    before = report_path.read_bytes()
+    monkeypatch.chdir(other)  # the same names as seen from there
+    with pytest.raises(InputError, match=r"r\.json: is the report of another shot, whose frames are .*/a/out/beauty"):
+        fuse_shot(*pair, **more)
+    assert report_path.read_bytes() == before
+    fuse_shot(folder / "lr", folder / "hr", folder / "out", **more)
+    assert [entry["status"] for entry in json.loads(report_path.read_text())["frames"]] == ["skipped", "fused"]
+
+
+@pytest.mark.parametrize("target", ["hr/beauty.1002.exr", "lr/lr.1003.exr"])
+def test_a_result_that_is_a_link_to_the_render_of_another_frame_is_refused(tmp_path, bilinear_models, target):
+    """Though that frame is not to be fused: its neighbours read it, and so will the run that fuses it."""
+    folder = make_shot(tmp_path, 3)
+    (folder / "out").mkdir()
+    (folder / "out/beauty.1001.exr").symlink_to(folder / target)
+    before = everything(folder)
+    with pytest.raises(InputError, match=r"beauty\.1001\.exr: is one of the inputs"):
+        run(folder, bilinear_models[4], overwrite=True, frames="1001")
     assert everything(folder) == before
 
 
@@ -616,6 +727,28 @@ def test_files_of_layers_beside_a_render_are_inputs(tmp_path, bilinear_models, n
     assert warning.startswith(f"is older than {folder / newer}")
     report = fuse(update=True)
     assert [report.results[number].status for number in (1001, 1002)] == ["fused", "skipped"]
+
+
+def test_a_warning_that_a_frame_is_older_is_not_taken_from_an_earlier_report(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 1)
+    not_finite(np.nan)(None, folder / "hr/beauty.1001.exr")
+    more = {"report_path": folder / "r.json", "skip_existing": True}
+    (repaired,) = run(folder, bilinear_models[4], **more).results[1001].warnings
+    written, render = (folder / f"{name}/beauty.1001.exr" for name in ("out", "hr"))
+    later = written.stat().st_mtime + 9
+    os.utime(render, (later, later))
+    for _ in range(2):
+        found = run(folder, bilinear_models[4], **more).results[1001].warnings
+        assert found == [repaired, f"is older than {render}; --update fuses such frames again"]
+    os.utime(written, (later + 9, later + 9))
+    assert run(folder, bilinear_models[4], **more).results[1001].warnings == [repaired]
+
+
+def test_a_folder_with_the_name_of_a_frame_does_not_count_as_done(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 1)
+    (folder / "out/beauty.1001.exr").mkdir(parents=True)
+    result = run(folder, bilinear_models[4], skip_existing=True).results[1001]
+    assert result.status == "failed" and "is a folder" in result.message
 
 
 def test_write_protected_frames_are_not_replaced(tmp_path, bilinear_models):

@@ -4,6 +4,7 @@
 import mmap
 import os
 import signal
+import struct
 import subprocess
 import sys
 import time
@@ -17,14 +18,16 @@ from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion import FLOW, VECTORS
+from oiio_msspl.fusion.tiling import MAX_MEMORY
 from oiio_msspl.jobs import frame_memory, frame_window, stages
 from oiio_msspl.jobs.frame_memory import FrameMemory
 from oiio_msspl.jobs.frame_window import FrameWindow
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, shares
-from tests.conftest import downsample, noisy, read_bits, rgb, write_exr
+from tests import shots
+from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.moving_plane import positions, standing, texture, truck, vectors
-from tests.shots import contents
+from tests.shots import contents, low_layers
 
 FIRST, COUNT = 1001, 9
 #: Passes of the shot with passes.
@@ -506,3 +509,37 @@ def test_a_number_of_neighbours_is_enough(shot, bilinear_models, tmp_path, tempo
     options = {"model": str(bilinear_models[4]), "frames": [FIRST]}
     report = fuse_shot(shot / "lr", shot / "hr", tmp_path / "out", temporal=temporal, **options)
     assert report.exit_code == 0 and report.temporal.startswith(text)
+
+
+def damage_pixels(path, part):
+    """Overwrite the compressed pixels of one part of a multipart EXR. Its headers stay whole."""
+    stored = bytearray(path.read_bytes())
+    for y in range(0, shots.HEIGHT, 16):  # rows of a block of ZIP
+        # A chunk of a multipart file: part, first row, size, pixels. The last match is no entry of a table in front.
+        start = stored.rfind(struct.pack("<ii", part, y))
+        (size,) = struct.unpack_from("<i", stored, start + 8)
+        stored[start + 12 : start + 12 + size] = b"\xff" * size
+    path.write_bytes(stored)
+
+
+def test_a_neighbour_with_one_damaged_pass_is_left_out_wherever_pixels_wait(tmp_path, bilinear_models):
+    """The beauty of the damaged frame can be decoded. Only the pixels of one of its passes can't."""
+    for name in ("lr", "hr"):
+        (tmp_path / name).mkdir()
+    for n in range(1, 6):
+        write_exr(tmp_path / f"lr/lr.{n:04d}.exr", low_layers(n))
+        clean = picture(shots.HEIGHT, shots.WIDTH)
+        light = np.round(noisy(clean, 1, n) * 32) / 32
+        first = np.round(light * 12) / 32
+        layers = {"": light, "light_1.": first, "light_2.": light - first, "albedo.": (clean > 0.3) + light / 8}
+        parts = {name or "rgb": rgb(values.astype(np.float32), name) for name, values in layers.items()}
+        write_exr(tmp_path / f"hr/hr.{n:04d}.exr", [(name, each, (0, 0)) for name, each in parts.items()])
+    damage_pixels(tmp_path / "hr/hr.0003.exr", 1)
+    fused = {}
+    for name, memory in (("pixels wait in memory", MAX_MEMORY), ("pixels are read twice", 1 << 29)):
+        out = tmp_path / name
+        report = fuse_shot(tmp_path / "lr", tmp_path / "hr", out, model=str(bilinear_models[4]), max_memory=memory)
+        assert [report.results[n].status for n in range(1, 6)] == ["fused", "fused", "failed", "fused", "fused"]
+        assert any("frame 3 is not averaged" in text for text in report.results[2].warnings), report.temporal
+        fused[name] = contents(out)
+    assert fused["pixels wait in memory"] == fused["pixels are read twice"]

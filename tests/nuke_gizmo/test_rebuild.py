@@ -117,3 +117,18 @@ def test_layers_are_found_by_the_names_that_nuke_gives_them():
     for nothing in (None, "[]"):
         with pytest.raises(FuseError, match="no fused passes"):
             fused_sets(nothing, channels)
+
+
+def test_a_set_that_lacks_a_layer_is_left_out_and_named_if_it_is_the_only_one():
+    names = {"light groups": ["light_1", "light_2"], "components": ["diffuse", "specular"]}
+    stored = json.dumps([{"name": name, "layers": [[layer] for layer in layers]} for name, layers in names.items()])
+    lights, parts = (FusedSet(name, [[layer] for layer in layers]) for name, layers in names.items())
+    channels = [f"{layer}.red" for layers in names.values() for layer in layers]
+    assert fused_sets(stored, channels) == [lights, parts]
+    assert fused_sets(stored, channels[:-1]) == [lights]
+    assert fused_sets(stored, channels[1:]) == [parts]
+    with pytest.raises(FuseError, match="has no layer light_2; fuse it again with all layers of light groups"):
+        fused_sets(stored, ["light_1.red", "diffuse.red"])
+    alone = json.dumps(json.loads(stored)[1:])
+    with pytest.raises(FuseError, match="has no layer specular; fuse it again with all layers of components"):
+        fused_sets(alone, channels[:-1])

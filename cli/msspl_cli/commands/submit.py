@@ -42,6 +42,8 @@ def submit(
     timeout: Annotated[
         int, typer.Option(metavar="SECONDS", min=1, help="Time limit of a frame. A task gets N times as long.")
     ] = 1800,
+    # Typer splits a short option that it does not know into letters: in -o/path it would find the -h of --help.
+    output: Annotated[str | None, typer.Option("--output", "-o", metavar="OUT", hidden=True)] = None,
     help_all: Annotated[
         bool,
         typer.Option(
@@ -58,18 +60,19 @@ def submit(
     of [bold]msspl-fuse[/bold]. Each task runs msspl-fuse on N frames. A task that
     runs again fuses only the frames that do not exist.
     """
-    given, passed_on = _parse(context.args)
+    given, passed_on = _parse([*context.args, *(() if output is None else ("--output", output))])
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import format_frames
-    from oiio_msspl.jobs.shot_checks import check_first_pair, check_wanted_outputs
+    from oiio_msspl.jobs.shot_checks import check_first_pair, check_temporal, check_wanted_outputs
+    from oiio_msspl.parallel import limit_threads
 
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
     written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
     write = options.make_write_options(**{name: given[name] for name in written})
-    options.make_temporal_options(given["temporal"], given["motion_format"])
+    temporal = options.make_temporal_options(given["temporal"], given["motion_format"])
     max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     job = make_job(
@@ -87,6 +90,8 @@ def submit(
         timeout=timeout,
     )
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
+    with limit_threads(given["threads"]):
+        check_temporal(job.shot, inputs, temporal, model, write)
     doubts = check_first_pair(job.shot.frames, inputs)
     write_bundle(bundle, job)
     for doubt in doubts:

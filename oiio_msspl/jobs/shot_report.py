@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from collections import Counter
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -25,8 +26,8 @@ MOST_NAMES = 6
 #: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
 LARGEST_REPORT = 128 << 20
 
-#: Beginning and end of :func:`older_than`.
-_OLDER = "is older than ", "; --update fuses such frames again"
+#: What :func:`older_than` returns.
+_OLDER = re.compile(r"is older than .*; --update fuses such frames again", re.DOTALL)
 
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
 
@@ -252,9 +253,9 @@ def read_earlier(
 
 def older_than(path: Path) -> str:
     """The warning that a result is older than a file that it is made from."""
-    return f"{_OLDER[0]}{path}{_OLDER[1]}"
+    return f"is older than {path}; --update fuses such frames again"
 
 
 def _lasting(warnings: list[str]) -> list[str]:
     """Those of an earlier report that are still true: whether an input is newer is found out in each run."""
-    return [text for text in warnings if not (text.startswith(_OLDER[0]) and text.endswith(_OLDER[1]))]
+    return [text for text in warnings if not _OLDER.fullmatch(text)]

@@ -25,12 +25,15 @@ from benchmarks.runtime import frame, in_process, peak_mb, processor
 LAYERS = {"rgb": "RGB", "albedo": "RGB", "normal": "XYZ", "diffuse": "RGB", "specular": "RGB"}
 
 
-def write_frame(path: Path, width: int, height: int, groups: int = 0) -> None:
-    """Write an EXR file with `LAYERS`, and light groups that sum to the beauty."""
+def write_frame(path: Path, width: int, height: int, scale: int = 1, groups: int = 0) -> None:
+    """Write an EXR file with `LAYERS`, and light groups that sum to the beauty: the HRLS of a frame, or with a
+    ``scale`` its LRHS."""
     import numpy as np
     import OpenEXR
 
-    pixels = frame(height, width)
+    from oiio_msspl.arrays import box_downsample
+
+    pixels = {name: box_downsample(values, scale) for name, values in frame(height, width, scale).items()}
     lights = {f"light_{i}": pixels["rgb"] / groups for i in range(groups)}
     channels, stored = {}, np.float32 if groups else np.float16
     for layer, suffixes in (LAYERS | dict.fromkeys(lights, "RGB")).items():
@@ -84,8 +87,8 @@ def main() -> None:
     width, height = (int(v) for v in args.size.split("x"))
     name = Session(find_model(args.scale, args.model)).contract.name
     with tempfile.TemporaryDirectory() as folder:
-        write_frame(Path(folder, "lr.exr"), width // args.scale, height // args.scale, args.light_groups)
-        write_frame(Path(folder, "hr.exr"), width, height, args.light_groups)
+        write_frame(Path(folder, "lr.exr"), width, height, args.scale, args.light_groups)
+        write_frame(Path(folder, "hr.exr"), width, height, 1, args.light_groups)
         options = "--model", args.model, "--max-memory", str(args.max_memory)
         row = in_process("benchmarks.runtime_files", "--measure", folder, *options)
     rows = [{"method": name, "size": args.size, "machine": processor(), "cores": os.cpu_count(), **row}]

@@ -4,8 +4,8 @@
     python -m benchmarks.runtime_passes --table benchmarks/results/runtime_passes.csv
     python -m benchmarks.runtime_passes --pair LR.exr HR.exr --table benchmarks/results/runtime_passes_cycles.csv
 
-A pair of half-float EXRs has eight light groups that sum to the beauty, an albedo and a normal. All of
-them have light everywhere, which takes longest. ``--pair`` measures all sets of a rendered pair instead, such as one of
+A pair of half-float EXRs has eight light groups that sum to the beauty, an albedo and a normal. All of them have light
+everywhere, which takes longest. ``--pair`` measures all sets of a rendered pair instead, such as one of
 ``datagen.cycles.passes``: some of its layers are black, or are so in parts.
 
 Ours reads the layers from the files. OIDN gets them as arrays in memory, without those that are black. The methods take

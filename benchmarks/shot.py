@@ -31,10 +31,10 @@ from benchmarks.runtime_files import write_frame
 
 def make_shot(folder: Path, count: int, width: int, height: int, scale: int) -> None:
     """Write one pair and link the other frames to it: every frame costs the same, whatever it shows."""
-    for name, w, h in (("lr", width // scale, height // scale), ("hr", width, height)):
+    for name, factor in (("lr", scale), ("hr", 1)):
         (folder / name).mkdir()
         first = folder / name / f"{name}.0001.exr"
-        write_frame(first, w, h)
+        write_frame(first, width, height, factor)
         for frame in range(2, count + 1):
             os.link(first, folder / name / f"{name}.{frame:04d}.exr")
 

@@ -189,7 +189,7 @@ def _picture(render: MappedRender, window: Window) -> _Picture:
             found.setdefault(same_spelling(name), layer)
             in_sets.add(each.channels)
     views = render.view.split("/")
-    for stored in layers_of(render.file, flat=True):
+    for stored in layers_of(render.file):
         # Cryptomattes hold numbers that stand for objects: their pictures tell nothing.
         if "crypto" in stored.name.lower() or (stored.view and stored.view not in views):
             continue

@@ -91,7 +91,7 @@ class LayerFinder:
     def _formula_of_file(self, feature: str, path: Path) -> FeatureFormula:
         """The feature of another render, found by the table of renderers; or its only layer, for a file of one AOV."""
         other = self._open(path)
-        layers = layers_of(other, flat=True)
+        layers = layers_of(other)
         renderer = detect_renderer(other, layers)
         found: dict[tuple[Channel, ...], FeatureFormula] = {}
         for candidate in renderer.get(feature, []):
@@ -135,12 +135,12 @@ class LayerFinder:
             sibling = sibling_of(file.path, name)
             if sibling is None:
                 return None
-            layers = layers_of(self._open(sibling), flat=True)
+            layers = layers_of(self._open(sibling))
             first = next((layer for layer in layers if layer.triple()), layers[0] if layers else None)
             return first and replace(first, name=sibling.name)
         path = Path(named)
         other = self._open(path)
-        layers = layers_of(other, flat=True)
+        layers = layers_of(other)
         renderer = detect_renderer(other, layers)
         if not wanted:
             return replace(_only_layer(path, layers, feature, renderer), name=path.name)

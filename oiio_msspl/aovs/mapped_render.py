@@ -104,7 +104,7 @@ class MappedRender:
         used |= {channel for each in fused for layer in each.layers for channel in layer.channels}
         used |= {each.alpha for each in (self, *others) if each.alpha}
         names = []
-        for layer in layers_of(self.file, flat=True):
+        for layer in layers_of(self.file):
             rest = [c for c in layer.channels.values() if c not in used]
             whole = len(rest) == len(layer.channels) and layer.name
             view = f" ({layer.view})" if layer.view and layer.view not in self.view.split("/") else ""

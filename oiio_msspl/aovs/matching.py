@@ -104,7 +104,7 @@ def _flat_layers(file: ExrFile) -> list[Layer]:
         raise InputError(
             f"{file.path}: holds deep data only; flatten it first (a deep pixel has no single colour to fuse)"
         )
-    return layers_of(file, flat=True)
+    return layers_of(file)
 
 
 def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:

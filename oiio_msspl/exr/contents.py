@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.layers import Layer, layers_of, matches_layer
+from oiio_msspl.exr.layers import Layer, layer_by_channel, matches_layer
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.replaced import DTYPES, ReplacedChannels
 from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOptions
@@ -77,7 +77,7 @@ class FileContents:
     @cached_property
     def layers(self) -> dict[Channel, Layer]:
         """The layer of each channel of the HRLS. A channel may be in none, and those of deep parts are."""
-        return {c: layer for layer in layers_of(self.source, flat=True) for c in layer.channels.values()}
+        return layer_by_channel(self.source)
 
     @property
     def view(self) -> str:
@@ -121,8 +121,7 @@ def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequenc
     if not patterns:
         return frozenset()
     # A deep part must not take the place of a flat one that has a layer of the same name.
-    layers = [*layers_of(file), *layers_of(file, flat=True)]
-    layer_of = {c: layer for layer in layers for c in layer.channels.values()}
+    layer_of = layer_by_channel(file, deep=True) | layer_by_channel(file)
     others = [c for part in file.parts for c in part.channels if c not in beauty]
     kept: set[Channel] = set()
     for pattern in patterns:

@@ -39,8 +39,8 @@ class Layer:
         return tuple(self.channels.values()) if len(self.channels) == 1 else None
 
 
-def layers_of(file: ExrFile, *, flat: bool = False) -> list[Layer]:
-    """Group a file's channels into layers, in file order: all, or only those of ``flat`` parts, which are not deep.
+def layers_of(file: ExrFile, *, deep: bool = False) -> list[Layer]:
+    """Group a file's channels into layers, in file order: those of flat parts, or with ``deep`` of all parts.
 
     Renderers name layers in three ways. OpenEXR's rule puts the layer in front of the channel's name
     (``diffuse.R``). Karma and Nuke put it in the part's name only. Blender 5 does both. So the prefix of the channel
@@ -51,11 +51,16 @@ def layers_of(file: ExrFile, *, flat: bool = False) -> list[Layer]:
     views = views_of(file)
     layers: dict[tuple[str, str], Layer] = {}
     for part in file.parts:
-        for channel in () if flat and part.deep else part.channels:
+        for channel in () if part.deep and not deep else part.channels:
             view, name, component = _split_name(channel.name, part, views, several=len(file.parts) > 1)
             layer = layers.setdefault((view, name), Layer(name, view))
             layer.channels.setdefault(component, channel)
     return list(layers.values())
+
+
+def layer_by_channel(file: ExrFile, *, deep: bool = False) -> dict[Channel, Layer]:
+    """The layer of each channel that is in one of :func:`layers_of`."""
+    return {channel: layer for layer in layers_of(file, deep=deep) for channel in layer.channels.values()}
 
 
 def same_spelling(name: str) -> str:

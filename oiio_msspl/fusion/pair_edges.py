@@ -135,7 +135,9 @@ class _Edges:
         that of the pattern with itself.
         """
         own, both = (_correlation(np.conj(self.spectrum) * each.spectrum, self.shape).ravel() for each in (self, other))
-        return bool(np.corrcoef(own, both)[0, 1] > SAME_PATTERN)
+        own, both = own - own.mean(), both - both.mean()
+        # Written so that a picture without edges, whose correlations are all 0, does not match.
+        return bool(own @ both > SAME_PATTERN * np.linalg.norm(own) * np.linalg.norm(both))
 
 
 def _fit_steps(a: list[Array], b: list[Array]) -> float:

@@ -472,19 +472,26 @@ class _Band:
         dark = (fitted.sum(axis=0) == 0) & (light > 0)
         if dark.any():
             fitted[:, dark] = self._shares_at(job, dark)
-        for i, layer in enumerate(layers):
+        if colours:
+            self._respect_black_colours(job, fitted, light, colours)
+        _make_sum(fitted, light, doubts)
+        return dict(zip(layers, fitted, strict=False))
+
+    def _respect_black_colours(
+        self, job: PassJob, fitted: Array, light: Array, colours: Mapping[AdditiveLayer, Array]
+    ) -> None:
+        """Take the light that can't be stored, because its colour is black, from the layers of a set (layers, 3, h, w).
+        Where none is left of ``light`` (3, h, w), the layers without colour get it."""
+        for planes, layer in zip(fitted, job.fitted, strict=False):
             if layer in colours:
-                fitted[i] *= colours[layer] >= DARKEST_COLOUR
-        # Light of a layer whose colour is black can't be stored. The layers without colour get it.
+                planes *= colours[layer] >= DARKEST_COLOUR
         lost = (fitted.sum(axis=0) == 0) & (light > 0)
-        free = [i for i, layer in enumerate(layers) if layer not in colours]
-        if free and colours and lost.any():
+        free = [i for i, layer in enumerate(job.fitted) if layer not in colours]
+        if free and lost.any():
             shares = self._shares_at(job, lost)[free]
             shares[:, shares.sum(axis=0) == 0] = 1
             for i, share in zip(free, shares, strict=True):
                 fitted[i][lost] = share
-        _make_sum(fitted, light, doubts)
-        return dict(zip(layers, fitted, strict=False))
 
     def _shares_at(self, job: PassJob, where: Mask) -> Array:
         """The shares that layers have around some values of the core (3, h, w), (layers, values)."""

@@ -203,30 +203,24 @@ class FrameWindow:
             MssplError: a neighbour has failed, and not for its files.
         """
         steps: list[Step[F]] = []
-        outcome = outcomes[number]
-        assert not isinstance(outcome, Exception)
-        here = placed(outcome)
+        own = outcomes[number]
+        assert not isinstance(own, Exception)
+        here = placed(own)
         count = self._temporal.renders if outcomes is self._loaded else self._temporal.results
         neighbours = [n for n in self._temporal.neighbours(number, count) if (n - number) * step > 0]
         for n in neighbours[::step]:
             try:
                 there = placed(_usable(n, outcomes[n]))
                 _check_alike(here, there)
-                own, its = here[1], there[1]
-                if (
-                    isinstance(own, RenderPair)
-                    and isinstance(its, RenderPair)
-                    and abs(n - number) == 1
-                    and shared_noise(own, its) > SAME_NOISE
-                ):
+                if abs(n - number) == 1 and _have_one_noise(here[1], there[1]):
                     warnings.append(f"frames {min(number, n)} and {max(number, n)} {SAME_SEED}")
                 way, back = self._read_both_ways(n - step, n)
             except InputError as error:
                 warnings.append(f"frame {n} is not averaged: {error}")
                 break
             steps.append(_step(there[1], way, back, self._tolerance))
-            if isinstance(own, RenderPair) and isinstance(its, RenderPair):
-                names = " and ".join(lacking_passes(own, its))
+            if isinstance(here[1], RenderPair) and isinstance(there[1], RenderPair):
+                names = " and ".join(lacking_passes(here[1], there[1]))
                 if names:
                     warnings.append(f"frame {n} has no set of passes with {names}, so passes are not averaged")
         return steps
@@ -307,6 +301,13 @@ def _step(frame: F, way: Way, way_back: Way, tolerance: float) -> Step[F]:
 
 def _fused_frame(alone: FusedAlone) -> tuple[LoadedFrame, FusedFrame]:
     return alone.loaded, alone.fused
+
+
+def _have_one_noise(frame: Placed, neighbour: Placed) -> bool:
+    """Whether two frames have the same noise, if they are renders and not fused yet."""
+    if not isinstance(frame, RenderPair) or not isinstance(neighbour, RenderPair):
+        return False
+    return shared_noise(frame, neighbour) > SAME_NOISE
 
 
 def _check_alike(frame: tuple[LoadedFrame, Placed], neighbour: tuple[LoadedFrame, Placed]) -> None:

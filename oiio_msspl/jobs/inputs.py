@@ -17,7 +17,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
 from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, same_space, space_of
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.layers import layer_by_channel
 from oiio_msspl.exr.reader import ExrFile, open_exr
 
 
@@ -153,7 +153,7 @@ def _map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
 
 def _features_of_others(render: MappedRender) -> set[str]:
     """The features that are read from layers of another view layer."""
-    names = {channel: layer.name for layer in layers_of(render.file, flat=True) for channel in layer.channels.values()}
+    names = {channel: layer.name for channel, layer in layer_by_channel(render.file).items()}
     own, *others = (f"{label.rpartition('/')[2]}." for label in (render.view, *render.other_views))
     others = [each for each in others if each not in (own, ".")]
     return {

@@ -14,7 +14,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.exr.contents import dropped_channels
-from oiio_msspl.exr.layers import layers_of
+from oiio_msspl.exr.layers import layer_by_channel, layers_of
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.model.contract import Contract
@@ -219,7 +219,7 @@ def written_layers(hr: MappedRender, write: WriteOptions) -> list[str]:
     left_out = {*dropped_channels(hr.file, hr.beauty_channels, write.layers), *hr.beauty_channels}
     names = {
         (f"{layer.view}: " if layer.view else "") + (layer.name or component)
-        for layer in layers_of(hr.file, flat=True)
+        for layer in layers_of(hr.file)
         for component, channel in layer.channels.items()
         if channel not in left_out
     }
@@ -250,14 +250,13 @@ def provenance(report: FrameReport) -> dict[str, str]:
 
 def _fused_layers(report: FrameReport) -> list[dict[str, Any]]:
     """The fused sets, with the layers' full names, as :func:`provenance` describes them."""
-    names = {
-        channel: layer.name for layer in layers_of(report.hr.file, flat=True) for channel in layer.channels.values()
-    }
+    layer_of = layer_by_channel(report.hr.file)
     return [
         {
             "name": each.name,
             "layers": [
-                [names[channels[0]] for channels in (layer.channels, layer.factor) if channels] for layer in each.layers
+                [layer_of[channels[0]].name for channels in (layer.channels, layer.factor) if channels]
+                for layer in each.layers
             ],
         }
         for each in report.fused_sets

@@ -116,6 +116,6 @@ def test_a_bracket_in_a_pattern_is_one():
 def test_a_deep_part_takes_no_layer_from_a_flat_one(tmp_path):
     """Even if its name means the same layer."""
     file = open_exr(behind_a_deep_part(tmp_path / "a.exr", dict.fromkeys("RGBA", np.ones((4, 4), np.float32))))
-    (layer,) = layers_of(file, flat=True)
+    (layer,) = layers_of(file)
     assert sorted(layer.channels) == ["A", "B", "G", "R"]
     assert all(not file.parts[channel.part].deep for channel in layer.channels.values())

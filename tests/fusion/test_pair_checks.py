@@ -65,6 +65,14 @@ def test_boards_of_one_width_belong_to_the_picture(period):
     assert warnings_of_boards(period, turned=False) == []
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+def test_a_picture_without_edges_says_nothing_of_the_albedo():
+    _, albedo, _ = scene(2)
+    grey = np.full_like(albedo, 0.5)
+    low, high = Render.from_arrays("lr", rgb=grey[::2, ::2].copy()), Render.from_arrays("hr", rgb=grey, albedo=albedo)
+    assert check_renders(low, high) == []
+
+
 def test_boards_that_run_the_other_way_do_not():
     (warning,) = warnings_of_boards(16, turned=True)
     assert "the albedo's edges are not in the picture" in warning

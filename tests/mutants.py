@@ -167,7 +167,7 @@ def run(command: list[str]) -> tuple[int, str, float, int]:
             pid, status, usage = os.wait4(process.pid, os.WNOHANG)
             if pid:
                 break
-            peak = max(peak, _peak_so_far(process.pid))
+            peak = max(peak, peak_mib(process.pid))
             if time.monotonic() - start > 2 * TIME_LIMIT:
                 process.kill()
             time.sleep(0.01)
@@ -177,7 +177,7 @@ def run(command: list[str]) -> tuple[int, str, float, int]:
     return process.returncode, text, time.monotonic() - start, peak or usage.ru_maxrss // 1024
 
 
-def _peak_so_far(pid: int) -> int:
+def peak_mib(pid: int | str = "self") -> int:
     """Largest resident set of a running process so far, in MiB; 0 where the kernel keeps no such mark.
 
     The peak that Linux reports at the end of a process counts the program that started it, too.

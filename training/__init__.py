@@ -5,5 +5,5 @@ Networks: ``paper`` is the paper's, ``joint`` and ``ensemble`` are ours; ``netwo
 ``ops``, ``encoding``, ``pu_curve``, ``oidn``, ``render_mean`` and ``mean_denoiser`` are what they are made of.
 Training: ``data`` draws pairs from views of :mod:`datagen`, ``losses``, ``validation``, ``train``, ``checkpoints``.
 Checkpoints: ``average``, ``prune`` and ``error`` change one. ``export``, ``gpu`` and ``quantise`` make a model of it:
-``tracing`` and ``whole_model`` write its graph.
+``tracing`` and ``whole_model`` write its graph, and ``export_checks`` compares it with PyTorch.
 """

@@ -18,7 +18,9 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from training import checkpoints, data, losses
 from training.export import denoiser_for
-from training.joint import JointFusion, with_denoised_mean, with_mean
+from training.joint import JointFusion
+from training.mean_denoiser import with_denoised_mean
+from training.render_mean import with_mean
 from training.train import lr_factor
 
 PATCH, BATCH, LEARNING_RATE = 256, 3, 2e-3

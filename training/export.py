@@ -14,39 +14,33 @@ weights, in ``NAME.weights``. ``-x2`` and so on are then added to ``--name``, an
 from __future__ import annotations
 
 import argparse
-import collections
 import copy
 import datetime
-import timeit
 from collections.abc import Sequence
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
-import onnxruntime
 import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
 from torch import nn
 
-from datagen.views import Folder, View
+from datagen.views import Folder
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.model.contract import SCALES, SPREAD, Contract
-from oiio_msspl.model.runtime import load_network
+from training import export_checks
 from training.checkpoints import load
-from training.encoding import log_encode
-from training.joint import FEATURES, SIZES, JointFusion, with_denoised_mean
-from training.mean_denoiser import ALIGNMENT, MeanDenoiser
-from training.networks import Network, denoiser_of, run
+from training.joint import FEATURES, SIZES, JointFusion
+from training.mean_denoiser import ALIGNMENT, MeanDenoiser, with_denoised_mean
+from training.networks import Network, denoiser_of
 from training.oidn import provenance
 from training.paper import MultiResolutionFusion
 from training.quantise import joint
-from training.quantise.layers import Networks, brightened, quantised
+from training.quantise.layers import Networks, quantised, varied
 from training.tracing import IR_VERSION, shuffle, traced, unshuffle
-from training.validation import ValidationPair
-from training.whole_model import CHECKPOINTS, InTorch, example, quantised_denoiser, save, whole_model
+from training.whole_model import CHECKPOINTS, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
@@ -150,7 +144,7 @@ def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Se
     """
     layers: Networks | None = None
     if network.layers is not None:
-        images = brightened([hrls for _, hrls in pairs])
+        images = varied([hrls for _, hrls in pairs])
         layers, clean = quantised(network.layers, images)
         pairs = [
             (lrhs, torch.cat([image[:, :3], albedo, 2 * normal - 1], dim=1))
@@ -191,87 +185,6 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
     graph.node.extend(nodes)
 
 
-# Checks
-
-
-@torch.inference_mode()
-def parity(network: Network, path: Path) -> float:
-    """Largest difference of an exported file's output from the network's, log-encoded."""
-    session, contract = load_network(path), Contract.of_file(path)
-    model = InTorch(contract, partial(run, network))
-    if isinstance(network, JointFusion):
-        model = InTorch(contract, network.fuse, denoiser_for(network, contract.denoiser))
-    block = contract.alignment * -(-6 // contract.alignment)  # at least six pixels
-    worst = 0.0
-    for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
-        inputs = example(contract, height, width, seed=height)
-        (found,) = session.run(["fused"], {name: values.numpy() for name, values in inputs.items()})
-        expected = model(inputs)
-        worst = max(worst, float((log_encode(torch.from_numpy(found)) - log_encode(expected)).abs().max()))
-    return worst
-
-
-@torch.inference_mode()
-def measure_overlap(network: Network, scale: int, views: list[View], tile: int = 16) -> dict[int, float]:
-    """Largest difference between a tile and the same pixels of the whole image, by overlap in LRHS pixels.
-
-    Trained weights use much less than the theoretical receptive field of over 60 LRHS pixels. Differences are
-    log-encoded, and the maximum of all views.
-    """
-    alignment = network.multiple // scale
-    differences: dict[int, list[np.ndarray]] = collections.defaultdict(list)
-    for view in views:
-        pair = ValidationPair.centre(view, scale, view.ref.shape[0])
-        lrhs = pair.lrhs
-        # Mirrored at its sides, a small view has room for the largest overlap
-        margin = 64
-        lrhs, hrls = (
-            torch.from_numpy(np.pad(image, ((m, m), (m, m), (0, 0)), "symmetric")).permute(2, 0, 1)[None]
-            for image, m in ((lrhs, margin), (pair.hrls, margin * scale))
-        )
-        whole, _ = run(network, lrhs, hrls)
-        start = (lrhs.shape[-1] - tile) // 2 // alignment * alignment
-        for overlap in (n for n in (4, 8, 12, 16, 24, 32, 48, 64) if n % alignment == 0):
-            part, _ = run(network, _square(lrhs, start, tile, overlap), _square(hrls, start, tile, overlap, scale))
-            middle = _square(part, overlap, tile, 0, scale)
-            difference = middle - _square(whole, start, tile, 0, scale)
-            differences[overlap].append(difference.abs().numpy().ravel())
-    return {overlap: float(np.concatenate(values).max()) for overlap, values in differences.items()}
-
-
-def _square(image: torch.Tensor, start: int, size: int, border: int, scale: int = 1) -> torch.Tensor:
-    """A square crop with a border, all in LRHS pixels of an image that is ``scale`` times as large."""
-    part = slice((start - border) * scale, (start + size + border) * scale)
-    return image[..., part, part]
-
-
-def _check_casts(path: Path) -> None:
-    """Refuse a file whose weights ONNX Runtime would cast in every run."""
-    options = onnxruntime.SessionOptions()
-    optimised = path.with_suffix(".optimised")
-    options.optimized_model_filepath = str(optimised)
-    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
-    onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
-    counts = collections.Counter(node.op_type for node in onnx.load(optimised).graph.node)
-    optimised.unlink()
-    print(f"as loaded: {dict(counts)}")
-    if counts["Cast"]:
-        raise SystemExit(
-            f"{path}: {counts['Cast']} casts of weights are left after loading; they would slow every tile"
-        )
-
-
-def describe(path: Path) -> None:
-    """Print the operators of a file, and how long ONNX Runtime takes."""
-    model = onnx.load(path)
-    counts = collections.Counter(node.op_type for node in model.graph.node)
-    print(f"{path}: {path.stat().st_size / 1e6:.1f} MB, {dict(counts)}")
-    session = load_network(path)
-    feed = {name: values.numpy() for name, values in example(Contract.of_file(path), 64, 64).items()}
-    seconds = min(timeit.repeat(lambda: session.run(None, feed), number=1, repeat=3))
-    print(f"64x64 LRHS pixels: {seconds:.2f} s")
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
@@ -296,20 +209,22 @@ def main() -> None:
         raise SystemExit("this network serves several scales; choose some with --scale")
     if args.measure_overlap:
         views = Folder(args.measure_overlap).split("validation")[:8]
-        for overlap, difference in measure_overlap(network, scales[0], views).items():
+        for overlap, difference in export_checks.measure_overlap(network, scales[0], views).items():
             print(f"overlap {overlap}: {difference:.2g}")
     if not args.output:
         return
     names = {scale: f"-x{scale}" if len(scales) > 1 else "" for scale in scales}
     contracts = [contract_of(network, each, args.name + end, args.overlap, state) for each, end in names.items()]
     files = [args.output.with_name(f"{args.output.name}{end}.onnx") if end else args.output for end in names.values()]
+    denoiser: MeanDenoiser | None = None
     if isinstance(network, JointFusion):
         if not args.int8:
             raise SystemExit("a joint network can only be exported with --int8")
         if len({each.denoiser for each in contracts}) > 1:
             raise SystemExit("--scale: these scales have other denoisers of both renders' mean; export each alone")
-        prepare = with_denoised_mean(denoiser_for(network, contracts[0].denoiser))
-        graphs = joint_to_onnx(network, contracts, joint.calibration_pairs(args.int8, scales, prepare))
+        denoiser = denoiser_for(network, contracts[0].denoiser)
+        pairs = joint.calibration_pairs(args.int8, scales, with_denoised_mean(denoiser))
+        graphs = joint_to_onnx(network, contracts, pairs)
     else:
         graphs = [to_onnx(network, each, half=args.half) for each in contracts]
     models = {
@@ -319,9 +234,9 @@ def main() -> None:
     save(models, args.name if len(scales) > 1 else "")
     for file in files:
         if args.half:
-            _check_casts(file)
-        describe(file)
-        print(f"largest difference from PyTorch: {parity(network, file):.2g}")
+            export_checks.check_casts(file)
+        export_checks.describe(file)
+        print(f"largest difference from PyTorch: {export_checks.parity(network, file, denoiser):.2g}")
 
 
 if __name__ == "__main__":

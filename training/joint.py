@@ -22,19 +22,17 @@ from __future__ import annotations
 import functools
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import Array
 from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, SPREAD
-from oiio_msspl.model.render_mean import lrhs_share
 from training.encoding import log_decode, log_encode, log_to_pu, pu_to_log
 from training.layer_denoisers import LayerDenoisers
-from training.mean_denoiser import MeanDenoiser
+from training.mean_denoiser import MeanDenoiser, denoise_mean
 from training.oidn import (
     BASE,
     BASE_HDR,
@@ -46,9 +44,8 @@ from training.oidn import (
     pretrained_weights,
     run_unet_on_tensors,
 )
-from training.ops import box_downsample, highest_around, log2_scale, pyramid, upsample
+from training.ops import highest_around, log2_scale, pyramid, upsample
 from training.paper import LRHS_CHANNELS
-from training.render_mean import mean_of_renders
 
 #: Features of the HRLS that the network reads.
 FEATURES = (RGB, ALBEDO, NORMAL)
@@ -159,7 +156,7 @@ class JointFusion(nn.Module):
     def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
         """
         Args:
-            lrhs: (N, 7, h, w): the LRHS, the mean of both renders, its noise (:func:`with_mean`).
+            lrhs: (N, 7, h, w): the LRHS, the mean of both renders, its noise (:func:`training.render_mean.with_mean`).
             hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
 
         Returns:
@@ -203,14 +200,6 @@ class JointFusion(nn.Module):
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))
         return blend(lrhs, samples, albedo, denoised, logits), log_error
-
-
-def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
-    """The first argument of :meth:`JointFusion.fuse`, for the arguments of :meth:`JointFusion.forward`."""
-    low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
-    scale = 2 ** log2_scale(lrhs, hrls)
-    albedo, normal = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
-    return torch.cat([low, denoiser(mean, noise, albedo, normal)], dim=1)
 
 
 def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
@@ -294,32 +283,3 @@ def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
         brightest = F.max_pool2d(brightest, 9, stride=1, padding=4)
     expected = F.max_pool2d(torch.minimum(mean, brightest), 3, stride=1, padding=1)
     return torch.maximum(highest_around(lrhs, samples), upsample(expected, scale // 2))
-
-
-def mean_and_noise(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean of an encoded LRHS (1, 3, h, w) and HRLS (1, 16, s*h, s*w), log-encoded (1, 3, h, w), and its noise
-    (1, 1, h, w)."""
-    features = {RGB: log_decode(hrls[:, :3]), ALBEDO: hrls[:, 3:6], NORMAL: hrls[:, 6:9]}
-    means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(lrhs, hrls)))
-    images = (image[0].permute(1, 2, 0).cpu().numpy() for image in (lrhs, means))
-    share = torch.tensor(lrhs_share(*images), device=lrhs.device)
-    colour, noise, *_ = mean_of_renders({RGB: log_decode(lrhs)}, features, {RGB: share})
-    return colour, noise
-
-
-def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
-    """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
-    low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (lrhs, hrls))
-    return torch.cat([low, *mean_and_noise(low, high)], dim=1)[0].permute(1, 2, 0).numpy(), hrls
-
-
-def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Array, Array], tuple[Array, Array]]:
-    """A function that appends the denoised mean of both renders to an encoded LRHS, as :meth:`JointFusion.fuse` reads
-    it."""
-
-    @torch.inference_mode()
-    def prepare(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
-        images = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in with_mean(lrhs, hrls))
-        return denoise_mean(denoiser, *images)[0].permute(1, 2, 0).numpy(), hrls
-
-    return prepare

@@ -8,11 +8,17 @@ the colour's noise. The fine-tuned network reads all of these as they are.
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
+from oiio_msspl.arrays import Array
 from training.encoding import log_to_pu, pu_to_log
 from training.oidn import BASE, LARGE, LARGE_HDR, SMALL_CLEAN_HDR, FineTunedUNet, Start
+from training.ops import box_downsample, log2_scale
+from training.paper import LRHS_CHANNELS
+from training.render_mean import with_mean
 
 #: Height and width of its input are multiples of this.
 ALIGNMENT = 16
@@ -53,3 +59,30 @@ class MeanDenoiser(FineTunedUNet):
         """
         colour = self.run(torch.cat([log_to_pu(mean), albedo.clamp(0.0, 1.0), 0.5 * normal + 0.5, noise], dim=1))
         return pu_to_log(colour.clamp_max(1.0))
+
+
+def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
+    """Replace a mean of both renders by the denoised one.
+
+    Args:
+        lrhs: (N, 7, h, w): the LRHS, the mean of both renders, its noise, see :func:`training.render_mean.with_mean`.
+        hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
+
+    Returns:
+        (N, 6, h, w), log-encoded: the LRHS and the denoised mean.
+    """
+    low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
+    scale = 2 ** log2_scale(lrhs, hrls)
+    albedo, normal = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
+    return torch.cat([low, denoiser(mean, noise, albedo, normal)], dim=1)
+
+
+def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """A function that appends the denoised mean of both renders to an encoded LRHS (h, w, 3), given an HRLS."""
+
+    @torch.inference_mode()
+    def prepare(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+        images = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in with_mean(lrhs, hrls))
+        return denoise_mean(denoiser, *images)[0].permute(1, 2, 0).numpy(), hrls
+
+    return prepare

@@ -7,8 +7,9 @@ from torch import Tensor
 
 from oiio_msspl.model.contract import NO_DENOISER
 from training.data import Prepare
-from training.joint import JointFusion, with_mean
+from training.joint import JointFusion
 from training.paper import MultiResolutionFusion
+from training.render_mean import with_mean
 
 Network = MultiResolutionFusion | JointFusion
 NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {

@@ -38,9 +38,11 @@ from oiio_msspl.aovs.features import HRLS_FEATURES
 from training import checkpoints
 from training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
 from training.encoding import compress, exposure_of, log_decode, log_to_pu, pu_to_log
-from training.joint import FEATURES, JointFusion, denoise_mean, mean_and_noise
+from training.joint import FEATURES, JointFusion
 from training.layer_denoisers import LayerDenoisers, untouched
+from training.mean_denoiser import denoise_mean
 from training.oidn import LARGE, LARGE_HDR, FineTunedUNet
+from training.render_mean import mean_and_noise
 
 log = logging.getLogger(__name__)
 
@@ -113,8 +115,8 @@ def draw_pairs(
 ) -> list[Pair]:
     """Draw a view ``count`` times: ``lrhs`` (7, h, w), ``hrls`` (9, s*h, s*w), ``target`` (3, s*h, s*w), half floats.
 
-    The LRHS has the mean of both renders and its noise, see :func:`training.joint.with_mean`. Or it is (6, h, w), with
-    the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread. Without
+    The LRHS has the mean of both renders and its noise, see :func:`training.render_mean.with_mean`. Or it is (6, h, w),
+    with the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread. Without
     ``denoisers``, references that were stored with their noise keep it.
     """
     rng = np.random.default_rng([*view.path.name.encode(), count])

@@ -16,8 +16,9 @@ import torch
 from torch import Tensor, nn
 
 from training import checkpoints, data
-from training.joint import DECODED, PREDECESSOR, JointFusion, with_mean
+from training.joint import DECODED, PREDECESSOR, JointFusion
 from training.oidn import FineTunedConv
+from training.render_mean import with_mean
 
 PAIRS, PATCH = 24, 256
 

@@ -12,8 +12,10 @@ import torch
 from torch import Tensor
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from training.encoding import log_encode
-from training.ops import box_downsample
+from oiio_msspl.arrays import Array
+from oiio_msspl.model.render_mean import lrhs_share
+from training.encoding import log_decode, log_encode
+from training.ops import box_downsample, log2_scale
 
 #: Factor that brings the estimated noise into [0, 1].
 NOISE_GAIN = 2.0
@@ -46,3 +48,20 @@ def mean_of_renders(lrhs: Images, hrls: Images, shares: Images) -> tuple[Tensor,
         if name in lrhs:
             means[name] = means[name] + shares[name] * (lrhs[name].clamp(low, 1.0) - means[name])
     return colour, noise, means[ALBEDO], means[NORMAL]
+
+
+def mean_and_noise(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
+    """The mean of an encoded LRHS (1, 3, h, w) and HRLS (1, 16, s*h, s*w), log-encoded (1, 3, h, w), and its noise
+    (1, 1, h, w)."""
+    features = {RGB: log_decode(hrls[:, :3]), ALBEDO: hrls[:, 3:6], NORMAL: hrls[:, 6:9]}
+    means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(lrhs, hrls)))
+    images = (image[0].permute(1, 2, 0).cpu().numpy() for image in (lrhs, means))
+    share = torch.tensor(lrhs_share(*images), device=lrhs.device)
+    colour, noise, *_ = mean_of_renders({RGB: log_decode(lrhs)}, features, {RGB: share})
+    return colour, noise
+
+
+def with_mean(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+    """Append the mean of both renders and its noise to an encoded LRHS (h, w, 3), given an HRLS (s*h, s*w, 16)."""
+    low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in (lrhs, hrls))
+    return torch.cat([low, *mean_and_noise(low, high)], dim=1)[0].permute(1, 2, 0).numpy(), hrls

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl.arrays import box_downsample
+from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.runtime import load_network
 from tests.conftest import noisy, picture
@@ -20,12 +21,17 @@ pytest.importorskip("onnxscript")
 
 from benchmarks.oidn import run_filter  # noqa: E402
 from training import average, checkpoints, export, prune  # noqa: E402
-from training.joint import JointFusion, with_denoised_mean, with_mean  # noqa: E402
-from training.mean_denoiser import STARTS, MeanDenoiser  # noqa: E402
+from training.joint import JointFusion  # noqa: E402
+from training.mean_denoiser import (  # noqa: E402
+    STARTS,
+    MeanDenoiser,
+    with_denoised_mean,
+)
 from training.oidn import BASE  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT, run_denoiser  # noqa: E402
 from training.quantise.codes import denoiser_codes  # noqa: E402
-from training.whole_model import CHECKPOINTS, denoiser_file  # noqa: E402
+from training.render_mean import with_mean  # noqa: E402
+from training.whole_model import CHECKPOINTS, denoiser_file, network_of  # noqa: E402
 
 #: Open Image Denoise's quality whose networks each size starts from.
 QUALITY = {"small": "fast", "usual": "high", "large": "high"}
@@ -103,6 +109,20 @@ def test_the_graph_computes_what_the_network_does(scale, size, tmp_path, denoise
             expected = [values.numpy() for values in network.fuse(lrhs, hrls)]
         assert np.abs(fused - expected[0]).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - expected[0]).mean()
         assert np.abs(log_error - expected[1]).mean() < 0.1
+
+
+@pytest.mark.parametrize(("family", "scale"), [("joint-small", 2), ("joint", 8), ("joint-spread", 4)])
+def test_the_shipped_files_agree_with_their_checkpoint(family, scale, tmp_path, denoised_mean):
+    """To a fifth of the noise that is removed."""
+    network, _ = checkpoints.load(CHECKPOINT.with_stem(family.replace("-", "_")))
+    onnx.save(network_of(onnx.load(find_model(scale, family))), tmp_path / "network.onnx")
+    model = load_network(tmp_path / "network.onnx")
+    ((lrhs, hrls),) = pairs(scale, denoised_mean, count=1, size=16 * scale)
+    fused, log_error = model.run(["fused", "log_error"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
+    with torch.inference_mode():
+        expected = [values.numpy() for values in network.fuse(lrhs, hrls)]
+    assert np.abs(fused - expected[0]).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - expected[0]).mean()
+    assert np.abs(log_error - expected[1]).mean() < 0.1
 
 
 def test_pruning_channels_that_nothing_reads_changes_nothing():

@@ -377,7 +377,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     pytest.importorskip("onnxscript")
     onnx = pytest.importorskip("onnx")
     onnxruntime = pytest.importorskip("onnxruntime")
-    from training import export
+    from training import export, export_checks
     from training.whole_model import whole_model
 
     path = tmp_path / "tiny.onnx"
@@ -385,7 +385,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     network = export.to_onnx(tiny_network, contract, half=half)
     onnx.save(whole_model(network, contract, None), path)
 
-    assert export.parity(tiny_network, path) < (5e-3 if half else 1e-5)
+    assert export_checks.parity(tiny_network, path) < (5e-3 if half else 1e-5)
     kinds = {node.op_type for node in network.graph.node}
     assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
     assert str(Path(__file__).parents[2]).encode() not in path.read_bytes()
@@ -413,10 +413,15 @@ def test_the_mean_of_checkpoints_is_one(tmp_path: Path) -> None:
         }  # fmt: skip
 
     both = average.mean([state(1.0), state(2.0)])
-    assert both["provenance"] == {"steps": 2.0, "mean_of": [{"steps": 1.0}, {"steps": 2.0}]}
+    assert both["provenance"] == {"steps": 2.0, "mean_of": [{"share": 0.5, "steps": 1.0}, {"share": 0.5, "steps": 2.0}]}
     assert "network" not in both and "optimizer" not in both
     torch.save(both, tmp_path / "mean.pt")
     network, _ = checkpoints.load(tmp_path / "mean.pt")
     assert all((parameter == 1.5).all() for parameter in network.parameters())
+    unequal = average.mean([state(1.0), state(2.0)], shares=(0.75, 0.25))
+    assert all((weights == 1.25).all() for weights in unequal["ema"].values())
+    for shares in ((1.0,), (0.5, 0.4)):
+        with pytest.raises(SystemExit, match="with a sum of 1"):
+            average.mean([state(1.0), state(2.0)], shares=shares)
     with pytest.raises(SystemExit, match="different networks"):
         average.mean([state(1.0), state(1.0) | {"architecture": "joint"}])

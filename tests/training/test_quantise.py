@@ -20,6 +20,7 @@ from training.pu_curve import pu_encode  # noqa: E402
 from training.quantise import gptq  # noqa: E402
 from training.quantise.codes import INPUT_CHANNELS, OUTPUT_SLICES, denoiser_codes  # noqa: E402
 from training.quantise.graph import COPIES, Graph, Nodes  # noqa: E402
+from training.quantise.layers import varied  # noqa: E402
 
 
 def codes_of(image, noise=0.3):
@@ -88,6 +89,20 @@ def test_slices_are_distributed_for_the_least_noise():
     assert int(slices.sum()) == 10
     assert slices[-1] == 1
     assert float((noise / slices**2).sum()) == pytest.approx(min(float((noise / way**2).sum()) for way in ways))
+
+
+def test_calibration_sees_bright_and_black_albedos():
+    """Other images, colours and normals stay as they are."""
+    generator = torch.Generator().manual_seed(0)
+    images = [torch.rand(1, 9, 8, 8, generator=generator) for _ in range(8)]
+    found = varied(images)
+    for index, (before, after) in enumerate(zip(images, found, strict=True)):
+        torch.testing.assert_close(after[:, :3], before[:, :3])
+        torch.testing.assert_close(after[:, 6:], before[:, 6:])
+        albedo = after[:, 3:6]
+        assert index % 2 == 0 or (albedo >= before[:, 3:6]).all()
+        assert (index % 4 == 2) == (not albedo.any())
+        assert index % 4 != 0 or (albedo == before[:, 3:6]).all()
 
 
 def in_integers(layer, codes):

@@ -24,12 +24,13 @@ from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.runtime import load_network
 from training.checkpoints import load
 from training.data import fixed_batches
-from training.joint import JointFusion, with_mean
+from training.joint import JointFusion
 from training.oidn import provenance
 from training.ops import box_downsample
 from training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code
 from training.quantise.gptq import quantise_mean_denoiser
 from training.quantise.graph import Graph
+from training.render_mean import with_mean
 from training.whole_model import CHECKPOINTS, denoiser_file
 
 CHECKPOINT = CHECKPOINTS / "joint.pt"

@@ -37,13 +37,14 @@ from training.data import Sampling, draw, fixed_batches, view_tensors
 from training.encoding import log_to_pu
 from training.ensemble import BandWeights, EnsembleFusion, load
 from training.export import MEMORY
-from training.joint import JointFusion, with_denoised_mean
+from training.joint import JointFusion
 from training.large import LargeDenoiser
+from training.mean_denoiser import with_denoised_mean
 from training.oidn import ALBEDO_BASE, LARGE_HDR, NORMAL_BASE
 from training.quantise.codes import log_encoded_of_code, sliced
 from training.quantise.gptq import Activations, CodeLayout, concatenated, sliced_layout
 from training.quantise.graph import Graph, Nodes
-from training.quantise.layers import Networks, add_layers, brightened, fitted, quantised
+from training.quantise.layers import Networks, add_layers, fitted, quantised, varied
 from training.tracing import shuffle, traced, unshuffle
 from training.whole_model import CHECKPOINTS, network_of, quantised_denoiser, save, whole_model
 
@@ -156,7 +157,7 @@ def calibration_pairs(views: Path, joint: JointFusion, count: int = IMAGES) -> l
     """Encoded pairs of training views, some with brighter albedos."""
     batches = islice(fixed_batches(views, "train", [2], PATCH, 1, with_denoised_mean(joint.mean_denoiser)), count)
     pairs = [(batch["lrhs"].contiguous(), batch["hrls"][:, :9].contiguous()) for batch in batches]
-    return list(zip((lrhs for lrhs, _ in pairs), brightened([hrls for _, hrls in pairs]), strict=True))
+    return list(zip((lrhs for lrhs, _ in pairs), varied([hrls for _, hrls in pairs]), strict=True))
 
 
 # The files that ship

@@ -90,7 +90,7 @@ def calibration_pairs(
 
     Args:
         scales: of each pair, one of these at random.
-        prepare: see :func:`training.joint.with_denoised_mean`.
+        prepare: see :func:`training.mean_denoiser.with_denoised_mean`.
     """
     batches = fixed_batches(views, "train", scales, PATCH, 1, prepare)
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]

@@ -20,23 +20,27 @@ from training.quantise.graph import ENTRIES, Graph, Nodes
 
 #: Slices of albedo and normal before and after they are denoised.
 SLICES = 5
-#: Bounds of the powers of brighter albedos, see :func:`brightened`.
+#: Bounds of the powers of brighter albedos, see :func:`varied`.
 BRIGHTER = (0.1, 1.0)
 
 #: The networks by layer, ``albedo`` and ``normal``.
 Networks = dict[str, onnx.ModelProto]
 
 
-def brightened(images: Sequence[Tensor]) -> list[Tensor]:
-    """Encoded HRLS of which every second one has a brighter albedo, up to white, in some channels.
+def varied(images: Sequence[Tensor]) -> list[Tensor]:
+    """Encoded HRLS, some with another albedo than training views have.
 
-    Codes only cover the range that calibration has seen, so bright walls would become darker.
+    Weights and codes only suit what calibration has seen. So every second image gets a brighter albedo, up to white, in
+    some channels: else bright walls would become darker. Of the others, every second one gets a black albedo: else
+    mirrors, glass and lamps would.
     """
     generator = torch.Generator().manual_seed(0)
     result = [image.clone() for image in images]
     for image in result[1::2]:
         power = BRIGHTER[0] + (BRIGHTER[1] - BRIGHTER[0]) * torch.rand(1, 3, 1, 1, generator=generator)
         image[:, 3:6] = image[:, 3:6].clamp(0, 1) ** power
+    for image in result[2::4]:
+        image[:, 3:6] = 0
     return result
 
 

@@ -28,6 +28,7 @@ from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import AUTO, TemporalOptions, plan_temporal
+from oiio_msspl.model.devices import require_device
 from oiio_msspl.parallel import limit_threads
 
 if TYPE_CHECKING:
@@ -99,6 +100,8 @@ def fuse_shot(
     report_path = None if report_path is None else Path(report_path)
     if previews:
         shot = replace(shot, frames=[replace(each, preview=each.output.with_suffix(".png")) for each in shot.frames])
+    if client is None:  # workers of a cluster may have other devices
+        require_device(device)
     prepare_output(shot, inputs, model, [] if report_path is None else [report_path])
     with limit_threads(threads):
         over_time = plan_temporal(shot, inputs, temporal, model, write)

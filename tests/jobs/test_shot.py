@@ -294,6 +294,13 @@ def test_a_read_only_folder_is_said_at_once(tmp_path, bilinear_models):
         run(folder, bilinear_models[4])
 
 
+def test_a_wrong_device_leaves_no_folder(tmp_path, bilinear_models):
+    folder = make_shot(tmp_path, 1)
+    with pytest.raises(InputError, match="'abacus': use one of cpu"):
+        run(folder, bilinear_models[4], device="abacus")
+    assert not (folder / "out").exists()
+
+
 def test_a_fault_of_the_program_in_one_frame_does_not_stop_the_others(tmp_path, bilinear_models, monkeypatch):
     folder = make_shot(tmp_path, 3)
     real = stages.fuse

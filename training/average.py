@@ -3,7 +3,7 @@
 
     python -m training.average training/checkpoints/NEW.pt training/checkpoints/OLD.pt RUN/checkpoint.pt
     python -m training.average training/checkpoints/joint.pt RUN/checkpoint.pt --initial 0.25 0.75
-    python -m training.average training/checkpoints/joint_large.pt OLD.pt RUN/checkpoint.pt --shares 0.65 0.35
+    python -m training.average NEW.pt OLD.pt RUN/checkpoint.pt --shares 0.65 0.35
 
 The mean of a network and of its continuation by further training often keeps the strengths of both (Wortsman et al.
 2022). The mean of a joint network may include its initial state, which is Open Image Denoise with constant logits. The

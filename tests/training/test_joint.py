@@ -22,11 +22,7 @@ pytest.importorskip("onnxscript")
 from benchmarks.oidn import run_filter  # noqa: E402
 from training import average, checkpoints, export, prune  # noqa: E402
 from training.joint import JointFusion  # noqa: E402
-from training.mean_denoiser import (  # noqa: E402
-    STARTS,
-    MeanDenoiser,
-    with_denoised_mean,
-)
+from training.mean_denoiser import STARTS, MeanDenoiser, with_denoised_mean  # noqa: E402
 from training.oidn import BASE  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT, run_denoiser  # noqa: E402
 from training.quantise.codes import denoiser_codes  # noqa: E402

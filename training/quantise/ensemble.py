@@ -154,7 +154,7 @@ def store_pairs(views: Path, out: Path, joint: JointFusion) -> None:
 
 
 def calibration_pairs(views: Path, joint: JointFusion, count: int = IMAGES) -> list[tuple[Tensor, Tensor]]:
-    """Encoded pairs of training views, some with brighter albedos."""
+    """Encoded pairs of training views, some with other albedos, see :func:`training.quantise.layers.varied`."""
     batches = islice(fixed_batches(views, "train", [2], PATCH, 1, with_denoised_mean(joint.mean_denoiser)), count)
     pairs = [(batch["lrhs"].contiguous(), batch["hrls"][:, :9].contiguous()) for batch in batches]
     return list(zip((lrhs for lrhs, _ in pairs), varied([hrls for _, hrls in pairs]), strict=True))

@@ -30,9 +30,9 @@ Networks = dict[str, onnx.ModelProto]
 def varied(images: Sequence[Tensor]) -> list[Tensor]:
     """Encoded HRLS, some with another albedo than training views have.
 
-    Weights and codes only suit what calibration has seen. So every second image gets a brighter albedo, up to white, in
-    some channels: else bright walls would become darker. Of the others, every second one gets a black albedo: else
-    mirrors, glass and lamps would.
+    Weights and codes only suit what calibration has seen; the rest becomes darker. So every second image gets a
+    brighter albedo, up to white, in some channels, as bright walls have. Every fourth one gets a black albedo, as
+    mirrors, glass and lamps have.
     """
     generator = torch.Generator().manual_seed(0)
     result = [image.clone() for image in images]

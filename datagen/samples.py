@@ -14,6 +14,7 @@ samples a pixel are L * s^2 samples for each LRHS pixel at scale s.
 
 * ``ref``: uint32 (R * H, R * W), the reference at R = ``REF_CELLS`` times the resolution, filtered with a box of one of
   its own pixels. Filters for the reference are applied to these cells. It is independent of all samples.
+  In views of the split ``NO_REFERENCE``, it is the mean of the samples for the LRHS.
 * ``ref_albedo`` and ``ref_normal``: as ``albedo`` and ``normal``, (R * H, R * W, 3), of a reference that is to be
   denoised.
 * ``meta``: a JSON string, as in :mod:`datagen.views`.

@@ -62,6 +62,11 @@ PASS_FEATURES = tuple(name for name in HRLS_FEATURES if name != VARIANCE)
 # Names
 
 
+#: The split of views that were rendered without a reference, see ``--ref-spp 0`` of
+#: :mod:`datagen.mitsuba.render_samples`.
+NO_REFERENCE = "no-reference"
+
+
 def split_of(seed: int) -> str:
     """The split of a scene. Whole scenes are held out, never single views of one."""
     return {0: "validation", 1: "test"}.get(seed % 20, "train")

@@ -4,6 +4,7 @@
     python -m training.pool VIEWS POOL --draws 6
     python -m training.train --network joint --spread --scale 2 4 8 --pool POOL --data VIEWS --out RUN --minutes 10
     python -m training.pool VIEWS POOL_LARGE --draws 6 --denoise training/checkpoints/joint{,_spread}.pt
+    python -m training.pool VIEWS POOL_TAUGHT --denoise JOINT{,_SPREAD}.pt --teach FIRST{,_SPREAD}.pt
 
 A GPU takes a step in less time than :func:`training.data.draw` takes for one pair. So a process of its own draws whole
 views some times each: other samples, filters, light and missing layers at each draw. It writes the pairs of a view into
@@ -12,6 +13,8 @@ GPU. Each batch has crops of some of them, mirrored, turned, and with permuted c
 
 With ``--denoise``, pairs are those that the size ``large`` of `joint` reads: albedo, normal and the mean of both
 renders are denoised. Of views with single samples, every second pair then has noise that the pixel filter has spread.
+
+With ``--teach``, the target of a pair is no reference but what a :class:`Teacher` makes of both renders.
 
 References that were stored with their noise (:mod:`datagen.mitsuba.render_samples`) become the mean of the rendered
 and of a denoised one: half of the noise is left, and half of what a denoiser gets wrong.
@@ -33,11 +36,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from datagen.views import Folder, SampleView, View
+from datagen.views import NO_REFERENCE, Folder, SampleView, View
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from training import checkpoints
 from training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
-from training.encoding import compress, exposure_of, log_decode, log_to_pu, pu_to_log
+from training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
 from training.joint import FEATURES, JointFusion
 from training.layer_denoisers import LayerDenoisers, untouched
 from training.mean_denoiser import denoise_mean
@@ -64,7 +67,7 @@ M = TypeVar("M", bound=nn.Module)
 
 
 class Denoisers:
-    """The networks that prepare pairs.
+    """The networks that prepare pairs, and OIDN's large one, which denoises references and teaches.
 
     Args:
         joints: two ``joint`` networks, for independent noise and for spread noise. Their denoisers of both renders'
@@ -76,33 +79,70 @@ class Denoisers:
 
     def __init__(self, joints: Sequence[JointFusion], device: torch.device) -> None:
         self.device = device
-        self.means = [self._moved(joint.mean_denoiser) for joint in joints if joint.mean_denoiser is not None]
+        self.joints = [self.moved(joint) for joint in joints]
+        self.means = [joint.mean_denoiser for joint in self.joints if joint.mean_denoiser is not None]
         if joints and (len(self.means) != 2 or [joint.spread for joint in joints] != [False, True]):
             raise SystemExit("--denoise: give a joint network for independent noise, then one for spread noise")
 
     @functools.cached_property
     def layers(self) -> LayerDenoisers:
         """The networks for albedo and normal."""
-        return self._moved(LayerDenoisers())
+        return self.moved(LayerDenoisers())
 
     @functools.cached_property
     def large(self) -> FineTunedUNet:
         """OIDN's large network."""
-        return self._moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)))
+        return self.moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)))
 
-    def _moved(self, network: M) -> M:
+    def moved(self, network: M) -> M:
+        """A network without gradients, on the device."""
         return network.requires_grad_(False).to(self.device, memory_format=torch.channels_last)
+
+    def denoised(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """A log-encoded colour, denoised with an albedo and a normal in [0, 1] that are free of noise."""
+        output = self.large.run(torch.cat([log_to_pu(colour), albedo, normal], dim=1))
+        return pu_to_log(output.float().clamp(0, 1))
 
     def reference(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
         """The mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
         exposure = exposure_of(colour.movedim(1, -1))
         encoded = compress(colour.movedim(1, -1), exposure).movedim(-1, 1)
-        output = self.large.run(torch.cat([log_to_pu(encoded), *self.layers(albedo, normal)], dim=1))
-        return 0.5 * (colour + log_decode(pu_to_log(output.float().clamp(0, 1))) / exposure)
+        return 0.5 * (colour + log_decode(self.denoised(encoded, *self.layers(albedo, normal))) / exposure)
 
     def prepared(self, lrhs: Tensor, hrls: Tensor, spread: bool) -> tuple[Tensor, Tensor]:
         """The arguments of :meth:`JointFusion.fuse_prepared` for those of :meth:`JointFusion.forward`."""
         return denoise_mean(self.means[spread], lrhs, hrls), self.layers.applied(hrls)
+
+
+class Teacher:
+    """Targets from the renders themselves: a weighted mean of what several networks make of them.
+
+    The networks err in different places, so their mean is better than each. One network that learns to reproduce it
+    from many pairs comes close, without their time (Hinton et al. 2015, *Distilling the knowledge in a neural
+    network*). It needs no reference, so views for it are rendered in a few seconds.
+
+    The members are ``joint`` (one quarter), OIDN's large network on the HRLS (one quarter), and a first network of the
+    size ``large`` (one half). OIDN has not learnt spread noise, so it is left out there.
+
+    Args:
+        denoisers: with two ``joint`` networks.
+        larges: two of the size ``large``, for independent noise and for spread noise.
+    """
+
+    def __init__(self, denoisers: Denoisers, larges: Sequence[JointFusion]) -> None:
+        if len(denoisers.means) != 2 or [large.size for large in larges] != ["large", "large"]:
+            raise SystemExit("--teach: give two networks of the size large, and --denoise")
+        self.denoisers, self.larges = denoisers, [denoisers.moved(large) for large in larges]
+
+    def target(self, lrhs: Tensor, hrls: Tensor, prepared: Tensor, spread: bool) -> Tensor:
+        """The mean (1, 3, s*H, s*W), log-encoded; the arguments are those of :meth:`JointFusion.fuse_prepared`, and
+        ``hrls`` with its albedo and normal as rendered."""
+        joint, _ = self.denoisers.joints[spread].fuse(lrhs, hrls)
+        first, _ = self.larges[spread].fuse_prepared(lrhs, prepared)
+        results = [joint, first, first]
+        if not spread:
+            results.append(self.denoisers.denoised(prepared[:, :3], prepared[:, 3:6], 0.5 * prepared[:, 6:9] + 0.5))
+        return log_encode(torch.stack([log_decode(result) for result in results]).mean(dim=0))
 
 
 @torch.no_grad()
@@ -112,12 +152,13 @@ def draw_pairs(
     count: int,
     device: torch.device,
     denoisers: Denoisers | None = None,
+    teacher: Teacher | None = None,
 ) -> list[Pair]:
     """Draw a view ``count`` times: ``lrhs`` (7, h, w), ``hrls`` (9, s*h, s*w), ``target`` (3, s*h, s*w), half floats.
 
     The LRHS has the mean of both renders and its noise, see :func:`training.render_mean.with_mean`. Or it is (6, h, w),
     with the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread. Without
-    ``denoisers``, references that were stored with their noise keep it.
+    ``denoisers``, references that were stored with their noise keep it. With a ``teacher``, targets are its own.
     """
     rng = np.random.default_rng([*view.path.name.encode(), count])
     tensors: ViewTensors | SampleTensors
@@ -136,9 +177,12 @@ def draw_pairs(
         batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
         lrhs, hrls = batch["lrhs"], batch["hrls"]
         lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :CHANNELS]
+        target, rendered = batch["target"], hrls
         if denoisers is not None and prepares:
             lrhs, hrls = denoisers.prepared(lrhs, hrls, spread)
-        batch = {"lrhs": lrhs, "hrls": hrls, "target": batch["target"]}
+        if teacher is not None:
+            target = teacher.target(lrhs, rendered, hrls, spread)
+        batch = {"lrhs": lrhs, "hrls": hrls, "target": target}
         pair = {name: image[0].half().contiguous().cpu() for name, image in batch.items()}
         if all(bool(image.isfinite().all()) for image in pair.values()):
             pairs.append(pair | ({SPREAD_NOISE: torch.tensor(spread)} if prepares else {}))
@@ -154,19 +198,26 @@ def fill(
     parts: int,
     device: torch.device,
     denoisers: Denoisers,
+    teacher: Teacher | None = None,
 ) -> None:
-    """Write the pairs of every ``parts``-th view of the training split, and wait for more."""
+    """Write the pairs of every ``parts``-th view of the training split, and wait for more.
+
+    Views without a reference are only drawn for a teacher.
+    """
     folder = Folder(views)
     pool.mkdir(parents=True, exist_ok=True)
     while True:
+        views_of_samples = folder.sample_views("train")
+        if teacher is not None:
+            views_of_samples += folder.sample_views(NO_REFERENCE)
         todo = [
             view
-            for view in (*folder.split("train"), *folder.sample_views("train"))
+            for view in (*folder.split("train"), *views_of_samples)
             if sum(view.path.name.encode()) % parts == part and not (pool / f"{view.path.name}.pt").exists()
         ]
         for view in todo:
             file = pool / f"{view.path.name}.pt"
-            torch.save(draw_pairs(view, scales, draws, device, denoisers), file.with_suffix(".partial"))
+            torch.save(draw_pairs(view, scales, draws, device, denoisers, teacher), file.with_suffix(".partial"))
             os.replace(file.with_suffix(".partial"), file)
             log.info("%s", file.name)
         time.sleep(0 if todo else 1)
@@ -252,6 +303,19 @@ class PooledBatches:
         return turned({name: torch.stack(crops).float() for name, crops in parts.items()}, rng)
 
 
+def joint_networks(paths: Sequence[Path]) -> list[JointFusion]:
+    """The networks of checkpoints.
+
+    Raises:
+        SystemExit: one is no ``joint`` network.
+    """
+    networks = [checkpoints.load(path)[0] for path in paths]
+    for path, network in zip(paths, networks, strict=True):
+        if not isinstance(network, JointFusion):
+            raise SystemExit(f"{path}: not a joint network")
+    return [network for network in networks if isinstance(network, JointFusion)]
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         prog="python -m training.pool", description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -265,14 +329,14 @@ def main() -> None:
     parser.add_argument(
         "--denoise", type=Path, nargs=2, default=(), metavar="JOINT", help="pairs for the size large, see above"
     )
+    parser.add_argument(
+        "--teach", type=Path, nargs=2, default=(), metavar="LARGE", help="targets by a teacher with these, see above"
+    )
     args = parser.parse_args()
     torch.set_num_threads(1)
-    device = torch.device(args.device)
-    joints = [checkpoints.load(path)[0] for path in args.denoise]
-    if not all(isinstance(each, JointFusion) for each in joints):
-        raise SystemExit("--denoise: give checkpoints of joint networks")
-    denoisers = Denoisers([each for each in joints if isinstance(each, JointFusion)], device)
-    fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, device, denoisers)
+    denoisers = Denoisers(joint_networks(args.denoise), torch.device(args.device))
+    teacher = Teacher(denoisers, joint_networks(args.teach)) if args.teach else None
+    fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, denoisers.device, denoisers, teacher)
 
 
 if __name__ == "__main__":

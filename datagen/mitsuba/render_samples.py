@@ -8,6 +8,9 @@ else built (:mod:`datagen.mitsuba.rooms`). References for training and validatio
 resolution of their cells. With ``--keep-noise``, they stay as rendered, with their albedo and normal, and
 :mod:`training.pool` denoises them on a GPU. References for testing always stay as rendered, because a denoiser must not
 be scored against its own results.
+
+With ``--ref-spp 0``, no reference is rendered, and a view takes a few seconds. Such views are only for the teacher of
+:mod:`training.pool`.
 """
 
 from __future__ import annotations
@@ -76,7 +79,7 @@ def render_view(
     rng = np.random.default_rng([seed, view, 7])
     # The reference, the samples of the HRLS and those of the LRHS are independent
     base = [int(s) * 1000 for s in rng.choice(4_000_000, 3, replace=False)]
-    found = _reference(scene, camera, ref_spp, base[0])
+    found = _reference(scene, camera, ref_spp, base[0]) if ref_spp else ({}, 0, 0.0)
     if found is None:
         return None
     images, ref_spp, psnr = found
@@ -89,16 +92,26 @@ def render_view(
     lr = drawn(samples.LR_SAMPLES, base[2], LAYERS[:3])
     meta = {
         "seed": f"{plan.kind}-{seed}" if split == "room" else seed, "view": view,
-        "split": "train" if split == "room" else split, "generator": VERSION, "kind": plan.kind,
+        "split": _stored_split(split, ref_spp), "generator": VERSION, "kind": plan.kind,
         "renderer": f"Mitsuba {mi.__version__}, variant {mi.variant()}, own path tracer, {MAX_DEPTH} bounces",
         "sampler": "independent", "ref_spp": ref_spp, "ref_psnr": psnr,
-        "ref_denoised": split != "test" and not keep_noise,
+        "ref_denoised": ref_spp > 0 and split != "test" and not keep_noise,
         "assets": sorted(plan.sources), "camera": camera.__dict__,
     }  # fmt: skip
+    if not ref_spp:
+        mean = lr["color"].mean(axis=0).repeat(views.REF_CELLS, axis=0).repeat(views.REF_CELLS, axis=1)
+        return samples.pack(hr, lr, mean, rng, meta)
     if keep_noise:
         layers = {name: images[name] for name in ("albedo", "normal")}
         return samples.pack(hr, lr, images["color"], rng, meta, layers)
     return samples.pack(hr, lr, images["color"] if split == "test" else _denoised(images), rng, meta)
+
+
+def _stored_split(split: str, ref_spp: int) -> str:
+    """The split that a view's file names."""
+    if not ref_spp:
+        return views.NO_REFERENCE
+    return "train" if split == "room" else split
 
 
 def render_scene(args: argparse.Namespace, assets, seed: int) -> tuple[int, str]:
@@ -110,12 +123,14 @@ def render_scene(args: argparse.Namespace, assets, seed: int) -> tuple[int, str]
     if not missing:
         return 0, "done before"
     is_room = args.rooms is not None and seed % 3 == 2
+    # Rooms of other people are for training only: all seeds share their walls
+    split = "room" if is_room else views.split_of(seed)
+    if not args.ref_spp and split not in ("room", "train"):
+        return 0, f"for {split}"
     scene, plan = rooms.build(args.rooms, seed, assets) if is_room else scenes.build(seed, assets)
     written = 0
     for view in missing:
         cameras = find_cameras(scene, plan, seed, view, _LIT)
-        # Rooms of other people are for training only: all seeds share their walls
-        split = "room" if is_room else views.split_of(seed)
         renders = (
             render_view(scene, plan, c, seed, view, split, args.ref_spp, keep_noise=args.keep_noise) for c in cameras
         )

@@ -17,7 +17,12 @@ def sample_folder(tmp_path: Path) -> Path:
     return write_wall(tmp_path)
 
 
-def write_wall(folder: Path, ref: np.ndarray | None = None, ref_layers: dict[str, np.ndarray] | None = None) -> Path:
+def write_wall(
+    folder: Path,
+    ref: np.ndarray | None = None,
+    ref_layers: dict[str, np.ndarray] | None = None,
+    split: str = "train",
+) -> Path:
     """The view of :func:`sample_folder`, with another reference."""
     rng = np.random.default_rng(0)
     size = samples.SIZE
@@ -36,7 +41,7 @@ def write_wall(folder: Path, ref: np.ndarray | None = None, ref_layers: dict[str
         layers(samples.LR_SAMPLES, ("color", "albedo", "normal")),
         np.full((cells, cells, 3), 0.5, np.float32) if ref is None else ref,
         rng,
-        {"seed": 3, "split": "train", "renderer": "none", "generator": 0},
+        {"seed": 3, "split": split, "renderer": "none", "generator": 0},
         ref_layers,
     )
     views.save(samples.path_of(folder, "mitsuba", 3, 0), arrays)

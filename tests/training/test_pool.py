@@ -11,15 +11,17 @@ import pytest
 torch = pytest.importorskip("torch", reason="training is an extra")
 
 from datagen.samples import SIZE  # noqa: E402
-from datagen.views import REF_CELLS, Folder  # noqa: E402
+from datagen.views import NO_REFERENCE, REF_CELLS, Folder  # noqa: E402
 from tests.training.conftest import write_wall  # noqa: E402
 from training import checkpoints  # noqa: E402
 from training.data import SampleTensors  # noqa: E402
+from training.encoding import log_encode  # noqa: E402
 from training.joint import JointFusion  # noqa: E402
-from training.pool import Denoisers, PooledBatches, draw_pairs  # noqa: E402
+from training.pool import Denoisers, PooledBatches, Teacher, draw_pairs  # noqa: E402
 from training.whole_model import CHECKPOINTS  # noqa: E402
 
 CPU = torch.device("cpu")
+Tensor = torch.Tensor
 
 
 def test_views_are_drawn_whole(sample_folder: Path) -> None:
@@ -67,6 +69,47 @@ def test_pairs_for_the_large_size_are_denoised_before(sample_folder: Path) -> No
     lrhs, hrls = next(batches.loader())["lrhs"], next(batches.loader())["hrls"]
     fused, _ = JointFusion(size="large")(lrhs, hrls)
     assert fused.shape == (1, 3, 128, 128)
+
+
+def test_a_teacher_needs_no_reference(tmp_path: Path) -> None:
+    """Its networks agree on the wall, whatever the view has as a reference."""
+    pytest.importorskip("pyoidn")
+    cells = SIZE * REF_CELLS
+    (view,) = Folder(
+        write_wall(tmp_path, np.full((cells, cells, 3), 9.0, np.float32), split=NO_REFERENCE)
+    ).sample_views(NO_REFERENCE)
+    joints = [checkpoints.load(CHECKPOINTS / name)[0] for name in ("joint.pt", "joint_spread.pt")]
+    denoisers = Denoisers(joints, CPU)
+    teacher = Teacher(denoisers, [JointFusion(size="large"), JointFusion(size="large", spread=True)])
+    for pair in draw_pairs(view, (4,), 2, CPU, denoisers, teacher):
+        wall, target = (pair[name].mean(dim=(1, 2)) for name in ("lrhs", "target"))
+        torch.testing.assert_close(target, wall[:3], atol=0.01, rtol=0)
+
+
+def test_a_teacher_averages_radiance(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of `joint` once, of the large size twice and, without spread noise, of OIDN's large network once."""
+    pytest.importorskip("pyoidn")
+    joints = [checkpoints.load(CHECKPOINTS / name)[0] for name in ("joint.pt", "joint_spread.pt")]
+    denoisers = Denoisers(joints, CPU)
+    teacher = Teacher(denoisers, [JointFusion(size="large"), JointFusion(size="large", spread=True)])
+
+    def grey(radiance: float) -> Tensor:
+        return log_encode(torch.full((1, 3, 4, 4), radiance))
+
+    monkeypatch.setattr(JointFusion, "fuse", lambda *_: (grey(1.0), None))
+    monkeypatch.setattr(JointFusion, "fuse_prepared", lambda *_: (grey(4.0), None))
+    monkeypatch.setattr(Denoisers, "denoised", lambda *_: grey(7.0))
+    unread = torch.zeros(1, 9, 4, 4)
+    for spread, mean in ((False, 4.0), (True, 3.0)):
+        torch.testing.assert_close(teacher.target(unread, unread, unread, spread), grey(mean))
+
+
+@pytest.mark.parametrize("sizes", [("large",), ("large", "usual")])
+def test_a_teacher_has_two_large_networks(sizes: tuple[str, ...]) -> None:
+    pytest.importorskip("pyoidn")
+    joints = [checkpoints.load(CHECKPOINTS / name)[0] for name in ("joint.pt", "joint_spread.pt")]
+    with pytest.raises(SystemExit, match="two networks of the size large"):
+        Teacher(Denoisers(joints, CPU), [JointFusion(size=size) for size in sizes])
 
 
 def test_networks_in_the_wrong_order_are_refused() -> None:

@@ -59,7 +59,7 @@ class Comparison:
     """What is compared of each render, see :func:`common_windows`."""
     broken: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were NaN or infinite, by the name of the render, as far as it was read. NaN counts as
-    black, infinity as the largest half float."""
+    black, infinity as the largest half float of its sign."""
 
     @cached_property
     def truth(self) -> Array:
@@ -74,9 +74,9 @@ class Comparison:
     def _read(self, position: int) -> Array:
         """The beauty of a render without NaN and infinities, in the linear RGB space of the largest one."""
         render = self.renders[position]
-        rgb, changed = repair(pixels := render.read(self.windows[position], [RGB])[RGB])
-        if changed is not None and (count := int(np.count_nonzero(~np.isfinite(pixels)))):
-            self.broken[render.name] = count
+        rgb, broken = repair(render.read(self.windows[position], [RGB])[RGB], signed=True)
+        if broken is not None:
+            self.broken[render.name] = int(np.count_nonzero(broken))
         return in_space_of(rgb, render, self.renders[self.largest])
 
 

@@ -75,7 +75,12 @@ class Inspection:
 
     def as_dict(self) -> dict[str, Any]:
         """The inspection as it is written to JSON."""
-        result: dict[str, Any] = {"file": str(self.path), "usable": not self.problems, "problems": self.problems}
+        result: dict[str, Any] = {
+            "file": str(self.path),
+            "usable": not self.problems,
+            "problems": self.problems,
+            "facts": self.facts,
+        }
         if self.file is not None:
             result |= {
                 "display_window": str(self.file.display_window),

@@ -26,12 +26,12 @@ def write_exr(path, parts, *, display=None, compression=OpenEXR.ZIP_COMPRESSION,
     """Write an EXR with OpenEXR's own module.
 
     ``parts``: a list of (name, {channel: array}, (x, y) of the data window), or one {channel: array}. Types follow the
-    arrays' dtypes.
+    arrays' dtypes. A part may have attributes of its own, in a fourth place.
     """
     if isinstance(parts, dict):
         parts = [("", parts, (0, 0))]
     made, shown = [], display
-    for name, channels, (x, y) in parts:
+    for name, channels, (x, y), *own in parts:
         height, width = next(iter(channels.values())).shape
         window = (np.array([x, y], np.int32), np.array([x + width - 1, y + height - 1], np.int32))
         shown = shown or window  # the parts of a file share one
@@ -41,6 +41,7 @@ def write_exr(path, parts, *, display=None, compression=OpenEXR.ZIP_COMPRESSION,
             "dataWindow": window,
             "displayWindow": shown,
             **attributes,
+            **(own[0] if own else {}),
         }
         made.append(OpenEXR.Part(header, {k: np.ascontiguousarray(v) for k, v in channels.items()}, name))
     with OpenEXR.File(made) as file:

@@ -81,6 +81,16 @@ def test_pixels_that_are_no_numbers_are_counted(tmp_path):
     ]
 
 
+def test_negative_values_are_scored(tmp_path):
+    """A normal may point away, and a beauty may lie outside the gamut."""
+    truth = picture(32, 32) - np.float32(0.5)
+    reference = write_exr(tmp_path / "ref.exr", rgb(truth))
+    image = write_exr(tmp_path / "image.exr", rgb(np.where(truth < 0, 2 * truth, truth)))
+    (scores,) = score_images(open_comparison([image], reference))
+    expected = 0.5 * np.square(np.minimum(truth, 0)) / (np.square(truth) + 0.01)
+    assert scores["relmse"] == pytest.approx(expected.mean(), rel=1e-3)
+
+
 def test_pictures_of_two_parts_of_the_frame_are_refused(tmp_path):
     truth = picture(48, 64)
     left, right = (part_of(tmp_path / f"{x}.exr", truth, x, 0, 32, 48) for x in (0, 32))

@@ -107,5 +107,7 @@ def _part_layer(part: Part) -> str:
     """The layer that a part's name means: without the view at its end or in front, and empty for names such as
     ``rgba``."""
     view = re.escape(part.view)
-    name = re.sub(rf"[._ -]?{view}$|^{view}[._ -]", "", part.name) if view else part.name
-    return "" if _PLAIN_PART.fullmatch(name) else name
+    name = re.sub(rf"(^|[._ -]){view}$|^{view}[._ -]", "", part.name) if view else part.name
+    # Without a separator, only a plain name may be left: a view "l" is no part of "normal"
+    joined = part.name.removesuffix(part.view)
+    return "" if any(_PLAIN_PART.fullmatch(each) for each in (name, joined)) else name

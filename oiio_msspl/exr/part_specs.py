@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 from typing import Any
 
 import OpenImageIO as oiio
@@ -32,6 +33,14 @@ _KEPT_IN_EVERY_PART = (*_SHARED, "view", "name", "oiio:subimagename", "compressi
 LARGEST_MIXED_PART = 256 << 20
 
 
+class NameOrigin(IntEnum):
+    """Where the name of a part is from. If two parts would get the same, the first of these keeps it."""
+
+    PART = 0
+    LAYER = 1
+    MADE_UP = 2
+
+
 @dataclass(frozen=True)
 class _Piece:
     """What becomes a part: a whole part of the HRLS, or its channels of one layer and pixel type."""
@@ -41,8 +50,8 @@ class _Piece:
     channels: tuple[Channel, ...]
     whole: bool
     name: str
-    keeps_name: bool
-    """Whether ``name`` is that of the HRLS's part. Otherwise it is made up, and gives way to names that are kept."""
+    origin: NameOrigin
+    """Where ``name`` is from."""
     repeats_metadata: bool
     """Whether another part that is written holds the metadata of ``source``."""
 
@@ -94,9 +103,9 @@ def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedO
         taken: names of the parts so far; those of the new parts are added.
     """
     pieces = list(_pieces(contents))
-    kept = {piece.name for piece in pieces if piece.keeps_name}
     for piece in pieces:
-        name = _unique(piece.name, taken, kept - {piece.name} if piece.keeps_name else kept)
+        others = (each for each in pieces if each.name != piece.name or each.origin < piece.origin)
+        name = _unique(piece.name, taken, {each.name for each in others if each.origin <= piece.origin})
         yield _whole_part(piece.source, name) if piece.whole else _layer_part(contents, piece, name)
 
 
@@ -107,8 +116,8 @@ def _pieces(contents: FileContents) -> Iterator[_Piece]:
         if part.deep:
             continue
         if _stays_whole(part, contents):
-            name = part.name or f"part{part.index}"
-            yield _Piece(part, part.view, part.channels, True, name, bool(part.name), repeats_metadata=False)
+            name, origin = part.name or f"part{part.index}", NameOrigin.PART if part.name else NameOrigin.MADE_UP
+            yield _Piece(part, part.view, part.channels, True, name, origin, repeats_metadata=False)
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
         for channel in part.channels:
@@ -120,8 +129,8 @@ def _pieces(contents: FileContents) -> Iterator[_Piece]:
         # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
         repeats_metadata = not set(contents.beauty).isdisjoint(part.channels)
         for (view, layer_name, _), channels in groups.items():
-            name, keeps_name = _layer_name(contents, part, view, layer_name, channels)
-            yield _Piece(part, view, tuple(channels), False, name, keeps_name, repeats_metadata)
+            name, origin = _layer_name(contents, part, view, layer_name, channels)
+            yield _Piece(part, view, tuple(channels), False, name, origin, repeats_metadata)
             repeats_metadata = True
 
 
@@ -159,18 +168,20 @@ def _whole_part(part: Part, name: str) -> PassedOnPart:
 
 def _layer_name(
     contents: FileContents, part: Part, view: str, layer: str, channels: Sequence[Channel]
-) -> tuple[str, bool]:
-    """The name of the part for the channels of one layer and pixel type, and whether the HRLS's part has it."""
+) -> tuple[str, NameOrigin]:
+    """The name of the part for the channels of one layer and pixel type."""
     components = _components(channels)
     is_beauty = not layer and view and {"R", "G", "B"} <= {*components}  # of another view
     plain = layer or ("rgba" if is_beauty else "depth" if components == ["Z"] else "other")
     if contents.options.layout == "nuke":
         name = _nuke_name(plain, view)
-        return name, name in (_nuke_name(part.name, ""), _nuke_name(part.name.removesuffix(f".{view}"), view))
-    if is_beauty and part.name and len(contents.source.parts) > 1:
-        return part.name, True
-    name = f"{plain}.{view}" if view and view != contents.view else plain
-    return name, name == part.name
+        is_parts = name in (_nuke_name(part.name, ""), _nuke_name(part.name.removesuffix(f".{view}"), view))
+    elif is_beauty and part.name and len(contents.source.parts) > 1:
+        name, is_parts = part.name, True
+    else:
+        name = f"{plain}.{view}" if view and view != contents.view else plain
+        is_parts = name == part.name
+    return name, NameOrigin.PART if is_parts else NameOrigin.LAYER if layer else NameOrigin.MADE_UP
 
 
 def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPart:

@@ -146,6 +146,7 @@ def fuse_passes(
     tell(done, steps)
     fused_light: dict[AdditiveLayer, Array] = {}
     clipped = dict.fromkeys((job.layers.name for job in jobs), 0)
+    broken: dict[str, int] = {}
     colours = _colour_names(jobs)
     low_layers = {key: each for job in jobs for key, each in job.lrhs.items()}
     high_layers = {key: layer for job in jobs for layer, key in job.keys.items()}
@@ -187,6 +188,8 @@ def fuse_passes(
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 done += 1
                 tell(done, steps)
+            for name, count in band.broken.items():
+                broken[name] = broken.get(name, 0) + count
             for image in (*fused_light.values(), *guides.values()):
                 unload(image)
             for render in (low, high):
@@ -196,6 +199,9 @@ def fuse_passes(
         "to the beauty there; render them as float"
         for name, count in clipped.items()
         if count
+    ]
+    fused.warnings += [
+        f"{name}: {count} values of the HRLS are NaN or infinite; they were repaired" for name, count in broken.items()
     ]
     return fused
 
@@ -393,8 +399,11 @@ class _Band:
         if self._to_fit:
             needed += [ALBEDO, NORMAL]
         features: dict[str, Array] = {}
+        counts = RepairCounts()
         if needed:
-            features = read_features(high, self._hrls_area, self._alignment.hr_data_window, needed)
+            core = in_hrls_pixels(self._core, self._scale)
+            window = self._alignment.hr_data_window
+            features = read_features(high, self._hrls_area, window, needed, counts=counts, counted=core)
         self._colours = {factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()}
         guides = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
         #: For each layer without noise that is fitted, the range of the HRLS around each pixel of the core.
@@ -409,6 +418,9 @@ class _Band:
         self._lrhs_layers = {}
         if theirs:
             self._lrhs_layers = read_lrhs(low, self._alignment, self._area, [RGB, *theirs], RepairCounts())
+        #: How many values of each layer of the HRLS were NaN or infinite.
+        keys = {key: layer for job in jobs for layer, key in job.keys.items()}
+        self.broken = {keys[key].name: count for key, count in counts.repaired.items() if key in keys}
         return guides
 
     def fuse(

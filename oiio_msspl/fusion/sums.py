@@ -40,13 +40,17 @@ class SumCheck:
     remainder: bool = False
     """The layers lack some of the light, such as lights in no group. The rest is nowhere negative."""
     problem: str = ""
-    """Why the layers do not sum to the beauty; empty if they do."""
+    """Why the layers do not sum to the beauty, or can't be fused though they do; empty if they can."""
+    negative: bool = False
+    """They sum to it, but a layer takes light away."""
     noise_free: frozenset[AdditiveLayer] = frozenset()
     """Layers without noise, but for that of edges: they show a lamp or the sky directly."""
 
     @property
     def text(self) -> str:
         """In words."""
+        if self.negative:
+            return f"can't be fused: {self.problem}"
         if self.problem:
             return f"does not sum to the beauty: {self.problem}"
         if self.remainder:
@@ -70,6 +74,7 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool =
     if other:
         return SumCheck(1.0, problem=f"{other[0]} has another data window")
     light = wrong = missing = surplus = 0.0
+    negative, positive = np.zeros((2, len(additive_set.layers)))
     finite = np.zeros(len(additive_set.layers), np.bool_)
     alike = np.zeros((len(additive_set.layers), 2), np.int64)
     for layers, beauty, rest, usable in _strips_of(render, additive_set):
@@ -77,6 +82,8 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool =
         missing += np.maximum(rest[usable], 0).sum()
         surplus += np.maximum(-rest[usable], 0).sum()
         alike += [_equal_pixels(pixels) for pixels in layers]
+        negative += [-np.minimum(pixels, 0)[usable].sum(dtype=np.float64) for pixels in layers]
+        positive += [np.maximum(pixels, 0)[usable].sum(dtype=np.float64) for pixels in layers]
         if not finite.all():
             finite |= [bool(np.isfinite(pixels).any()) for pixels in layers]
     if not finite.all():
@@ -84,6 +91,12 @@ def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool =
         return SumCheck(1.0, problem=f"the layer {broken} is NaN or infinite")
     if light == 0:
         return SumCheck(0.0, problem="the beauty is black")
+    # Pixel filters with negative lobes make some values negative. Light that is taken away is another matter: a fused
+    # layer is nowhere negative.
+    taken = np.where(negative > positive, negative, 0)
+    if taken.max(initial=0) > TOLERANCE * light:
+        name = additive_set.layers[int(taken.argmax())].name
+        return SumCheck(float(wrong / light), problem=f"the layer {name} is negative", negative=True)
     residual = float(wrong / light)
     noise_free = frozenset(
         layer
@@ -160,11 +173,14 @@ def _equal_pixels(pixels: Array) -> tuple[int, int]:
 
 
 def is_sum_of(render: MappedRender, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
-    """Whether a layer is the sum of others of the same file, on some strips of rows.
+    """Whether a layer is the sum of others of the same file, on some strips of rows. A layer with another data window
+    than the beauty's is none.
 
     Raises:
         InputError: pixels can't be decoded.
     """
+    if any(_window_of(render, channel.part) != render.data_window for channel in layer.channels):
+        return False
     whole = replace(render, features={RGB: layer.formula}, alpha=None)
     check = check_sum(whole, AdditiveSet(layer.name, tuple(parts)), advise=False)
     return not check.problem and not check.remainder

@@ -68,7 +68,8 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
         for its own first one if it lacks that.
 
     Raises:
-        InputError: one of the files can't be used, both are the same, or their headers declare two colour spaces.
+        InputError: one of the files can't be used, both are the same, the LRHS lacks the first view of the HRLS and
+            has another one of it, or their headers declare two colour spaces.
     """
     lr_path, hr_path = Path(lr_path), Path(hr_path)
     if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
@@ -77,6 +78,11 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
     lr, hr = _map_lrhs(lr_file, inputs), map_hrls(hr_file, inputs)
     if hr.view in lr.other_views:
         lr = _map_lrhs(lr_file, replace(inputs, view=hr.view))
+    elif lr.view in hr.other_views:
+        raise InputError(
+            f"{lr_path}: has no view or view layer {hr.view!r}, which would be fused of {hr_path}; "
+            f"choose one that both have with --view-layer, such as {lr.view!r}"
+        )
     lr.space = hr.space = _common_space(lr, hr, inputs.colourspace)
     return lr, hr
 

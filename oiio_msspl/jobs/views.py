@@ -62,7 +62,7 @@ FusedViews = tuple[ReplacedChannels | None, list[FrameReport]]
 def find_other_views(
     lr: MappedRender, hr: MappedRender, inputs: InputOptions, write: WriteOptions = WriteOptions()
 ) -> OtherViews:
-    """The views and view layers to fuse beside the first one: those with a beauty in both renders that is written.
+    """The views and view layers to fuse beside the first one: those of which the beauty or a pass is written.
 
     Args:
         lr, hr: the pair, mapped for its first view.
@@ -88,10 +88,11 @@ def find_other_views(
         except InputError as error:
             passed_on.append(f"{name_of(label)} is passed on as it is: {error}")
             continue
-        if not dropped.issuperset(view.hr.beauty_channels):
-            # A layer of no view layer may be found for several.
-            sets = [each for each in view.hr.additive_sets if taken.isdisjoint(_channels_of_set(each))]
-            view.hr.additive_sets = sets
+        # A layer of no view layer may be found for several.
+        sets = [each for each in view.hr.additive_sets if taken.isdisjoint(_channels_of_set(each))]
+        view.hr.additive_sets = sets
+        made = view.hr.beauty_channels if write.passes == ("none",) else _channels(view.hr)
+        if not dropped.issuperset(made):
             taken |= _channels(view.hr)
             views.append(view)
     return OtherViews(tuple(views), tuple(passed_on))
@@ -157,8 +158,13 @@ def store_view(view: View, fused: FusedFrame, session: Session) -> FrameReport:
 
 
 def _store(replaced: ReplacedChannels, hr: MappedRender, fused: FusedFrame) -> None:
-    """Keep the beauty and the alpha of a view. What half can't hold is clipped, and a warning says so."""
-    channels = hr.beauty_channels
+    """Keep the beauty and the alpha of a view. What half can't hold is clipped, and a warning says so.
+
+    An alpha in a part with another data window is passed on as it is.
+    """
+    channels = [each for each in hr.beauty_channels if hr.file.parts[each.part].data_window == hr.data_window]
+    if len(channels) < len(hr.beauty_channels):
+        fused.warnings.append("the alpha has another data window than the beauty, so it is passed on as it is")
     height, width = fused.rgb.shape[:2]
     replaced.add(channels, width, height)
     clipped = 0

@@ -41,6 +41,14 @@ def test_some_part_names_name_no_layer(tmp_path, name):
     assert grouped(tmp_path, {name: ["R", "G", "B"]}) == {("", ""): ["B", "G", "R"]}
 
 
+def test_a_short_name_of_a_view_is_no_end_of_a_layers_name(tmp_path):
+    plane = np.zeros((2, 2), np.float32)
+    names = {"rgba": "RGB", "normal": "XYZ", "depth.l": "Z"}
+    parts = [(name, dict.fromkeys(channels, plane), (0, 0), {"view": "l"}) for name, channels in names.items()]
+    file = open_exr(write_exr(tmp_path / "a.exr", parts))
+    assert [(each.view, each.name) for each in layers_of(file)] == [("l", ""), ("l", "normal"), ("l", "depth")]
+
+
 def test_a_layer_may_lie_in_several_parts(tmp_path):
     assert grouped(tmp_path, {"part0": ["R"], "part1": ["G"], "part2": ["B"]}) == {("", ""): ["B", "G", "R"]}
 

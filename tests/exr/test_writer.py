@@ -464,6 +464,16 @@ def test_parts_keep_their_names_and_made_up_names_give_way(tmp_path, layout):
     assert (channels["depth2"], channels["other2"]) == (["Z"], ["matte"])
 
 
+@pytest.mark.parametrize("layout", ["spec", "nuke"])
+def test_layers_keep_their_names_and_made_up_names_give_way(tmp_path, layout):
+    """A plain depth beside a layer of that name."""
+    beauty = rgb(picture(H, W)) | {"Z": plain(0), "depth.Z": plain(1)}
+    _, _, after = written(tmp_path, beauty, WriteOptions(layout))
+    by_name = dict(after)
+    assert same_bits(next(iter(by_name["depth"].values())), plain(1))
+    assert same_bits(by_name["depth2"]["Z"], plain(0))
+
+
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_an_alpha_of_integers_is_passed_on(tmp_path, layout):
     """It is no alpha, so the fused alpha does not take its place."""

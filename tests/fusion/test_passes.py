@@ -676,6 +676,44 @@ def test_a_coarser_layer_whose_pixels_are_no_sum_is_passed_on(tmp_path, bilinear
     assert same_bits(out["diffuse_key.R"], read_bits(pair[1])[0][1]["diffuse_key.R"])
 
 
+def test_a_coarser_layer_with_another_data_window_is_passed_on(tmp_path, bilinear_models):
+    pair = write_levels(tmp_path, {"diffuse_key": {"diffuse", "key"}})
+    channels = read_bits(pair[1])[0][1]
+    cropped = {name: channels.pop(name)[20:] for name in list(channels) if name.startswith("diffuse_key.")}
+    write_exr(pair[1], [("rgba", channels, (0, 0)), ("cropped", cropped, (0, 20))], **{"arnold/AA_samples": "3"})
+    report, out = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]))
+    assert report.passes["finest components"].startswith("fused: ")
+    assert "sums of these" not in report.passes["finest components"]
+    assert all(same_bits(out[name], values) for name, values in cropped.items())
+
+
+def test_a_light_that_takes_light_away_is_passed_on(tmp_path, bilinear_models):
+    """A few negative values, as pixel filters make them, are none."""
+    clean = lights()
+    dimmer = -0.3 * clean["light_spot"].astype(np.float32)
+    pair = write_pair(tmp_path, clean | {"light_dim": dimmer}, noise_free=("light_dim", "light_spot"))
+    report, out = fused(pair, tmp_path / "out.exr", str(bilinear_models[4]))
+    assert report.passes["light groups"] == "passed on: can't be fused: the layer light_dim is negative"
+    assert same_bits(out["light_dim.R"], dimmer[..., 0])
+    clean["light_key"][20:40, 20:40] *= -0.05
+    report, _ = fused(write_pair(tmp_path, clean), tmp_path / "out.exr", str(bilinear_models[4]))
+    assert report.passes["light groups"].startswith("fused: ")
+
+
+def test_broken_values_of_a_layer_are_told(tmp_path, model, monkeypatch):
+    """Whether it is fused in one band or in several."""
+    clean = lights()
+    pair = write_pair(tmp_path, clean)
+    channels = read_bits(pair[1])[0][1]
+    channels["light_key.R"][30:40, 50:60] = np.nan
+    write_exr(pair[1], channels)
+    for rows in (passes.BAND_ROWS, 16):
+        monkeypatch.setattr(passes, "BAND_ROWS", rows)
+        report, out = fused(pair, tmp_path / "out.exr", model)
+        assert "light_key: 100 values of the HRLS are NaN or infinite; they were repaired" in report.warnings
+        assert_sum([layer(out, name) for name in clean], layer(out))
+
+
 def test_light_groups_and_components_may_share_a_layer(tmp_path, model):
     """Each set sums to the beauty; the shared layer has the value that the larger set gives it."""
     emission = lobes_by_light()["emission"]

@@ -179,6 +179,40 @@ def test_a_pattern_may_mean_passes_of_another_view(tmp_path, bilinear_models):
     assert list(report.passes) == ["bg: light groups"]
 
 
+def test_passes_of_all_views_are_fused_without_their_beauties(tmp_path, bilinear_models):
+    pair = write_layers(tmp_path)
+    _, out = fused(pair, tmp_path / "out.exr", bilinear_models, write=WriteOptions(layers=("*_key",)))
+    _, everything = fused(pair, tmp_path / "all.exr", bilinear_models)
+    assert not any(name.startswith("bg.Combined.") for name in out)
+    for name in ("fg.Combined_key.R", "bg.Combined_key.R"):
+        assert same_bits(out[name], everything[name])
+        assert not same_bits(out[name], channels_of(name[:2], 1, 1)[name])
+
+
+def test_the_first_view_needs_a_partner_of_its_own(tmp_path, bilinear_models):
+    """Not the LRHS of another view of the same file."""
+    pair = write_layers(tmp_path, low=("bg",))
+    with pytest.raises(InputError, match=r"lr\.exr: has no view or view layer 'fg'.*--view-layer, such as 'bg'"):
+        fused(pair, tmp_path / "out.exr", bilinear_models)
+    report, _ = fused(pair, tmp_path / "out.exr", bilinear_models, "bg")
+    assert report.lr.view == report.hr.view == "bg"
+
+
+@pytest.mark.parametrize("columns", [slice(None), slice(8, 40)])
+def test_an_alpha_of_another_view_may_have_a_data_window_of_its_own(tmp_path, bilinear_models, columns):
+    pair = []
+    for name, scale, spp in (("lr", 4, 16), ("hr", 1, 1)):
+        light = noisy(downsample(picture(HEIGHT, WIDTH), scale), spp)
+        parts = [(f"rgba.{view}", rgb(light), (0, 0), {"view": view}) for view in ("left", "right")]
+        if name == "hr":
+            alpha = np.full((HEIGHT - 20, WIDTH), 0.5, np.float32)[:, columns]
+            parts.append(("rgba.main.right", {"A": alpha}, (columns.start or 0, 20), {"view": "right"}))
+        pair.append(write_exr(tmp_path / f"{name}.exr", parts))
+    report, _ = fused(pair, tmp_path / "out.exr", bilinear_models)
+    assert any("right: the alpha has another data window" in text for text in report.warnings)
+    assert [planes["A"].shape for name, planes in read_bits(tmp_path / "out.exr") if "A" in planes] == [alpha.shape]
+
+
 def test_a_full_name_in_a_mapping_means_its_own_view(tmp_path):
     pair = write_layers(tmp_path)
     for entry, first in (("fg.Denoising Albedo", "fg"), ("Denoising Albedo", "fg")):
@@ -241,6 +275,7 @@ def test_check_and_inspect_look_at_all_views(tmp_path):
     found = inspect_file(pair[1], InputOptions())
     assert [view.view for view in found.other_views] == ["bg"]
     assert any(fact.startswith("bg: light groups (Combined_fill, Combined_key): sums") for fact in found.facts)
+    assert found.as_dict()["facts"] == found.facts
     assert found.unused == []
     assert inspect_file(pair[1], InputOptions(view="fg")).other_views == []
 

@@ -173,6 +173,8 @@ def inspect_noise(found: Sequence[Inspection]) -> None:
         spread = is_noise_spread(lr, hr, align(lr, hr))
     except InputError:
         return
+    if spread is None:
+        return
     high.noise = "spread" if spread else "independent"
     text = "the pixel filter has spread it over neighbouring pixels" if spread else "independent in each pixel"
     high.facts.append(f"noise, compared with {low.path.name}: {text}")

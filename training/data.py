@@ -512,13 +512,14 @@ def fixed_batches(
     batch: int,
     prepare: Prepare | None = None,
     rng: np.random.Generator | None = None,
+    sampling: Sampling = Sampling(),
 ) -> Iterator[Batch]:
     """Endless batches on the CPU that are the same in every call, for calibration, pruning and the like."""
     rng = rng or np.random.default_rng(0)
     tensors = view_tensors(Folder(views), split, torch.device("cpu"))
     while True:
         with torch.no_grad():
-            pairs = draw(tensors, int(rng.choice(scales)), patch, batch, rng, Sampling(), prepare)
+            pairs = draw(tensors, int(rng.choice(scales)), patch, batch, rng, sampling, prepare)
         yield pairs
 
 

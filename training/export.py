@@ -223,7 +223,7 @@ def main() -> None:
         if len({each.denoiser for each in contracts}) > 1:
             raise SystemExit("--scale: these scales have other denoisers of both renders' mean; export each alone")
         denoiser = denoiser_for(network, contracts[0].denoiser)
-        pairs = joint.calibration_pairs(args.int8, scales, with_denoised_mean(denoiser))
+        pairs = joint.calibration_pairs(args.int8, scales, with_denoised_mean(denoiser), spread=network.spread)
         graphs = joint_to_onnx(network, contracts, pairs)
     else:
         graphs = [to_onnx(network, each, half=args.half) for each in contracts]

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+import io
+import os
 import signal
 import sys
 import traceback
@@ -16,6 +18,7 @@ from oiio_msspl.parallel import end_pools
 def run(app: typer.Typer) -> None:
     """Run a program and exit. Typer itself ends wrong usage with exit code 2. ``--debug`` shows the traceback."""
     _exit_on_signals()
+    _make_streams_usable()
     try:
         app()
     except Exception as error:
@@ -26,6 +29,16 @@ def run(app: typer.Typer) -> None:
         sys.exit(code)
     finally:
         end_pools()
+
+
+def _make_streams_usable() -> None:
+    """A name that a stream's encoding lacks is escaped, and a stream that is closed, as daemons have it, takes all."""
+    for name in ("stdout", "stderr"):
+        stream = getattr(sys, name)
+        if stream is None:
+            setattr(sys, name, open(os.devnull, "w"))  # noqa: SIM115 - it lives as long as the process
+        elif isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _exit_on_signals() -> None:

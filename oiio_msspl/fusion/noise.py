@@ -24,6 +24,8 @@ from oiio_msspl.model.encoding import encode_radiance, find_exposure
 BLOCK, SAMPLE = 8, 32
 #: Samples along each side of the frame.
 SAMPLES = 3
+#: Blocks with noise that a judgement needs.
+FEWEST = 4
 #: Bytes of decoded rows that neighbouring samples share.
 CACHE_BYTES = 256 << 20
 #: Noise is spread if neighbouring pixels of the HRLS, and of the difference between both renders, correlate by more.
@@ -31,8 +33,9 @@ CACHE_BYTES = 256 << 20
 SPREAD_HRLS, SPREAD_DIFFERENCE = 0.15, 0.02
 
 
-def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool:
-    """Whether the noise of neighbouring pixels is alike in both renders.
+def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool | None:
+    """Whether the noise of neighbouring pixels is alike in both renders. None if there is hardly any noise, as in a
+    black frame.
 
     The HRLS alone does not tell: fine texture also makes neighbours alike. Texture is the same in both renders and
     cancels in the difference of the LRHS and the averaged HRLS, noise does not. So both must correlate. Small samples
@@ -51,7 +54,9 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
             )
             found.append((_correlations(high), _correlations(low - mean)))
     hrls, difference = (np.concatenate(parts) for parts in zip(*found, strict=True))
-    return _median(hrls) > SPREAD_HRLS and _median(difference) > SPREAD_DIFFERENCE
+    if min(len(hrls), len(difference)) < FEWEST:
+        return None
+    return bool(np.median(hrls) > SPREAD_HRLS and np.median(difference) > SPREAD_DIFFERENCE)
 
 
 def _samples(grid: Window) -> list[Window]:
@@ -99,8 +104,3 @@ def _neighbours_of_white_noise() -> float:
     across = np.mean([covariance[y, i, y, i + 1] for y in range(BLOCK)])
     down = np.mean([covariance[i, x, i + 1, x] for x in range(BLOCK)])
     return float((across + down) / 2 / np.diag(_without_course()).mean())
-
-
-def _median(values: NDArray[np.float64]) -> float:
-    """Median, or 0 where there is no noise at all."""
-    return float(np.median(values)) if len(values) else 0.0

@@ -7,6 +7,7 @@ complete frame or none.
 
 from __future__ import annotations
 
+import json
 import logging
 import uuid
 from collections import Counter
@@ -54,6 +55,11 @@ def connect(scheduler: str) -> Client:
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'dask[distributed]'") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks repeat our messages
+    if Path(scheduler).is_file():
+        try:
+            json.loads(Path(scheduler).read_text(encoding="utf-8"))["address"]
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            raise InputError(f"--scheduler {scheduler}: is no scheduler file of Dask; it has no address") from error
     try:
         return Client(scheduler_file=scheduler) if Path(scheduler).is_file() else Client(scheduler)
     except (OSError, ValueError) as error:
@@ -81,6 +87,8 @@ def fuse_frames(
     from dask.distributed import CancelledError, KilledWorker, as_completed
     from distributed.comm import CommClosedError
 
+    if not frames:
+        return
     workers = _most_workers_on_a_machine(client)
     if stages.model is not None and Path(stages.model).is_file():
         stages = replace(stages, model=str(Path(stages.model).absolute()))

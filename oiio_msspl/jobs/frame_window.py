@@ -232,8 +232,12 @@ class FrameWindow:
         window = self._motion_frame(start).hr.data_window
         # To decode vectors takes several times their memory.
         if self._temporal.motion.reads_one_frame and window.width * window.height <= LARGEST_READ:
-            return in_parallel(there, back)
-        return there(), back()
+            ways = in_parallel(there, back)
+        else:
+            ways = there(), back()
+        if any(vectors is None and (valid is None or valid.any()) for vectors, valid, *_ in ways):
+            self._temporal.motion.check_zeros(self._motion_frame(start), self._motion_frame(end))
+        return ways
 
     def _read_vectors(self, start: int, end: int) -> Way:
         """Motion from one frame to the next or the previous one."""

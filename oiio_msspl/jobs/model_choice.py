@@ -12,7 +12,14 @@ from oiio_msspl.model.contract import SPREAD
 
 
 def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
-    """The model that is meant: a quality, ``auto`` and None are a family that suits the pair.
+    """The model of :func:`choose_model`."""
+    return choose_model(lr, hr, model)[0]
+
+
+def choose_model(lr: MappedRender, hr: MappedRender, model: str | None) -> tuple[str, bool]:
+    """The model that is meant, and whether the pair has noise that tells it: a black frame has none.
+
+    A quality, ``auto`` and None are a family that suits the pair.
 
     ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
     filter has spread needs the family that was trained for it. Notes of the HRLS tell, also if a model that is named
@@ -25,20 +32,22 @@ def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
     if family is None:
         assert model is not None
         suited = for_spread_noise(model)
-        if suited is not None and is_noise_spread(lr, hr, align(lr, hr)):
+        spread = suited is not None and is_noise_spread(lr, hr, align(lr, hr))
+        if spread:
             hr.notes.append(
                 f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
                 f"--model {suited}"
             )
-        return model
+        return model, spread is not None
     suited = family_for_layers(hr, family)
     if suited != family:
         family = suited
         hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
-    if not is_noise_spread(lr, hr, align(lr, hr)):
-        return family
+    spread = is_noise_spread(lr, hr, align(lr, hr))
+    if not spread:
+        return family, spread is not None
     hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")
-    return family + SPREAD
+    return family + SPREAD, True
 
 
 def family_for_layers(hr: MappedRender, family: str) -> str:

@@ -22,7 +22,7 @@ from oiio_msspl.fusion.render_average import USUAL_CHANNELS
 from oiio_msspl.jobs.frame_checks import require_frame_memory
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import map_pair
-from oiio_msspl.jobs.model_choice import resolve_auto
+from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import AUTO, Temporal, TemporalOptions, shares
@@ -159,9 +159,10 @@ class RenderedShot:
         self._at_work = frame.number
         try:
             with limit_threads(self._stages.threads):
-                if family_of(self._stages.model):  # all frames get the model that suits the first pair
-                    family = resolve_auto(*map_pair(lr, hr, self._stages.inputs), self._stages.model)
-                    self._stages = replace(self._stages, model=family)
+                if family_of(self._stages.model):  # all frames get the model that suits the first pair with noise
+                    family, told = choose_model(*map_pair(lr, hr, self._stages.inputs), self._stages.model)
+                    if told:
+                        self._stages = replace(self._stages, model=family)
                 loaded = self._read(frame)
                 for ready, outcome in self._window.add(frame.number, loaded):
                     self._at_work = ready.number

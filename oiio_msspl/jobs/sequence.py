@@ -17,6 +17,8 @@ from pathlib import Path
 import fileseq
 
 from oiio_msspl.errors import InputError
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.model.contract import SCALES
 
 #: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq understands each of these, but
 #: it splits the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no
@@ -142,11 +144,19 @@ def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | 
     Raises:
         InputError: there are no frames, a pattern can't be read, or several sequences in a folder could be meant.
     """
-    lows, highs = _sequences(Path(lr)), _sequences(Path(hr))
+    lows, highs = (_not_written(_sequences(Path(path)), Path(output)) for path in (lr, hr))
     low, high = _choose(lows, highs, Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
     target = _output_pattern(Path(output), high.pattern)
     return Shot(low, high, target, [Frame(n, low.files.get(n), high.files.get(n), target.path(n)) for n in numbers])
+
+
+def _not_written(sequences: list[Sequence], output: Path) -> list[Sequence]:
+    """Sequences but for the results that a run that resumes finds beside its renders."""
+    if output.is_dir() or not _number_fields(output.name):
+        return sequences
+    written = str(parse_pattern(output))
+    return [each for each in sequences if str(each.pattern) != written] or sequences
 
 
 def format_frames(numbers: Iterable[int]) -> str:
@@ -282,13 +292,34 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         for path, found in ((lr, lows), (hr, highs))
     )
     # Both may be the same folder. A sequence is no partner of itself.
-    every = [(str(low.pattern), str(high.pattern)) for low, high in [*pairs, *itertools.product(lows, highs)]]
-    example = " ".join(next((names for names in every if len(set(names)) > 1), every[0]))
+    pairs = [(low, high) for low, high in pairs if str(low.pattern) != str(high.pattern)]
     why = f"{len(pairs)} sequences go by the same name in both" if pairs else "none has the same name in both"
+    if lr == hr:
+        why = "both are to be in one folder"
     raise InputError(
         f"which sequences belong together? {seen}, and {why}; "
-        f"name the two, the low-resolution one first, such as {example}"
+        f"name the two, the low-resolution one first{_example(pairs or list(itertools.product(lows, highs)))}"
     )
+
+
+def _example(pairs: list[tuple[Sequence, Sequence]]) -> str:
+    """ ", such as LOW HIGH": the first two whose sizes fit, those with short names first, because layers in files of
+    their own have longer names. Empty if none fit."""
+    for low, high in sorted(pairs, key=lambda pair: sum(len(each.pattern.name) for each in pair)):
+        widths = [_width(next(iter(each.files.values()))) for each in (low, high)]
+        if all(widths) and any(abs(widths[1] - scale * widths[0]) < scale for scale in SCALES):
+            return f", such as {low.pattern} {high.pattern}"
+    return ""
+
+
+def _width(path: Path) -> int:
+    """Of a render, in pixels; 0 for a file that can't be read and for a fused one."""
+    try:
+        file = open_exr(path)
+    except InputError:
+        return 0
+    file.close()
+    return 0 if "msspl/version" in file.metadata else file.display_window.width
 
 
 def _output_pattern(output: Path, hr: Pattern) -> Pattern:

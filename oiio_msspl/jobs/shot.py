@@ -24,7 +24,7 @@ from oiio_msspl.jobs.dask_cluster import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.sequence import Frame, find_shot
-from oiio_msspl.jobs.shot_checks import check_first_pair, known_result, model_of_shot, prepare_output
+from oiio_msspl.jobs.shot_checks import check_first_pair, check_output, known_result, make_output, model_of_shot
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import AUTO, TemporalOptions, plan_temporal
@@ -102,11 +102,12 @@ def fuse_shot(
         shot = replace(shot, frames=[replace(each, preview=each.output.with_suffix(".png")) for each in shot.frames])
     if client is None:  # workers of a cluster may have other devices
         require_device(device)
-    prepare_output(shot, inputs, model, [] if report_path is None else [report_path])
+    check_output(shot, inputs, model, [] if report_path is None else [report_path])
     with limit_threads(threads):
         over_time = plan_temporal(shot, inputs, temporal, model, write)
     report = ShotReport(shot, temporal=over_time.text)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
+    make_output(shot)
 
     def finish(result: FrameResult) -> None:
         report.results[result.frame] = result
@@ -154,6 +155,8 @@ def fuse_shot(
             warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
             result = replace(result, **entry | {"warnings": warnings})
         finish(result)
+    if report.first is not None and report.first["frame"] in {frame.number for frame in to_fuse}:
+        report.first = None  # the report of a result that is replaced
     if to_fuse:
         with limit_threads(threads):
             stages = replace(stages, model=model_of_shot(shot, inputs, model))

@@ -15,7 +15,7 @@ from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
 from oiio_msspl.jobs.frame_passes import check_passes
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
-from oiio_msspl.jobs.model_choice import resolve_auto
+from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import Frame, Shot
 from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
@@ -27,8 +27,8 @@ from oiio_msspl.model.catalogue import family_of, for_spread_noise, load_model
 log = logging.getLogger(__name__)
 
 
-def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_targets: Iterable[Path]) -> None:
-    """Create the output folder if only the folder itself is missing.
+def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targets: Iterable[Path]) -> None:
+    """Check that results can be written. The output folder itself may be missing, see :func:`make_output`.
 
     Args:
         shot: the shot.
@@ -36,15 +36,22 @@ def prepare_output(shot: Shot, inputs: InputOptions, model: str | None, more_tar
         more_targets: what is written beside the frames.
 
     Raises:
-        InputError: the folder can't be created or written to, or a result would replace an input.
+        InputError: the folder can't be written to, or a result would replace an input.
     """
     folder = shot.output.folder
     check_no_file(folder)
-    if not folder.exists():
-        check_folder(folder)
-        make_folder(folder)
-    check_folder(shot.output.path(0))
+    check_folder(shot.output.path(0) if folder.exists() else folder)
     check_no_input(shot, inputs, model, more_targets)
+
+
+def make_output(shot: Shot) -> None:
+    """Create the output folder if it is missing.
+
+    Raises:
+        InputError: it can't be created.
+    """
+    make_folder(shot.output.folder)
+    check_folder(shot.output.path(0))
 
 
 def check_no_file(folder: Path) -> None:
@@ -60,7 +67,7 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
 
     All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and
     not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
-    turn comes.
+    turn comes. So is one without noise, such as a black frame.
     """
     family = family_of(model)
     if family is None:
@@ -72,7 +79,9 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
             known = len(hr.notes)
-            suitable = resolve_auto(lr, hr, model)
+            suitable, told = choose_model(lr, hr, model)
+            if not told:
+                continue
             for note in hr.notes[known:]:
                 log.warning("frame %d: %s", number, note)
             return suitable

@@ -90,12 +90,13 @@ class ShotReport:
         entries = [*self.others, *entries]
         count = len(self.shot.frames) + len(self.others)
         counts = Counter(entry.get("status") for entry in entries)
+        finished = len(self.results) == len(self.shot.frames)
         return {
             "lrhs": str(self.shot.lr.pattern),
             "hrls": str(self.shot.hr.pattern),
             "output": os.path.abspath(str(self.shot.output)),  # a run that resumes may have another working directory
-            "finished": len(self.results) == len(self.shot.frames),
-            "exit_code": self.exit_code,
+            "finished": finished,
+            "exit_code": self.exit_code if finished else None,
             "counts": {"all": count, **{status: counts[status] for status in STATUSES}},
             "seconds": {k: round(v, 3) for k, v in {"wall": self.seconds, **self.stage_seconds}.items()},
             "temporal": self.temporal,

@@ -155,8 +155,9 @@ class Temporal:
 
 
 def _is_slow(model: str | None) -> bool:
-    """Whether a name stands for a model of the quality `best`, at any scale."""
-    return (family_of(model) or model or "").startswith(QUALITIES["best"])
+    """Whether a name stands for a model of the quality `best`, at any scale. The path of a file does not."""
+    name = family_of(model) or model or ""
+    return name.startswith(QUALITIES["best"]) and Path(name).suffix != ".onnx"
 
 
 def plan_temporal(

@@ -23,6 +23,27 @@ def test_a_piped_table_is_plain_text(capsys):
     assert lines == [f"  {'name':{width}}  b", f"  {LONG}  warning", f"  {'':{width}}  x"]
 
 
+def test_names_that_a_stream_can_not_encode_are_escaped(tmp_path):
+    """Such a pipe is usual on Windows. The frames go on."""
+    folder = make_shot(tmp_path / "\u65e5", 1)
+    code = "from msspl_cli.app import msspl; msspl()"
+    command = [sys.executable, "-c", code, "inspect", str(folder / "hr/beauty.1001.exr")]
+    done = subprocess.run(command, capture_output=True, env=os.environ | {"PYTHONIOENCODING": "cp1252"})
+    assert (done.returncode, done.stderr) == (0, b"")
+    assert rb"\u65e5" in done.stdout
+
+
+@pytest.mark.parametrize("closed", ["1", "2"])
+def test_a_closed_stream_is_no_fault(tmp_path, bilinear_models, closed):
+    """As a daemon has it."""
+    folder = make_shot(tmp_path, 1)
+    code = "from msspl_cli.app import msspl_fuse; msspl_fuse()"
+    pair = [str(folder / name) for name in ("lr/lr.1001.exr", "hr/beauty.1001.exr")]
+    command = [sys.executable, "-c", code, *pair, "-o", str(folder / "o.exr"), "--model", str(bilinear_models[4])]
+    done = subprocess.run(["sh", "-c", f'exec "$@" {closed}>&-', "sh", *command])
+    assert done.returncode == 0 and (folder / "o.exr").exists()
+
+
 @pytest.mark.parametrize(
     ("row", "text"),
     [

@@ -35,6 +35,13 @@ def test_texture_is_no_noise():
     assert not asked(texture, 4, 1000)
 
 
+@pytest.mark.parametrize("light", [0.0, 0.5])
+def test_black_and_flat_frames_tell_nothing(light):
+    flat = np.full((128, 128, 3), light, np.float32)
+    pair = Render.from_arrays("lr", rgb=flat[::2, ::2]), Render.from_arrays("hr", rgb=flat)
+    assert is_noise_spread(*pair, align(*pair)) is None
+
+
 def test_frames_without_noise_are_not_spread():
     for clean in (picture(300, 200), np.zeros((64, 64, 3), np.float32), np.ones((6, 6, 3), np.float32)):
         pair = Render.from_arrays("lr", rgb=box_downsample(clean, 2)), Render.from_arrays("hr", rgb=clean)

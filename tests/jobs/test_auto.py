@@ -8,9 +8,9 @@ from oiio_msspl.arrays import box_downsample
 from oiio_msspl.fusion.motion import VECTORS, MotionSource
 from oiio_msspl.jobs.openjd import make_job
 from oiio_msspl.jobs.sequence import find_shot
-from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
+from oiio_msspl.jobs.temporal import TemporalOptions, _is_slow, plan_temporal
 from oiio_msspl.model.catalogue import load_model
-from tests.conftest import noisy, picture, rgb, write_exr
+from tests.conftest import noisy, picture, read_bits, rgb, write_exr
 from tests.fusion.test_noise import spread
 
 
@@ -88,6 +88,26 @@ def test_a_model_is_taken_as_it_is_named(tmp_path, caplog):
         assert any(note in each for each in report.as_dict()["notes"]) == told
     assert fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", model="joint-small").exit_code == 0
     assert f"frame 1: the pixel filter has spread the noise over neighbouring pixels, {note}" in caplog.text
+
+
+def test_a_black_frame_does_not_choose_the_model_of_a_shot(tmp_path, monkeypatch):
+    """Shots fade in."""
+    for number in range(1, 4):
+        write_pair(tmp_path, f"a.{number:04}", 0.5)
+    for name in ("lr", "hr"):
+        path = tmp_path / name / "a.0001.exr"
+        write_exr(path, {c: 0 * plane for c, plane in read_bits(path)[0][1].items()})
+    pair = tmp_path / "lr", tmp_path / "hr", tmp_path / "out"
+    assert fuse_shot(*pair, frames=[1, 3]).exit_code == 0
+    assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "joint-spread-x4"
+    action = make_job(*pair).template["steps"][0]["script"]["actions"]["onRun"]
+    assert action["args"][-2:] == ["--model", "joint-spread"]
+
+
+@pytest.mark.parametrize("folder", ["", "ensemble/"])
+def test_the_path_of_a_model_does_not_say_that_it_is_slow(folder):
+    assert _is_slow("best") and _is_slow("ensemble-x4")
+    assert not _is_slow(f"{folder}ensemble-mine.onnx") and not _is_slow(f"/models/{folder}x.onnx")
 
 
 def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path, caplog, monkeypatch):

@@ -16,7 +16,7 @@ from oiio_msspl import InputError, MssplError, fuse_shot
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.jobs import dask_cluster
-from oiio_msspl.jobs.dask_cluster import _sessions, fuse_frames
+from oiio_msspl.jobs.dask_cluster import _sessions, connect, fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import Stages
@@ -202,6 +202,19 @@ def test_an_address_without_a_scheduler_is_a_mistake(tmp_path):
     assert done.returncode == 2
     assert done.stderr.startswith("error: --scheduler nobody: no Dask scheduler answers there")
     assert done.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize("text", ["{}", "[]", "no JSON"])
+def test_a_file_without_a_scheduler_is_a_mistake(tmp_path, text):
+    pytest.importorskip("distributed")
+    (tmp_path / "scheduler.json").write_text(text)
+    with pytest.raises(InputError, match=r"scheduler\.json: is no scheduler file of Dask"):
+        connect(str(tmp_path / "scheduler.json"))
+
+
+def test_a_shot_that_is_done_waits_for_no_worker():
+    pytest.importorskip("distributed")
+    assert list(fuse_frames(None, None, [])) == []
 
 
 #: Frames of the tasks that :func:`fail_once` has got.

@@ -7,6 +7,7 @@ import pytest
 
 from oiio_msspl import InputError
 from oiio_msspl.jobs.sequence import find_shot, format_frames, frame_in_name, is_sequence, parse_frames, parse_pattern
+from tests.conftest import picture, rgb, write_exr
 
 
 def touch(folder, *names):
@@ -99,10 +100,27 @@ def test_folders_that_leave_a_doubt_are_explained(tmp_path, lr, hr, message):
 
 
 def test_a_folder_with_both_sequences_is_explained_by_two_patterns(tmp_path):
-    folder = touch(tmp_path / "both", "beauty.1.exr", "lr.1.exr")
-    example = f"the low-resolution one first, such as {folder}/beauty.#.exr {folder}/lr.#.exr"
-    with pytest.raises(InputError, match=f"{re.escape(example)}$"):
+    """By their sizes, which may be rounded. Files of one layer have longer names, and results are no renders."""
+    folder = touch(tmp_path / "both", "broken.1.exr")
+    for name, size, header in (
+        ("beauty", 31, {}),
+        ("beauty.albedo", 31, {}),
+        ("lr", 16, {}),
+        ("lr.albedo", 16, {}),
+        ("a", 31, {"msspl/version": "1"}),
+    ):
+        write_exr(folder / f"{name}.1.exr", rgb(picture(size, size)), **header)
+    message = f"both are to be in one folder; name the two, the low-resolution one first, such as {folder}/lr.#.exr "
+    with pytest.raises(InputError, match=f"{re.escape(message)}{re.escape(str(folder))}/beauty.#.exr$"):
         find_shot(folder, folder, tmp_path / "out")
+
+
+def test_results_beside_the_renders_are_no_candidates(tmp_path):
+    """So a run can resume."""
+    touch(tmp_path / "lr", "shot.1.exr", "shot.2.exr")
+    touch(tmp_path / "hr", "beauty.1.exr", "beauty.2.exr", "fused.1.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "hr" / "fused.#.exr")
+    assert found.hr.pattern.name == "beauty.#.exr"
 
 
 @pytest.mark.parametrize(

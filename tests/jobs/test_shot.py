@@ -24,7 +24,7 @@ from oiio_msspl.jobs.shot_report import fused_result, read_earlier
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.session import Session
-from tests.conftest import downsample, noisy, picture, rgb, write_exr
+from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
 
 
@@ -294,10 +294,21 @@ def test_a_read_only_folder_is_said_at_once(tmp_path, bilinear_models):
         run(folder, bilinear_models[4])
 
 
-def test_a_wrong_device_leaves_no_folder(tmp_path, bilinear_models):
-    folder = make_shot(tmp_path, 1)
-    with pytest.raises(InputError, match="'abacus': use one of cpu"):
-        run(folder, bilinear_models[4], device="abacus")
+@pytest.mark.parametrize(
+    ("wrong", "message"),
+    [
+        ({"device": "abacus"}, "'abacus': use one of cpu"),
+        ({"temporal": TemporalOptions("auto", "layer=foo")}, "foo"),
+        ({"report_path": "r.json", "skip_existing": True}, "of another shot"),
+    ],
+)
+def test_a_wrong_option_leaves_no_folder(tmp_path, bilinear_models, monkeypatch, wrong, message):
+    folder = make_shot(tmp_path, 2)
+    monkeypatch.chdir(folder)
+    other = make_shot(tmp_path / "other", 1)
+    run(other, bilinear_models[4], report_path=folder / "r.json")
+    with pytest.raises(InputError, match=message):
+        run(folder, bilinear_models[4], **wrong)
     assert not (folder / "out").exists()
 
 
@@ -402,6 +413,23 @@ def test_a_resumed_report_keeps_the_frames_of_other_runs(tmp_path, bilinear_mode
     assert saved["finished"] and saved["exit_code"] == 0
     run(folder, bilinear_models[4], frames="1004", overwrite=True, report_path=report_path)
     assert [entry["frame"] for entry in json.loads(report_path.read_text())["frames"]] == [1004]
+
+
+def test_a_frame_that_is_fused_anew_replaces_the_first_one_of_a_report(tmp_path, bilinear_models):
+    """Others are not compared with a result that is gone."""
+    folder = make_shot(tmp_path, 2)
+    more = {"report_path": folder / "r.json"}
+    run(folder, bilinear_models[4], **more)
+    for number in (1001, 1002):
+        path = folder / f"hr/beauty.{number}.exr"
+        channels = read_bits(path)[0][1]
+        write_exr(path, {name: plane for name, plane in channels.items() if not name.startswith("albedo")})
+        os.utime(path, (2e9, 2e9))
+    report = run(folder, bilinear_models[4], update=True, **more)
+    assert [result.status for result in report.results.values()] == ["fused", "fused"]
+    assert not any("may flicker" in text for result in report.results.values() for text in result.warnings)
+    first = json.loads((folder / "r.json").read_text())["first_fused"]
+    assert {row["feature"]: row["status"] for row in first["aovs"]}["albedo"] != "found"
 
 
 def test_another_model_or_scale_than_that_of_the_first_frame_is_a_warning(tmp_path, bilinear_models):

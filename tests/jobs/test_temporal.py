@@ -183,6 +183,29 @@ def test_a_frame_without_usable_neighbours_is_the_single_frame_bit_for_bit(tmp_p
     assert any(text.startswith("frame 1007 is not averaged: ") for text in report.results[1008].warnings)
 
 
+def test_zeros_in_some_frames_of_a_moving_shot_are_not_believed(tmp_path, bilinear_models):
+    """Cycles writes them if motion blur is on. Of a standing camera they are."""
+    folder = make_moving_shot(tmp_path / "moving", count=6)
+    for number in (1004, 1005, 1006):
+        path = folder / f"hr/hr.{number}.exr"
+        channels = read_bits(path)[0][1]
+        write_exr(path, channels | {c: 0 * channels[c] for c in ("motionFore.X", "motionFore.Y")})
+    run(folder, bilinear_models[4], "alone", "off")
+    report = run(folder, bilinear_models[4], "out")
+    assert "motion vectors" in report.temporal
+    assert contents(folder / "out")["hr.1006.exr"] == contents(folder / "alone")["hr.1006.exr"]
+    assert any("are 0, though the picture moves" in text for text in report.results[1005].warnings)
+    assert contents(folder / "out")["hr.1002.exr"] != contents(folder / "alone")["hr.1002.exr"]
+
+
+def test_zeros_while_the_camera_rests_are_believed(tmp_path, bilinear_models):
+    folder = make_moving_shot(tmp_path, lambda t: truck(min(t, 2)), count=6)
+    run(folder, bilinear_models[4], "alone", "off")
+    report = run(folder, bilinear_models[4], "out")
+    assert not any("is not averaged" in text for each in report.results.values() for text in each.warnings)
+    assert contents(folder / "out")["hr.1005.exr"] != contents(folder / "alone")["hr.1005.exr"]
+
+
 @pytest.mark.parametrize("in_memory", [True, False])
 def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models, monkeypatch, in_memory):
     folder = make_moving_shot(tmp_path, count=4)

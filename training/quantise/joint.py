@@ -15,7 +15,7 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
-from training.data import Prepare, fixed_batches
+from training.data import Prepare, Sampling, fixed_batches
 from training.encoding import log_to_pu
 from training.joint import DECODED, FEATURES, OUTPUTS, JointFusion, blend
 from training.ops import log2_scale, upsample
@@ -84,15 +84,16 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
 
 
 def calibration_pairs(
-    views: Path, scales: Sequence[int], prepare: Prepare, count: int = PAIRS
+    views: Path, scales: Sequence[int], prepare: Prepare, count: int = PAIRS, *, spread: bool = False
 ) -> list[tuple[Tensor, Tensor]]:
     """Inputs of the network, from views as training draws them.
 
     Args:
         scales: of each pair, one of these at random.
         prepare: see :func:`training.mean_denoiser.with_denoised_mean`.
+        spread: of views with single samples, only pixel filters that spread noise; otherwise only others.
     """
-    batches = fixed_batches(views, "train", scales, PATCH, 1, prepare)
+    batches = fixed_batches(views, "train", scales, PATCH, 1, prepare, sampling=Sampling(spread_noise=spread))
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 

@@ -101,7 +101,8 @@ def submit(
         console.say(text, error=True)
     if given["quiet"]:
         return
-    skipped = f"; {job.existing} exist and will be skipped" if job.existing else ""
+    skips = "are skipped unless an input is newer" if given["update"] else "will be skipped"
+    skipped = f"; {job.existing} exist and {skips}" if job.existing else ""
     console.say(f"{len(job.shot.frames)} frames{skipped}. To run the job:")
     values = f"file://{bundle / OPENJD_VALUES}"
     console.say(f"  openjd run {shlex.quote(str(bundle / TEMPLATE))} --job-param {shlex.quote(values)}")

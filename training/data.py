@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
 from datagen.samples import MANTISSA, STEP
-from datagen.views import PASS_FEATURES, REF_CELLS, Array, Folder, SampleView, View
+from datagen.views import NO_REFERENCE, PASS_FEATURES, REF_CELLS, Array, Folder, SampleView, View
 from oiio_msspl.aovs.features import (
     ALBEDO,
     DEFAULTS,
@@ -513,10 +513,18 @@ def fixed_batches(
     prepare: Prepare | None = None,
     rng: np.random.Generator | None = None,
     sampling: Sampling = Sampling(),
+    *,
+    without_reference: bool = False,
 ) -> Iterator[Batch]:
-    """Endless batches on the CPU that are the same in every call, for calibration, pruning and the like."""
-    rng = rng or np.random.default_rng(0)
-    tensors = view_tensors(Folder(views), split, torch.device("cpu"))
+    """Endless batches on the CPU that are the same in every call, for calibration, pruning and the like.
+
+    Args:
+        without_reference: also of views that have none; their targets are not to be read.
+    """
+    rng, folder, device = rng or np.random.default_rng(0), Folder(views), torch.device("cpu")
+    tensors = view_tensors(folder, split, device)
+    if without_reference:
+        tensors += view_tensors(folder, NO_REFERENCE, device)
     while True:
         with torch.no_grad():
             pairs = draw(tensors, int(rng.choice(scales)), patch, batch, rng, sampling, prepare)

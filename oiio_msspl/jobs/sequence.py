@@ -303,7 +303,7 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
 
 
 def _example(pairs: list[tuple[Sequence, Sequence]]) -> str:
-    """ ", such as LOW HIGH": the first two whose sizes fit, those with short names first, because layers in files of
+    """The end of that message: the first two whose sizes fit, those with short names first, because layers in files of
     their own have longer names. Empty if none fit."""
     for low, high in sorted(pairs, key=lambda pair: sum(len(each.pattern.name) for each in pair)):
         widths = [_width(next(iter(each.files.values()))) for each in (low, high)]

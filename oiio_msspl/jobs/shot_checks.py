@@ -75,19 +75,21 @@ def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
         family = model
         if for_spread_noise(model) is None:
             return model  # it suits any noise, or is no model of ours
+    without_noise: str | None = None
     for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
             known = len(hr.notes)
             suitable, told = choose_model(lr, hr, model)
             if not told:
+                without_noise = without_noise or suitable
                 continue
             for note in hr.notes[known:]:
                 log.warning("frame %d: %s", number, note)
             return suitable
         except MssplError as error:
             log.debug("frame %d: %s", number, error)
-    return family
+    return without_noise or family
 
 
 def check_no_input(

@@ -8,6 +8,7 @@ from oiio_msspl.arrays import box_downsample
 from oiio_msspl.fusion.motion import VECTORS, MotionSource
 from oiio_msspl.jobs.openjd import make_job
 from oiio_msspl.jobs.sequence import find_shot
+from oiio_msspl.jobs.shot_checks import model_of_shot
 from oiio_msspl.jobs.temporal import TemporalOptions, _is_slow, plan_temporal
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture, read_bits, rgb, write_exr
@@ -102,6 +103,17 @@ def test_a_black_frame_does_not_choose_the_model_of_a_shot(tmp_path, monkeypatch
     assert open_exr(tmp_path / "out/a.0003.exr").metadata["msspl/model"] == "joint-spread-x4"
     action = make_job(*pair).template["steps"][0]["script"]["actions"]["onRun"]
     assert action["args"][-2:] == ["--model", "joint-spread"]
+
+
+def test_a_black_shot_gets_the_model_for_its_layers(tmp_path):
+    """Without an albedo, `best` gains nothing."""
+    for number in (1, 2):
+        write_pair(tmp_path, f"a.{number:04}", None)
+        for name in ("lr", "hr"):
+            path = tmp_path / name / f"a.{number:04}.exr"
+            write_exr(path, {c: 0 * plane for c, plane in read_bits(path)[0][1].items()})
+    shot = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert model_of_shot(shot, InputOptions(), "best") == "joint"
 
 
 @pytest.mark.parametrize("folder", ["", "ensemble/"])

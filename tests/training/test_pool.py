@@ -18,6 +18,7 @@ from training.data import SampleTensors  # noqa: E402
 from training.encoding import log_encode  # noqa: E402
 from training.joint import JointFusion  # noqa: E402
 from training.pool import Denoisers, PooledBatches, Teacher, draw_pairs  # noqa: E402
+from training.quantise.joint import calibration_pairs  # noqa: E402
 from training.whole_model import CHECKPOINTS  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -102,6 +103,12 @@ def test_a_teacher_averages_radiance(tmp_path: Path, monkeypatch: pytest.MonkeyP
     unread = torch.zeros(1, 9, 4, 4)
     for spread, mean in ((False, 4.0), (True, 3.0)):
         torch.testing.assert_close(teacher.target(unread, unread, unread, spread), grey(mean))
+
+
+def test_calibration_needs_no_reference(tmp_path: Path) -> None:
+    folder = write_wall(tmp_path, split=NO_REFERENCE)
+    ((lrhs, hrls),) = calibration_pairs(folder, [2], None, 1)
+    assert lrhs.shape[2:] == (128, 128) and hrls.shape[2:] == (256, 256)
 
 
 @pytest.mark.parametrize("sizes", [("large",), ("large", "usual")])

@@ -84,7 +84,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
 
 
 def calibration_pairs(
-    views: Path, scales: Sequence[int], prepare: Prepare, count: int = PAIRS, *, spread: bool = False
+    views: Path, scales: Sequence[int], prepare: Prepare | None, count: int = PAIRS, *, spread: bool = False
 ) -> list[tuple[Tensor, Tensor]]:
     """Inputs of the network, from views as training draws them.
 
@@ -93,7 +93,8 @@ def calibration_pairs(
         prepare: see :func:`training.mean_denoiser.with_denoised_mean`.
         spread: of views with single samples, only pixel filters that spread noise; otherwise only others.
     """
-    batches = fixed_batches(views, "train", scales, PATCH, 1, prepare, sampling=Sampling(spread_noise=spread))
+    sampling = Sampling(spread_noise=spread)
+    batches = fixed_batches(views, "train", scales, PATCH, 1, prepare, sampling=sampling, without_reference=True)
     return [(batch["lrhs"].contiguous(), batch["hrls"].contiguous()) for batch in islice(batches, count)]
 
 

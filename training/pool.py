@@ -309,11 +309,13 @@ def joint_networks(paths: Sequence[Path]) -> list[JointFusion]:
     Raises:
         SystemExit: one is no ``joint`` network.
     """
-    networks = [checkpoints.load(path)[0] for path in paths]
-    for path, network in zip(paths, networks, strict=True):
+    networks = []
+    for path in paths:
+        network, _ = checkpoints.load(path)
         if not isinstance(network, JointFusion):
             raise SystemExit(f"{path}: not a joint network")
-    return [network for network in networks if isinstance(network, JointFusion)]
+        networks.append(network)
+    return networks
 
 
 def main() -> None:

@@ -33,7 +33,7 @@ _KEPT_IN_EVERY_PART = (*_SHARED, "view", "name", "oiio:subimagename", "compressi
 LARGEST_MIXED_PART = 256 << 20
 
 
-class NameOrigin(IntEnum):
+class _NameOrigin(IntEnum):
     """Where the name of a part is from. If two parts would get the same, the first of these keeps it."""
 
     PART = 0
@@ -50,7 +50,7 @@ class _Piece:
     channels: tuple[Channel, ...]
     whole: bool
     name: str
-    origin: NameOrigin
+    origin: _NameOrigin
     """Where ``name`` is from."""
     repeats_metadata: bool
     """Whether another part that is written holds the metadata of ``source``."""
@@ -116,7 +116,7 @@ def _pieces(contents: FileContents) -> Iterator[_Piece]:
         if part.deep:
             continue
         if _stays_whole(part, contents):
-            name, origin = part.name or f"part{part.index}", NameOrigin.PART if part.name else NameOrigin.MADE_UP
+            name, origin = part.name or f"part{part.index}", _NameOrigin.PART if part.name else _NameOrigin.MADE_UP
             yield _Piece(part, part.view, part.channels, True, name, origin, repeats_metadata=False)
             continue
         groups: dict[tuple[str, str, str], list[Channel]] = {}
@@ -168,7 +168,7 @@ def _whole_part(part: Part, name: str) -> PassedOnPart:
 
 def _layer_name(
     contents: FileContents, part: Part, view: str, layer: str, channels: Sequence[Channel]
-) -> tuple[str, NameOrigin]:
+) -> tuple[str, _NameOrigin]:
     """The name of the part for the channels of one layer and pixel type."""
     components = _components(channels)
     is_beauty = not layer and view and {"R", "G", "B"} <= {*components}  # of another view
@@ -181,7 +181,7 @@ def _layer_name(
     else:
         name = f"{plain}.{view}" if view and view != contents.view else plain
         is_parts = name == part.name
-    return name, NameOrigin.PART if is_parts else NameOrigin.LAYER if layer else NameOrigin.MADE_UP
+    return name, _NameOrigin.PART if is_parts else _NameOrigin.LAYER if layer else _NameOrigin.MADE_UP
 
 
 def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPart:

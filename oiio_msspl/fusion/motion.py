@@ -106,16 +106,15 @@ class MotionSource:
                 known[:] = False
         return vectors, known
 
-    def check_zeros(self, frame: MotionFrame, neighbour: MotionFrame) -> None:
-        """Raise InputError if the vectors of a frame are 0 everywhere, though the picture moves.
+    def zeros_are_right(self, frame: MotionFrame, neighbour: MotionFrame) -> bool:
+        """Whether vectors that are 0 everywhere can be believed: False if the picture moves.
 
         Cycles writes such vectors if motion blur is on, also if other frames of the shot were rendered without it.
         """
         if self.kind != VECTORS:
-            return
+            return True
         pair = open_pair(frame.hr, neighbour.hr, LOOK)
-        if pair.guides and not _camera_stands(*still_and_moved(pair)):
-            raise InputError(f"motion vectors from {frame.hr.name} or back are 0, though the picture moves")
+        return not pair.guides or _camera_stands(*still_and_moved(pair))
 
     def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
         """Where an object has moved that :meth:`read` does not follow, so that both frames show different surfaces.

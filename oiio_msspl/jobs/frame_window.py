@@ -82,6 +82,8 @@ class FrameWindow:
         self._vectors: dict[tuple[int, int], Way] = {}
         #: Where objects have moved between two frames, where they are the same both ways.
         self._moved_objects: dict[frozenset[int], Mask | None] = {}
+        #: Between two frames with vectors of 0, whether these can be believed.
+        self._zeros_are_right: dict[frozenset[int], bool] = {}
         self._warnings: dict[int, list[str]] = {}
 
     def order(self) -> list[Frame]:
@@ -144,6 +146,7 @@ class FrameWindow:
         known = self._loaded.keys() | self._fused.keys()
         self._vectors = {(a, b): found for (a, b), found in self._vectors.items() if a in known and b in known}
         self._moved_objects = {pair: found for pair, found in self._moved_objects.items() if pair <= known}
+        self._zeros_are_right = {pair: found for pair, found in self._zeros_are_right.items() if pair <= known}
 
     def _release_renders(self) -> None:
         """Forget the renders that no frame needs that is still to be fused."""
@@ -236,8 +239,18 @@ class FrameWindow:
         else:
             ways = there(), back()
         if any(vectors is None and (valid is None or valid.any()) for vectors, valid, *_ in ways):
-            self._temporal.motion.check_zeros(self._motion_frame(start), self._motion_frame(end))
+            self._check_zeros(*sorted((start, end)))
         return ways
+
+    def _check_zeros(self, first: int, second: int) -> None:
+        """Raise InputError if the vectors between two frames are 0 everywhere, though the picture moves."""
+        assert self._temporal.motion is not None
+        pair = frozenset((first, second))
+        if pair not in self._zeros_are_right:
+            frames = self._motion_frame(first), self._motion_frame(second)
+            self._zeros_are_right[pair] = self._temporal.motion.zeros_are_right(*frames)
+        if not self._zeros_are_right[pair]:
+            raise InputError(f"motion vectors between frames {first} and {second} are 0, though the picture moves")
 
     def _read_vectors(self, start: int, end: int) -> Way:
         """Motion from one frame to the next or the previous one."""

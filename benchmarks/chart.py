@@ -20,6 +20,7 @@ from benchmarks import quality, results
 from benchmarks.results import MEAN
 from benchmarks.runtime import SAME_WORK
 from benchmarks.scenes import NOISY_REFERENCE
+from oiio_msspl.model.contract import SPREAD
 
 TEMPLATE = Path(__file__).parent / "chart_template.html"
 MEASURES = ("psnr", "relmse", "flip")
@@ -45,8 +46,8 @@ def data() -> dict[str, Any]:
     """
     rows = results.read("quality")
     found = results.index(rows, *quality.KEYS)
-    times = results.index(results.read("runtime"), "method")
-    cost = {row["scene"]: row["hrls_s"] for row in results.read("render_time")}
+    times = results.index(results.read("runtime_vnni"), "method")
+    cost = {row["scene"]: row["hrls_s"] for row in results.read("render_time_vnni")}
     cost[MEAN] = round(statistics.fmean(value for name, value in cost.items() if name not in NOISY_REFERENCE), 4)
     names = [MEAN, *(name for name in dict.fromkeys(row["scene"] for row in rows) if name in cost and name != MEAN)]
 
@@ -57,7 +58,7 @@ def data() -> dict[str, Any]:
 
     families: dict[str, list[str]] = {}
     for name in times:
-        if "-x" in str(name):
+        if "-x" in str(name) and SPREAD not in str(name):
             families.setdefault(str(name).rpartition("-x")[0], []).append(str(name))
     series = []
     for family, members in families.items():

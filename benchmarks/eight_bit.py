@@ -32,7 +32,6 @@ from oiio_msspl.metrics import psnr
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.devices import gpu_file
 from oiio_msspl.model.render_mean import Images, Shares
-from training import ensemble
 from training.checkpoints import load as load_checkpoint
 from training.export import denoiser_for
 from training.joint import JointFusion
@@ -47,7 +46,7 @@ _FOLDER = Path(__file__).parents[1] / "training/checkpoints"
 CHECKPOINTS = {
     "joint": _FOLDER / "joint.pt",
     "joint-small": _FOLDER / "joint_small.pt",
-    "ensemble": _FOLDER / "ensemble.pt",
+    "joint-large": _FOLDER / "joint_large.pt",
 }
 
 
@@ -78,12 +77,9 @@ class InPyTorch(Session):
 
     def __init__(self, path: Path, family: str) -> None:
         super().__init__(path)
-        network, _ = load_checkpoint(CHECKPOINTS[family.replace("ensemble", "joint")])
+        network, _ = load_checkpoint(CHECKPOINTS[family])
         assert isinstance(network, JointFusion)
-        fuse: Callable[..., Sequence[torch.Tensor]] = network.fuse
-        if family == "ensemble":
-            fuse, _ = ensemble.load(CHECKPOINTS[family], network)
-        self._model = InTorch(self.contract, fuse, denoiser_for(network, self.contract.denoiser))
+        self._model = InTorch(self.contract, network.fuse, denoiser_for(network, self.contract.denoiser))
 
     @torch.inference_mode()
     def run(self, lrhs: Images, hrls: Images, exposure: float, shares: Shares, **_: object) -> Images:

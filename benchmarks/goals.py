@@ -11,7 +11,7 @@ from benchmarks.quality import AVERAGES
 from benchmarks.results import Row
 from benchmarks.runtime import OIDN, OIDN_BASE_GUIDES, OIDN_PREFILTERED
 
-FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "ensemble-x2"
+FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "joint-large-x2"
 ON_HRLS, SAME_SAMPLES = "OIDN prefiltered on the HRLS", "OIDN prefiltered, same samples"
 
 

@@ -23,7 +23,7 @@ import numpy as np
 
 #: Height and width of the frames. The second is 1080p, padded to what the models take.
 SIZES = ((1024, 1024), (1088, 1920))
-MODELS = ("joint-small-x2", "joint-x2", "ensemble-x2", "joint-small-x4", "joint-x4", "ensemble-x4")
+MODELS = ("joint-small-x2", "joint-x2", "joint-large-x2", "joint-small-x4", "joint-x4", "joint-large-x4")
 OIDN = {"OIDN fast": "fast", "OIDN": "high", "OIDN prefiltered": "high"}
 REPEATS = 20
 

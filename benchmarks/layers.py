@@ -28,7 +28,7 @@ from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.fusion.render_average import feature_names
 from oiio_msspl.model.catalogue import load_model
 
-MODELS = ("joint-small-x2", "joint-x2", "ensemble-x2", "joint-x4", "ensemble-x4", "paper-x4")
+MODELS = ("joint-small-x2", "joint-x2", "joint-large-x2", "joint-x4", "joint-large-x4", "paper-x4")
 #: Average spp.
 AVERAGES = (2, 4)
 #: What is left out -> of the HRLS, and of the LRHS.

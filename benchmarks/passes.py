@@ -79,7 +79,7 @@ ALL = "all"
 #: Share of the beauty's light that a scored layer has at least.
 FAINT = 0.01
 #: The model of each quality that is measured.
-BALANCED, BEST = "joint", "ensemble"
+BALANCED, BEST = "joint", "joint-large"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
 #: The same for noise that a pixel filter has spread.

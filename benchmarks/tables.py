@@ -44,7 +44,7 @@ from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SCALES, SPREAD
 
 ROOT = Path(__file__).parents[1]
-FAMILIES = ("paper", "joint-small", "joint", "ensemble")
+FAMILIES = ("paper", "joint-small", "joint", "joint-large")
 #: OIDN on both renders at its best: see :func:`benchmarks.peers.match_local_means`.
 JOINED = "OIDN prefiltered on both x2, together"
 #: Methods of :mod:`benchmarks.quality` that most tables compare the models with.
@@ -58,12 +58,12 @@ PEERS = (
 )
 DEFAULT = "joint-x2"
 #: Models of the qualities "balanced" and "best", and the latter with most samples in the HRLS.
-BETTER = (DEFAULT, "ensemble-x2", "ensemble-x2, 7:1")
+BETTER = (DEFAULT, "joint-large-x2", "joint-large-x2, 7:1")
 #: A method of README's table -> its title, and what it needs.
 WHEN_IT_PAYS = {
     "joint-small-x2": ("`--quality fast` (`joint-small-x2`)", "LRHS and HRLS"),
     "joint-x2": ("`--quality balanced` (`joint-x2`)", "LRHS and HRLS"),
-    "ensemble-x2": ("`--quality best` (`ensemble-x2`)", "LRHS and HRLS"),
+    "joint-large-x2": ("`--quality best` (`joint-large-x2`)", "LRHS and HRLS"),
     "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
     "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
     "OIDN prefiltered with base guides on the HRLS": ("the same with base networks for albedo and normal", "HRLS"),
@@ -102,7 +102,6 @@ MACHINES = {
 SAME_VIEWS = (
     "joint-small-x2",
     "joint-x2",
-    "ensemble-x2",
     "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS",
     "OIDN, same samples",
@@ -116,7 +115,7 @@ SPREAD_NOISE = {
     "joint-x2": "`joint-x2`",
     "joint-small-spread-x2": "`--quality fast` (`joint-small-spread-x2`)",
     "joint-spread-x2": "`--quality balanced` (`joint-spread-x2`)",
-    "ensemble-spread-x2": "`--quality best` (`ensemble-spread-x2`)",
+    "joint-large-spread-x2": "`--quality best` (`joint-large-spread-x2`)",
     "paper-x2": "`paper-x2`",
     "OIDN on the HRLS": "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS": "OIDN on the HRLS, prefiltered",
@@ -185,7 +184,10 @@ def against_oidn() -> str:
     """Models against OIDN at its best, with intervals, on all renders on which both were measured."""
     tables = {name: results.read(table) for name, table in SETS.items()}
     text = versus.table(
-        tables, ("ensemble-x2", "ensemble-x4", "joint-x2", "joint-x4", "joint-small-x4"), AT_ITS_BEST, quality.AVERAGES
+        tables,
+        ("joint-large-x2", "joint-large-x4", "joint-x2", "joint-x4", "joint-small-x4"),
+        AT_ITS_BEST,
+        quality.AVERAGES,
     )
     missing = [name for name, rows in tables.items() if not versus.compare(rows, DEFAULT, next(iter(AT_ITS_BEST)), 2)]
     return text + f"\nPrefiltered OIDN was not measured on these renders: {', '.join(missing)}.\n" * bool(missing)
@@ -199,18 +201,6 @@ def goals_of_accuracy() -> str:
 def goals_of_time() -> str:
     """The same for time."""
     return goals.time({title: results.read(table) for title, (table, _) in MACHINES.items()})
-
-
-def size_large() -> str:
-    """The size ``large`` of ``joint``, which does not ship yet, beside the models that do, at x2."""
-    sets = {name: (table, table.replace("quality", "quality_large"), "") for name, table in SETS.items()}
-    body = []
-    for name, (shipped, new, noise) in (sets | {"Gaussian": ("quality_gauss", "quality_large_gauss", SPREAD)}).items():
-        means = {**means_of(results.read(shipped)), **means_of(results.read(new))}
-        for spp in quality.AVERAGES:
-            names = (f"{family}{noise}-x2" for family in ("joint", "ensemble", "joint-large"))
-            body.append([name, str(spp), *(quality.cell(means.get((spp, each)), "psnr", "relmse") for each in names)])
-    return results.markdown(["PSNR / RelMSE: renders", "spp", "`joint`", "`ensemble`", "`joint-large`"], body)
 
 
 def spread_noise() -> str:
@@ -298,7 +288,7 @@ def filters() -> str:
     tables = {"box": results.read("quality_box"), "Blackman-Harris": results.read("quality_blackman_harris")}
     means = {name: means_of(rows) for name, rows in tables.items()}
     names = [*PEERS, *models(SCALES[:2], FAMILIES[1:])]
-    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("joint", "ensemble")) for a, b in quality.UNEVEN]
+    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("joint", "joint-large")) for a, b in quality.UNEVEN]
     head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in tables for spp in quality.AVERAGES)]
     cases = [(name, spp) for name in tables for spp in quality.AVERAGES]
     body = _measured(
@@ -325,7 +315,7 @@ def cycles() -> str:
     """Views by Cycles."""
     rows = results.read("quality_cycles")
     means = means_of(rows)
-    names = [*PEERS, *models(), *(f"ensemble-x2, {a}:{b}" for a, b in quality.UNEVEN)]
+    names = [*PEERS, *models(), *(f"joint-large-x2, {a}:{b}" for a, b in quality.UNEVEN)]
     body = _measured(
         [title(name), *(quality.cell(means.get((spp, name)), "psnr", "relmse", "flip") for spp in quality.AVERAGES)]
         for name in names
@@ -365,7 +355,7 @@ def division() -> str:
     body = _measured(
         [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
         for name in (
-            "ensemble-x2",
+            "joint-large-x2",
             "joint-x2",
             "joint-x4",
             "joint-small-x4",
@@ -420,7 +410,7 @@ def _total(rows: Sequence[Row], runtime: Sequence[Row], render_time: Sequence[Ro
         return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
 
     for model, call, spp in itertools.product(
-        ("joint-x2", "joint-x4", "ensemble-x2", "ensemble-x4"), peers, quality.AVERAGES
+        ("joint-x2", "joint-x4", "joint-large-x2", "joint-large-x4"), peers, quality.AVERAGES
     ):
         if model not in times:
             continue
@@ -583,7 +573,6 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
     ROOT / "docs/design/results.md": (
         goals_of_accuracy,
         goals_of_time,
-        size_large,
         against_oidn,
         scenes,
         runtime,

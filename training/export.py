@@ -4,7 +4,7 @@
     python -m training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
     python -m training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
     python -m training.export JOINT.pt --scale 2 --name joint-x2 -o joint-x2.onnx --int8 VIEWS --overlap 48
-    python -m training.export LARGE.pt --scale 2 4 8 --name joint-large -o joint-large --int8 VIEWS --overlap 48
+    python -m training.export LARGE.pt --scale 2 4 8 --name joint-large -o joint-large --int8 VIEWS --overlap 48 32 16
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
 computation. ``--int8`` computes convolutions in 8 bits (:mod:`training.quantise`). Files of several scales share their
@@ -44,7 +44,7 @@ from training.whole_model import CHECKPOINTS, quantised_denoiser, save, whole_mo
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
-MEMORY = {"paper": 1000, "joint-small": 700, "joint": 800, "ensemble": 1160, "joint-large": 1160}
+MEMORY = {"paper": 1000, "joint-small": 700, "joint": 800, "joint-large": 1160}
 
 #: Smaller tensors, such as biases, stay float32.
 HALF_ELEMENTS = 256
@@ -196,7 +196,7 @@ def main() -> None:
         "--int8", type=Path, metavar="VIEWS", help="compute convolutions in 8 bits, calibrated on these views"
     )
     parser.add_argument(
-        "--overlap", type=int, default=24, help="LRHS pixels that tiles share on each side (%(default)s)"
+        "--overlap", type=int, nargs="+", default=[24], help="LRHS pixels that tiles share on each side, for each scale"
     )
     parser.add_argument(
         "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on these views"
@@ -214,7 +214,13 @@ def main() -> None:
     if not args.output:
         return
     names = {scale: f"-x{scale}" if len(scales) > 1 else "" for scale in scales}
-    contracts = [contract_of(network, each, args.name + end, args.overlap, state) for each, end in names.items()]
+    if len(args.overlap) not in (1, len(scales)):
+        raise SystemExit("--overlap: give one number, or one for each scale")
+    overlaps = args.overlap * (len(scales) // len(args.overlap))
+    contracts = [
+        contract_of(network, each, args.name + end, overlap, state)
+        for (each, end), overlap in zip(names.items(), overlaps, strict=True)
+    ]
     files = [args.output.with_name(f"{args.output.name}{end}.onnx") if end else args.output for end in names.values()]
     denoiser: MeanDenoiser | None = None
     if isinstance(network, JointFusion):

@@ -1,14 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export the `joint` or the `ensemble` models for GPUs: convolutions in half floats, the rest in float32.
+"""Export a joint network for GPUs: convolutions in half floats, the rest in float32.
 
     python -m training.gpu training/checkpoints/joint.pt oiio_msspl/model/weights/joint-x*.onnx
     python -m training.gpu training/checkpoints/joint_small.pt oiio_msspl/model/weights/joint-small-x*.onnx
-    python -m training.gpu training/checkpoints/joint.pt oiio_msspl/model/weights/ensemble-x*.onnx \\
-        --ensemble training/checkpoints/ensemble.pt
 
-The arguments are a checkpoint of `joint` and the files for CPUs that were exported from it. Each file for GPUs lies in
-the folder `gpu` beside the one for CPUs and has the same contract, so every device cuts a frame into the same tiles.
-The denoiser of both renders' mean is in it, too.
+The arguments are a checkpoint and the files for CPUs that were exported from it. Each file for GPUs lies in the folder
+`gpu` beside the one for CPUs and has the same contract, so every device cuts a frame into the same tiles. The denoiser
+of both renders' mean is in it, too.
 
 The log curve stays in float32, because half floats overflow in it. Weights are stored as 8-bit codes with a scale for
 each 3 x 3 kernel, and become half floats when the file is loaded. The networks of all scales have the same weights,
@@ -31,12 +29,9 @@ from torch import Tensor, nn
 
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import GPU_FOLDER
-from training import ensemble
 from training.checkpoints import load
-from training.ensemble import EnsembleFusion
 from training.export import denoiser_for, network_example
 from training.joint import JointFusion
-from training.layer_denoisers import LayerDenoisers
 from training.mean_denoiser import ALIGNMENT, MeanDenoiser
 from training.oidn import FineTunedUNet
 from training.tracing import traced
@@ -76,33 +71,17 @@ def joint_in_half_floats(network: JointFusion) -> JointFusion:
     network.heads.half()
     network.error.half()
     if network.layers is not None:
-        network.layers = layers_in_half_floats(network.layers)
+        network.layers.albedo = in_half_floats(network.layers.albedo)
+        network.layers.normal = in_half_floats(network.layers.normal)
     return network
 
 
-def layers_in_half_floats(layers: LayerDenoisers) -> LayerDenoisers:
-    """A copy of the denoisers of albedo and normal."""
-    layers = copy.deepcopy(layers)
-    layers.albedo, layers.normal = in_half_floats(layers.albedo), in_half_floats(layers.normal)
-    return layers
-
-
-def ensemble_in_half_floats(ensemble: EnsembleFusion) -> EnsembleFusion:
-    """A copy of an ensemble whose convolutions compute in half floats."""
-    weights = copy.deepcopy(ensemble.weights).half()
-    result = EnsembleFusion(joint_in_half_floats(ensemble.joint), in_half_floats(ensemble.large), weights)
-    result.layers = layers_in_half_floats(ensemble.layers)
-    return result.eval()
-
-
 @torch.inference_mode()
-def to_onnx(network: JointFusion | EnsembleFusion, contract: Contract, denoiser: MeanDenoiser) -> onnx.ModelProto:
+def to_onnx(network: JointFusion, contract: Contract, denoiser: MeanDenoiser) -> onnx.ModelProto:
     """The whole model of a network in half floats, with a denoiser in half floats."""
-    joint, module = (network, Fuse(network)) if isinstance(network, JointFusion) else (network.joint, network)
-    inputs = network_example(joint, contract.scale, contract.alignment)
-    denoises_layers = isinstance(network, EnsembleFusion) or network.layers is not None
-    outputs = ["fused", "log_error", *(["albedo", "normal"] if denoises_layers else [])]
-    graph = traced(module, inputs, ["lrhs", "hrls"], outputs, contract.alignment)
+    inputs = network_example(network, contract.scale, contract.alignment)
+    outputs = ["fused", "log_error", *(["albedo", "normal"] if network.layers is not None else [])]
+    graph = traced(Fuse(network), inputs, ["lrhs", "hrls"], outputs, contract.alignment)
     _store_kernels_in_8_bits(graph.graph)
     contract = replace(contract, provenance=contract.provenance | PRECISION)
     model = whole_model(graph, contract, _denoiser_graph(denoiser))
@@ -146,18 +125,13 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("models", type=Path, nargs="+", help="the network's files for CPUs, one for each scale")
-    parser.add_argument("--ensemble", type=Path, metavar="CHECKPOINT", help="checkpoint of the ensemble models")
     args = parser.parse_args()
-    joint, _ = load(args.checkpoint)
-    if not isinstance(joint, JointFusion):
+    network, _ = load(args.checkpoint)
+    if not isinstance(network, JointFusion):
         raise SystemExit(f"{args.checkpoint}: not a joint network")
     modes = {Contract.of_file(path).denoiser for path in args.models}
-    denoisers = {mode: in_half_floats(denoiser_for(joint, mode)) for mode in modes}
-    network: JointFusion | EnsembleFusion
-    if args.ensemble:
-        network = ensemble_in_half_floats(ensemble.load(args.ensemble, joint)[0])
-    else:
-        network = joint_in_half_floats(joint)
+    denoisers = {mode: in_half_floats(denoiser_for(network, mode)) for mode in modes}
+    network = joint_in_half_floats(network)
     folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
     folder.mkdir(exist_ok=True)
     contracts = {folder / path.name: Contract.of_file(path) for path in args.models}

@@ -5,7 +5,7 @@ A network reads and returns encoded images. Its model computes what comes before
 it, and nothing waits for NumPy:
 
 1. expose, log-encode and stack the features of both renders,
-2. for `joint` and `ensemble`: average both renders, and denoise their mean,
+2. for `joint`: average both renders, and denoise their mean,
 3. run the network,
 4. decode the fused image, and divide it by the exposure.
 
@@ -14,7 +14,6 @@ Inputs and outputs are those of :class:`oiio_msspl.model.contract.Contract`.
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
@@ -202,27 +201,6 @@ def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.Mod
             (:mod:`training.quantise.codes`), or images, with the output ``denoised``.
     """
     return _Whole(network, contract, denoiser).model()
-
-
-def network_of(model: onnx.ModelProto) -> onnx.ModelProto:
-    """The network in the graph of a model: the reverse of :func:`whole_model`."""
-    names = {"encoded.both": "lrhs", "encoded.lrhs": "lrhs", "encoded.hrls": "hrls", "encoded.fused": "fused"}
-    results = {"encoded.fused", *(value.name for value in model.graph.output)} - {"fused"}
-    nodes = [
-        copy.deepcopy(node)
-        for node in model.graph.node
-        if all(name.startswith(NETWORK) or name in results for name in node.output)
-    ]
-    for node in nodes:
-        for tensors in (node.input, node.output):
-            tensors[:] = [names.get(name, name) for name in tensors]
-    read, written = ({name for node in nodes for name in getattr(node, kind)} for kind in ("input", "output"))
-    tensors = [tensor for tensor in model.graph.initializer if tensor.name in read]
-    kind = TensorProto.FLOAT
-    inputs = [helper.make_tensor_value_info(name, kind, [1, None, None, None]) for name in ("lrhs", "hrls")]
-    outputs = [value for value in model.graph.output if value.name in written]
-    graph = helper.make_graph(nodes, "network", inputs, outputs, tensors)
-    return helper.make_model(graph, opset_imports=model.opset_import, ir_version=model.ir_version)
 
 
 def denoiser_file(mode: str) -> str:

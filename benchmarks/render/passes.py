@@ -7,7 +7,8 @@
 Of every ``NAME/scene.xml`` the crop of `benchmarks.render.pairs` is rendered with Mitsuba 3, once for each group of
 lamps with the same random numbers: a lamp's share of each path, as renderers write light groups. So the file has two
 additive sets: ``light_1`` to ``light_n``, and ``diffuse``, ``specular`` and ``other`` (seen directly, or through
-glass). There are HRLS of 1, 2 and 4 spp, LRHS with as many samples a HRLS pixel, and a reference. Files that exist are
+glass). There are HRLS of 1, 2 and 4 spp, LRHS with as many samples a HRLS pixel, and a reference. Mitsuba orders the
+lamps of a scene anew when it loads it, so all files of a scene come from one run: a scene whose files all exist is
 kept. With ``--spread``, each sample counts in the pixels around it, too, as with Mitsuba's default filter.
 """
 
@@ -49,7 +50,7 @@ class Lamps:
 
 
 def render(file: Path, folder: Path, reference: int, *, spread: bool) -> None:
-    """Render the files of one scene that do not exist yet. ``reference`` is in spp."""
+    """Render the files of one scene, unless all of them exist. ``reference`` is in spp."""
     import mitsuba as mi
 
     from datagen.mitsuba.trace import box
@@ -58,10 +59,12 @@ def render(file: Path, folder: Path, reference: int, *, spread: bool) -> None:
     camera, lamps = SensorCamera(mi, scene.sensors()[0]), Lamps(mi, scene)
     jobs = [(f"hr_{spp}spp", 1, spp) for spp in SPP]
     jobs += [(f"lr_x{scale}_{scale**2 * spp}spp", scale, scale**2 * spp) for scale in SCALES[:2] for spp in SPP]
-    for name, scale, spp in [*jobs, ("ref", 1, reference)]:
-        path = folder / f"{name}.exr"
-        if path.exists():
-            continue
+    jobs.append(("ref", 1, reference))
+    paths = {name: folder / f"{name}.exr" for name, _, _ in jobs}
+    if all(path.exists() for path in paths.values()):
+        return
+    for name, scale, spp in jobs:
+        path = paths[name]
         size, images = camera.at(scale), []
         for group in range(len(lamps.groups)):
             lamps.switch_on(group)

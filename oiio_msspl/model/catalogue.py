@@ -15,7 +15,7 @@ WEIGHTS = Path(__file__).parent / "weights"
 #: Table of :func:`measured`.
 MEASURED = WEIGHTS / "measured.csv"
 #: The family of models of each quality. From the first to the last, pictures get better and take more time.
-QUALITIES = {"fast": "joint-small", "balanced": "joint", "best": "ensemble"}
+QUALITIES = {"fast": "joint-small", "balanced": "joint", "best": "joint-large"}
 #: The name that stands for the default quality.
 AUTO, DEFAULT_QUALITY = "auto", "balanced"
 

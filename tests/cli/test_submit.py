@@ -65,7 +65,7 @@ def test_what_no_task_could_do_is_said_at_submission(tmp_path, monkeypatch, argu
     [
         ([], "joint"),
         (["--model", "auto"], "joint"),
-        (["--quality", "best"], "ensemble"),
+        (["--quality", "best"], "joint-large"),
         (["--model", "paper-x4"], "paper-x4"),
     ],
 )

@@ -75,7 +75,7 @@ def tiles_of(monkeypatch, session, pixels):
     monkeypatch.setattr(tiling, "TILE_MEMORY", pixels * session.contract.bytes_per_pixel)
 
 
-@pytest.mark.parametrize("family", ["ensemble", "joint", "joint-small", "paper"])
+@pytest.mark.parametrize("family", ["joint-large", "joint", "joint-small", "paper"])
 def test_the_result_depends_neither_on_memory_nor_on_threads(scale, family, monkeypatch, tmp_path):
     """In a frame of two tiles: bit for bit whether decoded rows are kept or decoded again, and to float32's rounding
     whatever the threads, because ONNX Runtime cuts its work by them."""
@@ -167,7 +167,7 @@ def test_a_frame_of_nan_is_refused_however_many_tiles_it_has(session, scale, mon
         fuse(low, high, session)
 
 
-@pytest.mark.parametrize("family", ["ensemble", "ensemble-spread"])
+@pytest.mark.parametrize("family", ["joint-large", "joint-large-spread"])
 def test_albedo_and_normal_without_noise(monkeypatch, family):
     """They are cleaner, tiles or not, and the beauty is the same bit for bit."""
     session = Session(find_model(2, family))
@@ -194,13 +194,13 @@ def test_an_albedo_above_1_stays_as_it_is(has_noise):
     if not has_noise:
         for render in (low, high):
             render.layers["rgb"] = np.full_like(render.layers["rgb"], 0.25)
-    found = fuse(low, high, Session(find_model(2, "ensemble")), clean_aovs=True).clean_aovs["albedo"]
+    found = fuse(low, high, Session(find_model(2, "joint-large")), clean_aovs=True).clean_aovs["albedo"]
     np.testing.assert_array_equal(found[20:30, 40:60], np.float16([[(870, 0.5, 65504)]]) + np.zeros((10, 20, 1)))
 
 
 def test_albedo_and_normal_without_noise_show_what_the_hrls_has():
     """A frame that is black, or free of noise, keeps its own layers. A layer that is absent stays absent."""
-    session = Session(find_model(2, "ensemble"))
+    session = Session(find_model(2, "joint-large"))
     albedo = picture(64, 96).clip(0, 1)
     for light in (np.zeros((64, 96, 3), np.float32), np.full((64, 96, 3), 0.25, np.float32)):
         low, high = (

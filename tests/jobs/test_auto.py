@@ -28,7 +28,7 @@ def write_pair(folder, name, sigma, extra=None):
 
 @pytest.mark.parametrize(("sigma", "ending"), [(None, ""), (0.5, "-spread")])
 @pytest.mark.parametrize(
-    ("quality", "model"), [(None, "joint-x4"), ("fast", "joint-small-x4"), ("best", "ensemble-x4")]
+    ("quality", "model"), [(None, "joint-x4"), ("fast", "joint-small-x4"), ("best", "joint-large-x4")]
 )
 def test_a_frame_gets_the_model_for_its_noise(tmp_path, sigma, ending, quality, model):
     write_pair(tmp_path, "a", sigma, "albedo")
@@ -44,14 +44,14 @@ def test_the_best_quality_needs_an_albedo_or_a_normal(tmp_path, caplog):
     pair = tmp_path / "lr/a.0001.exr", tmp_path / "hr/a.0001.exr"
     report = fuse_files(*pair, tmp_path / "out.exr", model="best")
     assert (report.model, note in report.as_dict()["notes"]) == ("joint-x4", True)
-    assert fuse_files(*pair, tmp_path / "named.exr", model="ensemble").model == "ensemble-x4"
+    assert fuse_files(*pair, tmp_path / "named.exr", model="joint-large").model == "joint-large-x4"
     assert fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "shot", model="best").exit_code == 0
     assert note in caplog.text
     with pytest.raises(InputError, match=r"hr/a\.0001\.exr has neither an albedo nor a normal; name them with --map"):
         fuse_files(*pair, tmp_path / "more.exr", model="best", write=WriteOptions(data_passes=True))
     write_pair(tmp_path, "normal", None, "N")
     report = fuse_files(tmp_path / "lr/normal.exr", tmp_path / "hr/normal.exr", tmp_path / "out2.exr", model="best")
-    assert report.model == "ensemble-x4"
+    assert report.model == "joint-large-x4"
 
 
 def test_a_job_s_model_has_as_many_neighbours_as_one_run(tmp_path, monkeypatch):
@@ -64,13 +64,13 @@ def test_a_job_s_model_has_as_many_neighbours_as_one_run(tmp_path, monkeypatch):
     assert job[-2:] == ["--model", "joint"]
     found = MotionSource(VECTORS, "as vectors say")
     monkeypatch.setattr("oiio_msspl.jobs.temporal.find_motion", lambda *arguments, **more: found)
-    plans = [plan_temporal(shot, InputOptions(), options, model) for model in ("best", "joint", "ensemble")]
+    plans = [plan_temporal(shot, InputOptions(), options, model) for model in ("best", "joint", "joint-large")]
     assert [plan.count for plan in plans] == [4, 4, 6]
 
 
 @pytest.mark.parametrize(
     ("name", "layers"),
-    [("best", "joint-small-x4"), ("ensemble-spread", "joint-small-spread-x4"), ("balanced", None)],
+    [("best", "joint-small-x4"), ("joint-large-spread", "joint-small-spread-x4"), ("balanced", None)],
 )
 def test_only_the_best_quality_has_a_network_for_single_layers(name, layers):
     """It copes with spread noise where the model of the beauty does."""
@@ -116,10 +116,10 @@ def test_a_black_shot_gets_the_model_for_its_layers(tmp_path):
     assert model_of_shot(shot, InputOptions(), "best") == "joint"
 
 
-@pytest.mark.parametrize("folder", ["", "ensemble/"])
+@pytest.mark.parametrize("folder", ["", "joint-large/"])
 def test_the_path_of_a_model_does_not_say_that_it_is_slow(folder):
-    assert _is_slow("best") and _is_slow("ensemble-x4")
-    assert not _is_slow(f"{folder}ensemble-mine.onnx") and not _is_slow(f"/models/{folder}x.onnx")
+    assert _is_slow("best") and _is_slow("joint-large-x4")
+    assert not _is_slow(f"{folder}joint-large-mine.onnx") and not _is_slow(f"/models/{folder}x.onnx")
 
 
 def test_all_frames_of_a_shot_and_its_job_get_the_model_of_the_first_pair(tmp_path, caplog, monkeypatch):

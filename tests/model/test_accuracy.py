@@ -14,12 +14,12 @@ from oiio_msspl.model.catalogue import shipped_models
 
 #: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``.
 SCORES = {
-    "ensemble-spread-x2": (24.52, 0.0248),
-    "ensemble-spread-x4": (24.34, 0.0255),
-    "ensemble-spread-x8": (24.20, 0.0257),
-    "ensemble-x2": (24.85, 0.0227),
-    "ensemble-x4": (24.62, 0.0236),
-    "ensemble-x8": (24.49, 0.0236),
+    "joint-large-spread-x2": (24.56, 0.0255),
+    "joint-large-spread-x4": (24.23, 0.0273),
+    "joint-large-spread-x8": (24.01, 0.0287),
+    "joint-large-x2": (24.81, 0.0255),
+    "joint-large-x4": (24.46, 0.0267),
+    "joint-large-x8": (24.24, 0.0262),
     "joint-small-spread-x2": (23.94, 0.0293),
     "joint-small-spread-x4": (23.69, 0.0312),
     "joint-small-spread-x8": (23.50, 0.0326),

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The `joint` and `ensemble` models, which began as networks of Open Image Denoise."""
+"""The `joint` models of all sizes, which began as networks of Open Image Denoise."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ from oiio_msspl.model.encoding import encode_radiance
 from tests.conftest import noisy, picture, rgb, write_exr
 
 #: Names of models with the denoiser of both renders' mean.
-WITH_DENOISER = [name for name in shipped_models() if name.startswith(("joint", "ensemble"))]
+WITH_DENOISER = [name for name in shipped_models() if name.startswith("joint")]
 
 
 @pytest.mark.parametrize("name", shipped_models())
 def test_weights_that_models_share_lie_beside_them(name):
-    """Those of the denoiser, which is another one for spread noise; and the ensemble's, the same for all scales."""
+    """Those of the denoiser, which is another one for spread noise; all scales of the large size share its weights."""
     onnx = pytest.importorskip("onnx")
     model = onnx.load(WEIGHTS / f"{name}.onnx", load_external_data=False)
     files = {entry.value for t in model.graph.initializer for entry in t.external_data if entry.key == "location"}
     noise = "_spread" if "-spread-" in name else ""
     small = "_small" if name.startswith("joint-small") and name.endswith("x2") else ""
     expected = set() if name.startswith("paper") else {f"mean_denoiser{small}{noise}.weights"}
-    if name.startswith("ensemble"):
-        expected.add(f"ensemble{noise.replace('_', '-')}.weights")
+    if name.startswith("joint-large"):
+        expected.add(f"joint-large{noise.replace('_', '-')}.weights")
     assert files == expected
     assert all((WEIGHTS / file).is_file() for file in files)
 
@@ -56,14 +56,14 @@ def test_it_is_the_default():
     assert find_model(2).stem == find_model(2, "auto").stem == "joint-x2"
 
 
-@pytest.mark.parametrize("family", ["joint", "ensemble"])
+@pytest.mark.parametrize("family", ["joint", "joint-large"])
 def test_its_file_says_where_its_weights_come_from(family):
     assert "Open Image Denoise 2.5.1" in Session(find_model(2, family)).contract.provenance["initial_weights"]
 
 
 @pytest.mark.parametrize("spp_of_albedo", [64, 1024])
 @pytest.mark.parametrize("scale", SCALES)
-@pytest.mark.parametrize("family", ["joint", "ensemble"])
+@pytest.mark.parametrize("family", ["joint", "joint-large"])
 def test_it_denoises_no_worse_than_open_image_denoise(family, scale, spp_of_albedo):
     """Its error is at most OIDN's, and 1.1 times that at x8, whose LRHS has 17 x 25 pixels, and at x2 with a noisy
     albedo. The sides are no multiples of the alignment, and the result stays in the range of the renders."""
@@ -90,7 +90,7 @@ def test_it_denoises_no_worse_than_open_image_denoise(family, scale, spp_of_albe
 
 
 @pytest.mark.parametrize("scale", [2, 4])
-@pytest.mark.parametrize("family", ["joint", "ensemble"])
+@pytest.mark.parametrize("family", ["joint", "joint-large"])
 def test_rare_light_leaves_no_holes(family, scale):
     """One sample of fifty finds the light, so most pixels around are black in both renders. No pixel of the result is
     below a tenth of the truth, or below a quarter of what is around it."""

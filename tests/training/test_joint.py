@@ -20,6 +20,7 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 
 from benchmarks.oidn import run_filter  # noqa: E402
+from tests.training.extracted import network_of  # noqa: E402
 from training import average, checkpoints, export, prune  # noqa: E402
 from training.joint import JointFusion  # noqa: E402
 from training.mean_denoiser import STARTS, MeanDenoiser, with_denoised_mean  # noqa: E402
@@ -27,7 +28,7 @@ from training.oidn import BASE  # noqa: E402
 from training.quantise.__main__ import CHECKPOINT, run_denoiser  # noqa: E402
 from training.quantise.codes import denoiser_codes  # noqa: E402
 from training.render_mean import with_mean  # noqa: E402
-from training.whole_model import CHECKPOINTS, denoiser_file, network_of  # noqa: E402
+from training.whole_model import CHECKPOINTS, denoiser_file  # noqa: E402
 
 #: Open Image Denoise's quality whose networks each size starts from.
 QUALITY = {"small": "fast", "usual": "high", "large": "high"}
@@ -107,18 +108,27 @@ def test_the_graph_computes_what_the_network_does(scale, size, tmp_path, denoise
         assert np.abs(log_error - expected[1]).mean() < 0.1
 
 
-@pytest.mark.parametrize(("family", "scale"), [("joint-small", 2), ("joint", 8), ("joint-spread", 4)])
+@pytest.mark.parametrize(
+    ("family", "scale"),
+    [("joint-small", 2), ("joint-spread", 4), ("joint-large", 2), ("joint-large", 8), ("joint-large-spread", 4)],
+)
 def test_the_shipped_files_agree_with_their_checkpoint(family, scale, tmp_path, denoised_mean):
     """To a fifth of the noise that is removed."""
     network, _ = checkpoints.load(CHECKPOINT.with_stem(family.replace("-", "_")))
     onnx.save(network_of(onnx.load(find_model(scale, family))), tmp_path / "network.onnx")
     model = load_network(tmp_path / "network.onnx")
+    outputs = [output.name for output in model.get_outputs()]
     ((lrhs, hrls),) = pairs(scale, denoised_mean, count=1, size=16 * scale)
-    fused, log_error = model.run(["fused", "log_error"], {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()})
+    found = dict(zip(outputs, model.run(outputs, {"lrhs": lrhs.numpy(), "hrls": hrls.numpy()}), strict=True))
     with torch.inference_mode():
-        expected = [values.numpy() for values in network.fuse(lrhs, hrls)]
-    assert np.abs(fused - expected[0]).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - expected[0]).mean()
-    assert np.abs(log_error - expected[1]).mean() < 0.1
+        fused, log_error = (values.numpy() for values in network.fuse(lrhs, hrls))
+        prepared = network.prepared(hrls)
+    assert np.abs(found["fused"] - fused).mean() < 0.2 * np.abs(hrls[:, :3].numpy() - fused).mean()
+    assert np.abs(found["log_error"] - log_error).mean() < 0.1
+    assert (found.keys() == {"fused", "log_error", "albedo", "normal"}) == ("large" in family)
+    if "large" in family:
+        for name, expected in (("albedo", prepared[:, 3:6]), ("normal", 0.5 * prepared[:, 6:9] + 0.5)):
+            assert np.abs(found[name] - expected.numpy()).mean() < 0.01
 
 
 def test_pruning_channels_that_nothing_reads_changes_nothing():

@@ -91,6 +91,23 @@ def test_slices_are_distributed_for_the_least_noise():
     assert float((noise / slices**2).sum()) == pytest.approx(min(float((noise / way**2).sum()) for way in ways))
 
 
+@pytest.mark.parametrize(("name", "largest"), [("dec_conv2b", 2.0), ("dec_conv1b", 1.0), ("enc_conv2b", 1.0)])
+def test_lower_levels_of_the_decoder_have_room_for_brighter_values(name, largest):
+    """Twice the brightest value of the calibration fits into their codes. Other layers end at that value."""
+    generator = torch.Generator().manual_seed(0)
+    weights = {f"{name}.weight": torch.zeros(16, 16, 3, 3), f"{name}.bias": torch.zeros(16)}
+    weights[f"{name}.weight"][range(16), range(16), 1, 1] = 1.0
+    if name in LARGE.up[-1]:
+        weights |= {f"{LARGE.last}.{kind}": torch.ones(size) for kind, size in (("weight", (3, 16, 3, 3)), ("bias", 3))}
+    codes = torch.randint(0, 256, (1, 16, 80, 80), generator=generator).float()
+    codes[:, :, 0, 0] = 255
+    layout = gptq.CodeLayout(torch.full((16,), 1 / 255), torch.arange(16))
+    fit = gptq.Fit(LARGE, weights)
+    found = fit.conv(name, gptq.Activations([codes / 255], [codes], layout)).layout
+    reached = found.dequantise(torch.full((len(found.scale), 1, 1), 255.0))
+    torch.testing.assert_close(reached, torch.full_like(reached, largest), rtol=0.02, atol=0)
+
+
 def test_calibration_sees_bright_and_black_albedos():
     """Other images, colours and normals stay as they are."""
     generator = torch.Generator().manual_seed(0)

@@ -16,9 +16,10 @@ torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 
+from tests.training.extracted import network_of  # noqa: E402
 from training.encoding import packed  # noqa: E402
 from training.render_mean import NOISE_GAIN, mean_of_renders  # noqa: E402
-from training.whole_model import Enter, Leave, example, network_of  # noqa: E402
+from training.whole_model import Enter, Leave, example  # noqa: E402
 
 
 def tensor(image):

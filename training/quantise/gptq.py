@@ -28,6 +28,9 @@ from training.quantise.codes import INPUT_SLICES, OUTPUT_SLICES
 PIXELS = 4000
 #: Share of a layer's values, in every image, that the range of its codes covers.
 COVERED = 0.9995
+#: On the decoder's levels below the last one, the range is the largest value of all images times this: rare light of
+#: other scenes has brighter values there, and the rounding of these levels does not show.
+HEADROOM = 2.0
 #: Channel ranges lie between one range for the whole layer (0) and a range of its own for each channel (1). In between,
 #: neither the values of a weak channel nor the weights that read it have too few codes.
 OWN_RANGE = 0.75
@@ -40,7 +43,8 @@ MAX_WEIGHT = 127
 #: channels, and processors without VNNI instructions add both products in 16 bits. 255 times this fits.
 MAX_PAIR = 128
 #: Further code channels for each layer of the last level, for slices: rounding errors there go straight into the
-#: colour, mostly from a few channels. The large network runs at the LRHS's resolution, so it affords more.
+#: colour, mostly from a few channels. The large network has more channels there. Twice as many slices as these gain
+#: 0.01 dB at most.
 EXTRA_SLICES, EXTRA_SLICES_LARGE = 16, 32
 #: Convolutions that read a layer of the U-Net but are no part of it. Their outputs, and the last layer's outputs after
 #: the colours, are logits and logarithms: signed, in [-SIGNED_RANGE, SIGNED_RANGE], with SIGNED_ZERO as the code of 0.
@@ -201,7 +205,9 @@ class Fit:
         if name == self.shape.last or rectified < count:
             tops, slices = torch.ones(rectified), torch.full((rectified,), self.slices_out)
         else:
-            tops = torch.stack([_quantile(image[0].flatten(1), COVERED) for image in exact]).amax(dim=0)
+            below = any(name in level for level in self.shape.up[:-1])
+            share, headroom = (1.0, HEADROOM) if below else (COVERED, 1.0)
+            tops = headroom * torch.stack([_quantile(image[0].flatten(1), share) for image in exact]).amax(dim=0)
             tops = tops.clamp_min(1e-3 * tops.max())
             tops = tops**OWN_RANGE * tops.max() ** (1 - OWN_RANGE)
             slices = torch.ones(rectified, dtype=torch.long)

@@ -191,6 +191,8 @@ def _words(part: str, text: str) -> dict[str, Any]:
         problem = ""
         if key not in known:
             problem = f"{key!r} is none of {', '.join(known)}"
+        elif key in words:
+            problem = f"{key} is given twice"
         elif key in CHOICES and value not in CHOICES[key]:
             problem = f"{key} is {' or '.join(CHOICES[key])}"
         elif key in ("scale", "offset"):

@@ -26,7 +26,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
-from oiio_msspl.fusion.motion_check import FieldCheck, check_field
+from oiio_msspl.fusion.motion_check import MARGIN, FieldCheck, check_field
 from oiio_msspl.fusion.motion_guides import FramePair, has_guide, open_pair, still_and_moved
 from oiio_msspl.fusion.motion_vectors import channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
@@ -66,6 +66,8 @@ class MotionSource:
     """``vectors``: verified layers. ``static``: all layers of vectors; a pixel where one is not 0 is not followed."""
     projection: Projection | None = None
     """``camera``: how the matrices are to be read."""
+    open: bool = False
+    """``vectors``: other formats say the same in the frames that were looked at, so others should be looked at, too."""
 
     def read(self, frame: MotionFrame, neighbour: MotionFrame, step: int) -> tuple[Array, Mask]:
         """Where the surfaces of a frame lie in a neighbour.
@@ -203,48 +205,63 @@ def _nothing(render: MappedRender) -> tuple[Array, Mask]:
 
 
 def find_motion(
-    first: MappedRender, second: MappedRender, wanted: str | None = None, *, required: bool = False
+    first: MappedRender,
+    second: MappedRender,
+    wanted: str | None = None,
+    verified: Sequence[MotionField] = (),
+    *,
+    required: bool = False,
 ) -> MotionSource:
     """Find out how the movement in a shot is known.
 
     Args:
         first, second: consecutive frames t and t + 1, in which something moves if anything does in the shot.
         wanted: the user's ``--motion-format``, see :func:`oiio_msspl.aovs.motion.user_fields`.
+        verified: layers whose format other frames of the shot have shown.
         required: the user wants several frames to be fused, so not to know the movement is an error.
 
     Raises:
         InputError: pixels can't be decoded; ``wanted`` can't be read or does not fit; or, if ``required``, nothing is
             known of the movement.
     """
-    source = _find(first, second, wanted)
+    source = _find(first, second, wanted, {each.name: each for each in verified})
     if required and source.kind == NONE:
         raise InputError(f"{first.name}: {source.text}")
     return source
 
 
-def _find(first: MappedRender, second: MappedRender, wanted: str | None) -> MotionSource:
+def _find(
+    first: MappedRender, second: MappedRender, wanted: str | None, verified: Mapping[str, MotionField]
+) -> MotionSource:
     pair = open_pair(first, second)
     if not pair.window.width or not pair.window.height:
         return MotionSource(NONE, f"its data window and that of {second.name} have no common part")
-    fields = user_fields(first.motion, wanted, first.name) if wanted else first.motion.fields
-    checks = [_check(pair, each) for each in fields]
-    if verified := _one_each_way(checks):
-        return _vectors(verified)
+    fields = first.motion.fields if wanted is None else user_fields(first.motion, wanted, first.name)
+    checks = []
+    for each in fields:
+        known = verified.get(each.name)
+        checks.append(_check(pair, replace(each, format=known.format) if known else each, verified=known is not None))
+    if found := _one_each_way(checks):
+        return _vectors(found)
     source = _without_vectors(pair, checks)
-    if wanted and source.kind != STATIC:
+    if wanted is not None and source.kind != STATIC:
         raise InputError(f"--motion-format {wanted!r} does not fit {first.name}: {_problems(checks)}")
     return source
 
 
-def _check(pair: FramePair, each: MotionField) -> FieldCheck:
+def _check(pair: FramePair, each: MotionField, *, verified: bool) -> FieldCheck:
     """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
     stored = in_parallel(*(partial(_stored, pair, frame, each) for frame in (0, 1)))
     if stored[0] is None or stored[1] is None:
         return FieldCheck(each, f"{pair.second.name} lacks it")
-    check = check_field(pair, each, (stored[0], stored[1]))
-    if check.problem and not check.zero and check.fit <= 1 and {"to", "x", "y", "unit"} <= each.fixed:
-        return replace(check, problem="", by_user=True)
-    return check
+    check = check_field(pair, each, (stored[0], stored[1]), verified=verified)
+    if check.zero or not {"to", "x", "y", "unit"} <= each.fixed:
+        return check
+    other = check_field(pair, replace(each, fixed=frozenset({"to"})), (stored[0], stored[1]))
+    if not other.problem and other.fit * MARGIN < check.fit:
+        fits = f"'{other.field.format}' explains {1 - other.fit:.0%} of what changes"
+        return replace(check, problem=f"{fits}, and this {max(1 - check.fit, 0):.0%}")
+    return replace(check, problem="", by_user=True) if check.problem and check.fit <= 1 else check
 
 
 def _stored(pair: FramePair, frame: int, each: MotionField) -> Array | None:
@@ -271,7 +288,8 @@ def _vectors(verified: Sequence[FieldCheck]) -> MotionSource:
     if len(verified) == 1:
         opposite = "previous" if verified[0].field.format.step == 1 else "next"
         texts += f"; vectors to the {opposite} frame are computed by inverting these"
-    return MotionSource(VECTORS, f"motion vectors of {texts}", tuple(check.field for check in verified))
+    fields, is_open = tuple(check.field for check in verified), any(check.open for check in verified)
+    return MotionSource(VECTORS, f"motion vectors of {texts}", fields, open=is_open)
 
 
 def _without_vectors(pair: FramePair, checks: Sequence[FieldCheck]) -> MotionSource:

@@ -34,6 +34,11 @@ FEWEST = 64
 DIFFERENT = 0.25
 #: Scales of vectors that are known to occur; 2 is a shutter of 180 degrees.
 VECTOR_SCALES = (1.0, 2.0, 0.5)
+#: Where none of these fits, any scale is tried, because a shutter may have any length. So many formats may fit by
+#: chance, so the best one must fit ``MARGIN`` times better still. One at either end of this range is not the best.
+ANY_SCALES = tuple(2.0 ** (k / 8) for k in range(-40, 41))
+#: The other units only repeat the scales of these two.
+ANY_SCALES_OF = ("pixels", "ndc")
 #: Scales of vectors that are encoded as colours, in pixels: the renderer's setting is not in the file.
 ENCODED_SCALES = tuple(2.0 ** (k / 2) for k in range(2, 23))
 
@@ -52,6 +57,9 @@ class FieldCheck:
     """What is left of the differences between the frames; without motion it is 1."""
     by_user: bool = False
     """The user has described them, and nothing verifies that."""
+    open: bool = False
+    """Other formats say the same places in these frames: a camera that moves sideways does not tell y. The one that was
+    expected is taken."""
 
     @property
     def text(self) -> str:
@@ -63,19 +71,25 @@ class FieldCheck:
         return f"{self.field.name} ({self.field.format}), which explains {1 - self.fit:.0%} of what changes"
 
 
-def check_field(pair: FramePair, field: MotionField, stored: tuple[Array, Array]) -> FieldCheck:
+def check_field(
+    pair: FramePair, field: MotionField, stored: tuple[Array, Array], *, verified: bool = False
+) -> FieldCheck:
     """Find the format of motion vectors.
 
     Args:
         pair: frames t and t+1.
         field: the layer, with the format that is expected. Words in ``fixed`` are not varied.
         stored: its pixels (h, w, 2) in both frames, over the pair's window and reduced as the guides are.
+        verified: other frames of the shot have shown the expected format, so only one that fits clearly better is
+            taken instead.
     """
-    checks = [_check_offset(pair, field, stored, offset) for offset in _offsets(field, stored)]
+    checks = [_check_offset(pair, field, stored, offset, verified) for offset in _offsets(field, stored)]
     return min(checks, key=lambda check: (bool(check.problem), not check.zero, check.fit))
 
 
-def _check_offset(pair: FramePair, field: MotionField, stored: tuple[Array, Array], offset: float) -> FieldCheck:
+def _check_offset(
+    pair: FramePair, field: MotionField, stored: tuple[Array, Array], offset: float, verified: bool
+) -> FieldCheck:
     """Find the format of vectors whose offset is known."""
     field = replace(field, format=replace(field.format, offset=offset))
     if all(not _moving(values, offset).any() for values in stored):
@@ -87,25 +101,50 @@ def _check_offset(pair: FramePair, field: MotionField, stored: tuple[Array, Arra
         return FieldCheck(field, "albedo, normal and position are too even to verify it by")
     fits = trial.fits(_formats(field, encoded=offset != 0))
     best = min(fits, key=lambda form: fits[form])
+    needed = MARGIN
     if "scale" not in field.fixed:
+        usual = set(fits)
         for form in (best, _mirrored(best)):
             if form in fits:
                 scale = trial.fit_scale(form, fits[form])
                 fits |= trial.fits(_formats(replace(field, format=form), encoded=False, scales=[scale]))
         best = min(fits, key=lambda form: fits[form])
+        if offset == 0 and (best not in usual or fits[best] * MARGIN > 1):
+            best, fits = _with_any_scale(trial, field, fits)
+            needed = MARGIN if best in usual else MARGIN**2
     # Even movement fits equally well if the vectors are taken for those from the other frame: the table decides.
     mirrored = _mirrored(best)
     if mirrored.to == field.format.to and fits.get(mirrored, np.inf) < MARGIN * fits[best]:
         best = mirrored
     # Formats may differ in nothing that these frames show: a camera that moves sideways does not tell y.
     best = next(form for form in (field.format, best) if form == best or trial.is_same(form, best, fits))
-    if fits[best] * MARGIN > 1:
+    at_end = offset == 0 and "scale" not in field.fixed and not ANY_SCALES[0] < best.scale < ANY_SCALES[-1]
+    if fits[best] * needed > 1 or at_end:
         return FieldCheck(field, _no_format(pair, fits[best]), fit=fits[best])
+    if verified and fits.get(field.format, np.inf) < MARGIN * max(fits[best], FLOOR):
+        return FieldCheck(field, fit=fits[field.format], open=trial.is_open(field.format, fits))
     rivals = [f for f in fits if f.to == best.to and f != best and fits[f] < MARGIN**2 * max(fits[best], FLOOR)]
     for rival in rivals:
         if not trial.beats(best, rival):
             return FieldCheck(field, f"'{best}' and '{rival}' fit it equally well")
-    return FieldCheck(replace(field, format=best), fit=fits[best])
+    return FieldCheck(replace(field, format=best), fit=fits[best], open=trial.is_open(best, fits))
+
+
+def _with_any_scale(
+    trial: _Trial, field: MotionField, fits: dict[MotionFormat, float]
+) -> tuple[MotionFormat, dict[MotionFormat, float]]:
+    """The best format of any scale, and how well it and those of ``fits`` fit.
+
+    Others of these scales are left out. They lie so close that several fit about as well.
+    """
+    units = (field.format.unit,) if "unit" in field.fixed else ANY_SCALES_OF
+    formats = (form for form in _formats(field, encoded=False, scales=ANY_SCALES) if form.unit in units)
+    every = fits | trial.fits(formats)
+    for to in {form.to for form in every}:
+        best = min((form for form in every if form.to == to), key=lambda form: every[form])
+        scale = trial.fit_scale(best, every[best], clearly=False)
+        fits = fits | trial.fits(replace(form, scale=scale) for form in (best, _mirrored(best)) if form in every)
+    return min(fits, key=lambda form: fits[form]), fits
 
 
 def _no_format(pair: FramePair, fit: float) -> str:
@@ -194,22 +233,27 @@ class _Trial:
             for form, each in left.items()
         }
 
-    def fit_scale(self, form: MotionFormat, fit: float) -> float:
-        """The scale of a format that fits clearly better than its own, if there is one: a shutter may have any
-        length."""
+    def fit_scale(self, form: MotionFormat, fit: float, *, clearly: bool = True) -> float:
+        """The scale of a format that fits better than its own, ``clearly`` or not, if there is one: a shutter may have
+        any length."""
         best, best_fit = form, fit
         for width, steps in ((2.0, 8), (2 ** (1 / 8), 8), (2 ** (1 / 64), 8)):
             scales = [best.scale * width ** (k / steps) for k in range(-steps, steps + 1)]
             fits = self.fits([replace(best, scale=float(f"{s:.4g}")) for s in scales] + [best])
             best = min(fits, key=lambda f: fits[f])
             best_fit = fits[best]
-        return best.scale if best_fit * MARGIN < fit else form.scale
+        return best.scale if best_fit * (MARGIN if clearly else 1) < fit else form.scale
 
     def is_same(self, form: MotionFormat, other: MotionFormat, fits: dict[MotionFormat, float]) -> bool:
         """Whether two formats say the same places in these frames."""
         if form not in fits or form.to != other.to:
             return False
         return not any(self._apart(place, form, other).any() for place in self._of(form))
+
+    def is_open(self, form: MotionFormat, fits: dict[MotionFormat, float]) -> bool:
+        """Whether a format with another axis or unit says the same places in these frames."""
+        others = (f for f in fits if (f.x, f.y, f.unit) != (form.x, form.y, form.unit))
+        return any(self.is_same(other, form, fits) for other in others)
 
     def beats(self, form: MotionFormat, rival: MotionFormat) -> bool:
         """Whether a format fits clearly better where the two say different places; True if they nowhere do.

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.motion import MotionField
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import has_many_pixels
 from oiio_msspl.errors import InputError, MssplError
@@ -43,6 +44,8 @@ AUTO_COUNT, AUTO_COUNT_SLOW = 4, 6
 MOST_RESULTS = 2
 #: The most that can be asked for.
 MOST = 8
+#: Pairs of frames that are looked at to find out how motion is stored.
+LOOKED_AT = 3
 #: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, whether an
 #: object has moved that it does not follow, and whether it is at a border; and the averaged frame.
 FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 11, 20
@@ -182,20 +185,21 @@ def plan_temporal(
         return Temporal()
     asked = options.frames != AUTO
     low, high = shot.lr.files, shot.hr.files
-    frames = {n: Frame(n, low[n], high[n], shot.output.path(n)) for n in sorted(low.keys() & high.keys())}
+    frames = {n: Frame(n, low[n], high[n], shot.target(n)) for n in sorted(low.keys() & high.keys())}
     pairs = [n for n in frames if n + 1 in frames]
     if not pairs:
         if asked:
             raise InputError(f"--temporal {options.frames}: {shot.hr.pattern} has no two frames that follow each other")
         return Temporal(text="frame by frame: no two frames follow each other")
-    looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1])))
+    # Others come last: they are looked at if some of these can't be read.
+    looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1], *pairs)))
     mapped = functools.cache(lambda number: _map_frame(frames[number], inputs))
     count = options.count(_family_of_shot(mapped, frames, model))
     first = _plan(_motion_of(mapped, looked_at, inputs, options, required=asked), count, frames, asked=asked)
     if not first.count:
         return first
     views, text = {}, first.text
-    others = _other_views(mapped, looked_at, inputs, write)
+    others = _other_views(mapped, looked_at[:LOOKED_AT], inputs, write)
     for label in others:
         source = _motion_of(mapped, looked_at, inputs, options, label, required=False)
         plan = _plan(source, count, frames, asked=asked)
@@ -263,36 +267,66 @@ def _motion_of(
 ) -> MotionSource:
     """How the motion of a shot is known, by some of its frames and the frames after these.
 
-    The camera may stand still at one end, so several frames are looked at. One that can't be read is passed over,
+    The camera may stand still at one end, or move in one direction only, so several frames are looked at, until they
+    tell how vectors are stored. What one shows has to hold for those before. A frame that can't be read is passed over,
     because the run says so when its turn comes.
 
     Args:
         mapped: opens and maps a frame.
         view: the view or view layer; None for each file's first one.
     """
-    found: list[MotionSource] = []
+
+    def look(number: int, verified: Sequence[MotionField] = ()) -> MotionSource:
+        hrls = [mapped(n)[1] for n in (number, number + 1)]
+        first, second = (hr if view is None else map_other_hrls(hr, view, inputs) for hr in hrls)
+        return find_motion(first, second, options.motion_format, verified, required=required)
+
+    found: dict[int, MotionSource] = {}
+    vectors: MotionSource | None = None
     problem: InputError | None = None
     for number in numbers:
+        if len(found) == LOOKED_AT or (vectors and not vectors.open):
+            break
         try:
-            hrls = [mapped(n)[1] for n in (number, number + 1)]
-            first, second = (hr if view is None else map_other_hrls(hr, view, inputs) for hr in hrls)
-            found.append(find_motion(first, second, options.motion_format, required=required))
+            found[number] = look(number, vectors.fields if vectors else ())
         except InputError as error:
             problem = problem or error
             log.debug("frames %d and %d: %s", number, number + 1, error)
             continue
-        if found[-1].kind == VECTORS:
-            break
-    for kind in (VECTORS, CAMERA, STATIC, FLOW):
-        for source in found:
+        if found[number].kind != VECTORS:
+            continue
+        earlier = [n for n, source in found.items() if source.kind == VECTORS and n != number]
+        for before in earlier:
+            if not _agree(look(before, found[number].fields), found[number]):
+                return _contradiction(found, before, number, required=required)
+        vectors = found[number]
+    if vectors:
+        return vectors
+    for kind in (CAMERA, STATIC, FLOW):
+        for source in found.values():
             if source.kind == kind:
                 return source
     if found:
-        return found[0]
+        return next(iter(found.values()))
     assert problem is not None
     if required or (options.motion_format is not None and view is None):
         raise problem
     return MotionSource(NONE, str(problem))
+
+
+def _agree(one: MotionSource, other: MotionSource) -> bool:
+    """Whether two pairs of frames tell the same of each layer of vectors that both tell something of."""
+    formats = {each.name: each.format for each in one.fields}
+    return all(formats.get(each.name, each.format) == each.format for each in other.fields)
+
+
+def _contradiction(found: Mapping[int, MotionSource], before: int, number: int, *, required: bool) -> MotionSource:
+    """What is known of vectors that are stored in one way in some frames, and in another way in others."""
+    texts = "; ".join(f"frames {n} and {n + 1}: {found[n].text}" for n in (before, number))
+    text = f"the frames contradict each other on how motion vectors are stored ({texts})"
+    if required:
+        raise InputError(f"{text}; describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels")
+    return MotionSource(NONE, text)
 
 
 def _map_frame(frame: Frame, inputs: InputOptions) -> Pair:

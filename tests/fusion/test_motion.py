@@ -259,6 +259,48 @@ def test_the_user_s_format_may_be_wrong(tmp_path):
         find_motion(frames[0], frames[1], "layer=velocity,to=next,x=left,y=up,unit=pixels")
 
 
+def test_a_complete_description_that_the_pixels_contradict_is_refused(tmp_path):
+    """The message names what fits better."""
+    frames = shot(tmp_path, MotionFormat(y="up"), "velocity")
+    described = "layer=velocity,to=next,x=right,unit=pixels,y="
+    assert find_motion(*frames[:2], f"{described}up").kind == "vectors"
+    better = "does not fit .*'to=next,x=right,y=up,unit=pixels' explains 100% of what changes, and this "
+    for wrong in ("down", "up,scale=1.5"):
+        with pytest.raises(InputError, match=better):
+            find_motion(*frames[:2], described + wrong)
+
+
+@pytest.mark.parametrize("scale", [1 / 24, 0.2, 5.0, 16.0, 24.0])
+def test_a_shutter_may_have_any_length(tmp_path, scale):
+    """The scale is found, and no other unit stands in for it."""
+    frames = shot(tmp_path, MotionFormat(y="up", scale=scale), "velocity")
+    source = find_motion(*frames[:2])
+    (found,) = source.fields
+    assert (found.format.x, found.format.y, found.format.unit) == ("right", "up", "pixels"), source.text
+    assert found.format.scale == pytest.approx(scale, rel=0.01)
+    assert right_share(source, frames, 0, 1) == 1
+
+
+def test_a_scale_that_no_shutter_has_is_not_found(tmp_path):
+    frames = shot(tmp_path, MotionFormat(scale=0.01), "velocity")
+    assert "no known format" in find_motion(*frames[:2]).text
+
+
+def test_what_other_frames_have_shown_is_kept_unless_another_format_fits_better(tmp_path):
+    """A sideways movement does not tell y. One upwards does."""
+    sideways = shot(tmp_path, MotionFormat(y="up"), "velocity", truck)
+    first = find_motion(*sideways[:2])
+    assert first.open
+    (tmp_path / "up").mkdir()
+    lift = lambda t: np.array([0.0, 0.02 * t + 0.01 * t * t, 1.0])  # noqa: E731
+    upwards = shot(tmp_path / "up", MotionFormat(y="up"), "velocity", lift)
+    second = find_motion(*upwards[:2], None, first.fields)
+    assert second.fields[0].format.y == "up"
+    wrong = [replace(each, format=replace(each.format, y="down")) for each in first.fields]
+    assert find_motion(*upwards[:2], None, wrong).fields[0].format.y == "up"
+    assert find_motion(*sideways[:2], None, wrong).fields[0].format.y == "down"
+
+
 def test_a_standing_camera_needs_no_vectors(tmp_path):
     frames = [frame(tmp_path, t, {}, standing) for t in (0, 1)]
     source = find_motion(*frames, required=True)

@@ -22,8 +22,8 @@ from oiio_msspl.fusion.tiling import MAX_MEMORY
 from oiio_msspl.jobs import frame_memory, frame_window, stages
 from oiio_msspl.jobs.frame_memory import FrameMemory
 from oiio_msspl.jobs.frame_window import FrameWindow
-from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, shares
+from oiio_msspl.jobs.sequence import Frame, find_shot
+from oiio_msspl.jobs.temporal import AUTO_COUNT, Temporal, TemporalOptions, plan_temporal, shares
 from tests import shots
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.moving_plane import positions, standing, texture, truck, vectors
@@ -34,15 +34,16 @@ FIRST, COUNT = 1001, 9
 LAMPS = ("light_key", "light_fill")
 
 
-def make_moving_shot(folder, camera=truck, count=COUNT, layers=("motion",), seeds=range(COUNT)):
-    """Pairs at x4 of a textured plane before a moving camera; the HRLS has vectors to the next frame."""
+def make_moving_shot(folder, camera=truck, count=COUNT, layers=("motion",), seeds=range(COUNT), signs=lambda t: (1, 1)):
+    """Pairs at x4 of a textured plane before a moving camera; the HRLS has vectors to the next frame, x to the right
+    and y down if their ``signs`` in that frame are 1."""
     for name in ("lr", "hr", "out"):
         (folder / name).mkdir(parents=True)
     for t, seed in zip(range(count), seeds, strict=False):
         places = positions(camera, t)
         clean = texture(places[..., 0], places[..., 1])
         albedo = rgb(clean.astype(np.float32), "albedo.")
-        there = vectors(camera, t, 1)
+        there = vectors(camera, t, 1) * np.float32(signs(t))
         motion = {"motionFore.X": there[..., 0], "motionFore.Y": there[..., 1]} if "motion" in layers else {}
         low = noisy(downsample(clean, 4), 16, 100 + seed)
         write_exr(folder / f"lr/lr.{FIRST + t}.exr", rgb(low.astype(np.float32)))
@@ -181,6 +182,45 @@ def test_a_frame_without_usable_neighbours_is_the_single_frame_bit_for_bit(tmp_p
     assert contents(out)["hr.1002.exr"] != contents(alone)["hr.1002.exr"]
     assert "frame 1004 is missing, so fewer neighbours are averaged" in report.results[1005].warnings
     assert any(text.startswith("frame 1007 is not averaged: ") for text in report.results[1008].warnings)
+
+
+def turning(t):
+    """A camera that moves to the right, and from the third frame on as fast downwards."""
+    return np.array([0.03 * min(t, 2), -0.03 * max(t - 2, 0), 1.0])
+
+
+def planned(shot, **options):
+    found = find_shot(shot / "lr", shot / "hr", shot / "out")
+    return plan_temporal(found, InputOptions(), TemporalOptions(**options))
+
+
+def test_what_one_movement_does_not_tell_another_one_does(tmp_path):
+    """The first frames move sideways. So y is what the table expects, until later frames show that it is not."""
+    shot = make_moving_shot(tmp_path, turning, signs=lambda t: (1, -1))
+    plan = planned(shot)
+    assert "y=up" in plan.text and plan.count == AUTO_COUNT
+    again = planned(make_moving_shot(tmp_path / "expected", turning))
+    assert "y=down" in again.text
+
+
+def test_frames_that_contradict_each_other_are_fused_alone(tmp_path):
+    """x changes its sign in the middle of the shot, where the camera moves both ways."""
+    both = lambda t: turning(t) if t < 3 else np.array([0.03 * t, -0.03 * (t - 2), 1.0])  # noqa: E731
+    shot = make_moving_shot(tmp_path, both, signs=lambda t: (1 if t < 3 else -1, 1))
+    plan = planned(shot)
+    assert not plan.count
+    assert "the frames contradict each other on how motion vectors are stored (frames 1001 and 1002" in plan.text
+    with pytest.raises(InputError, match=r"contradict each other .* describe them with --motion-format"):
+        planned(shot, frames=2)
+
+
+def test_other_frames_are_looked_at_if_some_are_broken(tmp_path):
+    """The first, the middle and the last pair of frames can't be decoded."""
+    shot = make_moving_shot(tmp_path)
+    for number in (FIRST, FIRST + COUNT // 2, FIRST + COUNT - 1):
+        path = shot / f"hr/hr.{number}.exr"
+        path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
+    assert "motion vectors of motionFore.XY" in planned(shot).text
 
 
 def test_zeros_in_some_frames_of_a_moving_shot_are_not_believed(tmp_path, bilinear_models):

@@ -24,7 +24,7 @@ from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
 from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
-from oiio_msspl.jobs.sequence import frame_in_name
+from oiio_msspl.jobs.sequence import next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -197,7 +197,7 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
     Raises:
         InputError: this frame can't be read, or ``wanted`` does not fit.
     """
-    path = _next_frame(result.path)
+    path = next_file(result.path)
     if path is not None:
         if wanted:
             user_fields(render.motion, wanted, render.name)
@@ -216,16 +216,6 @@ def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptio
     elif render.motion.fields:
         layers = " and ".join(f"{each.name} ({each.format})" for each in render.motion.fields)
         result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")
-
-
-def _next_frame(path: Path) -> Path | None:
-    """The file beside this one whose frame number is one higher, if it has a number and there is such a file."""
-    found = frame_in_name(path)
-    if found is None:
-        return None
-    pattern, number = found
-    following = pattern.path(number + 1)
-    return following if following.is_file() else None
 
 
 def _renderer_fact(render: MappedRender) -> str:

@@ -59,6 +59,12 @@ class Pattern:
         """The file of one frame."""
         return self.folder / f"{self.head}{self.number.frame(number)}{self.tail}"
 
+    def spellings(self, number: int) -> set[str]:
+        """How names may spell a number. Some programs count the sign of a negative one as a digit (-003), others do not
+        (-0003)."""
+        digits = self.number.frame(abs(number))
+        return {self.number.frame(number), digits if number >= 0 else f"-{digits}"}
+
     @property
     def base(self) -> str:
         """The sequence's name without number, separators and extension."""
@@ -112,6 +118,10 @@ class Shot:
     output: Pattern
     frames: list[Frame]
 
+    def target(self, number: int) -> Path:
+        """The fused frame."""
+        return _target(self.output, self.hr, number)
+
 
 def is_sequence(path: Path) -> bool:
     """Whether this is a folder or a pattern, and not a single file."""
@@ -147,8 +157,20 @@ def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | 
     lows, highs = (_not_written(_sequences(Path(path)), Path(output)) for path in (lr, hr))
     low, high = _choose(lows, highs, Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
-    target = _output_pattern(Path(output), high.pattern)
-    return Shot(low, high, target, [Frame(n, low.files.get(n), high.files.get(n), target.path(n)) for n in numbers])
+    pattern = _output_pattern(Path(output), high.pattern)
+    each = [Frame(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
+    return Shot(low, high, pattern, each)
+
+
+def _target(output: Pattern, hr: Sequence, number: int) -> Path:
+    """The file of a fused frame. In a folder it is named as the HRLS, whose frames may differ in their padding."""
+    in_folder = output.number is hr.pattern.number
+    return output.folder / _with_exr(hr.files[number].name) if in_folder and number in hr.files else output.path(number)
+
+
+def _with_exr(name: str) -> str:
+    """The HRLS may be named hr.exr.####. Programs know an EXR by its extension, so the result gets one."""
+    return name if name.lower().endswith(".exr") else f"{name}.exr"
 
 
 def _not_written(sequences: list[Sequence], output: Path) -> list[Sequence]:
@@ -174,6 +196,8 @@ def parse_frames(frames: str | Iterable[int]) -> list[int]:
         InputError: the range can't be read, names no frame, or names fractions of frames.
     """
     if isinstance(frames, str):
+        if re.search(r"\d\s+\d", frames):
+            raise InputError(f"--frames {frames!r}: separate numbers and ranges by commas, such as 1001,1005-1010")
         try:
             # Open Job Description and Houdini write a step as :2. fileseq takes that for a staggered range.
             parsed = list(fileseq.FrameSet(frames.replace(":", "x")))
@@ -207,8 +231,30 @@ def frame_in_name(path: Path) -> tuple[Pattern, int] | None:
     match = _NUMBER_INSIDE.fullmatch(path.name) or _NUMBER_LAST.fullmatch(path.name)
     if match is None:
         return None
+    head, number, width, tail = _numbered(match)
+    return Pattern.padded(path.parent, head, width, tail), number
+
+
+def next_file(path: Path) -> Path | None:
+    """The file beside this one whose frame number is one higher, if it has a number and there is such a file."""
+    found = frame_in_name(path)
+    if found is None:
+        return None
+    pattern, number = found
+    width = pattern.number.zfill()
+    # The sign of a negative number may count as a digit.
+    widths = (width, width + 1) if number < 0 else (width,)
+    every = (_files_of(Pattern.padded(pattern.folder, pattern.head, each, pattern.tail)) for each in widths)
+    return next((files[number + 1] for files in every if number + 1 in files), None)
+
+
+def _numbered(match: re.Match[str]) -> tuple[str, int, int, str]:
+    """Head, number, digits of the number, and tail of a name."""
     head, digits, tail = match.groups()
-    return Pattern.padded(path.parent, head, len(digits), tail), int(digits)
+    # A hyphen after a letter or digit is a separator. Otherwise it is a sign.
+    if head.endswith("-") and not head[-2:-1].isalnum():
+        return head[:-1], -int(digits), len(digits), tail
+    return head, int(digits), len(digits), tail
 
 
 def _sequences(path: Path) -> list[Sequence]:
@@ -241,8 +287,10 @@ def _files_of(pattern: Pattern) -> dict[int, Path]:
     """
     files = {}
     for name in os.listdir(pattern.folder):
-        text = name.removeprefix(pattern.head).removesuffix(pattern.tail)
-        if re.fullmatch(r"-?\d+", text) and pattern.path(int(text)).name == name:
+        if not (name.startswith(pattern.head) and name.endswith(pattern.tail)):
+            continue
+        text = name[len(pattern.head) : len(name) - len(pattern.tail)]
+        if re.fullmatch(r"-?\d+", text) and text in pattern.spellings(int(text)):
             files[int(text)] = pattern.folder / name
     return files
 
@@ -268,8 +316,8 @@ def _sequences_in(folder: Path) -> list[Sequence]:
             # fileseq gives a sequence for each padding. One name with two paddings is refused below.
             by_name.setdefault((head, found.extension()), []).append((number, width, name))
     for match in [] if by_name else inside:
-        head, digits, tail = match.groups()
-        by_name.setdefault((head, tail), []).append((int(digits), len(digits), match[0]))
+        head, number, width, tail = _numbered(match)
+        by_name.setdefault((head, tail), []).append((number, width, match[0]))
     sequences = []
     for (head, tail), members in sorted(by_name.items()):
         pattern = Pattern.padded(folder, head, min(width for _, width, _ in members), tail)
@@ -331,5 +379,4 @@ def _output_pattern(output: Path, hr: Pattern) -> Pattern:
         return pattern
     if output.suffix.lower() == ".exr" and not output.is_dir():
         raise InputError(f"{output}: one name for many frames; write {output.stem}.####.exr or name a folder")
-    # The HRLS may be named hr.exr.####. Programs know an EXR by its extension, so the result gets one.
-    return Pattern(output, hr.head, hr.number, hr.tail if hr.tail.lower().endswith(".exr") else f"{hr.tail}.exr")
+    return Pattern(output, hr.head, hr.number, _with_exr(hr.tail))

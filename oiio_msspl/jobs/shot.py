@@ -105,7 +105,7 @@ def fuse_shot(
     check_output(shot, inputs, model, [] if report_path is None else [report_path])
     with limit_threads(threads):
         over_time = plan_temporal(shot, inputs, temporal, model, write)
-    report = ShotReport(shot, temporal=over_time.text)
+    report = ShotReport(shot, temporal=over_time.text, neighbours=over_time.count)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
     make_output(shot)
 

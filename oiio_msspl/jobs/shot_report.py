@@ -68,6 +68,8 @@ class ShotReport:
     """Wall time."""
     temporal: str = ""
     """Which neighbours frames are averaged with, and how motion is known; empty if that is switched off."""
+    neighbours: int = 0
+    """Frames before and after each that it is averaged with."""
 
     @property
     def exit_code(self) -> int:
@@ -130,11 +132,12 @@ def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport)
         report: of the shot. What differs from the first fused frame and may flicker gives a warning, see
             :func:`_differences`.
     """
-    first = report.first = report.first or {"frame": frame.number, **frame_report}
+    here = {"frame": frame.number, "neighbours": report.neighbours, **frame_report}
+    first = report.first = report.first or here
     warnings = list(frame_report["warnings"])
     if frame_report["repaired"]:
         warnings.append(f"repaired values that were NaN or infinite in {', '.join(frame_report['repaired'])}")
-    warnings += [f"{text} in frame {first['frame']}: it may flicker" for text in _differences(frame_report, first)]
+    warnings += [f"{text} in frame {first['frame']}: it may flicker" for text in _differences(here, first)]
     return result_of(
         frame, FUSED, warnings=warnings, repaired=frame_report["repaired"], seconds=frame_report["seconds"]
     )
@@ -142,12 +145,14 @@ def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport)
 
 def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     """What differs between the reports of two fused frames: "WHAT is X here and Y" for each feature, the scale, the
-    model, the layers, the views and the sets of passes."""
+    model, the number of neighbours, the layers, the views and the sets of passes."""
     there = {row["feature"]: row["status"] for row in first["aovs"]}
     changes = {row["feature"]: (row["status"], there[row["feature"]]) for row in here["aovs"]}
     changes["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         changes["the model"] = here["model"], first["model"]
+    if "neighbours" in first:  # those of earlier versions lack it
+        changes["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
     words = {"default": "not found", "absent": "not found"}
     found = []
     for what, states in changes.items():

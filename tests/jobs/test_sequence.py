@@ -6,7 +6,15 @@ import re
 import pytest
 
 from oiio_msspl import InputError
-from oiio_msspl.jobs.sequence import find_shot, format_frames, frame_in_name, is_sequence, parse_frames, parse_pattern
+from oiio_msspl.jobs.sequence import (
+    find_shot,
+    format_frames,
+    frame_in_name,
+    is_sequence,
+    next_file,
+    parse_frames,
+    parse_pattern,
+)
 from tests.conftest import picture, rgb, write_exr
 
 
@@ -51,6 +59,32 @@ def test_folders_pair_by_number_whatever_names_and_padding(tmp_path):
         (2, "0002.exr", "shot-2.exr", "shot-2.exr"),
         (10, None, "shot-10.exr", "shot-10.exr"),
     ]
+
+
+def test_results_are_named_as_the_hrls_whatever_its_padding(tmp_path):
+    touch(tmp_path / "lr", "lr.998.exr", "lr.999.exr", "lr.1000.exr")
+    touch(tmp_path / "hr", "hr.998.exr", "hr.0999.exr", "hr.1000.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", "998-1001")
+    assert [frame.output.name for frame in found.frames] == ["hr.998.exr", "hr.0999.exr", "hr.1000.exr", "hr.1001.exr"]
+    assert found.target(999).name == "hr.0999.exr"
+
+
+@pytest.mark.parametrize("names", [("hr.-002.exr", "hr.-001.exr"), ("hr.-0002.exr", "hr.-0001.exr")])
+@pytest.mark.parametrize("pattern", ["hr.####.exr", "hr.%04d.exr", ""])
+def test_negative_numbers_have_a_sign_beside_their_digits_or_in_place_of_one(tmp_path, names, pattern):
+    touch(tmp_path / "lr", "lr.-0002.exr", "lr.-0001.exr", "lr.0000.exr", "lr.0001.exr")
+    touch(tmp_path / "hr", *names, "hr.0000.exr", "hr.0001.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr" / pattern, tmp_path / "out")
+    assert [frame.number for frame in found.frames] == [-2, -1, 0, 1]
+    assert [frame.output.name for frame in found.frames] == [*names, "hr.0000.exr", "hr.0001.exr"]
+    assert [next_file(frame.hr) for frame in found.frames] == [*(f.hr for f in found.frames[1:]), None]
+
+
+def test_negative_numbers_inside_of_names_are_of_the_same_sequence(tmp_path):
+    touch(tmp_path / "lr", "lr.-001_b.exr", "lr.0001_b.exr")
+    touch(tmp_path / "hr", "shot-0001_b.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    assert [(frame.number, bool(frame.hr)) for frame in found.frames] == [(-1, False), (1, True)]
 
 
 def test_of_several_sequences_those_of_one_name_are_paired(tmp_path):
@@ -173,6 +207,9 @@ def test_a_hyphen_after_a_letter_is_a_separator_and_a_sign_elsewhere(tmp_path):
 def test_a_step_may_be_written_with_a_colon():
     """As Houdini and Open Job Description write it. To fileseq a colon means a staggered range."""
     assert parse_frames("1-9:4") == [1, 5, 9]
+    assert parse_frames("1001, 1003") == [1001, 1003]
+    with pytest.raises(InputError, match="separate numbers and ranges by commas"):
+        parse_frames("1001 1002")
 
 
 @pytest.mark.parametrize(

@@ -444,6 +444,16 @@ def test_another_model_or_scale_than_that_of_the_first_frame_is_a_warning(tmp_pa
     assert other_scale == "the scale is x2 here and x4 in frame 1001: it may flicker"
 
 
+def test_another_number_of_neighbours_than_that_of_the_first_frame_is_a_warning(tmp_path, bilinear_models):
+    """The earlier run was fused frame by frame. This one knows that nothing moves."""
+    folder = make_shot(tmp_path, 3)
+    more = {"skip_existing": True, "report_path": folder / "r.json"}
+    run(folder, bilinear_models[4], frames="1001", temporal=TemporalOptions("off"), **more)
+    report = run(folder, bilinear_models[4], temporal=TemporalOptions(2), **more)
+    for number in (1002, 1003):
+        assert "--temporal is 2 here and off in frame 1001: it may flicker" in report.results[number].warnings
+
+
 def layers_with_passes(seed):
     """Channels of an HRLS with two light groups that sum to the beauty."""
     light = (noisy(picture(HEIGHT, WIDTH), 1, seed) * 32).round() / 32

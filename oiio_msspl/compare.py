@@ -179,56 +179,86 @@ def note_on_windows(comparison: Comparison) -> str:
     return f"The data windows differ; only the part that all pictures show is compared: {part}"
 
 
+@dataclass(frozen=True)
+class _Place:
+    """Where a render lies in the pixels of the one at whose size all are compared.
+
+    Its pixel x covers those from ``x0 + scale * x`` on, ``scale`` of them; y likewise.
+    """
+
+    scale: int
+    x0: int
+    y0: int
+    shown: Window
+    """What it shows."""
+
+
 def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> list[Window]:
     """The rectangle of each render, in its own pixels, over which all of them are compared.
 
-    Renders of one display window are laid over each other by their places in it. Each other one shows what the data
-    window of ``largest`` shows, at its size or smaller by a scale of ``SCALES``.
+    Renders are laid over each other by their places in their display windows, if these are equal, or one of them is
+    cropped and the sizes of their display windows differ by a scale of ``SCALES``. Each other one shows what the data
+    window of ``largest`` shows, at its size or smaller by such a scale.
 
     Args:
         renders: what is compared.
         largest: the one of these at whose size all are compared.
 
     Raises:
-        InputError: a size does not fit, or renders of one display window have no part in common.
+        InputError: a size does not fit, or renders have no part in common.
     """
     whole = common = largest.data_window
-    same = [each for each in renders if each.display_window == largest.display_window]
-    for each in same:
-        common = common.intersect(each.data_window)
-    scales = [None if each.display_window == largest.display_window else _scale(each, largest) for each in renders]
-    if common == whole:
-        return [whole if scale is None else each.data_window for each, scale in zip(renders, scales, strict=True)]
+    places = [_place(each, largest) for each in renders]
+    for place in places:
+        common = common.intersect(place.shown)
+    if common == whole and all(place.scale == 1 or place.shown == whole for place in places):
+        # An odd side may have been rounded, so smaller renders may show a little more or less.
+        return [
+            whole.shift(-place.x0, -place.y0) if place.scale == 1 and place.shown != whole else each.data_window
+            for each, place in zip(renders, places, strict=True)
+        ]
     # Smaller renders are cut between whole pixels.
-    step = max((scale for scale in scales if scale), default=1)
-    left, top = (-(-offset // step) * step for offset in (common.x0 - whole.x0, common.y0 - whole.y0))
-    right, bottom = (offset // step * step for offset in (common.x1 - whole.x0, common.y1 - whole.y0))
-    if left >= right or top >= bottom:
-        names = ", ".join(f"{each.name} ({each.data_window})" for each in same)
+    columns = [x for x in range(common.x0, common.x1 + 1) if all((x - each.x0) % each.scale == 0 for each in places)]
+    rows = [y for y in range(common.y0, common.y1 + 1) if all((y - each.y0) % each.scale == 0 for each in places)]
+    if len(columns) < 2 or len(rows) < 2:
+        names = ", ".join(f"{each.name} ({each.data_window})" for each in renders)
         raise InputError(f"these pictures have no part of the frame in common: {names}; compare those of one part")
-    part = Window(left, top, right, bottom)
-    windows = []
-    for each, scale in zip(renders, scales, strict=True):
-        home = each.data_window if scale else whole
-        windows.append(Window(*(side // (scale or 1) for side in astuple(part))).shift(home.x0, home.y0))
-    return windows
+    return [
+        Window(
+            (columns[0] - each.x0) // each.scale,
+            (rows[0] - each.y0) // each.scale,
+            (columns[-1] - each.x0) // each.scale,
+            (rows[-1] - each.y0) // each.scale,
+        )
+        for each in places
+    ]
 
 
-def _scale(render: MappedRender, largest: MappedRender) -> int:
-    """How much smaller a render is than another one.
+def _place(render: MappedRender, largest: MappedRender) -> _Place:
+    """Where a render lies in the pixels of another one.
 
     Raises:
-        InputError: it is neither of the same size, nor smaller by a scale of ``SCALES``.
+        InputError: its size does not fit.
     """
-    size, wanted = ((window.height, window.width) for window in (render.data_window, largest.data_window))
-    for scale in (1, *SCALES):
-        # An odd side may have been rounded up or down.
-        if all(a in (b // scale, -(-b // scale)) for a, b in zip(size, wanted, strict=True)):
-            return scale
-    raise InputError(
-        f"{render.name} is {render.data_window.size}, but {largest.name} is {largest.data_window.size}; "
-        "compare pictures of one size"
-    )
+    data, display, whole, frame = render.data_window, render.display_window, largest.data_window, largest.display_window
+    if display == frame:
+        return _Place(1, 0, 0, data)
+    scale = _scale(display, frame)
+    if scale and (data != display or whole != frame):
+        x0, y0 = frame.x0 - scale * display.x0, frame.y0 - scale * display.y0
+        return _Place(scale, x0, y0, Window(*(scale * side for side in astuple(data))).shift(x0, y0))
+    scale = _scale(data, whole)
+    if scale:
+        return _Place(scale, whole.x0 - scale * data.x0, whole.y0 - scale * data.y0, whole)
+    raise InputError(f"{render.name} is {data.size}, but {largest.name} is {whole.size}; compare pictures of one size")
+
+
+def _scale(window: Window, other: Window) -> int | None:
+    """How much smaller a window is than another one; None if its size is neither the same nor smaller by a scale of
+    ``SCALES``."""
+    sides = ((window.height, other.height), (window.width, other.width))
+    # An odd side may have been rounded up or down.
+    return next((scale for scale in (1, *SCALES) if all(a in (b // scale, -(-b // scale)) for a, b in sides)), None)
 
 
 def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None:

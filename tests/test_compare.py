@@ -55,6 +55,23 @@ def test_pictures_are_compared_where_they_lie(tmp_path):
     assert note_on_windows(open_comparison([low], reference)) == ""
 
 
+@pytest.mark.parametrize("crop", [(16, 12, 32, 24), (14, 9, 33, 25)])
+def test_a_smaller_picture_of_the_whole_frame_lies_under_a_crop(tmp_path, crop):
+    """The smaller one is cut between its pixels, and not stretched over the crop."""
+    truth = picture(48, 64)
+    reference = part_of(tmp_path / "ref.exr", truth, *crop)
+    low = downsample(truth, 4)
+    whole = write_exr(tmp_path / "low.exr", rgb(low))
+    part = part_of(tmp_path / "part.exr", low, 3, 2, 13, 10)
+    comparison = open_comparison([whole, part], reference)
+    x0, y0 = (-(-each // 4) for each in crop[:2])
+    x1, y1 = ((crop[i] + crop[i + 2]) // 4 for i in (0, 1))
+    shown = upsample_bicubic(low[y0:y1, x0:x1], 4 * (x1 - x0), 4 * (y1 - y0))
+    expected = relmse(shown, truth[4 * y0 : 4 * y1, 4 * x0 : 4 * x1])
+    assert [each["relmse"] for each in score_images(comparison)] == pytest.approx([expected, expected], rel=1e-4)
+    assert note_on_windows(comparison).endswith(f": {4 * (x1 - x0)}x{4 * (y1 - y0)}+{4 * x0}+{4 * y0}")
+
+
 def test_pictures_are_compared_in_the_space_of_the_reference(tmp_path):
     truth = picture(48, 64)
     reference = write_exr(tmp_path / "ref.exr", rgb(truth), chromaticities=REC709.chromaticities)

@@ -19,23 +19,43 @@ from contextvars import ContextVar
 from functools import partial
 from typing import Any, TypeVar, cast
 
+from oiio_msspl.errors import InputError
+
 #: Values of a block: 512 KiB of float32.
 BLOCK_VALUES = 1 << 17
 
 T = TypeVar("T")
 U = TypeVar("U")
 
+#: The most threads that may be asked for.
+MOST_THREADS = 1024
+
 _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
 
 
 @contextlib.contextmanager
 def limit_threads(count: int) -> Iterator[None]:
-    """Use at most ``count`` threads inside the ``with`` block; 0 means one for each available core."""
+    """Use at most ``count`` threads inside the ``with`` block; 0 means one for each available core.
+
+    Raises:
+        InputError: see :func:`check_threads`.
+    """
+    check_threads(count)
     token = _thread_limit.set(count)
     try:
         yield
     finally:
         _thread_limit.reset(token)
+
+
+def check_threads(count: int) -> None:
+    """Check a number of threads that the caller asks for.
+
+    Raises:
+        InputError: it is below 0, or so large that the system could run out of them.
+    """
+    if not 0 <= count <= MOST_THREADS:
+        raise InputError(f"--threads {count}: give a number from 0, which means one a core, to {MOST_THREADS}")
 
 
 def half_of_the_threads() -> AbstractContextManager[None]:

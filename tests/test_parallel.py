@@ -8,6 +8,7 @@ import pytest
 
 from oiio_msspl import parallel
 from oiio_msspl.arrays import box_downsample
+from oiio_msspl.errors import InputError
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.parallel import (
     _thread_limit,
@@ -18,6 +19,13 @@ from oiio_msspl.parallel import (
     two_at_a_time,
 )
 from tests.conftest import picture
+
+
+@pytest.mark.parametrize("count", [-1, 100_000])
+def test_a_number_of_threads_has_bounds(count):
+    """So many threads that the system runs out of them would take other programs down."""
+    with pytest.raises(InputError, match=rf"--threads {count}: give a number from 0"), limit_threads(count):
+        pass
 
 
 @pytest.mark.parametrize("count", [1, 2, 5])

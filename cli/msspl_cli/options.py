@@ -299,7 +299,9 @@ def make_write_options(
     from oiio_msspl.exr.write_options import WriteOptions
 
     pixel_type = None if half is None else "half" if half else "float"
-    patterns = tuple(passes) if passes and "auto" not in passes else ()
+    if passes and "auto" in passes and len(passes) > 1:
+        raise InputError(f"--passes {', '.join(passes)}: auto fuses all sets; leave it out, or the others")
+    patterns = () if passes in (None, ["auto"]) else tuple(passes or ())
     return WriteOptions(
         layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer, data_passes
     )

@@ -74,6 +74,8 @@ def parse_map_options(options: Iterable[str]) -> dict[str, Any]:
         feature, equals, layer = option.partition("=")
         if not equals or not layer:
             raise InputError(f"--map {option!r}: write it as feature=layer, e.g. --map albedo=my_albedo")
+        if feature in mapping:
+            raise InputError(f"--map {option!r}: {feature} is mapped twice; give one layer, or a sum such as a+b")
         if is_exr(layer):
             mapping[feature] = f"file:{Path(layer).absolute()}"
         else:
@@ -132,10 +134,17 @@ def _problem(feature: str, candidate: Any) -> str | None:
     """What is wrong with a candidate, or None."""
     if isinstance(candidate, str):
         is_file = candidate.startswith("file:")
-        return "the beauty must be a layer of the render itself" if feature == RGB and is_file else None
+        if feature == RGB and is_file:
+            return "the beauty must be a layer of the render itself"
+        return None if is_file else _problem_of_name(candidate)
     if not isinstance(candidate, dict):
         return f"{str(candidate)[:80]} is neither a layer's name nor a table such as {{ sum = ['a', 'b'] }}"
     return _problem_of_form(candidate) or _problem_of_feature(feature, candidate)
+
+
+def _problem_of_name(name: str) -> str | None:
+    """What is wrong with a layer's name, or None. Wildcards are for the table of renderers."""
+    return f"{name!r} is a pattern; name one layer" if set("*?") & set(name) else None
 
 
 def _problem_of_form(candidate: dict[str, Any]) -> str | None:

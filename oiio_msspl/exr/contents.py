@@ -122,22 +122,25 @@ def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequenc
         return frozenset()
     # A deep part must not take the place of a flat one that has a layer of the same name.
     layer_of = layer_by_channel(file, deep=True) | layer_by_channel(file)
-    others = [c for part in file.parts for c in part.channels if c not in beauty]
-    kept: set[Channel] = set()
+    every = {c for part in file.parts for c in part.channels}
+    kept: set[Channel] = {*beauty}
     for pattern in patterns:
-        found = {c for c in others if _is_meant(pattern, c, layer_of.get(c), file.parts[c.part])}
+        # The beauty may be named, too, though it is written anyway.
+        found = {c for c in every if _is_meant(pattern, c, layer_of.get(c), file.parts[c.part])}
         if not found and pattern != "none":
-            names = {layer_of[c].name or c.name if c in layer_of else c.name for c in others}
+            names = {layer_of[c].name or c.name if c in layer_of else c.name for c in every.difference(beauty)}
             known = ", ".join(sorted(names)) or "no other layer"
             raise InputError(f"--layers {pattern!r}: {file.path} has no such layer; it has: {known}")
         kept |= found
-    return frozenset(set(others) - kept)
+    return frozenset(every - kept)
 
 
 def _is_meant(pattern: str, channel: Channel, layer: Layer | None, part: Part) -> bool:
-    """Whether a pattern means a channel. ``depth`` also means a plain Z, as in Nuke."""
+    """Whether a pattern means a channel. ``depth`` also means a plain Z, as in Nuke. A layer without a name, such as a
+    view's beauty, goes by the names of its part and its view."""
     prefix, _, component = channel.name.rpartition(".")
     name = layer.name if layer else prefix
     if not name:
-        return matches_layer(pattern, channel.name) or (channel.name == "Z" and matches_layer(pattern, "depth"))
+        names = [channel.name, part.name, layer.view if layer else "", "depth" if channel.name == "Z" else ""]
+        return any(matches_layer(pattern, each) for each in names if each)
     return matches_layer(pattern, name if name == part.name else f"{part.name}.{name}", component)

@@ -33,7 +33,7 @@ class WriteOptions:
     """How the result is stored.
 
     Raises:
-        InputError: there is no such layout or compression.
+        InputError: there is no such layout, compression or pixel type, or patterns exclude each other.
     """
 
     layout: str = "spec"
@@ -60,6 +60,14 @@ class WriteOptions:
             raise InputError(f"--layout {self.layout!r}: use one of {', '.join(LAYOUTS)}")
         if self.compression is not None and self.compression not in COMPRESSIONS:
             raise InputError(f"--compression {self.compression!r}: use one of {', '.join(COMPRESSIONS)}")
+        if self.pixel_type not in (None, "half", "float"):
+            raise InputError(f"pixel type {self.pixel_type!r}: use half or float")
+        for option, patterns in (("--layers", self.layers), ("--passes", self.passes)):
+            if isinstance(patterns, str):
+                raise InputError(f"{option} {patterns!r}: give a tuple of patterns, such as ({patterns!r},)")
+            if "none" in patterns and len(patterns) > 1:
+                others = ", ".join(each for each in patterns if each != "none")
+                raise InputError(f"{option} none excludes {others or 'a second none'}; give one of them")
         if self.layout == "multilayer" and self.compression not in (None, *LOSSLESS) and self.layers != ("none",):
             raise InputError(
                 f"--compression {self.compression}: with --layout multilayer all layers would lose bits, such as depth "

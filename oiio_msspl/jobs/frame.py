@@ -72,6 +72,8 @@ def fuse_files(
         raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
     if preview_path is not None:
         preview_path = check_target(preview_path, overwrite=overwrite)
+        if preview_path.suffix.lower() != ".png":
+            raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
         if view_transform is not None:
             check_view(view_transform)
     stages = Stages(

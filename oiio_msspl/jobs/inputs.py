@@ -42,6 +42,8 @@ class InputOptions:
     """The file that ``mapping`` was read from, if any."""
 
     def __post_init__(self) -> None:
+        if isinstance(self.sums, str):
+            raise InputError(f"--sum {self.sums!r}: give a tuple, such as ({self.sums!r},)")
         for option, spp in (("--lr-spp", self.lr_spp), ("--hr-spp", self.hr_spp)):
             if spp is not None and not 0 < spp < math.inf:
                 raise InputError(f"{option} {spp:g}: give the samples per pixel, a number above 0")

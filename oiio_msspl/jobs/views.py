@@ -95,6 +95,8 @@ def find_other_views(
         if not dropped.issuperset(made):
             taken |= _channels(view.hr)
             views.append(view)
+        if dropped.issuperset(view.hr.beauty_channels):
+            passed_on.append(f"the beauty of {name_of(label)} is left out, because --layers does not name it")
     return OtherViews(tuple(views), tuple(passed_on))
 
 

@@ -7,7 +7,7 @@ import csv
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.model.contract import SPREAD
+from oiio_msspl.model.contract import SCALES, SPREAD
 from oiio_msspl.model.session import Session
 
 #: Folder of the models: ``NAME.onnx`` for each.
@@ -70,6 +70,8 @@ def find_model(scale: int, name: str | None = None) -> Path:
             return models[known]
     if Path(name).is_file():
         return Path(name)
+    if scale not in SCALES:
+        raise InputError(f"there is no model for x{scale}; the scales are {', '.join(f'x{each}' for each in SCALES)}")
     families = dict.fromkeys(known.rpartition("-x")[0] for known in models)
     raise InputError(f"no model {name!r}: neither a file nor one of {', '.join([*families, *models])}")
 

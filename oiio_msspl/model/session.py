@@ -21,6 +21,7 @@ from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, r
 from oiio_msspl.model.encoding import default_value
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
+from oiio_msspl.parallel import check_threads
 
 log = logging.getLogger(__name__)
 
@@ -53,6 +54,7 @@ class Session:
     ) -> None:
         require_device(device)
         file = file_for(Path(path), device)
+        check_threads(threads)
         self._session = load_network(file, threads, providers(device))
         self.provider = self._session.get_providers()[0]
         if self.provider != PROVIDERS[device]:

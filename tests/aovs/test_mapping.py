@@ -49,6 +49,8 @@ def test_files_that_a_mapping_names_do_not_depend_on_the_working_directory(tmp_p
         (["rgb=a+b"], "must be a single layer"),
         (["rgb=other.exr"], "must be a layer of the render itself"),
         (["variance=a+b"], "variances don't add up"),
+        (["albedo=light_*"], r"albedo: 'light_\*' is a pattern; name one layer"),
+        (["albedo=a", "albedo=b"], "albedo is mapped twice"),
     ],
 )
 def test_a_wrong_mapping_option_is_explained(options, message):

@@ -11,6 +11,11 @@ from oiio_msspl.exr.write_options import WriteOptions
         ({"layout": "x"}, "use one of spec, nuke, multilayer"),
         ({"compression": "x"}, "use one of none"),
         ({"layout": "multilayer", "compression": "dwaa"}, "all layers would lose bits, .* or one of none, rle, zip"),
+        ({"pixel_type": "uint"}, "use half or float"),
+        ({"layers": "depth"}, r"--layers 'depth': give a tuple of patterns, such as \('depth',\)"),
+        ({"passes": "light*"}, "--passes 'light.*': give a tuple"),
+        ({"passes": ("none", "light*")}, "--passes none excludes light"),
+        ({"layers": ("depth", "none")}, "--layers none excludes depth"),
     ],
 )
 def test_unknown_options_are_refused(options, message):

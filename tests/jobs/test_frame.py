@@ -153,6 +153,12 @@ def test_no_file_that_is_read_is_written_even_with_overwrite(tmp_path, monkeypat
     assert protected(tmp_path) == before
 
 
+def test_a_preview_is_a_png(pair, tmp_path):
+    with pytest.raises(InputError, match=r"out\.jpg: the preview is a PNG; name it \.png"):
+        fuse_files(*pair, tmp_path / "out.exr", preview_path=tmp_path / "out.jpg")
+    assert not (tmp_path / "out.exr").exists()
+
+
 def test_a_preview_that_is_a_link_to_the_result_is_refused(pair, tmp_path, bilinear_models):
     (tmp_path / "out.png").symlink_to("out.exr")
     with pytest.raises(InputError, match="is the same file as"):

@@ -171,6 +171,24 @@ def test_views_that_are_not_written_are_not_fused(tmp_path, bilinear_models):
     assert [each["view"] for each in report.as_dict()["fused_views"]] == ["fg"]
 
 
+def test_a_view_whose_beauty_is_left_out_is_named(tmp_path, bilinear_models):
+    report, out = fused(
+        write_layers(tmp_path), tmp_path / "out.exr", bilinear_models, write=WriteOptions(layers=("none",))
+    )
+    assert "the beauty of bg is left out, because --layers does not name it" in report.warnings
+    assert not any(name.startswith("bg") for name in out)
+
+
+@pytest.mark.parametrize("pattern", ["fg.Combined", "bg.Combined", "Combined"])
+def test_the_beauty_of_any_view_may_be_named(tmp_path, bilinear_models, pattern):
+    """As `inspect` prints it. That of the first view is written anyway."""
+    write = WriteOptions(layers=(pattern,))
+    report, out = fused(write_layers(tmp_path), tmp_path / "out.exr", bilinear_models, write=write)
+    views = ["fg"] if pattern.startswith("fg") else ["fg", "bg"]
+    assert [each["view"] for each in report.as_dict()["fused_views"]] == views
+    assert {name.partition(".")[0] for name in out} == set(views)
+
+
 def test_a_pattern_may_mean_passes_of_another_view(tmp_path, bilinear_models):
     pair = write_layers(tmp_path)
     raw = {name: values for name, values in channels_of("fg", 1, 1).items() if "_" not in name}

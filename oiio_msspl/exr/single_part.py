@@ -98,8 +98,7 @@ def _names(contents: FileContents) -> dict[Channel, str]:
         InputError: parts have different data windows, or two channels would have one name.
     """
     path, home = contents.source.path, contents.home
-    added = {f"{name}.{c}" for name in contents.pixels.extra for c in COMPONENTS[name]}
-    taken = {channel.name for channel in contents.beauty} | added
+    taken = {channel.name for channel in contents.beauty}
     names: dict[Channel, str] = {}
     for part, passed_on in _passed_on(contents):
         if part.data_window != home.data_window:
@@ -110,9 +109,7 @@ def _names(contents: FileContents) -> dict[Channel, str]:
         for channel in passed_on:
             name = names[channel] = _name(contents, channel)
             if name in taken:
-                whose = f"{path} holds a channel" if name in added else f"two parts of {path} hold a channel"
-                also = ", as does a layer that is added" if name in added else ""
-                raise InputError(f"--layout multilayer: {whose} '{name}'{also}; use --layout spec")
+                raise InputError(f"--layout multilayer: two parts of {path} hold a channel '{name}'; use --layout spec")
             taken.add(name)
     return names
 

@@ -26,6 +26,13 @@ ERROR_LAYER, FRAMES_LAYER = "error", "frames"
 ALBEDO_LAYER, NORMAL_LAYER = "denoised_albedo", "denoised_normal"
 #: The channels of each of these layers.
 COMPONENTS = {ERROR_LAYER: "Y", FRAMES_LAYER: "Y", ALBEDO_LAYER: "RGB", NORMAL_LAYER: "XYZ"}
+#: The option that adds each.
+OPTIONS = {
+    ERROR_LAYER: "--error-layer",
+    FRAMES_LAYER: "--frames-layer",
+    ALBEDO_LAYER: "--data-passes",
+    NORMAL_LAYER: "--data-passes",
+}
 
 
 @dataclass(frozen=True)

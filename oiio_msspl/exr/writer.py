@@ -35,7 +35,7 @@ from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import check_single_part, write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
-from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.write_options import OPTIONS, WriteOptions
 from oiio_msspl.parallel import one_ahead
 
 
@@ -102,9 +102,17 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
         extra: names of further layers.
 
     Raises:
-        InputError: it can't, or a pattern of ``options`` matches nothing.
+        InputError: it can't, a layer of the HRLS has the name of a further one, or a pattern of ``options`` matches
+            nothing.
     """
     contents = _without_pixels(source, beauty, options, extra)
+    kept = {layer.name for channel, layer in contents.layers.items() if channel not in contents.dropped}
+    for name in contents.pixels.extra:
+        if name in kept:
+            raise InputError(
+                f"{OPTIONS[name]}: {source.path} has a layer '{name}' of its own; choose other layers with --layers, "
+                "or leave the option out"
+            )
     if options.layout == "multilayer":
         check_single_part(contents)
 

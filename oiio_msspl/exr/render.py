@@ -89,18 +89,19 @@ class Render:
         """
         if "rgb" not in layers:
             raise ValueError(f"{name}: no 'rgb' among the layers {sorted(layers)}")
-        height, width = layers["rgb"].shape[:2]
-        for key, value in layers.items():
+        arrays = {key: np.asarray(value) for key, value in layers.items()}
+        # Of another number of dimensions, it is refused as any other layer of a wrong shape.
+        height, width = arrays["rgb"].shape[:2] if arrays["rgb"].ndim == 3 else (0, 0)
+        for key, value in arrays.items():
             if key not in CHANNELS:
                 raise ValueError(f"{name}: layer {key!r} is none of {', '.join(CHANNELS)}")
             if value.shape != (height, width, CHANNELS[key]) or not value.size:
-                raise ValueError(
-                    f"{name}: layer {key!r} has shape {value.shape}, expected ({height}, {width}, {CHANNELS[key]})"
-                )
+                size = f"{height}, {width}" if height else "height, width"
+                raise ValueError(f"{name}: layer {key!r} has shape {value.shape}, expected ({size}, {CHANNELS[key]})")
             if not np.issubdtype(value.dtype, np.floating):
                 raise ValueError(f"{name}: layer {key!r} holds {value.dtype}, expected floats")
         window = Window(0, 0, width, height)
-        return cls({k: np.asarray(v, dtype=np.float32) for k, v in layers.items()}, window, window, name=name)
+        return cls({k: np.asarray(v, dtype=np.float32) for k, v in arrays.items()}, window, window, name=name)
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
         """Layers over a rectangle inside the data window, as views of the whole arrays.

@@ -38,6 +38,10 @@ def test_a_render_needs_a_beauty_and_layers_of_one_size():
         Render.from_arrays(albedo=np.ones((2, 2, 3)))
     with pytest.raises(ValueError, match=r"layer 'alpha' has shape \(2, 2\), expected \(2, 2, 1\)"):
         Render.from_arrays(rgb=np.ones((2, 2, 3)), alpha=np.ones((2, 2)))
+    for flat in ([1.0, 2.0], 1.0, None):
+        with pytest.raises(ValueError, match=r"layer 'rgb' has shape .*, expected \(height, width, 3\)"):
+            Render.from_arrays(rgb=flat)
+    assert Render.from_arrays(rgb=[[[1.0, 2.0, 3.0]]]).layers["rgb"].dtype == np.float32
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.camera_motion import Projection, camera_vectors, find_projection
-from oiio_msspl.fusion.motion_check import MARGIN, FieldCheck, check_field
+from oiio_msspl.fusion.motion_check import FEWEST, MARGIN, FieldCheck, check_field, is_silent
 from oiio_msspl.fusion.motion_guides import FramePair, has_guide, open_pair, still_and_moved
 from oiio_msspl.fusion.motion_vectors import channels_to_read, invert, judged_vectors
 from oiio_msspl.fusion.optical_flow import flow_vectors, has_optical_flow
@@ -66,8 +66,9 @@ class MotionSource:
     """``vectors``: verified layers. ``static``: all layers of vectors; a pixel where one is not 0 is not followed."""
     projection: Projection | None = None
     """``camera``: how the matrices are to be read."""
-    open: bool = False
-    """``vectors``: other formats say the same in the frames that were looked at, so others should be looked at, too."""
+    silent: frozenset[str] = frozenset()
+    """``vectors``: axes, ``x`` or ``y``, along which nothing moves in the frames that were looked at. Frames in which
+    something does should be looked at, too, see :meth:`tells_more`."""
 
     def read(self, frame: MotionFrame, neighbour: MotionFrame, step: int) -> tuple[Array, Mask]:
         """Where the surfaces of a frame lie in a neighbour.
@@ -135,6 +136,20 @@ class MotionSource:
         names = [name for name in (ALBEDO, NORMAL) if all(has_guide(each.hr, name, moves=moves) for each in both)]
         here, there = (each.pixels or each.hr for each in both)
         return other_surfaces(here, there, names, vectors if moves else None, known)
+
+    def tells_more(self, hr: MappedRender) -> bool:
+        """Whether something moves in a frame along an axis that is :attr:`silent`.
+
+        Raises:
+            InputError: pixels can't be decoded.
+        """
+        for each in self.fields:
+            vectors, known = self._vectors(MotionFrame(hr), each.format.step)
+            for axis in self.silent:
+                lengths = np.sort(np.abs(vectors[..., "xy".index(axis)][known]))[-FEWEST:]
+                if len(lengths) == FEWEST and not is_silent(lengths[0]):
+                    return True
+        return False
 
     @property
     def same_both_ways(self) -> bool:
@@ -288,8 +303,8 @@ def _vectors(verified: Sequence[FieldCheck]) -> MotionSource:
     if len(verified) == 1:
         opposite = "previous" if verified[0].field.format.step == 1 else "next"
         texts += f"; vectors to the {opposite} frame are computed by inverting these"
-    fields, is_open = tuple(check.field for check in verified), any(check.open for check in verified)
-    return MotionSource(VECTORS, f"motion vectors of {texts}", fields, open=is_open)
+    fields, silent = tuple(check.field for check in verified), frozenset[str]().union(*(c.silent for c in verified))
+    return MotionSource(VECTORS, f"motion vectors of {texts}", fields, silent=silent)
 
 
 def _without_vectors(pair: FramePair, checks: Sequence[FieldCheck]) -> MotionSource:

@@ -57,9 +57,9 @@ class FieldCheck:
     """What is left of the differences between the frames; without motion it is 1."""
     by_user: bool = False
     """The user has described them, and nothing verifies that."""
-    open: bool = False
-    """Other formats say the same places in these frames: a camera that moves sideways does not tell y. The one that was
-    expected is taken."""
+    silent: frozenset[str] = frozenset()
+    """Axes, ``x`` or ``y``, along which hardly anything moves in these frames. So they don't tell its sign, and the one
+    that was expected is taken."""
 
     @property
     def text(self) -> str:
@@ -122,12 +122,12 @@ def _check_offset(
     if fits[best] * needed > 1 or at_end:
         return FieldCheck(field, _no_format(pair, fits[best]), fit=fits[best])
     if verified and fits.get(field.format, np.inf) < MARGIN * max(fits[best], FLOOR):
-        return FieldCheck(field, fit=fits[field.format], open=trial.is_open(field.format, fits))
+        return FieldCheck(field, fit=fits[field.format], silent=trial.silent(field.format))
     rivals = [f for f in fits if f.to == best.to and f != best and fits[f] < MARGIN**2 * max(fits[best], FLOOR)]
     for rival in rivals:
         if not trial.beats(best, rival):
             return FieldCheck(field, f"'{best}' and '{rival}' fit it equally well")
-    return FieldCheck(replace(field, format=best), fit=fits[best], open=trial.is_open(best, fits))
+    return FieldCheck(replace(field, format=best), fit=fits[best], silent=trial.silent(best))
 
 
 def _with_any_scale(
@@ -250,10 +250,11 @@ class _Trial:
             return False
         return not any(self._apart(place, form, other).any() for place in self._of(form))
 
-    def is_open(self, form: MotionFormat, fits: dict[MotionFormat, float]) -> bool:
-        """Whether a format with another axis or unit says the same places in these frames."""
-        others = (f for f in fits if (f.x, f.y, f.unit) != (form.x, form.y, form.unit))
-        return any(self.is_same(other, form, fits) for other in others)
+    def silent(self, form: MotionFormat) -> frozenset[str]:
+        """Axes along which vectors of the other sign would lead to the same places."""
+        vectors = np.concatenate([self._vectors(place, form) for place in self._of(form)])
+        longest = np.abs(vectors).max(axis=0) * self._reduction
+        return frozenset(axis for axis, length in zip("xy", longest, strict=True) if is_silent(length))
 
     def beats(self, form: MotionFormat, rival: MotionFormat) -> bool:
         """Whether a format fits clearly better where the two say different places; True if they nowhere do.
@@ -313,6 +314,11 @@ class _Trial:
             return 2.0  # a format that leads out of the picture
         still = float(np.median(place.still[inside]))
         return float(np.median(errors[inside])) / still if still > 0 else 1.0
+
+
+def is_silent(length: float) -> bool:
+    """Whether so short a movement, in pixels, does not tell its sign."""
+    return bool(2 * length <= DIFFERENT)
 
 
 def _median(errors: Array) -> float:

@@ -276,18 +276,23 @@ def _motion_of(
         view: the view or view layer; None for each file's first one.
     """
 
+    def render(number: int) -> MappedRender:
+        hr = mapped(number)[1]
+        return hr if view is None else map_other_hrls(hr, view, inputs)
+
     def look(number: int, verified: Sequence[MotionField] = ()) -> MotionSource:
-        hrls = [mapped(n)[1] for n in (number, number + 1)]
-        first, second = (hr if view is None else map_other_hrls(hr, view, inputs) for hr in hrls)
-        return find_motion(first, second, options.motion_format, verified, required=required)
+        return find_motion(render(number), render(number + 1), options.motion_format, verified, required=required)
 
     found: dict[int, MotionSource] = {}
     vectors: MotionSource | None = None
     problem: InputError | None = None
     for number in numbers:
-        if len(found) == LOOKED_AT or (vectors and not vectors.open):
+        if len(found) == LOOKED_AT or (vectors and not vectors.silent):
             break
         try:
+            if vectors and not vectors.tells_more(render(number)):
+                found[number] = vectors
+                continue
             found[number] = look(number, vectors.fields if vectors else ())
         except InputError as error:
             problem = problem or error
@@ -295,11 +300,11 @@ def _motion_of(
             continue
         if found[number].kind != VECTORS:
             continue
-        earlier = [n for n, source in found.items() if source.kind == VECTORS and n != number]
-        for before in earlier:
-            if not _agree(look(before, found[number].fields), found[number]):
-                return _contradiction(found, before, number, required=required)
-        vectors = found[number]
+        if vectors and not _agree(found[number], vectors):
+            for before, source in found.items():
+                if source.kind == VECTORS and not _agree(look(before, found[number].fields), found[number]):
+                    return _contradiction(found, before, number, required=required)
+        vectors = replace(found[number], silent=found[number].silent & (vectors or found[number]).silent)
     if vectors:
         return vectors
     for kind in (CAMERA, STATIC, FLOW):

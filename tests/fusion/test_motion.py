@@ -290,11 +290,13 @@ def test_what_other_frames_have_shown_is_kept_unless_another_format_fits_better(
     """A sideways movement does not tell y. One upwards does."""
     sideways = shot(tmp_path, MotionFormat(y="up"), "velocity", truck)
     first = find_motion(*sideways[:2])
-    assert first.open
+    assert first.silent == {"y"} and not first.tells_more(sideways[1])
     (tmp_path / "up").mkdir()
     lift = lambda t: np.array([0.0, 0.02 * t + 0.01 * t * t, 1.0])  # noqa: E731
     upwards = shot(tmp_path / "up", MotionFormat(y="up"), "velocity", lift)
+    assert first.tells_more(upwards[0])
     second = find_motion(*upwards[:2], None, first.fields)
+    assert second.silent == {"x"}
     assert second.fields[0].format.y == "up"
     wrong = [replace(each, format=replace(each.format, y="down")) for each in first.fields]
     assert find_motion(*upwards[:2], None, wrong).fields[0].format.y == "up"

@@ -300,11 +300,18 @@ def _motion_of(
             continue
         if found[number].kind != VECTORS:
             continue
-        if vectors and not _agree(found[number], vectors):
+        latest, silent = found[number], found[number].silent & (vectors or found[number]).silent
+        candidates = [latest]
+        if vectors and _agree(latest, vectors):
+            candidates = [vectors, latest]
+        elif vectors:
             for before, source in found.items():
-                if source.kind == VECTORS and not _agree(look(before, found[number].fields), found[number]):
-                    return _contradiction(found, before, number, required=required)
-        vectors = replace(found[number], silent=found[number].silent & (vectors or found[number]).silent)
+                if source.kind == VECTORS and before != number:
+                    candidates.append(look(before, latest.fields))
+                    if not _agree(candidates[-1], latest):
+                        return _contradiction(found, before, number, required=required)
+        # The pair that tells of most layers.
+        vectors = replace(max(candidates, key=lambda source: len(source.fields)), silent=silent)
     if vectors:
         return vectors
     for kind in (CAMERA, STATIC, FLOW):

@@ -24,7 +24,7 @@ from oiio_msspl.fusion.noise import is_noise_spread
 from oiio_msspl.fusion.sums import check_sum
 from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
 from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
-from oiio_msspl.jobs.sequence import next_file
+from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
@@ -138,6 +138,8 @@ def inspect_file(
     """
     result = Inspection(path, contract=Contract.of_file(find_model(SCALES[0], model)))
     try:
+        if is_sequence(path) and not path.is_dir():
+            raise InputError(f"{path}: is a pattern; name one of its files, and the next frame is found beside it")
         file = result.file = open_exr(path)
         result.facts = _facts(file)
         render = result.render = map_hrls(file, inputs)

@@ -72,6 +72,8 @@ def test_inspect_explains_what_cannot_be_used(files):
     done = run("msspl", "inspect", files / "hr.exr", "--map", "rgb=mask")
     assert done.returncode == 2
     assert "can't be used: rgb: layer 'mask' has channels X, not R, G, B (or X, Y, Z)" in done.stdout
+    done = run("msspl", "inspect", files / "hr.####.exr")
+    assert done.returncode == 2 and "is a pattern; name one of its files" in done.stdout
 
 
 @needs_shared("exr")

@@ -45,6 +45,8 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
     check_encodable(path)
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
+    if path.exists() and not path.is_file():
+        raise InputError(f"{path}: is no ordinary file; name another one")
     if os.path.lexists(path) and not overwrite:
         raise InputError(f"{path}: exists; pass --overwrite to replace it")
     # Renaming would replace a write-protected file all the same. Somebody protected it on purpose.

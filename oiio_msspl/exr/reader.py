@@ -303,7 +303,7 @@ def _open(path: Path) -> Any:
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     if not path.is_file():
-        raise InputError(f"{path}: no such file")
+        raise InputError(f"{path}: {'is no ordinary file' if path.exists() else 'no such file'}")
     handle = oiio.ImageInput.open(str(path))
     if handle is None:
         raise _refused(path, reason_of(oiio))

@@ -231,8 +231,6 @@ def read_earlier(
     check_target(path, overwrite=overwrite or skip_existing)
     if not path.exists():
         return {}
-    if not path.is_file():
-        raise InputError(f"{path}: is no ordinary file; name another file for the report")
     if path.stat().st_size > LARGEST_REPORT:
         raise InputError(f"{path}: exists and is too large for a report of a shot; name another file")
     try:

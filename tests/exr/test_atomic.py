@@ -57,6 +57,9 @@ def test_targets_are_checked_before_any_work(tmp_path):
         check_target(tmp_path / "nowhere" / "x.exr", overwrite=False)
     with pytest.raises(InputError, match="is a folder"):
         check_target(tmp_path, overwrite=True)
+    os.mkfifo(tmp_path / "pipe.exr")
+    with pytest.raises(InputError, match="is no ordinary file"):
+        check_target(tmp_path / "pipe.exr", overwrite=True)
 
 
 def test_leftovers_of_killed_runs_are_removed_and_nothing_else(tmp_path):

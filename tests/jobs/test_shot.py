@@ -216,7 +216,7 @@ SORTS = {
     "PNG named .exr": (png, "failed", "is a png file; give an EXR"),
     "deep": (deep, "failed", "holds deep data only"),
     "folder": (folder_instead, "failed", "is a folder"),
-    "named pipe": (lambda lr, hr: (lr.unlink(), os.mkfifo(lr)), "failed", "no such file"),
+    "named pipe": (lambda lr, hr: (lr.unlink(), os.mkfifo(lr)), "failed", "is no ordinary file"),
     "broken link": (lambda lr, hr: (lr.unlink(), lr.symlink_to("nowhere")), "failed", "no such file"),
     "no beauty": (lambda lr, hr: write_exr(hr, {"Z": picture(8, 8)[..., 0]}), "failed", "no beauty"),
     "ids for a beauty": (

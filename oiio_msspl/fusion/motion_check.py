@@ -121,6 +121,8 @@ def _check_offset(
     at_end = offset == 0 and "scale" not in field.fixed and not ANY_SCALES[0] < best.scale < ANY_SCALES[-1]
     if fits[best] * needed > 1 or at_end:
         return FieldCheck(field, _no_format(pair, fits[best]), fit=fits[best])
+    expected = replace(best, **{axis: getattr(field.format, axis) for axis in trial.silent(best)})
+    fits[expected], best = fits[best], expected
     if verified and fits.get(field.format, np.inf) < MARGIN * max(fits[best], FLOOR):
         return FieldCheck(field, fit=fits[field.format], silent=trial.silent(field.format))
     rivals = [f for f in fits if f.to == best.to and f != best and fits[f] < MARGIN**2 * max(fits[best], FLOOR)]
@@ -139,12 +141,16 @@ def _with_any_scale(
     """
     units = (field.format.unit,) if "unit" in field.fixed else ANY_SCALES_OF
     formats = (form for form in _formats(field, encoded=False, scales=ANY_SCALES) if form.unit in units)
-    every = fits | trial.fits(formats)
-    for to in {form.to for form in every}:
-        best = min((form for form in every if form.to == to), key=lambda form: every[form])
-        scale = trial.fit_scale(best, every[best], clearly=False)
-        fits = fits | trial.fits(replace(form, scale=scale) for form in (best, _mirrored(best)) if form in every)
-    return min(fits, key=lambda form: fits[form]), fits
+    every = trial.fits(formats)
+    for to, unit in itertools.product(CHOICES["to"], units):
+        if each := [form for form in every if (form.to, form.unit) == (to, unit)]:
+            best = min(each, key=lambda form: every[form])
+            scale = trial.fit_scale(best, every[best], clearly=False)
+            fits = fits | trial.fits(replace(form, scale=scale) for form in (best, _mirrored(best)) if form in every)
+    best = min(fits, key=lambda form: fits[form])
+    # Along one axis alone, units differ in nothing but their scales.
+    same = (form for form in fits if form.unit == field.format.unit and trial.is_same(form, best, fits))
+    return next(same, best), fits
 
 
 def _no_format(pair: FramePair, fit: float) -> str:

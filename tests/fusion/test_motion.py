@@ -281,6 +281,14 @@ def test_a_shutter_may_have_any_length(tmp_path, scale):
     assert right_share(source, frames, 0, 1) == 1
 
 
+@pytest.mark.parametrize("y", ["up", "down"])
+def test_what_frames_do_not_tell_is_what_is_expected_at_any_scale(tmp_path, y):
+    frames = shot(tmp_path, MotionFormat(y=y, scale=7.0), "velocity", truck)
+    expected = find_motion(*frames[:2]).fields[0].format
+    assert expected.y == frames[0].motion.fields[0].format.y
+    assert expected.scale == pytest.approx(7, rel=0.01)
+
+
 def test_a_scale_that_no_shutter_has_is_not_found(tmp_path):
     frames = shot(tmp_path, MotionFormat(scale=0.01), "velocity")
     assert "no known format" in find_motion(*frames[:2]).text

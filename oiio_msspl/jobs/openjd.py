@@ -109,7 +109,7 @@ def make_job(
     if shipped_models().keys() & {name, *(f"{name}-x{scale}" for scale in SCALES)}:
         options += ["--model", name]
     else:
-        files["--model"] = find_model(0, name)
+        files["--model"] = find_model(SCALES[0], name)
         Contract.of_file(files["--model"])
 
     if not any(frame.lr and frame.hr for frame in shot.frames):

@@ -47,7 +47,7 @@ FILTERS = (
     PixelFilter("blackman-harris", 0.75, splatted=False),
 )
 SCALE, SPP = 2, (1, 4)
-MODELS = ("joint-x2", "joint-spread-x2", "joint-large-spread-x2")
+MODELS = ("joint-x2", "joint-large-x2", "joint-spread-x2", "joint-large-spread-x2")
 OIDN = "OIDN prefiltered on the HRLS"
 FEATURES = (RGB, ALBEDO, NORMAL)
 #: Names of the stored arrays.

@@ -301,7 +301,7 @@ def make_write_options(
     pixel_type = None if half is None else "half" if half else "float"
     if passes and "auto" in passes and len(passes) > 1:
         raise InputError(f"--passes {', '.join(passes)}: auto fuses all sets; leave it out, or the others")
-    patterns = () if passes in (None, ["auto"]) else tuple(passes or ())
+    patterns = () if passes == ["auto"] else tuple(passes or ())
     return WriteOptions(
         layout, compression, pixel_type, tuple(layers), patterns, error_layer, frames_layer, data_passes
     )

@@ -47,7 +47,7 @@ class OtherViews:
     views: tuple[View, ...] = ()
     """Those that are fused."""
     passed_on: tuple[str, ...] = ()
-    """Why others are not, one sentence each."""
+    """Why others are not, and which beauties are not written, one sentence each."""
 
     @property
     def hrls(self) -> list[MappedRender]:

@@ -15,6 +15,7 @@ import typer
 from msspl_cli import console, options
 from msspl_cli.shot_printer import ShotPrinter
 from oiio_msspl.errors import InputError
+from oiio_msspl.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -89,7 +90,7 @@ def fuse(
         int,
         typer.Option(
             min=0,
-            max=1024,
+            max=MOST_THREADS,
             metavar="N",
             help="CPU threads. 0: one on each core.",
             rich_help_panel=options.MODEL,

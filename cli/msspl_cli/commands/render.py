@@ -20,6 +20,7 @@ from oiio_msspl.exr.atomic import (
     remove_left_folders,
     remove_leftovers,
 )
+from oiio_msspl.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
     from oiio_msspl.jobs.rendered_shot import RenderedShot
@@ -123,7 +124,7 @@ def render(
         int,
         typer.Option(
             min=0,
-            max=1024,
+            max=MOST_THREADS,
             metavar="N",
             help="CPU threads. 0: as the scene says, or one on each core.",
             rich_help_panel=RENDER,

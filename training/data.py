@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+import torch.nn.functional as F
 from torch import Tensor
 from torch.utils.data import DataLoader, IterableDataset
 
@@ -37,7 +38,7 @@ from oiio_msspl.aovs.features import (
 from oiio_msspl.colour import LUMINANCE_WEIGHTS
 from training.encoding import compress, exposure_of, luminance, pack, repair
 from training.ops import box_downsample
-from training.splat import apply, draw_filter, filter_reference
+from training.splat import Filtered, apply, draw_filter, filter_reference
 
 #: A batch by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w), all encoded, in
 #: channels-last memory. Some networks read further channels of the first two.
@@ -83,6 +84,9 @@ class Sampling:
     """Share with colour only."""
     spread_noise: bool | None = None
     """Of views with single samples: only pixel filters that spread noise, only others, or all (None)."""
+    uneven: float = 0.0
+    """Share of the pairs of views with single samples in which parts of both renders have all stored samples. So it is
+    where a shot's frames have been averaged."""
 
 
 #: The paper's sampling, as far as its text describes it: crops only, all features, clipped, nearest-neighbour LRHS.
@@ -253,8 +257,7 @@ class SampleTensors:
         lr_count = len(self.arrays["lr_color"])
         n, lr_samples = _draw_spp(np.ones(lr_count), sampling, False, rng)
         device = light.device
-        drawn = torch.from_numpy(rng.permutation(len(self.arrays["color"]))).to(device)
-        drawn = drawn[: pixel_filter.samples_for(n)]
+        order = torch.from_numpy(rng.permutation(len(self.arrays["color"]))).to(device)
         generator = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
 
         # The crop with as much around it as the filter reaches
@@ -268,21 +271,35 @@ class SampleTensors:
             *(slice(side.start - w.start, side.stop - w.start) for side, w in zip(area, wide, strict=True)),
         )
         names = {RGB: "color"} | {name: name for name in PASS_FEATURES if name != RGB}
-        layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
-        for name in RADIANCE_FEATURES:
-            layers[name] = _lit(layers[name], light)
-        place = self.read("place", drawn, *wide)
-        measure = luminance(layers[RGB].movedim(1, -1))
-        filtered = apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, n, generator)
-        features = _split(filtered.mean[inner].movedim(0, -1))
-        for name in RADIANCE_FEATURES:
-            features[name] = features[name].clamp(0.0, sampling.clip)
-        has_variance = n > 1 or pixel_filter.spreads_noise
+
+        def hrls(n: int) -> Filtered:
+            drawn = order[: pixel_filter.samples_for(n)]
+            layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
+            for name in RADIANCE_FEATURES:
+                layers[name] = _lit(layers[name], light)
+            place = self.read("place", drawn, *wide)
+            measure = luminance(layers[RGB].movedim(1, -1))
+            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, n, generator)
 
         whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
-        chosen = torch.from_numpy(lr_samples).to(device)
-        color = _lit(self.read("lr_color", chosen, *whole), light)
-        lrhs = apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator)
+
+        def lrhs(samples: np.ndarray) -> Tensor:
+            chosen = torch.from_numpy(samples).to(device)
+            color = _lit(self.read("lr_color", chosen, *whole), light)
+            return apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator).mean
+
+        few = hrls(n)
+        features, variance, low = few.mean[inner], few.variance, lrhs(lr_samples)
+        has_variance = (n > 1 or pixel_filter.spreads_noise) and variance is not None
+        if sampling.uneven and rng.random() < sampling.uneven:
+            more = _random_parts(height, width, rng).to(device)
+            features = torch.where(more[area], hrls(len(order)).mean[inner], features)
+            coarse = more[::scale, ::scale][: low.shape[-2], : low.shape[-1]]
+            low = torch.where(coarse, lrhs(np.arange(lr_count)), low)
+            has_variance = False  # which parts have more samples is not known
+        features = _split(features.movedim(0, -1))
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name].clamp(0.0, sampling.clip)
 
         cells = [slice(w.start * REF_CELLS, w.stop * REF_CELLS) for w in wide]
         if self.clean_reference is None:
@@ -292,10 +309,19 @@ class SampleTensors:
         target = filter_reference(pixel_filter, _lit(ref, light)[0], REF_CELLS)[inner].movedim(0, -1)
         return Rendered(
             features,
-            filtered.variance[inner[1:]] if has_variance and filtered.variance is not None else None,
-            lrhs.mean.movedim(0, -1).clamp(0.0, sampling.clip),
+            variance[inner[1:]] if has_variance else None,
+            low.movedim(0, -1).clamp(0.0, sampling.clip),
             target.clamp(0.0, sampling.clip),
         )
+
+
+def _random_parts(height: int, width: int, rng: np.random.Generator, cell: int = 8) -> Tensor:
+    """A random part of an image, (H, W) of bool: where smooth noise is above a random one of its values. Its edges lie
+    on a grid of ``cell`` pixels, so that it is the same in an LRHS of every scale."""
+    noise = torch.from_numpy(rng.standard_normal((1, 1, 6, 6)).astype(np.float32))
+    cells = F.interpolate(noise, (-(-height // cell), -(-width // cell)), mode="bilinear")[0, 0]
+    chosen = cells > cells.flatten()[int(rng.integers(cells.numel()))]
+    return chosen.repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width]
 
 
 def _decode_radiance(stored: Tensor) -> Tensor:

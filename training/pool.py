@@ -53,6 +53,8 @@ log = logging.getLogger(__name__)
 CHANNELS = sum(HRLS_FEATURES[name] for name in FEATURES)
 #: Widths of a view are cut to a multiple of this.
 ALIGNMENT = 128
+#: Share of the pairs in which parts of both renders have more samples.
+UNEVEN = 0.3
 #: Seconds between two looks for new files.
 RESCAN_SECONDS = 5.0
 
@@ -173,7 +175,7 @@ def draw_pairs(
     pairs = []
     for index in range(count):
         spread = prepares and isinstance(view, SampleView) and index % 2 == 1
-        sampling = Sampling(spread_noise=spread if prepares else None)
+        sampling = Sampling(spread_noise=spread if prepares else None, uneven=UNEVEN)
         batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
         lrhs, hrls = batch["lrhs"], batch["hrls"]
         lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :CHANNELS]

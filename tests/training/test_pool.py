@@ -10,11 +10,11 @@ import pytest
 
 torch = pytest.importorskip("torch", reason="training is an extra")
 
-from datagen.samples import SIZE  # noqa: E402
+from datagen.samples import SIZE, encode  # noqa: E402
 from datagen.views import NO_REFERENCE, REF_CELLS, Folder  # noqa: E402
 from tests.training.conftest import write_wall  # noqa: E402
 from training import checkpoints  # noqa: E402
-from training.data import SampleTensors  # noqa: E402
+from training.data import SampleTensors, Sampling  # noqa: E402
 from training.encoding import log_encode  # noqa: E402
 from training.joint import JointFusion  # noqa: E402
 from training.pool import Denoisers, PooledBatches, Teacher, draw_pairs  # noqa: E402
@@ -36,6 +36,28 @@ def test_views_are_drawn_whole(sample_folder: Path) -> None:
     for image in (pair["hrls"][:3], pair["lrhs"][:3], pair["lrhs"][3:6]):
         torch.testing.assert_close(image.mean(dim=(1, 2)), colours, atol=0.01, rtol=0)
     assert pair["lrhs"][6].max() < 0.01
+
+
+def test_parts_of_both_renders_may_have_all_samples(sample_folder: Path) -> None:
+    """One sample of noise of variance 1 a pixel, and in some cells of 8 x 8 HRLS pixels the mean of all."""
+    (view,) = Folder(sample_folder).sample_views("train")
+    tensors, rng = SampleTensors.of(view, CPU), np.random.default_rng(1)
+    for name in ("color", "lr_color"):
+        noise = rng.exponential(1.0, (*tensors.arrays[name].shape, 3)).astype(np.float32)
+        tensors.arrays[name] = torch.from_numpy(encode(noise).view(np.int32))
+    sampling = Sampling(hrls_spp=(1.0,), lrhs_passes=(1.0,), spread_noise=False, uneven=1.0)
+    whole = (slice(0, SIZE), slice(0, SIZE))
+    for seed in range(4):
+        drawn = tensors.draw(4, whole, torch.eye(3), sampling, np.random.default_rng(seed))
+        assert drawn.variance is None
+        cells = []
+        for image, side in ((drawn.features["rgb"], 8), (drawn.lrhs, 2)):
+            blocks = image.unfold(0, side, side).unfold(1, side, side)
+            cells.append(blocks.sub(1.0).square().mean(dim=(2, 3, 4)))
+        fine = cells[0] < 0.5
+        assert 0 < fine.sum() < fine.numel()
+        for variance in cells:
+            assert variance[fine].mean() < 0.5 * variance[~fine].mean()
 
 
 def test_a_reference_with_noise_is_the_mean_of_itself_and_of_a_denoised_one(tmp_path: Path) -> None:

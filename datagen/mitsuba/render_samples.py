@@ -123,6 +123,8 @@ def render_scene(args: argparse.Namespace, assets, seed: int) -> tuple[int, str]
     if not missing:
         return 0, "done before"
     is_room = args.rooms is not None and seed % 3 == 2
+    if args.kind is not None and (is_room or scenes.kind_of(seed) != args.kind):
+        return 0, "another kind"
     # Rooms of other people are for training only: all seeds share their walls
     split = "room" if is_room else views.split_of(seed)
     if not args.ref_spp and split not in ("room", "train"):
@@ -146,6 +148,7 @@ def main() -> int:
         "datagen.mitsuba.render_samples", "Render training views that keep their samples.", ref_spp=48
     )
     parser.add_argument("--rooms", type=Path, help="folder with bathroom2/ and living-room-3/, Mitsuba scenes")
+    parser.add_argument("--kind", help="of scenes, only those of this one, such as ajar_room")
     parser.add_argument("--max-gib", type=float, default=6.0, help="start no new scene above this size (%(default)s)")
     parser.add_argument(
         "--keep-noise", action="store_true", help="references as rendered, for training.pool to denoise"
@@ -154,7 +157,10 @@ def main() -> int:
     args = parser.parse_args()
     start(args.threads, args.variant)
     from datagen.mitsuba.assets import Assets
+    from datagen.mitsuba.scenes import KINDS
 
+    if args.kind and args.kind not in (kinds := [kind.__name__ for kind in KINDS]):
+        parser.error(f"--kind {args.kind}: not one of {', '.join(kinds)}")
     assets = Assets(args.assets)
 
     def render(seed: int) -> tuple[int, str]:

@@ -636,11 +636,21 @@ KINDS: dict[Callable[[Scene], None], float] = {
 }  # fmt: skip
 
 
+def _drawn(seed: int) -> tuple[Callable[[Scene], None], Rng]:
+    """The kind of a seed's scene, and the random numbers that follow."""
+    rng = np.random.default_rng([seed, VERSION])
+    return list(KINDS)[rng.choice(len(KINDS), p=np.array(list(KINDS.values())) / sum(KINDS.values()))], rng
+
+
+def kind_of(seed: int) -> str:
+    """The name of the kind of a seed's scene, one of ``KINDS``."""
+    return _drawn(seed)[0].__name__
+
+
 def build(seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
     """The Mitsuba scene of a seed, and its plan."""
-    rng = np.random.default_rng([seed, VERSION])
+    kind, rng = _drawn(seed)
     plan = Scene(rng, assets)
-    kind = list(KINDS)[rng.choice(len(KINDS), p=np.array(list(KINDS.values())) / sum(KINDS.values()))]
     plan.kind = kind.__name__
     kind(plan)
     return plan.finish(), plan

@@ -85,8 +85,8 @@ class Sampling:
     spread_noise: bool | None = None
     """Of views with single samples: only pixel filters that spread noise, only others, or all (None)."""
     uneven: float = 0.0
-    """Share of the pairs of views with single samples in which parts of both renders have all stored samples. So it is
-    where a shot's frames have been averaged."""
+    """Share of the pairs of views with single samples in which parts of both renders have all stored samples, as the
+    averaged frames of a shot have."""
 
 
 #: The paper's sampling, as far as its text describes it: crops only, all features, clipped, nearest-neighbour LRHS.
@@ -272,14 +272,14 @@ class SampleTensors:
         )
         names = {RGB: "color"} | {name: name for name in PASS_FEATURES if name != RGB}
 
-        def hrls(n: int) -> Filtered:
-            drawn = order[: pixel_filter.samples_for(n)]
+        def hrls(count: int) -> Filtered:
+            drawn = order[: pixel_filter.samples_for(count)]
             layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
             for name in RADIANCE_FEATURES:
                 layers[name] = _lit(layers[name], light)
             place = self.read("place", drawn, *wide)
             measure = luminance(layers[RGB].movedim(1, -1))
-            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, n, generator)
+            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, count, generator)
 
         whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
 

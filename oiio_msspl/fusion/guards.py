@@ -193,8 +193,8 @@ class EmptyRegions:
     """Where neither render has any light, not even around: the result is black there, and a transparent film stays
     empty.
 
-    A dark surface may have no lit sample in the HRLS. So a pixel that shows a surface is empty only where the LRHS is
-    black far around.
+    A dark surface may have no lit sample near. So a pixel that shows a surface is empty only where both renders are
+    black far around: a network spreads the light of a single sample that far, and black pixels in it would be holes.
 
     The same holds for layers where light is rare. Few samples find a lamp that is out of focus, and the others find
     the empty background behind it. If the lamp's layer were black there, the light that the beauty has would go to
@@ -203,11 +203,12 @@ class EmptyRegions:
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
-        reach: how far, in LRHS pixels.
+        reach: how far, in LRHS pixels. Tiles that overlap by less may differ at their borders.
         of_layer: whether the pair shows a layer.
     """
 
     def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_layer: bool = False) -> None:
+        self._reach = reach
         self._black = _is_zero(lrhs_rgb)
         self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
         self._has_rare_light = np.zeros_like(self._black)
@@ -223,9 +224,14 @@ class EmptyRegions:
         """
         if not self._black[window].any():
             return None
-        empty = _holds_around(self._black[window], _is_zero(pair.hrls[RGB]), pair.scale)
+        black = _is_zero(pair.hrls[RGB])
+        empty = _holds_around(self._black[window], black, pair.scale)
         no_surface = _shows_no_surface(pair.hrls) & ~repeated(self._has_rare_light[window], pair.scale)
-        empty &= no_surface | repeated(self._black_far_around[window], pair.scale)
+        far = self._black_far_around[window]
+        if far.any():
+            blocks = black.reshape(len(far), pair.scale, -1, pair.scale, 1)
+            far = far & all_within(blocks.all(axis=(1, 3)), self._reach)
+        empty &= no_surface | repeated(far, pair.scale)
         return empty
 
 

@@ -73,6 +73,16 @@ def test_a_layer_with_rare_light_has_no_holes():
     assert layer[:, 112:].all()
 
 
+def test_a_surface_has_no_hole_where_only_the_hrls_has_found_light():
+    """The network spreads the light of that sample. Farther away, neither render has any."""
+    low, high = np.zeros((64, 64, 3), np.float32), np.zeros((128, 128, 3), np.float32)
+    high[60, 20] = 1.0
+    pair, whole = tile(low, {RGB: high, NORMAL: np.ones_like(high)}), (slice(0, 64), slice(0, 64))
+    empty = EmptyRegions(low, 7).mask(pair, whole)
+    assert not empty[46:76, 6:36].any()
+    assert empty[:, 36:].all()
+
+
 def test_a_lamp_makes_no_fireflies_around_it_believable():
     """Its light is in one square only."""
     low, high = np.full((64, 64, 3), 0.01, np.float32), np.full((128, 128, 3), 0.01, np.float32)

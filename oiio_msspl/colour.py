@@ -65,6 +65,8 @@ SPACES = (REC709, ACESCG, ACES2065, REC2020, P3)
 
 #: Names that files get which nobody gave a space, in lower case: OpenImageIO writes them by default.
 _INDEFINITE = ("", "linear", "scene_linear", "lin_rec709")
+#: Names, in lower case, of values that no curve encodes.
+_NO_COLOUR = ("raw", "data", "non-color", "utility - raw")
 #: Chromaticities are the same if none differs by more.
 _SAME = 0.003
 
@@ -142,6 +144,16 @@ def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
         return None if degenerate else ColourSpace(name, found)
     name = str(metadata.get("oiio:ColorSpace") or "")
     return None if name.lower() in _INDEFINITE else named_space(name)
+
+
+def encoding_of(metadata: Mapping[str, Any]) -> str:
+    """The name of the encoding that an EXR's header declares if it is not linear, such as ``srgb_rec709_scene``; empty
+    otherwise, and for names that neither ``$OCIO`` nor OpenImageIO knows."""
+    name = str(metadata.get("oiio:ColorSpace") or "")
+    config = oiio.ColorConfig()
+    if not name or named_space(name) is not None or config.getColorSpaceIndex(name) < 0:
+        return ""
+    return "" if config.isColorSpaceLinear(name) or name.lower() in _NO_COLOUR else name
 
 
 def same_space(one: ColourSpace, other: ColourSpace) -> bool:

@@ -159,8 +159,7 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
         InputError: the text can't be read, or the file has no such layer.
     """
     found = []
-    for part in re.split(r"\+(?=layer=)", text.strip()):
-        words = _words(part, text)
+    for words in read_format(text):
         layer = words.pop("layer")
         letters = words.pop("channels", "")
         # Words that the user leaves out keep what the table says, as long as the pixels agree.
@@ -180,6 +179,15 @@ def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionF
             replace(each, format=form, fixed=frozenset(words)) for each, form in zip(matching, formats, strict=True)
         ]
     return found
+
+
+def read_format(text: str) -> list[dict[str, Any]]:
+    """The words of each layer of a ``--motion-format``, see :func:`user_fields`.
+
+    Raises:
+        InputError: the text can't be read.
+    """
+    return [_words(part, text) for part in re.split(r"\+(?=layer=)", text.strip())]
 
 
 def _words(part: str, text: str) -> dict[str, Any]:

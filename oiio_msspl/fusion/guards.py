@@ -15,17 +15,13 @@ from oiio_msspl.arrays import Array, Mask, box_downsample
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.neighbourhood import all_within, grown, max_3x3, neighbours
-from oiio_msspl.fusion.tile_features import TilePair
+from oiio_msspl.fusion.tile_features import FIREFLY_FACTOR, TilePair
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 from oiio_msspl.parallel import for_row_blocks
 
 T = TypeVar("T", bound=np.generic)
 
-#: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
-#: render, but for rare light (:func:`_rare_light`). The LRHS is the mean of s x s HRLS pixels, so s^2 would be the
-#: exact bound without noise; 64 leaves room for the noise of the LRHS.
-FIREFLY_FACTOR = 64.0
 #: LRHS pixels on a side of the squares in which rare light is looked for, and the share of their pixels that it reaches
 #: at most. What reaches more is a surface or a lamp.
 _SQUARE, _RARE = 8, 0.25

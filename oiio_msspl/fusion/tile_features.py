@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import NORMAL, RGB
-from oiio_msspl.arrays import Array, Mask, enlarged, filled, interpolate, repair
+from oiio_msspl.arrays import HALF_MAX, Array, Mask, box_downsample, enlarged, filled, interpolate, repair
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.alignment import Alignment
+from oiio_msspl.fusion.neighbourhood import max_3x3
 from oiio_msspl.fusion.tiling import Tile
 
 Indices = NDArray[np.int64]
@@ -21,6 +22,10 @@ T = TypeVar("T", bound=np.generic)
 
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
+#: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
+#: render, but for rare light (:mod:`oiio_msspl.fusion.guards`). The LRHS is the mean of s x s HRLS pixels, so s^2 would
+#: be the exact bound without noise; 64 leaves room for the noise of the LRHS.
+FIREFLY_FACTOR = 64.0
 
 
 @dataclass
@@ -60,7 +65,7 @@ class TilePair:
     inside: tuple[slice, slice]
     """Rows and columns of ``lrhs`` that are inside the alignment's grid. The others only fill up the tile's size."""
     hrls_is_lost: bool = False
-    """The HRLS's beauty is NaN or minus infinity in all pixels, so it is filled from the LRHS alone."""
+    """The HRLS's beauty is broken in all pixels, so it is filled from the LRHS alone."""
 
 
 def read_tile(
@@ -74,6 +79,8 @@ def read_tile(
 ) -> TilePair:
     """Read both renders over a tile.
 
+    Where the beauty of one render is broken, it gets the light of the other one.
+
     Args:
         lrhs: features of the LRHS over ``grid``, see :func:`read_lrhs`.
         features: names of the HRLS's features to read.
@@ -83,11 +90,21 @@ def read_tile(
     area, core = in_hrls_pixels(tile.area, scale), in_hrls_pixels(tile.core, scale)
     window = tile.area.slices(grid)
     broken: dict[str, Mask] = {}
+    low = {name: values[window] for name, values in lrhs.items()}
     hrls = read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core, broken=broken)
-    if RGB in broken:  # the LRHS knows the light of a bucket that failed
-        hrls[RGB] = np.where(broken[RGB][..., None], enlarged(lrhs[RGB][window], scale), hrls[RGB])
+    lost = _infinite(hrls[RGB])
+    if lost.any():
+        lost &= ~_as_bright(low[RGB]).repeat(scale, axis=0).repeat(scale, axis=1)
+    if RGB in broken:
+        lost |= broken[RGB]
+    if lost.any():
+        hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
+    lost_below = _infinite(low[RGB])
+    if lost_below.any():
+        means = box_downsample(hrls[RGB], scale)
+        low[RGB] = np.where((lost_below & ~_as_bright(means))[..., None], means, low[RGB])
     return TilePair(
-        lrhs={name: values[window] for name, values in lrhs.items()},
+        lrhs=low,
         hrls=hrls,
         scale=scale,
         lrhs_area=tile.area,
@@ -95,8 +112,21 @@ def read_tile(
         hrls_target=core.intersect(alignment.hr_data_window),
         core=tile.core.intersect(alignment.grid).slices(tile.area),
         inside=tile.area.intersect(alignment.grid).slices(tile.area),
-        hrls_is_lost=RGB in broken and bool(broken[RGB].all()),
+        hrls_is_lost=bool(lost.all()),
     )
+
+
+def _infinite(rgb: Array) -> Mask:
+    """Where pixels (h, w) of a repaired beauty were infinite: as bright as half floats can be."""
+    return np.logical_or.reduce([rgb[..., c] == HALF_MAX for c in range(3)])
+
+
+def _as_bright(rgb: Array) -> Mask:
+    """Where pixels of one render (h, w, 3), or those beside them, confirm an infinite pixel of the other one.
+
+    A lamp that overflows half floats is bright in both renders. A sample or a bucket that failed is not.
+    """
+    return max_3x3(rgb).max(axis=-1) >= HALF_MAX / FIREFLY_FACTOR
 
 
 def read_lrhs(

@@ -52,12 +52,12 @@ class FrameMemory:
             return False
         if self.held_by_other_views:
             return True
-        return is_large(self.hr) and self._room(self._frames_held) < _vector_bytes(self.hr, self._motion_channels)
+        return is_large(self.hr) and self._room(self._frames_held) < _vector_bytes(self.hr, self.motion_channels)
 
     @cached_property
     def vectors_ahead(self) -> list[Channel]:
         """The motion vectors that are read with the pixels, if they fit beside these. Otherwise they are read later."""
-        channels = self._motion_channels
+        channels = self.motion_channels
         return channels if _vector_bytes(self.hr, channels) <= self._room(self._frames_in_memory) else []
 
     @cached_property
@@ -93,7 +93,7 @@ class FrameMemory:
         return 0 if self.on_disk else self._frames_held
 
     @cached_property
-    def _motion_channels(self) -> list[Channel]:
+    def motion_channels(self) -> list[Channel]:
         """The channels of the motion vectors; none if the motion is known otherwise."""
         motion = self.temporal.motion
         return motion.channels(self.hr) if motion else []

@@ -15,7 +15,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
-from oiio_msspl.colour import REC709, SPACES, ColourSpace, named_space, same_space, space_of
+from oiio_msspl.colour import REC709, SPACES, ColourSpace, encoding_of, named_space, same_space, space_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layer_by_channel
 from oiio_msspl.exr.reader import ExrFile, open_exr
@@ -130,6 +130,12 @@ def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> Colou
         if space is None:
             raise InputError(f"--colorspace {name!r}: use one of {', '.join(space.name for space in SPACES)}")
         return space
+    for render in (lr, hr):
+        if encoding := encoding_of(render.metadata):
+            raise InputError(
+                f"by its header {render.name} is in {encoding}, which is not linear; write it in a linear colour space "
+                "(or name the space of both renders with --colorspace if the header is wrong)"
+            )
     low, high = space_of(lr.metadata), space_of(hr.metadata)
     if low is not None and high is not None and not same_space(low, high):
         raise InputError(

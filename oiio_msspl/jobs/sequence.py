@@ -175,10 +175,16 @@ def _with_exr(name: str) -> str:
 
 def _not_written(sequences: list[Sequence], output: Path) -> list[Sequence]:
     """Sequences but for the results that a run that resumes finds beside its renders."""
-    if output.is_dir() or not _number_fields(output.name):
+    if output.is_dir() or not output.parent.is_dir() or not _number_fields(output.name):
         return sequences
-    written = str(parse_pattern(output))
-    return [each for each in sequences if str(each.pattern) != written] or sequences
+    # Files are compared, because a pattern may have fewer digits than its numbers: name.#.exr means name.1001.exr, too
+    written = {path.name for path in _files_of(parse_pattern(output)).values()}
+    others = (
+        each
+        for each in sequences
+        if not (each.pattern.folder.samefile(output.parent) and written.issuperset(p.name for p in each.files.values()))
+    )
+    return list(others) or sequences
 
 
 def format_frames(numbers: Iterable[int]) -> str:
@@ -375,7 +381,11 @@ def _output_pattern(output: Path, hr: Pattern) -> Pattern:
     if _number_fields(output.name) and not output.is_dir():
         pattern = parse_pattern(output)
         if not pattern.tail.lower().endswith(".exr"):
-            raise InputError(f"{output}: the results are EXRs; name them .exr")
+            mark = _number_fields(output.name)[0].group()
+            raise InputError(
+                f"{output}: {mark} stands for the frame number, and the results are EXRs; name them .exr, or make the "
+                "folder first if it is one"
+            )
         return pattern
     if output.suffix.lower() == ".exr" and not output.is_dir():
         raise InputError(f"{output}: one name for many frames; write {output.stem}.####.exr or name a folder")

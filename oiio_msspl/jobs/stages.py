@@ -184,10 +184,13 @@ class Stages:
         start = time.perf_counter()
         low, high = self._with_passes(lr, hr)
         memory = self._memory(low, high) if self.reads_ahead else None
-        if memory is not None and not memory.fits and self.temporal.count:
-            # A damaged frame is left out by its neighbours, whether its pixels wait in memory or not.
-            high.check_pixels(memory.vectors_ahead, memory.features)
-            low.check_pixels((), memory.features)
+        if memory is not None and self.temporal.count:
+            # A damaged frame is left out by its neighbours, whether its pixels and vectors wait in memory or not.
+            if not memory.fits:
+                high.check_pixels(memory.motion_channels, memory.features)
+                low.check_pixels((), memory.features)
+            elif not memory.vectors_ahead:
+                high.check_pixels(memory.motion_channels, ())
         if memory is None or not memory.fits:
             return LoadedFrame(frame, lr, hr, low, high, low, high, time.perf_counter() - start, self)
         motion, channels = self.temporal.motion, memory.vectors_ahead

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.aovs.motion import MotionField
+from oiio_msspl.aovs.motion import MotionField, read_format
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.arrays import has_many_pixels
 from oiio_msspl.errors import InputError, MssplError
@@ -58,7 +58,7 @@ class TemporalOptions:
     """How a shot is fused over time.
 
     Raises:
-        InputError: ``frames`` is none of what it may be.
+        InputError: ``frames`` is none of what it may be, or ``motion_format`` can't be read.
     """
 
     frames: str | int = AUTO
@@ -69,6 +69,8 @@ class TemporalOptions:
     def __post_init__(self) -> None:
         if self.frames not in (AUTO, OFF) and not (str(self.frames).isdecimal() and 1 <= int(self.frames) <= MOST):
             raise InputError(f"--temporal {self.frames}: give auto, off, or a number of frames from 1 to {MOST}")
+        if self.motion_format is not None:
+            read_format(self.motion_format)
 
     def count(self, model: str | None = None) -> int:
         """Frames before and after each frame, if their motion is known.

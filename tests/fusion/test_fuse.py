@@ -137,15 +137,26 @@ def test_an_albedo_that_is_broken_nearly_everywhere_is_told(session, scale):
     assert warning.startswith("9") and "% of the HRLS's albedo is NaN or infinite" in warning
 
 
-def test_a_bucket_that_failed_is_filled_from_the_lrhs():
-    """All layers of the HRLS are NaN there. Black instead would leave a dark square."""
+@pytest.mark.parametrize(("render", "value"), [("hrls", np.nan), ("hrls", np.inf), ("lrhs", np.inf)])
+def test_a_bucket_that_failed_is_filled_from_the_other_render(render, value):
+    """All layers are broken there. Black or infinity instead would leave a dark or a bright square."""
     session, side, bucket = Session(find_model(4, "joint")), 256, slice(96, 128)
     low, high, clean = pair_of(4, side, side, albedo=np.full((side, side, 3), 0.5, np.float32))
     expected = np.abs(fuse(low, high, session).rgb - clean)[bucket, bucket].mean()
-    for values in high.layers.values():
-        values[bucket, bucket] = np.nan
-    error = np.abs(fuse(low, high, session).rgb - clean)[bucket, bucket].mean()
+    failed, part = (high, bucket) if render == "hrls" else (low, slice(24, 32))
+    for values in failed.layers.values():
+        values[part, part] = value
+    fused = fuse(low, high, session)
+    error = np.abs(fused.rgb - clean)[bucket, bucket].mean()
     assert error < 3 * expected
+    assert not any("times as bright" in warning for warning in fused.warnings)
+
+
+def test_a_lamp_that_overflows_in_both_renders_is_no_failed_bucket():
+    low, high, _ = pair_of(4, 128, 128)
+    for render, part in ((low, slice(12, 16)), (high, slice(48, 64))):
+        render.layers["rgb"][part, part] = np.inf
+    assert (fuse(low, high, Session(find_model(4, "joint"))).rgb[52:60, 52:60] > 6e4).all()
 
 
 def test_a_failed_region_as_large_as_tiles_is_filled_from_the_lrhs(session, scale, monkeypatch):

@@ -25,7 +25,9 @@ def write_pair(folder, lr=None, hr=None):
     clean = picture(96, 128)
     for name, image, space in (("lr", noisy(downsample(clean, 4), 64), lr), ("hr", noisy(clean, 4, seed=1), hr)):
         buffer = oiio.ImageBuf(np.ascontiguousarray(image, np.float32))
-        if space is not None:  # OpenEXR's own module writes six of the eight numbers
+        if space is not None and space not in SPACES:
+            buffer.specmod().attribute("oiio:ColorSpace", space)
+        elif space is not None:  # OpenEXR's own module writes six of the eight numbers
             buffer.specmod().attribute("chromaticities", oiio.TypeDesc("float[8]"), SPACES[space].chromaticities)
         assert buffer.write(str(folder / f"{name}.exr"))
     return folder / "lr.exr", folder / "hr.exr"
@@ -34,6 +36,15 @@ def write_pair(folder, lr=None, hr=None):
 def test_two_colour_spaces_are_refused(tmp_path):
     pair = write_pair(tmp_path, "lin_rec709", "acescg")
     with pytest.raises(InputError, match=r"lr.exr is in lin_rec709 and .*hr.exr in acescg; write both in the same"):
+        map_pair(*pair, InputOptions())
+    assert map_pair(*pair, InputOptions(colourspace="ACEScg"))[1].space == ACESCG
+
+
+@pytest.mark.parametrize("encoding", ["srgb_rec709_scene", "g22_ap1_scene"])
+def test_an_encoding_that_is_not_linear_is_refused(tmp_path, encoding):
+    """Also if both renders have it."""
+    pair = write_pair(tmp_path, encoding, encoding)
+    with pytest.raises(InputError, match=rf"by its header .*lr.exr is in {encoding}, which is not linear; write it in"):
         map_pair(*pair, InputOptions())
     assert map_pair(*pair, InputOptions(colourspace="ACEScg"))[1].space == ACESCG
 

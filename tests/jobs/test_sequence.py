@@ -149,12 +149,15 @@ def test_a_folder_with_both_sequences_is_explained_by_two_patterns(tmp_path):
         find_shot(folder, folder, tmp_path / "out")
 
 
-def test_results_beside_the_renders_are_no_candidates(tmp_path):
-    """So a run can resume."""
-    touch(tmp_path / "lr", "shot.1.exr", "shot.2.exr")
-    touch(tmp_path / "hr", "beauty.1.exr", "beauty.2.exr", "fused.1.exr")
-    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "hr" / "fused.#.exr")
-    assert found.hr.pattern.name == "beauty.#.exr"
+@pytest.mark.parametrize(
+    ("first", "output"), [(1, "#"), (1001, "#"), (1001, "%d"), (1001, "####"), (10000, "####"), (-1, "#")]
+)
+def test_results_beside_the_renders_are_no_candidates(tmp_path, first, output):
+    """So a run can resume, and the next task of a farm can start. The numbers may have more digits than the pattern."""
+    touch(tmp_path / "lr", f"shot.{first}.exr", f"shot.{first + 1}.exr")
+    touch(tmp_path / "hr", f"beauty.{first}.exr", f"beauty.{first + 1}.exr", f"fused.{first}.exr")
+    found = find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "hr" / f"fused.{output}.exr")
+    assert sorted(path.name for path in found.hr.files.values()) == [f"beauty.{n}.exr" for n in (first, first + 1)]
 
 
 @pytest.mark.parametrize(
@@ -226,3 +229,9 @@ def test_a_step_may_be_written_with_a_colon():
 def test_the_frame_number_in_a_name_is_no_version(tmp_path, name, following):
     found = frame_in_name(tmp_path / name)
     assert (found and found[0].path(found[1] + 1)) == (following and tmp_path / following)
+
+
+def test_a_number_in_the_name_of_a_new_folder_is_explained(tmp_path):
+    touch(tmp_path, "lr.1.exr", "hr.1.exr")
+    with pytest.raises(InputError, match=r"take#2: # stands for the frame number, and the results are EXRs; name them"):
+        find_shot(tmp_path / "lr.#.exr", tmp_path / "hr.#.exr", tmp_path / "take#2")

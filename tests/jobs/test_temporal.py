@@ -26,7 +26,7 @@ from oiio_msspl.jobs.sequence import Frame, find_shot
 from oiio_msspl.jobs.temporal import AUTO_COUNT, Temporal, TemporalOptions, plan_temporal, shares
 from tests import shots
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
-from tests.moving_plane import positions, standing, texture, truck, vectors
+from tests.moving_plane import HEIGHT, positions, standing, texture, truck, vectors
 from tests.shots import contents, low_layers
 
 FIRST, COUNT = 1001, 9
@@ -212,6 +212,12 @@ def test_frames_that_contradict_each_other_are_fused_alone(tmp_path):
     assert "the frames contradict each other on how motion vectors are stored (frames 1001 and 1002" in plan.text
     with pytest.raises(InputError, match=r"contradict each other .* describe them with --motion-format"):
         planned(shot, frames=2)
+
+
+@pytest.mark.parametrize("temporal", ["off", "auto", "2"])
+def test_a_motion_format_that_can_t_be_read_is_refused_at_once(temporal):
+    with pytest.raises(InputError, match="--motion-format 'layer=v,to=sideways': to is next or previous"):
+        TemporalOptions(temporal, "layer=v,to=sideways")
 
 
 def test_other_frames_are_looked_at_if_some_are_broken(tmp_path):
@@ -574,15 +580,29 @@ def test_a_number_of_neighbours_is_enough(shot, bilinear_models, tmp_path, tempo
     assert report.exit_code == 0 and report.temporal.startswith(text)
 
 
-def damage_pixels(path, part):
+def damage_pixels(path, part, height=shots.HEIGHT):
     """Overwrite the compressed pixels of one part of a multipart EXR. Its headers stay whole."""
     stored = bytearray(path.read_bytes())
-    for y in range(0, shots.HEIGHT, 16):  # rows of a block of ZIP
+    for y in range(0, height, 16):  # rows of a block of ZIP
         # A chunk of a multipart file: part, first row, size, pixels. The last match is no entry of a table in front.
         start = stored.rfind(struct.pack("<ii", part, y))
         (size,) = struct.unpack_from("<i", stored, start + 8)
         stored[start + 12 : start + 12 + size] = b"\xff" * size
     path.write_bytes(stored)
+
+
+def test_a_frame_with_damaged_vectors_fails_however_much_memory_there_is(tmp_path, bilinear_models):
+    """Also where nothing else would read them: they are not copied, and wait in their file if memory is short."""
+    shot = make_moving_shot(tmp_path / "shot", count=4)
+    for path in (shot / "hr").iterdir():
+        channels = read_bits(path)[0][1]
+        motion = {name: channels.pop(name) for name in list(channels) if name.startswith("motionFore")}
+        write_exr(path, [("rgba", channels, (0, 0)), ("motionFore", motion, (0, 0))])
+    damage_pixels(shot / f"hr/hr.{FIRST + 2}.exr", 1, HEIGHT)
+    for memory in (MAX_MEMORY, 1 << 29):
+        more = {"temporal": TemporalOptions("2"), "write": WriteOptions(layers=("none",)), "max_memory": memory}
+        report = fuse_shot(shot / "lr", shot / "hr", tmp_path / str(memory), model=str(bilinear_models[4]), **more)
+        assert [report.results[FIRST + n].status for n in range(4)] == ["fused", "fused", "failed", "fused"]
 
 
 def test_a_neighbour_with_one_damaged_pass_is_left_out_wherever_pixels_wait(tmp_path, bilinear_models):

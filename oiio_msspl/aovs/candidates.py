@@ -220,7 +220,7 @@ def mapped_files(mapping: Mapping[str, Any], path: Path) -> set[Path]:
     return files
 
 
-def missing(feature: str, candidate: Any) -> str:
+def missing(feature: str, candidate: Any, file: ExrFile) -> str:
     """The sentence for a candidate of the user whose layers are not in the file."""
     entry = {"layer": candidate} if isinstance(candidate, str) else candidate
     if "channels" in entry:
@@ -229,7 +229,12 @@ def missing(feature: str, candidate: Any) -> str:
         names = [*(entry.get("sum") or entry.get("halves") or [entry["layer"]])]
     names += [entry["times"]] if "times" in entry else []
     text = _text([name.removeprefix("file:") for name in names], "times" in entry)
-    return f"{feature} is mapped to {text}, which is not there"
+    reason = "which is not there"
+    if any(part.deep and part.name == text for part in file.parts):
+        reason = "which is deep; flatten it first"
+    elif any(channel.name == text for part in file.parts for channel in part.channels):
+        reason = "which is a channel, not a layer; msspl inspect names the layers"
+    return f"{feature} is mapped to {text}, {reason}"
 
 
 def wrong_channels(feature: str, layer: Layer) -> str:

@@ -123,8 +123,13 @@ def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
         for layer in layers:
             if alias and view_layer_of(layer.name, alias) is not None:
                 return InputError(f"{file.path}: {wrong_channels(RGB, layer)}")
-        return InputError(f"{file.path}: {missing(RGB, mapped)}; a mapping of rgb applies to every file")
+        return InputError(f"{file.path}: {missing(RGB, mapped, file)}; a mapping of rgb applies to every file")
     names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
+    if not any(layer.triple() for layer in layers):
+        return InputError(
+            f"{file.path}: no layer with R, G, B among: {names}; write the beauty as RGB, or name three channels in a "
+            "--map-file"
+        )
     return InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
 
 
@@ -139,7 +144,7 @@ def _user_formula(finder: LayerFinder, feature: str, candidate: Any, file: ExrFi
     problems: list[str] = []
     formula = finder.formula(feature, candidate, problems)
     if formula is None:
-        raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, candidate)}")
+        raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, candidate, file)}")
     return formula
 
 

@@ -25,8 +25,10 @@ _ACES_FLAG = "acesImageContainerFlag"
 ZIP_LEVEL = 1
 #: Attributes that OpenEXR wants to be the same in all parts of a file. Only the first part may have one alone.
 _SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode")
-#: Attributes that every part keeps: the shared ones, and those that describe a single part.
-_KEPT_IN_EVERY_PART = (*_SHARED, "view", "name", "oiio:subimagename", "compression")
+#: Attributes to which OpenImageIO would give values of its own in every part that lacks them.
+_FILLED_IN = ("screenWindowWidth", "screenWindowCenter", "DateTime")
+#: Attributes that every part keeps: those that would be filled in, the shared ones, and those that describe a part.
+_KEPT_IN_EVERY_PART = (*_FILLED_IN, *_SHARED, "view", "name", "oiio:subimagename", "compression")
 
 
 #: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.

@@ -315,6 +315,17 @@ def test_of_a_candidate_that_is_missing_the_layers_are_named(tmp_path, feature, 
         mapped(tmp_path, layer("", 1), {feature: candidate})
 
 
+def test_a_channel_that_is_mapped_is_no_layer(tmp_path):
+    channels = layer("", 1) | {"Z": plane(1)}
+    with pytest.raises(InputError, match="albedo is mapped to Z, which is a channel, not a layer; msspl inspect"):
+        mapped(tmp_path, channels, {"albedo": "Z"})
+
+
+def test_a_grayscale_file_has_no_beauty(tmp_path):
+    with pytest.raises(InputError, match="no layer with R, G, B among: Y; write the beauty as RGB"):
+        mapped(tmp_path, {"Y": plane(1)})
+
+
 def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
     channels = layer("", 1) | {"mask.A": plane(1)}
     with pytest.raises(InputError, match="albedo is mapped to nothing, which is not there"):

@@ -254,6 +254,8 @@ def test_windows_and_metadata_are_kept(tmp_path):
         framesPerSecond=(24000, 1001),
         pixelAspectRatio=2.0,
         capDate="2026:01:01 00:00:00",
+        screenWindowWidth=1.25,
+        screenWindowCenter=np.array([0.5, 0.25], np.float32),
         shot="sq010",
     )
     with OpenEXR.File(str(out), header_only=True) as file:
@@ -262,6 +264,8 @@ def test_windows_and_metadata_are_kept(tmp_path):
             assert (*low, *high) == (-4, -6, W - 5, H - 7)
             assert (*part.header["displayWindow"][0], *part.header["displayWindow"][1]) == (0, 0, 99, 79)
             assert part.header["pixelAspectRatio"] == 2
+            assert part.header["capDate"] == "2026:01:01 00:00:00"
+            assert (part.header["screenWindowWidth"], *part.header["screenWindowCenter"]) == (1.25, 0.5, 0.25)
         assert file.parts[0].header["shot"] == "sq010"
         assert file.parts[0].header["msspl/model"] == "test"
         assert tuple(file.parts[0].header["framesPerSecond"]) == (24000, 1001)

@@ -30,7 +30,8 @@ from training.pu_curve import (
     pu_encode,
 )
 
-_LOG_SCALE = 1.0 / math.log1p(MU)
+#: Factor of the logarithm, which makes a log-encoded radiance of 1 a 1.
+LOG_SCALE = 1.0 / math.log1p(MU)
 
 
 # Log-encoded radiance, what every network reads and writes
@@ -38,12 +39,12 @@ _LOG_SCALE = 1.0 / math.log1p(MU)
 
 def log_encode(radiance: Tensor) -> Tensor:
     """Exposed radiance >= 0 to log-encoded radiance, as :func:`oiio_msspl.model.encoding.encode_radiance`."""
-    return torch.log1p(MU * radiance) * _LOG_SCALE
+    return torch.log1p(MU * radiance) * LOG_SCALE
 
 
 def log_decode(encoded: Tensor) -> Tensor:
     """Inverse of :func:`log_encode`, as :func:`oiio_msspl.model.encoding.decode_radiance`."""
-    return torch.expm1(encoded / _LOG_SCALE) / MU
+    return torch.expm1(encoded / LOG_SCALE) / MU
 
 
 # The PU curve, what Open Image Denoise's networks read and write

@@ -133,7 +133,7 @@ def mixing_of(network: JointFusion, contract: Contract) -> onnx.ModelProto:
     image = hrls[:, :3]
     inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
     names = [*joint.Blend.inputs, *(f"logits{level}" for level in levels)]
-    return traced(joint.Blend().eval(), inputs, names, ["fused"], alignment)
+    return traced(joint.Blend(network.size).eval(), inputs, names, ["fused"], alignment)
 
 
 @torch.inference_mode()

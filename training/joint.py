@@ -30,7 +30,7 @@ from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, SPREAD
-from training.encoding import log_decode, log_encode, log_to_pu, pu_to_log
+from training.encoding import LOG_SCALE, log_decode, log_encode, log_to_pu, pu_to_log
 from training.layer_denoisers import LayerDenoisers
 from training.mean_denoiser import MeanDenoiser, denoise_mean
 from training.oidn import (
@@ -60,6 +60,10 @@ FINER = (2.0, 0.0, 0.0, -2.0)
 MIN_ALBEDO = 0.02
 #: LRHS pixels over which the renders' brightest samples allow a bright result.
 FAR = 16
+#: By size: how far beyond the denoised mean a result may be where no sample is as bright, log-encoded. The size
+#: ``large`` does not denoise that mean itself, and is often brighter where light is rare. Clamped to the mean, its
+#: results would have dark patches between those samples that allow more. So they may be a quarter brighter.
+MARGIN = {"small": 0.0, "usual": 0.0, "large": math.log(1.25) * LOG_SCALE}
 #: Bounds of the ratio of a level's light to the denoised HRLS: 1 / MAX_RATIO and MAX_RATIO.
 MAX_RATIO = 8.0
 #: Added to both sides of that ratio, in exposed radiance, so that black pixels give a ratio of 1.
@@ -199,7 +203,7 @@ class JointFusion(nn.Module):
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))
-        return blend(lrhs, samples, albedo, denoised, logits), log_error
+        return blend(lrhs, samples, albedo, denoised, logits, MARGIN[self.size]), log_error
 
 
 def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
@@ -212,7 +216,9 @@ def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
     return functools.reduce(torch.add, (rest * weight * image for weight, image in zip(weights, images, strict=True)))
 
 
-def blend(lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor]) -> Tensor:
+def blend(
+    lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor], margin: float = 0.0
+) -> Tensor:
     """Blend the candidates with the softmax of the logits.
 
     Args:
@@ -221,6 +227,7 @@ def blend(lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logit
         denoised: (N, 3, s*h, s*w), the denoised HRLS, log-encoded.
         logits: of the levels H, H/2, ..., (N, 8, H/2^i, W/2^i): the first four choose between the candidates of a fine
             level, the others between those of the LRHS's level. At H, the fifth is the share of the albedo.
+        margin: see `MARGIN`.
 
     Returns:
         The fused image (N, 3, s*h, s*w), log-encoded.
@@ -252,14 +259,14 @@ def blend(lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logit
                 log_encode(means[level]) if level else samples,
             ],
         )
-    return within_renders(fused, lrhs, samples)
+    return within_renders(fused, lrhs, samples, margin)
 
 
-def within_renders(fused: Tensor, lrhs: Tensor, samples: Tensor) -> Tensor:
+def within_renders(fused: Tensor, lrhs: Tensor, samples: Tensor, margin: float) -> Tensor:
     """Clamp a result to what the renders allow, see :func:`highest_allowed`; arguments as of :func:`blend`."""
     low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
     lowest, highest = (
-        upsample(sign * highest_allowed(sign * low, sign * mean, sign * samples), 2) for sign in (-1.0, 1.0)
+        upsample(sign * highest_allowed(sign * low, sign * mean + margin, sign * samples), 2) for sign in (-1.0, 1.0)
     )
     return torch.clamp(fused, lowest, highest)
 
@@ -271,7 +278,7 @@ def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
     denoised mean of both renders counts, too, as far as some sample within ``FAR`` LRHS pixels is as bright.
 
     Args:
-        lrhs, mean: (N, 3, h, w), the LRHS and the denoised mean of both renders.
+        lrhs, mean: (N, 3, h, w), the LRHS and the denoised mean of both renders, with the margin added.
         samples: (N, 3, s*h, s*w), the HRLS.
 
     Returns:

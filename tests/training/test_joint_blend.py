@@ -10,7 +10,7 @@ from torch.nn import functional as F  # noqa: E402
 
 from oiio_msspl.model.contract import SCALES  # noqa: E402
 from training.encoding import log_encode  # noqa: E402
-from training.joint import blend, mixed  # noqa: E402
+from training.joint import MARGIN, blend, mixed  # noqa: E402
 
 HEIGHT, WIDTH = 64, 96
 #: Indices of the candidates in FINER and in COARSEST.
@@ -98,3 +98,14 @@ def test_where_all_samples_around_are_black_the_denoised_mean_counts(scale: int)
     fused = blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, preferring(DENOISED))
     row = 6 * scale  # beyond the LRHS pixels beside the lit one
     torch.testing.assert_close(fused[:, :, row, : 4 * scale], torch.full((1, 3, 4 * scale), 0.2))
+
+
+def test_a_margin_allows_more_than_the_denoised_mean() -> None:
+    """Between rare samples. So the result has no step where a sample is near enough to allow more."""
+    lrhs, hrls, denoised = (torch.zeros_like(image) for image in images(2))
+    lrhs[:, 3:], denoised[:], lrhs[:, :3, 2, 2] = 0.3, 0.5, 0.9
+    row = 12  # beyond the LRHS pixels beside the lit one
+    for margin, highest in ((0.0, 0.3), (0.1, 0.4), (0.3, 0.5)):
+        fused = blend(lrhs, hrls[:, :3], hrls[:, 3:6], denoised, preferring(DENOISED), margin)
+        torch.testing.assert_close(fused[:, :, row, :8], torch.full((1, 3, 8), highest))
+    assert MARGIN["usual"] == 0 < MARGIN["large"]

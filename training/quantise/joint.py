@@ -17,7 +17,7 @@ from torch.nn import functional as F
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from training.data import Prepare, Sampling, fixed_batches
 from training.encoding import log_to_pu
-from training.joint import DECODED, FEATURES, OUTPUTS, JointFusion, blend
+from training.joint import DECODED, FEATURES, MARGIN, OUTPUTS, JointFusion, blend
 from training.ops import log2_scale, upsample
 from training.paper import LRHS_CHANNELS
 from training.quantise.codes import log_encoded_of_code, sliced
@@ -47,10 +47,14 @@ class Blend(nn.Module):
     #: Names of its inputs in the whole graph, except those of the logits.
     inputs = ("lrhs", "hrls.colour", "hrls.albedo", "denoised")
 
+    def __init__(self, size: str) -> None:
+        super().__init__()
+        self.margin = MARGIN[size]
+
     def forward(
         self, lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor]
     ) -> Tensor:
-        return blend(lrhs, samples, albedo, denoised, logits)
+        return blend(lrhs, samples, albedo, denoised, logits, self.margin)
 
 
 # The U-Net's inputs as codes

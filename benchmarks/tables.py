@@ -16,6 +16,7 @@ from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Seq
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from benchmarks import (
     confidence,
@@ -373,7 +374,7 @@ def _measured(body: Iterable[list[str]]) -> list[list[str]]:
 
 
 #: Seconds for one sample in each pixel of a frame, as candidates for the break-even cost.
-_COSTS = tuple(np.geomspace(0.1, 100, 301))
+_COSTS = np.geomspace(0.1, 100, 301)
 
 
 def total() -> str:
@@ -402,12 +403,12 @@ def _total(rows: Sequence[Row], runtime: Sequence[Row], render_time: Sequence[Ro
     }
     octaves = np.log2([1, *quality.AVERAGES])
 
-    def gain(name: str, call: str, spp: int, scene: str, more: float) -> float:
+    def gain(name: str, call: str, spp: int, scene: str, more: NDArray[np.float64]) -> NDArray[np.float64]:
         """PSNR of a method minus that of OIDN with ``more`` samples. Beyond 8 spp OIDN's last slope goes on."""
         values = [psnr[method, n, scene] for method, n in peers[call]]
-        at = np.log2(max(spp + more, 1.0))  # OIDN needs at least one sample
-        beyond = max(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
-        return psnr[name, spp, scene] - float(np.interp(at, octaves, values)) - beyond
+        at = np.log2(np.maximum(spp + more, 1.0))  # OIDN needs at least one sample
+        beyond = np.maximum(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
+        return np.asarray(psnr[name, spp, scene] - np.interp(at, octaves, values) - beyond)
 
     for model, call, spp in itertools.product(
         ("joint-x2", "joint-x4", "joint-large-x2", "joint-large-x4"), peers, quality.AVERAGES
@@ -418,8 +419,9 @@ def _total(rows: Sequence[Row], runtime: Sequence[Row], render_time: Sequence[Ro
         for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
             if (name, spp, clean[0]) not in psnr:
                 continue
-            gains = {scene: gain(name, call, spp, scene, slower / costs[scene]) for scene in clean}
-            pays = [c for c in _COSTS if np.mean([gain(name, call, spp, scene, slower / c) for scene in clean]) >= 0]
+            gains = {scene: float(gain(name, call, spp, scene, np.array(slower / costs[scene]))) for scene in clean}
+            by_cost = np.mean([gain(name, call, spp, scene, slower / _COSTS) for scene in clean], axis=0)
+            pays = _COSTS[by_cost >= 0].tolist()
             without = np.mean([value for scene, value in gains.items() if scene != versus.TOO_EASY])
             cells = (versus.cell(versus.with_interval(np.array(list(gains.values()))), "+.2f"), f"{without:+.2f}")
             wins = f"{sum(value > 0 for value in gains.values())} of {len(gains)}"

@@ -7,6 +7,7 @@ what other scenes of the same kind might have given. With five scenes it is rath
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -84,6 +85,7 @@ def with_interval(values: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(values.mean()), *_ends(values[draws(len(values))].mean(axis=1))
 
 
+@functools.cache
 def draws(count: int) -> NDArray[np.int64]:
     """Indices of the drawn scenes, (DRAWS, count). They are the same in every run."""
     return np.random.default_rng(0).integers(count, size=(DRAWS, count))

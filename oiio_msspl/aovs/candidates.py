@@ -229,12 +229,11 @@ def missing(feature: str, candidate: Any, file: ExrFile) -> str:
         names = [*(entry.get("sum") or entry.get("halves") or [entry["layer"]])]
     names += [entry["times"]] if "times" in entry else []
     text = _text([name.removeprefix("file:") for name in names], "times" in entry)
-    reason = "which is not there"
     if any(part.deep and part.name == text for part in file.parts):
-        reason = "which is deep; flatten it first"
-    elif any(channel.name == text for part in file.parts for channel in part.channels):
-        reason = "which is a channel, not a layer; msspl inspect names the layers"
-    return f"{feature} is mapped to {text}, {reason}"
+        return f"{feature} is mapped to {text}, which is deep; flatten it first"
+    if any(channel.name == text for part in file.parts for channel in part.channels):
+        return f"{feature} is mapped to {text}, which is a channel, not a layer; msspl inspect names the layers"
+    return f"{feature} is mapped to {text}, which is not there"
 
 
 def wrong_channels(feature: str, layer: Layer) -> str:

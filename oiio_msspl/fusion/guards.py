@@ -226,7 +226,7 @@ class EmptyRegions:
         far = self._black_far_around[window]
         if far.any():
             blocks = black.reshape(len(far), pair.scale, -1, pair.scale, 1)
-            far = far & all_within(blocks.all(axis=(1, 3)), self._reach)
+            far = far & all_within(np.logical_and.reduce(blocks, axis=(1, 3)), self._reach)
         empty &= no_surface | repeated(far, pair.scale)
         return empty
 

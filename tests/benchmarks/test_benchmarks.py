@@ -215,9 +215,10 @@ def test_a_time_says_what_the_processor_has_for_networks(flags, name):
 
 def test_times_of_different_machines_are_not_mixed():
     """Times of methods and of rendering come from the same machine, and each line of the comparison names it."""
+    table = tables.total()
     for methods, _ in tables.MACHINES.values():
         (machine,) = {row["machine"] for row in results.read(methods)}
-        assert f"\n| {machine} |" in tables.total()
+        assert f"\n| {machine} |" in table
     assert "OIDN prefiltered" in {row["method"] for row in results.read("runtime")}
 
 

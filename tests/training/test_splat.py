@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from pathlib import Path
 
@@ -178,14 +179,13 @@ def test_training_draws_filters_from_sample_views(sample_folder: Path, monkeypat
     assert json.loads(str(view.arrays["meta"]))["exposure"]["log_mean"] > 0
     tensors = data.view_tensors(found, "train", torch.device("cpu"))
     plain = data.Sampling(drop_each=0, drop_lobes=0, drop_all=0, exposure_stops=0, gain_stops=0, grey=0)
-    for pixel_filter in (BOX, *INDEPENDENT, *LOBED):
+    for pixel_filter, scale in zip((BOX, *INDEPENDENT, *LOBED), itertools.cycle((2, 8))):
         monkeypatch.setattr(data, "draw_filter", lambda rng, f=pixel_filter, **_: f)
-        for scale in (2, 8):
-            batch = data.draw(tensors, scale, 64, 2, np.random.default_rng(0), plain)
-            assert batch["hrls"].shape == (2, 16, 64, 64)
-            torch.testing.assert_close(batch["hrls"][:, :3], batch["target"], atol=0.01, rtol=0)
-            torch.testing.assert_close(batch["lrhs"], batch["target"][..., ::scale, ::scale], atol=0.01, rtol=0)
-            assert (batch["hrls"][:, 3:6] - 0.6).abs().max() < 0.02  # the albedo
+        batch = data.draw(tensors, scale, 64, 2, np.random.default_rng(0), plain)
+        assert batch["hrls"].shape == (2, 16, 64, 64)
+        torch.testing.assert_close(batch["hrls"][:, :3], batch["target"], atol=0.01, rtol=0)
+        torch.testing.assert_close(batch["lrhs"], batch["target"][..., ::scale, ::scale], atol=0.01, rtol=0)
+        assert (batch["hrls"][:, 3:6] - 0.6).abs().max() < 0.02  # the albedo
     contract = data.spp_range(view, data.Sampling(), 4)
     assert contract == {"hrls": [1, 8], "lrhs": [16, 64]}
 

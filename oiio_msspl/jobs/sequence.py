@@ -36,6 +36,9 @@ _NUMBER_INSIDE = re.compile(r"(|.*[._ -])(\d+)([_ -]\D*\.exr)", re.IGNORECASE)
 #: A name whose number is at its end. Here it may follow a letter (``hr0001.exr``), but not a ``v``: that is a version.
 _NUMBER_LAST = re.compile(r"(|.*?[^vV\d])(\d+)(\.exr)", re.IGNORECASE)
 
+#: What stands before the number of a version.
+_VERSION = re.compile(r"(?<![^\W_])v$", re.IGNORECASE)
+
 #: One digit for each ``#``, as in Nuke, Katana and RV. fileseq's default is four digits for each.
 _PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
 
@@ -304,15 +307,16 @@ def _files_of(pattern: Pattern) -> dict[int, Path]:
 def _sequences_in(folder: Path) -> list[Sequence]:
     """The sequences of EXRs in a folder, by name. Hidden files are left out because they may be half written.
 
-    Numbers inside of names (``anim.0001_lr.exr``) count only if no name ends with its number: such files may lie beside
-    the frames that they belong to.
+    Versions (``still_v001.exr``) are no frames: two of them would be averaged. Numbers inside of names
+    (``anim.0001_lr.exr``) count only if no name ends with its number: such files may lie beside the frames that they
+    belong to.
     """
     every = [n for n in os.listdir(folder) if n.lower().endswith(".exr") and not n.startswith(".")]
     inside = [match for match in map(_NUMBER_INSIDE.fullmatch, every) if match]
     names = sorted({*every}.difference(match[0] for match in inside))
     by_name: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
     for found in fileseq.FileSequence.findSequencesInList(names, pad_style=_PAD_STYLE):
-        if found.frameSet() is None:
+        if found.frameSet() is None or _VERSION.search(found.basename()):
             continue
         for number, name in zip(map(int, found.frameSet() or ()), map(str, found), strict=True):
             head, width = found.basename(), found.zfill()

@@ -235,3 +235,16 @@ def test_a_number_in_the_name_of_a_new_folder_is_explained(tmp_path):
     touch(tmp_path, "lr.1.exr", "hr.1.exr")
     with pytest.raises(InputError, match=r"take#2: # stands for the frame number, and the results are EXRs; name them"):
         find_shot(tmp_path / "lr.#.exr", tmp_path / "hr.#.exr", tmp_path / "take#2")
+
+
+def test_versions_in_a_folder_are_no_frames(tmp_path):
+    """Or versions of a still would be averaged with each other. A pattern may name them."""
+    touch(tmp_path / "lr", "still_v001.exr", "still_v002.exr")
+    touch(tmp_path / "hr", "still_v001.exr", "still_v002.exr")
+    with pytest.raises(InputError, match="lr: no numbered EXRs in this folder"):
+        find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out")
+    found = find_shot(tmp_path / "lr/still_v###.exr", tmp_path / "hr/still_v###.exr", tmp_path / "out")
+    assert sorted(found.hr.files) == [1, 2]
+    touch(tmp_path / "lr", "rev1.exr")
+    touch(tmp_path / "hr", "rev1.exr")
+    assert list(find_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out").hr.files) == [1]

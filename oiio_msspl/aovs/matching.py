@@ -127,8 +127,8 @@ def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
     names = ", ".join(sorted({layer.name or " ".join(layer.channels) for layer in layers})[:12])
     if not any(layer.triple() for layer in layers):
         return InputError(
-            f"{file.path}: no layer with R, G, B among: {names}; write the beauty as RGB, or name three channels in a "
-            "--map-file"
+            f"{file.path}: no beauty, no layer with R, G, B among: {names}; write the beauty as RGB, or name three "
+            "channels in a --map-file"
         )
     return InputError(f"{file.path}: no beauty (R, G, B) found among: {names}; name it with --map rgb=LAYER")
 

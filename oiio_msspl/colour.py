@@ -65,8 +65,6 @@ SPACES = (REC709, ACESCG, ACES2065, REC2020, P3)
 
 #: Names that files get which nobody gave a space, in lower case: OpenImageIO writes them by default.
 _INDEFINITE = ("", "linear", "scene_linear", "lin_rec709")
-#: Names, in lower case, of values that no curve encodes.
-_NO_COLOUR = ("raw", "data", "non-color", "utility - raw")
 #: Chromaticities are the same if none differs by more.
 _SAME = 0.003
 
@@ -150,10 +148,14 @@ def encoding_of(metadata: Mapping[str, Any]) -> str:
     """The name of the encoding that an EXR's header declares if it is not linear, such as ``srgb_rec709_scene``; empty
     otherwise, and for names that neither ``$OCIO`` nor OpenImageIO knows."""
     name = str(metadata.get("oiio:ColorSpace") or "")
-    config = oiio.ColorConfig()
-    if not name or named_space(name) is not None or config.getColorSpaceIndex(name) < 0:
+    if not name or named_space(name) is not None:
         return ""
-    return "" if config.isColorSpaceLinear(name) or name.lower() in _NO_COLOUR else name
+    greys = oiio.ImageBuf(np.array([[[0.1] * 3, [0.2] * 3]], np.float32))
+    linear = oiio.ImageBufAlgo.colorconvert(greys, name, "scene_linear")
+    if linear.geterror():
+        return ""
+    dark, bright = np.asarray(linear.get_pixels(oiio.FLOAT))[0]
+    return "" if np.allclose(bright, 2 * dark, rtol=1e-3) else name
 
 
 def same_space(one: ColourSpace, other: ColourSpace) -> bool:

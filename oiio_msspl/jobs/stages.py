@@ -189,7 +189,7 @@ class Stages:
             if not memory.fits:
                 high.check_pixels(memory.motion_channels, memory.features)
                 low.check_pixels((), memory.features)
-            elif not memory.vectors_ahead:
+            elif memory.motion_channels and not memory.vectors_ahead:
                 high.check_pixels(memory.motion_channels, ())
         if memory is None or not memory.fits:
             return LoadedFrame(frame, lr, hr, low, high, low, high, time.perf_counter() - start, self)

@@ -59,6 +59,16 @@ def test_unloaded_images_keep_their_pixels(monkeypatch):
     np.testing.assert_array_equal(on_disk, image)
 
 
+@pytest.mark.parametrize("interleaved", [False, True])
+@pytest.mark.parametrize("on_disk", [False, True])
+def test_images_that_wait_keep_their_layout_in_memory(interleaved, on_disk):
+    image = arrays.blank((20, 30, 3), interleaved=interleaved)
+    assert np.ascontiguousarray(image).strides == image.strides if interleaved else image[..., 1].flags.c_contiguous
+    kept = arrays.kept(image, on_disk=on_disk)
+    assert kept.strides == image.strides
+    assert arrays.kept(kept, on_disk=True) is kept or not on_disk  # it is in a file already
+
+
 @pytest.mark.parametrize("code", [errno.ENOSPC, errno.EDQUOT])
 def test_a_full_disk_is_an_error_and_does_not_end_the_process(monkeypatch, code):
     def full(*arguments):

@@ -202,8 +202,7 @@ class MappedRender:
             strips, stored[window.slices(whole)] = self._read_with(window, features, channels)
             for name, rows in strips.items():
                 if name not in layers:
-                    shape = (whole.height, whole.width, rows.shape[-1])
-                    layers[name] = blank(shape, on_disk=True) if on_disk else np.empty(shape, np.float32)
+                    layers[name] = blank((whole.height, whole.width, rows.shape[-1]), on_disk=on_disk)
                 layers[name][window.slices(whole)] = rows
                 unload(layers[name])
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored

@@ -14,7 +14,7 @@ from oiio_msspl.arrays import Array
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.bands import REACH, grid_rows
-from oiio_msspl.fusion.neighbourhood import grown, max_3x3, mean_around, sum_3x3
+from oiio_msspl.fusion.neighbourhood import grown, max_3x3, means_around, sum_3x3
 
 #: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
 #: shadow, the large one a faint change of all the light.
@@ -47,14 +47,15 @@ class Light:
         self._alignment = alignment
         self.darkest = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
         """Luminance that is added to the local brightness."""
-        self._brightness = mean_around(picture, 1) + np.float32(self.darkest)
+        self._brightness = means_around(picture, [1])[0] + np.float32(self.darkest)
         self._renders = lrhs, hrls
         self._least, self._most = _bounds(lrhs, hrls)
         low, high = (render / self._brightness for render in self._renders)
         noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
         scale = alignment.scale
         #: For each radius in LRHS pixels: the variance of the mean of both renders.
-        self._noise = {reach: mean_around(noise, reach) for reach in (max(1, round(r / scale)) for r in RADII)}
+        reaches = [max(1, round(r / scale)) for r in RADII]
+        self._noise = dict(zip(reaches, means_around(noise, reaches), strict=True))
 
     def trust(self, lrhs: Array, hrls: Array, area: Window) -> Array:
         """How much a neighbour counts, from 0 to 1, (h, w) over :func:`grid_rows` of ``area``.
@@ -71,11 +72,11 @@ class Light:
         ]
         product = differences[0] * differences[1]
         trust = np.ones_like(product)
-        for reach, variance in self._noise.items():
+        for (reach, variance), mean in zip(self._noise.items(), means_around(product, list(self._noise)), strict=True):
             noise = variance[rows]
             own_error = noise * np.float32(self._alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
             uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
-            change = np.maximum(mean_around(product, reach) - uncertainty - own_error, 0)
+            change = np.maximum(mean - uncertainty - own_error, 0)
             np.minimum(trust, own_error / (own_error + change), out=trust)
         least, most = _bounds(lrhs, hrls)
         lamps = self._least[rows] > np.float32(LAMP) * (most + np.float32(self.darkest))

@@ -143,8 +143,11 @@ class MotionSource:
         Raises:
             InputError: pixels can't be decoded.
         """
-        for each in self.fields:
-            vectors, known = self._vectors(MotionFrame(hr), each.format.step)
+        channels = self.channels(hr)
+        if not channels:
+            return False
+        found = self.vectors_of(hr, hr, hr.file.read(channels, hr.data_window))
+        for vectors, known in found.values():
             for axis in self.silent:
                 lengths = np.sort(np.abs(vectors[..., "xy".index(axis)][known]))[-FEWEST:]
                 if len(lengths) == FEWEST and not is_silent(lengths[0]):
@@ -252,10 +255,13 @@ def _find(
     if not pair.window.width or not pair.window.height:
         return MotionSource(NONE, f"its data window and that of {second.name} have no common part")
     fields = first.motion.fields if wanted is None else user_fields(first.motion, wanted, first.name)
+    both = in_parallel(*(partial(_stored, pair, frame, fields) for frame in (0, 1)))
     checks = []
     for each in fields:
         known = verified.get(each.name)
-        checks.append(_check(pair, replace(each, format=known.format) if known else each, verified=known is not None))
+        stored = both[0].get(each.name), both[1].get(each.name)
+        each = replace(each, format=known.format) if known else each
+        checks.append(_check(pair, each, stored, verified=known is not None))
     if found := _one_each_way(checks):
         return _vectors(found)
     source = _without_vectors(pair, checks)
@@ -264,9 +270,14 @@ def _find(
     return source
 
 
-def _check(pair: FramePair, each: MotionField, *, verified: bool) -> FieldCheck:
-    """Verify a layer, or believe the user who has described it completely, unless the pixels contradict."""
-    stored = in_parallel(*(partial(_stored, pair, frame, each) for frame in (0, 1)))
+def _check(
+    pair: FramePair, each: MotionField, stored: tuple[Array | None, Array | None], *, verified: bool
+) -> FieldCheck:
+    """Verify a layer, or believe the user who has described it completely, unless the pixels contradict.
+
+    Args:
+        stored: its vectors in both frames, see :func:`_stored`.
+    """
     if stored[0] is None or stored[1] is None:
         return FieldCheck(each, f"{pair.second.name} lacks it")
     check = check_field(pair, each, (stored[0], stored[1]), verified=verified)
@@ -279,17 +290,25 @@ def _check(pair: FramePair, each: MotionField, *, verified: bool) -> FieldCheck:
     return replace(check, problem="", by_user=True) if check.problem and check.fit <= 1 else check
 
 
-def _stored(pair: FramePair, frame: int, each: MotionField) -> Array | None:
-    """Stored vectors of a frame, not multiplied by alpha; None if the frame lacks the layer."""
+def _stored(pair: FramePair, frame: int, fields: Sequence[MotionField]) -> dict[str, Array]:
+    """Stored vectors (h, w, 2) of a frame by the name of their layer, not multiplied by alpha. Layers that the frame
+    lacks are left out."""
     render = (pair.first, pair.second)[frame]
-    channels = render.motion.channels(each.layer, each.components)
-    if channels is None:
-        return None
-    stored = pair.read(frame, channels)
-    if each.format.premultiplied and render.alpha:
-        alpha = pair.read(frame, [render.alpha])
-        stored = np.where(alpha > 0, stored / np.where(alpha > 0, alpha, 1), 0).astype(np.float32)
-    return stored
+    found = {each: render.motion.channels(each.layer, each.components) for each in fields}
+    layers = {each: channels for each, channels in found.items() if channels is not None}
+    alpha = [render.alpha] if render.alpha and any(each.format.premultiplied for each in layers) else []
+    every = [*dict.fromkeys(channel for channels in layers.values() for channel in channels), *alpha]
+    if not layers:
+        return {}
+    pixels = pair.read(frame, every)  # one read, because layers of a part are decoded together
+    result = {}
+    for each, channels in layers.items():
+        stored = np.stack([pixels[..., every.index(channel)] for channel in channels], axis=-1)
+        if each.format.premultiplied and alpha:
+            cover = pixels[..., -1:]
+            stored = np.where(cover > 0, stored / np.where(cover > 0, cover, 1), 0).astype(np.float32)
+        result[each.name] = stored
+    return result
 
 
 def _one_each_way(checks: Sequence[FieldCheck]) -> list[FieldCheck]:

@@ -6,7 +6,7 @@ These layers have little noise and do not depend on the light. The beauty does.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -90,36 +90,38 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
     while window.width * window.height > MAX_PIXELS * reduction**2:
         reduction += 1
 
-    def image(name: str, read: Reader) -> Array:
-        values = reduced(read, window, reduction)
-        # Means lower the noise of few samples.
-        return values if name == POSITION else sum_3x3(values) / np.float32(9)
+    both = (first, second)
+    names = [name for name in (ALBEDO, NORMAL) if all(has_guide(each, name) for each in both)]
+    with_position = all(each.motion.position for each in both)
 
-    guides = [
-        Guide(name, in_parallel(*(partial(image, name, read) for read in reads)))
-        for name, reads in _readers(first, second)
-    ]
+    def images(render: MappedRender) -> dict[str, Array]:
+        found = _smoothed_features(render, names, window, reduction) if names else {}
+        if with_position and render.motion.position:
+            found[POSITION] = reduced(partial(render.file.read, render.motion.position), window, reduction)
+        return found
+
+    of_first, of_second = in_parallel(*(partial(images, render) for render in both))
+    guides = [Guide(name, (image, of_second[name])) for name, image in of_first.items()]
     return FramePair(first, second, window, reduction, tuple(guides))
 
 
-def _readers(first: MappedRender, second: MappedRender) -> Iterator[tuple[str, tuple[Reader, Reader]]]:
-    """The guides that both frames have, and how to read them from each."""
-    for name in (ALBEDO, NORMAL):
-        if has_guide(first, name) and has_guide(second, name):
-            yield name, (partial(_read_feature, first, name), partial(_read_feature, second, name))
-    positions = first.motion.position, second.motion.position
-    if positions[0] and positions[1]:
-        yield POSITION, (partial(first.file.read, positions[0]), partial(second.file.read, positions[1]))
+def _smoothed_features(render: MappedRender, names: Sequence[str], window: Window, reduction: int) -> dict[str, Array]:
+    """Features of a frame, reduced, and averaged over 3 x 3 pixels, which lowers the noise of few samples. All are read
+    at once, because layers of a part are decoded together."""
+
+    def read(part: Window) -> Array:
+        pixels = render.read(part, names)
+        return np.concatenate([pixels[name] for name in names], axis=-1)
+
+    values = sum_3x3(reduced(read, window, reduction)) / np.float32(9)
+    parts = np.split(values, len(names), axis=-1)
+    return {name: np.ascontiguousarray(part) for name, part in zip(names, parts, strict=True)}
 
 
 def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
     """Whether a frame has a feature that a surface keeps. If the camera moves, normals in camera space change."""
     formula = render.features.get(name)
     return formula is not None and not (moves and ("camera" in formula.note or "screen" in formula.note))
-
-
-def _read_feature(render: MappedRender, name: str, window: Window) -> Array:
-    return render.read(window, [name])[name]
 
 
 def reduced(read: Reader, window: Window, reduction: int) -> Array:

@@ -27,7 +27,7 @@ from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.bands import for_bands, from_grid, grid_rows, rows_in_bands, to_grid
 from oiio_msspl.fusion.light import Light, relative_difference
-from oiio_msspl.fusion.neighbourhood import grown, mean_around
+from oiio_msspl.fusion.neighbourhood import grown, means_around
 from oiio_msspl.fusion.pair_checks import bounded_luminance
 from oiio_msspl.fusion.tile_features import RepairCounts, read_lrhs
 from oiio_msspl.fusion.warp import Path, Step, nearest_indices, sample_cubic
@@ -295,7 +295,7 @@ class _Band:
         single noisy pixels for detail.
         """
         share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
-        near = mean_around(share, max(1, round(NEAR_OBJECTS / self._alignment.scale)))
+        (near,) = means_around(share, [max(1, round(NEAR_OBJECTS / self._alignment.scale))])
         return np.maximum(1 - near / np.float32(FEW), 0)
 
     def _as_bright(self, lrhs: Array) -> Array:
@@ -373,10 +373,10 @@ class _Nearest:
         pixels = _read(frame.hr, place, features)
         if not frame.hr_is_finite:
             pixels = _with_finite_passes(pixels)
-        self._flat = {name: np.ascontiguousarray(v).reshape(-1, v.shape[-1]) for name, v in pixels.items()}
+        self._planes = {name: _flat_planes(values) for name, values in pixels.items()}
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
-        self._finite = None if frame.hr_is_finite else _finite_pixels(self._flat)
+        self._finite = None if frame.hr_is_finite else _finite_pixels(pixels)
         self._luminance = None if frame.hr_luminance is None else frame.read_hr_luminance(place).reshape(-1)
 
     def finite(self) -> Mask:
@@ -413,10 +413,13 @@ class _Nearest:
     def _pixels(self, name: str, rows: slice) -> Array:
         """A feature at some rows (n, w, c). Pixels that are not finite are 0."""
         at = self._indices(rows)
-        values = self._flat[name].take(at, axis=0)
+        values = np.empty((len(self._planes[name]), *at.shape), np.float32)
+        for plane, out in zip(self._planes[name], values, strict=True):
+            # "wrap" makes NumPy write straight into the result; no index needs it.
+            plane.take(at, out=out, mode="wrap")
         if self._finite is not None:
-            values[~self._finite.take(at)] = 0
-        return values
+            values[:, ~self._finite.take(at)] = 0
+        return np.moveaxis(values, 0, -1)
 
 
 def _nearest_pixels(
@@ -425,17 +428,23 @@ def _nearest_pixels(
     """The pixels of features that are nearest to positions in them; the arguments are those of
     :func:`oiio_msspl.fusion.warp.sample_cubic`."""
     height, width = size
-    flat = {name: np.ascontiguousarray(v).reshape(-1, v.shape[-1]) for name, v in features.items()}
-    result = {name: np.empty((height, width, v.shape[-1]), np.float32) for name, v in features.items()}
+    flat = {name: _flat_planes(values) for name, values in features.items()}
+    result = {name: np.empty((len(planes), height, width), np.float32) for name, planes in flat.items()}
     window = Window(0, 0, *next((v.shape[1::-1] for v in features.values()), (1, 1)))
 
     def work(rows: slice) -> None:
         at = nearest_indices(*positions(rows), window)
-        for name, values in flat.items():
-            values.take(at, axis=0, out=result[name][rows], mode="wrap")  # "wrap" writes straight into the result
+        for name, planes in flat.items():
+            for plane, out in zip(planes, result[name][:, rows], strict=True):
+                plane.take(at, out=out, mode="wrap")  # "wrap" writes straight into the result
 
-    for_row_blocks(work, height if flat else 0, width * sum(v.shape[-1] for v in flat.values()))
-    return result
+    for_row_blocks(work, height if flat else 0, width * sum(len(planes) for planes in flat.values()))
+    return {name: np.moveaxis(values, 0, -1) for name, values in result.items()}
+
+
+def _flat_planes(image: Array) -> list[Array]:
+    """The channels of an image (h, w, c), (h * w) each, which are copied only if their pixels are apart in memory."""
+    return [np.asarray(plane).reshape(-1) for plane in np.moveaxis(image, -1, 0)]
 
 
 def _with_finite_passes(features: Features) -> Features:

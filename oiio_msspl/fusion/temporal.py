@@ -19,7 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from oiio_msspl.aovs.features import RGB
-from oiio_msspl.arrays import Array, Mask
+from oiio_msspl.arrays import Array, Mask, blank
 from oiio_msspl.colour import luminance
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.bands import for_bands, from_grid, rows_in_bands, to_grid
@@ -60,7 +60,7 @@ def accumulate(frame: FusedFrame, before: Sequence[Step[FusedFrame]], after: Seq
     """
     window = frame.alignment.hr_data_window
     own = _images(frame, window)
-    images = {name: np.empty(image.shape, np.float32) for name, image in own.items()}
+    images: Images = {name: blank(image.shape, on_disk=False) for name, image in own.items()}
     frames = np.empty((window.height, window.width, 1), np.float32)
     light = _light_of(frame)
 

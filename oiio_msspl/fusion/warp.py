@@ -98,15 +98,17 @@ class Path:
             good = valid[rows]
             at = None if self.nearest is None else self.nearest[rows]
             if step.valid is not None:
-                good &= self._at_pixels(step.valid, rows) if at is None else step.valid.reshape(-1).take(at)
+                good &= self._values(step.valid, rows, at)
             if moved is not None:
-                moved_objects[rows] = self._at_pixels(moved, rows) if at is None else moved.reshape(-1).take(at)
+                moved_objects[rows] = self._values(moved, rows, at)
             if vectors is not None:
-                vector = self._at_pixels(vectors, rows) if at is None else vectors.reshape(-1).take(at)
-                good &= np.isfinite(vector)
-                to_x = np.where(good, from_x + vector.real, from_x)
-                to_y = np.where(good, from_y + vector.imag, from_y)
+                vector = self._values(vectors, rows, at)
+                to_x, to_y = from_x + vector.real, from_y + vector.imag
+            # False for NaN, too.
             good &= (to_x > end.x0 - 0.5) & (to_x < end.x1 - 0.5) & (to_y > end.y0 - 0.5) & (to_y < end.y1 - 0.5)
+            if vectors is not None and not good.all():
+                bad = ~good
+                to_x[bad], to_y[bad] = from_x[bad], from_y[bad]
             there = at
             if found is not None:
                 there = nearest_indices(to_x, to_y, end)
@@ -114,11 +116,10 @@ class Path:
             if vectors is not None or back is not None or step.back_valid is not None:
                 home = np.complex64(0) if vectors is None else vector
                 if back is not None:
-                    home = home + (self._at_pixels(back, rows) if there is None else back.reshape(-1).take(there))
+                    home = home + self._values(back, rows, there)
                 good &= np.square(home.real) + np.square(home.imag) < step.tolerance**2  # false for NaN, too
                 if step.back_valid is not None:
-                    known = step.back_valid
-                    good &= self._at_pixels(known, rows) if there is None else known.reshape(-1).take(there)
+                    good &= self._values(step.back_valid, rows, there)
 
         for_row_blocks(work, len(valid), valid.shape[1])
         if found is not None:
@@ -127,8 +128,10 @@ class Path:
             self.moved_objects = moved_objects if self.moved_objects is None else self.moved_objects | moved_objects
         self.valid, self._last = valid, end
 
-    def _at_pixels(self, values: NDArray[Any], rows: slice) -> NDArray[Any]:
-        """Values over the data window, at these rows of the area."""
+    def _values(self, values: NDArray[Any], rows: slice, at: NDArray[np.intp] | None) -> NDArray[Any]:
+        """Values over a data window at flat indices; at these rows of the area if that is None."""
+        if at is not None:
+            return values.reshape(-1).take(at, mode="clip")  # a check of all indices takes as long as to take them
         area, window = self._area, self._area_window
         part = Window(area.x0, area.y0 + rows.start, area.x1, area.y0 + min(rows.stop, area.height))
         return np.asarray(values[part.slices(window)])
@@ -175,9 +178,10 @@ def _as_complex(vectors: Array) -> NDArray[np.complex64]:
 
 def nearest_indices(x: Array, y: Array, window: Window) -> NDArray[np.intp]:
     """Flat indices of the nearest pixels of a window."""
-    column = np.clip(np.rint(x - window.x0), 0, window.width - 1).astype(np.intp)
-    row = np.clip(np.rint(y - window.y0), 0, window.height - 1).astype(np.intp)
-    return row * window.width + column
+    # Four times as fast as to convert floats to 64 bits.
+    column = np.clip(np.rint(x - window.x0), 0, window.width - 1).astype(np.int32)
+    row = np.clip(np.rint(y - window.y0), 0, window.height - 1).astype(np.int32)
+    return row * np.intp(window.width) + column
 
 
 def sample_cubic(

@@ -1,7 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
 """Each view and view layer of a shot is averaged with its own neighbours."""
 
-import mmap
 import weakref
 
 import numpy as np
@@ -155,7 +154,7 @@ def test_frames_of_other_views_are_counted_as_memory(shot, whole):
     counted = {view: loaded.stages.held_by_other_views for view, loaded in views.items()}
     assert counted.keys() == {None, "bg"}
     pixels = views["bg"].hr_pixels.layers["rgb"]
-    assert isinstance(pixels.base, mmap.mmap)  # renders wait in files, and results and vectors in memory
+    assert isinstance(pixels, np.memmap)  # renders wait in files, and results and vectors in memory
     assert min(counted.values()) >= 2 * (4 * 16 + 16 * 9) * pixels[..., 0].size
     assert stages.Stages(temporal=stages.Temporal(2, 2)).read(frame).stages.held_by_other_views == 0
 

@@ -3,6 +3,7 @@
 
     python -m benchmarks.passes PASSES --table benchmarks/results/passes.csv
     python -m benchmarks.passes PASSES --spread --table benchmarks/results/passes_spread.csv
+    python -m benchmarks.passes PASSES --half --table benchmarks/results/passes_half.csv
     python -m benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
 
 PASSES is made by :mod:`benchmarks.render.passes` and ``datagen.cycles.passes``. The methods, all but the first two with
@@ -22,8 +23,11 @@ the albedo and the normal:
 - "msspl": :mod:`oiio_msspl.fusion.passes`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
+- "msspl, best, at half size": the same at half of the frame's resolution, as if the set had many layers.
 
 ``--spread`` is for renders whose pixel filter has spread the noise. It takes the models for such noise.
+
+``--half`` measures only what says what half of the resolution costs, for light groups.
 
 Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
 
@@ -44,6 +48,7 @@ import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 
@@ -53,7 +58,7 @@ from benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, pr
 from benchmarks.results import MEAN, Row
 from benchmarks.versus import cell, with_interval
 from oiio_msspl import FusedFrame, Session, fuse
-from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.additive_sets import LIGHT_GROUPS, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -90,6 +95,9 @@ STORED_PEER = "OIDN, prefiltered, stored"
 COMPONENTS = "components"
 #: Column of the gain -> over which method.
 GAINS = {"gain": PEER, "gain_split": SPLIT_PEER, "gain_stored": STORED_PEER}
+#: The way of many light groups, and the methods beside it with ``--half``.
+AT_HALF = "msspl, best, at half size"
+BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
 #: Methods in the table of single layers.
 IN_LAYERS = ("HRLS", "ratio", "OIDN", "OIDN, rescaled", PEER, "msspl-x2", "msspl-x2, best", "msspl-x4, best")
 #: Methods in the table of renders whose pixel filter has spread the noise.
@@ -151,8 +159,12 @@ def methods(
         encoded = (encode_radiance(layer, exposure) for layer in joined)
         return np.stack([decode_radiance(without_grid(layer), exposure) for layer in encoded])
 
-    def ours(low: MappedRender, model: str) -> Array:
+    def ours(low: MappedRender, model: str, *, half: bool = False) -> Array:
         frame, session = fused[model]
+        with patch("oiio_msspl.fusion.passes.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
+            return ours_of(low, frame, session)
+
+    def ours_of(low: MappedRender, frame: FusedFrame, session: Session) -> Array:
         made = fuse_passes(
             low,
             hr,
@@ -184,6 +196,8 @@ def methods(
     yield "msspl", lambda: ours(lr, BALANCED)
     yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]), BALANCED)
     yield "msspl, best", lambda: ours(lr, BEST)
+    if layers.name == LIGHT_GROUPS:
+        yield AT_HALF, lambda: ours(lr, BEST, half=True)
 
 
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
@@ -251,9 +265,16 @@ def timed(function: Callable[[], Array]) -> tuple[Array, float]:
 
 
 def measure(
-    folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = (), *, spread: bool = False
+    folder: Path,
+    scale: int,
+    spp: int,
+    known: Collection[tuple[object, ...]] = (),
+    *,
+    spread: bool = False,
+    half: bool = False,
 ) -> list[Row]:
-    """One scene: rows for each set and method, without those whose `KEYS` are known."""
+    """One scene: rows for each set and method, without those whose `KEYS` are known; with ``half``, for `BESIDE_HALF`
+    of light groups alone, else for all but `AT_HALF`."""
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     other = folder / f"hr_{2 * spp}spp.exr"
@@ -264,8 +285,12 @@ def measure(
     oidn_seconds = plain[-1]
     rows = []
     for layers in hr.additive_sets:
+        if half and layers.name != LIGHT_GROUPS:
+            continue
         clean = layers_of(reference, layers_like(reference, layers))
         for name, function in methods(lr, hr, fused, layers, ordinary, spread=spread):
+            if name not in BESIDE_HALF if half else name == AT_HALF:
+                continue
             title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
@@ -349,6 +374,7 @@ def main() -> None:
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
+    parser.add_argument("--half", action="store_true", help="measure only what half of the resolution costs")
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     results.add_option(parser)
     args = parser.parse_args()
@@ -362,7 +388,7 @@ def main() -> None:
             for scale in SCALES:
                 known = {tuple(row[k] for k in KEYS) for row in rows}
                 # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += measure(args.passes / scene, scale, spp, known, spread=args.spread)
+                rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
                 print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
         if args.table:
             add(args.table, rows)

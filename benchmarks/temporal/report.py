@@ -25,6 +25,7 @@ REFERENCE = "reference"
 DEVELOPMENT = (
     "lamp/moving", "lamp/static", "staircase2/moving", "staircase2/static",
     "room/slide", "room/shadow", "room/mirror", "room/lamp_on", "room/dolly", "room/foliage",
+    "room/particles", "room/turn",
 )  # fmt: skip
 #: Sequences whose camera moves.
 MOVING_CAMERA = ("lamp/moving", "staircase2/moving", "room/mirror", "room/foliage", "room/dolly", "cycles/slide")

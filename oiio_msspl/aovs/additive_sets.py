@@ -22,6 +22,8 @@ from oiio_msspl.exr.reader import Channel
 
 #: The words of a layer's name, also where a renderer writes them together (``directdiffuse``).
 _WORD = re.compile(r"indirect|direct|combined|rgba|(?:(?!indirect|direct|combined|rgba)[^ _.-])+")
+#: The name of a set with a layer for each lamp.
+LIGHT_GROUPS = "light groups"
 #: Words that mean all light.
 _ALL_LIGHT = frozenset({"rgba", "c", "combined"})
 

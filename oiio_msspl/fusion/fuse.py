@@ -163,14 +163,18 @@ def _lost_aovs(frame: FusedFrame) -> list[str]:
     ]
 
 
-def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame: FusedFrame) -> Iterator[Array]:
+def fuse_layers(
+    pairs: Iterable[tuple[Render, Render]], session: Session, alignment: Alignment, exposure: float, reach: int
+) -> Iterator[Array]:
     """Fuse layers of both renders of a frame, such as the light of each lamp.
 
     Args:
         pairs: both renders with a layer in place of the beauty, for each layer. The next pair is taken in the
             background while the network works.
         session: a model for the scale of the pair.
-        frame: the fused beauty. Layers are exposed as this is, because networks tell light from noise by brightness.
+        alignment: of the pairs.
+        exposure: that of the frame's beauty, because networks tell light from noise by its brightness.
+        reach: see :class:`oiio_msspl.fusion.guards.EmptyRegions`.
 
     The caller limits the threads of NumPy, see :func:`oiio_msspl.parallel.limit_threads`.
 
@@ -183,12 +187,14 @@ def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame:
         MssplError: the network failed, or returned NaN or infinite values.
     """
 
+    size = alignment.hr_data_window.height, alignment.hr_data_window.width
+
     def steps() -> Iterator[_Step]:
         for lr, hr in pairs:
             # The network works at the same time, and has threads on all cores.
             with half_of_the_threads():
-                pair = _Pair(lr, hr, frame.alignment, session, (), frame)
-            result = FusedFrame(blank(frame.rgb.shape), None, None, frame.alignment, frame.exposure, {})
+                pair = _Pair(lr, hr, alignment, session, (), (exposure, reach))
+            result = FusedFrame(blank((*size, 3)), None, None, alignment, exposure, {})
             for step in _steps(pair, result, half_of_the_threads):
                 for render in (lr, hr):
                     render.unload()
@@ -204,8 +210,17 @@ def fuse_layers(pairs: Iterable[tuple[Render, Render]], session: Session, frame:
 
 def layer_fuser(session: Session, frame: FusedFrame) -> LayerFuser | None:
     """What fuses single layers of a frame whose beauty ``session`` has fused; None if no network does."""
-    layer_session = session.layer_session
-    return None if layer_session is None else lambda pairs: fuse_layers(pairs, layer_session, frame)
+    if session.layers is None:
+        return None
+
+    def fuse_them(pairs: Iterable[tuple[Render, Render]], alignment: Alignment) -> Iterator[Array]:
+        whole = alignment.scale == frame.alignment.scale
+        layer_session = session.layer_session if whole else session.half_layer_session
+        assert layer_session is not None
+        reach = max(LAYER_REACH // frame.alignment.scale - 1, 1)
+        return fuse_layers(pairs, layer_session, alignment, frame.exposure, reach)
+
+    return fuse_them
 
 
 def memory_to_fuse(alignment: Alignment, session: Session, *, error: bool) -> int:
@@ -248,8 +263,8 @@ def check_model(session: Session, scale: int, *, error: bool) -> None:
 
 def _blank_frame(alignment: Alignment, exposure: float, *, error: bool, half: bool) -> FusedFrame:
     size = (alignment.hr_data_window.height, alignment.hr_data_window.width)
-    errors = np.zeros((*size, 1), dtype=np.float32) if error else None
-    rgb: NDArray[Any] = np.zeros((*size, 3), dtype=np.float16 if half else np.float32)
+    errors: Array | None = blank((*size, 1), on_disk=False) if error else None
+    rgb: NDArray[Any] = blank((*size, 3), np.float16 if half else np.float32, on_disk=False)
     return FusedFrame(rgb, None, errors, alignment, exposure, {})
 
 
@@ -294,12 +309,13 @@ class _Pair:
         alignment: Alignment,
         session: Session,
         aovs: Sequence[str],
-        beauty: FusedFrame | None = None,
+        of_layer: tuple[float, int] | None = None,
     ) -> None:
         """
         Args:
             aovs: see :attr:`_PreparedTile.aovs`.
-            beauty: that of the frame, if the pair shows a layer of it. Then there is no :meth:`check`.
+            of_layer: exposure and reach of :func:`fuse_layers`, if the pair shows a layer. Then there is no
+                :meth:`check`.
         """
         self._lr, self._hr, self._alignment, self._session, self._aovs = lr, hr, alignment, session, aovs
         self.grid = _grid(alignment, session)
@@ -307,11 +323,10 @@ class _Pair:
         features = [*session.contract.lrhs, "alpha"]
         self._lrhs = read_lrhs(lr, alignment, self.grid, features, self._lrhs_counts)
         self._lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
-        self.exposure = find_exposure(self._lrhs_rgb) if beauty is None else beauty.exposure
-        reach = FAR if beauty is None else max(LAYER_REACH // alignment.scale - 1, 1)
-        self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_layer=beauty is not None)
-        self._part = None if beauty is None else self._lit_part(reach)
-        self._averages = HrlsAverages(alignment) if beauty is None else None
+        self.exposure, reach = of_layer or (find_exposure(self._lrhs_rgb), FAR)
+        self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_layer=of_layer is not None)
+        self._part = self._lit_part(reach) if of_layer else None
+        self._averages = None if of_layer else HrlsAverages(alignment)
 
     @property
     def lrhs_has_alpha(self) -> bool:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 
@@ -45,6 +45,10 @@ class PassJob:
     @property
     def fitted(self) -> list[AdditiveLayer]:
         return [layer for layer in self.layers.layers if layer not in self.known]
+
+    def lit(self, names: Collection[str]) -> dict[AdditiveLayer, str]:
+        """The fitted layers whose light is among the ``names`` of features, and these names."""
+        return {layer: self.keys[layer] for layer in self.fitted if self.keys[layer] in names}
 
     @property
     def hrls_alone(self) -> str:

@@ -7,7 +7,8 @@ A layer is estimated in one of two ways:
   (:mod:`oiio_msspl.fusion.line_fit`). Pixels count by how much they look alike in albedo and normal. A fit needs
   averages of noisy layers only, so it is fast.
 - A network fuses it, as if it were a beauty. That is more accurate, and takes a run of the network for each layer. Both
-  renders must have the layer.
+  renders must have the layer. If there are many light groups, it does so at half of the frame's resolution, and they
+  are fitted to the beauty then.
 
 What the layers then lack of the fused beauty is spread over them, by the light of each and by how far the two renders
 differ in it. So their sum is the beauty to the last bits.
@@ -23,7 +24,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
+from oiio_msspl.aovs.additive_sets import LIGHT_GROUPS, AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -42,6 +43,11 @@ from oiio_msspl.parallel import for_row_blocks, half_of_the_threads, in_parallel
 
 T = TypeVar("T", bound=np.generic)
 
+#: If a network fuses more light groups than this, it does so at half of the frame's resolution. That takes a quarter of
+#: the time. Each lamp lights the same surfaces, so the beauty has their detail. Components have detail of their own.
+MOST_AT_FULL_SIZE = 5
+#: What is fitted then has little noise, so fewer pixels are averaged, see :data:`oiio_msspl.fusion.line_fit.STEPS`.
+HALF, HALF_STEPS = 2, (1,)
 #: HRLS rows that are fused at a time.
 BAND_ROWS = 128
 #: Pixels that differ by this much have 1/e of the weight in an average: albedo, normal, logarithm of the fused beauty.
@@ -71,9 +77,9 @@ NO_COLOURS: Mapping[Factor, str] = {}
 #: Albedo and normal without noise, of half or float.
 Guides = Mapping[str, NDArray[Any]]
 NO_GUIDES: Guides = {}
-#: Fuses layers, given both renders with a layer in place of the beauty, for each layer: (height, width, 3) over the
-#: HRLS's data window. It takes the next pair in the background.
-LayerFuser = Callable[[Iterable[tuple[Render, Render]]], Iterator[Array]]
+#: Fuses layers, given both renders with a layer in place of the beauty, for each layer, and the alignment of these
+#: pairs: (height, width, 3) over the HRLS's data window. It takes the next pair in the background.
+LayerFuser = Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]]
 #: Larger values of fitted layers are clipped before they are scaled to the sum, which would overflow.
 BRIGHTEST = np.float32(1e30)
 
@@ -145,6 +151,7 @@ def fuse_passes(
     done = steps - len(_bands(alignment)) * sum(1 + by_network * len(job.fitted) for job in jobs)
     tell(done, steps)
     fused_light: dict[AdditiveLayer, Array] = {}
+    half_light: dict[AdditiveLayer, Array] = {}
     clipped = dict.fromkeys((job.layers.name for job in jobs), 0)
     broken: dict[str, int] = {}
     colours = _colour_names(jobs)
@@ -163,9 +170,11 @@ def fuse_passes(
     if fuse_layers is not None and by_network:
         (low, low_lit), (high, high_lit) = in_parallel(partial(_decoded, low), partial(_decoded, high))
         for job in jobs:
-            for layer, light in _fused_layers(low, high, job, low_lit, high_lit, fuse_layers):
+            many = job.layers.name == LIGHT_GROUPS and len(job.lit(low_lit & high_lit)) > MOST_AT_FULL_SIZE
+            pairs = _HalfPairs(low, high, alignment) if many else _Pairs(low, high, alignment)
+            for layer, light in _fused_layers(pairs, job, low_lit, high_lit, fuse_layers):
                 if light is not None:
-                    fused_light[layer] = light
+                    (fused_light if light.shape == rgb.shape else half_light)[layer] = light
                 done += len(_bands(alignment))
                 tell(done, steps)
     lit = rgb[::4, ::4][rgb[::4, ::4] > 0]
@@ -175,7 +184,8 @@ def fuse_passes(
 
         def prepare(core: Window) -> _Band:
             with half_of_the_threads():
-                return _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, fused_light, shares)
+                lights = fused_light, half_light
+                return _Band(low, high, colours, rgb, alignment, core, dark, jobs, guides, *lights, shares)
 
         # The next band is read and compared while the layers of this one are fitted.
         for band in one_ahead(map(prepare, _bands(alignment))) if jobs else []:
@@ -190,7 +200,7 @@ def fuse_passes(
                 tell(done, steps)
             for name, count in band.broken.items():
                 broken[name] = broken.get(name, 0) + count
-            for image in (*fused_light.values(), *guides.values()):
+            for image in (*fused_light.values(), *half_light.values(), *guides.values()):
                 unload(image)
             for render in (low, high):
                 render.unload()
@@ -235,22 +245,69 @@ def _with_layers_of(
     return replace(render, features=formulas, alpha=None)
 
 
+class _Pairs:
+    """Both renders with one layer each in place of the beauty.
+
+    Args:
+        low, high: both renders with all layers, see :func:`_decoded`.
+        alignment: of the pair.
+    """
+
+    def __init__(self, low: Render, high: Render, alignment: Alignment) -> None:
+        self.low, self.high, self.alignment = low, high, alignment
+
+    def pair(self, layer: str) -> tuple[Render, Render]:
+        """Both renders with a layer."""
+        return _as_beauty(self.low, layer), _as_beauty(self.high, layer)
+
+
+class _HalfPairs(_Pairs):
+    """The same with the HRLS averaged over 2 x 2 pixels, over the whole grid."""
+
+    def __init__(self, low: Render, high: Render, alignment: Alignment) -> None:
+        scale = alignment.scale // HALF
+        window = in_hrls_pixels(alignment.grid, scale)
+        super().__init__(low, high, replace(alignment, scale=scale, hr_data_window=window))
+        self._data_window = alignment.hr_data_window
+        self._guides = {name: self._half_of(name) for name in (ALBEDO, NORMAL) if name in high.layers}
+
+    def pair(self, layer: str) -> tuple[Render, Render]:
+        window = self.alignment.hr_data_window
+        frame = Window(0, 0, window.x1, window.y1)
+        half = Render({RGB: self._half_of(layer), **self._guides}, window, frame, name=self.high.name)
+        return _as_beauty(self.low, layer), half
+
+    def _half_of(self, layer: str) -> Array:
+        image, window = self.high.layers[layer], self.alignment.hr_data_window
+        result: Array = blank((window.height, window.width, image.shape[-1]))
+        for top in range(window.y0, window.y1, BAND_ROWS):
+            part = Window(window.x0, top, window.x1, min(top + BAND_ROWS, window.y1))
+            full = mirrored(image, self._data_window, in_hrls_pixels(part, HALF))
+            result[part.slices(window)] = box_downsample(full, HALF)
+        unload(image)
+        unload(result)
+        return result
+
+
 def _fused_layers(
-    low: Render, high: Render, job: PassJob, low_lit: set[str], high_lit: set[str], fuse_layers: LayerFuser
+    pairs: _Pairs, job: PassJob, low_lit: set[str], high_lit: set[str], fuse_layers: LayerFuser
 ) -> Iterator[tuple[AdditiveLayer, Array | None]]:
     """Each layer of a set that is to be fitted, and its light as a network fuses it; None if that can't be done.
 
+    The light of a black layer has the full size.
+
     Args:
-        low, high: both renders with the layers, see :func:`_decoded`.
-        low_lit, high_lit: names of their features that are not black.
+        pairs: of the layers.
+        low_lit, high_lit: names of features of both renders that are not black.
     """
-    lit = low_lit & high_lit
-    keys = {layer: job.keys[layer] for layer in job.fitted}
-    fused = fuse_layers((_as_beauty(low, key), _as_beauty(high, key)) for key in keys.values() if key in lit)
-    for layer, key in keys.items():
-        if key in lit:
+    low, high = pairs.low, pairs.high
+    lit = job.lit(low_lit & high_lit)
+    fused = fuse_layers((pairs.pair(key) for key in lit.values()), pairs.alignment)
+    for layer in job.fitted:
+        key = job.keys[layer]
+        if layer in lit:
             light = next(fused)
-            if layer in job.noise_free:
+            if layer in job.noise_free and light.shape == high.layers[key].shape:
                 _keep_in_range(light, high.layers[key])
                 unload(high.layers[key])
             unload(light)
@@ -327,6 +384,7 @@ class _Band:
         jobs: Sequence[PassJob],
         guides: Guides,
         fused_light: Mapping[AdditiveLayer, Array],
+        half_light: Mapping[AdditiveLayer, Array],
         shares: SharesAround,
     ) -> None:
         """
@@ -336,9 +394,10 @@ class _Band:
             dark: light that counts as equal to none in logarithms.
             guides: see :func:`fuse_passes`.
             fused_light: light (height, width, 3) of the layers that a network has fused, over the HRLS's data window.
+            half_light: the same at half of the resolution, over the whole grid.
             shares: of the layers, where none has a sample near.
         """
-        self._fused_light, self._shares = fused_light, shares
+        self._fused_light, self._half_light, self._shares = fused_light, half_light, shares
         self._alignment, self._core, self._scale, self._dark = alignment, core, alignment.scale, dark
         reach = 2 * sum(STEPS[self._scale]) + 2
         area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach)
@@ -376,12 +435,15 @@ class _Band:
                 # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
                 guide = np.where((noisy > 1).any(axis=0), guide, clean)
             planes.append(guide / SPREAD[name])
-        full = np.concatenate(planes, dtype=np.float32)
-        low = downsampled(full, self._scale)
-        with np.errstate(over="ignore", invalid="ignore"):
-            self._fit = LineFit(self._low_beauty, low, STEPS[self._scale])
-        self._nearby = LinesNearby(low, full, self._scale, self._core_rows)
-        self._beauty_core = self._nearby.phases(self._beauty[:, self._hrls_rows])
+        self._guides = np.concatenate(planes, dtype=np.float32)
+        self._fits: dict[tuple[int, ...], _Fit] = {}
+
+    def _fit_at(self, scale: int, steps: Sequence[int]) -> _Fit:
+        """What layers with 1/scale of the frame's resolution are fitted to."""
+        if (scale, *steps) not in self._fits:
+            rows = slice(self._hrls_rows.start // scale, self._hrls_rows.stop // scale)
+            self._fits[scale, *steps] = _Fit(self._beauty, self._guides, scale, steps, rows)
+        return self._fits[scale, *steps]
 
     def _read(
         self, low: ReadableRender, high: ReadableRender, colours: Mapping[Factor, str], jobs: Sequence[PassJob]
@@ -472,8 +534,18 @@ class _Band:
         renders = self._renders_of(job)
         doubts = self._doubts(job, *renders) if job.lrhs else None
         if job in self._to_fit:
-            missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in self._fused_light]
-            self._fit_layers(self._average(job, *renders), missing, fitted)
+            by_network = self._fused_light.keys() | self._half_light
+            missing = [i for i in range(len(fitted)) if i >= len(layers) or layers[i] not in by_network]
+            noisy = self._average(job, *renders)
+            if missing := [i for i in missing if noisy[i].any()]:
+                fit = self._fit_at(self._scale, STEPS[self._scale])
+                fit.fit_layers([noisy[i] for i in missing], [fitted[i] for i in missing], few_samples=True)
+            if halves := [i for i, layer in enumerate(layers) if layer in self._half_light]:
+                low = [self._half_over_area(layers[i]) for i in halves]
+                self._fit_at(HALF, HALF_STEPS).fit_layers(low, [fitted[i] for i in halves])
+                rows = slice(self._hrls_rows.start // HALF, self._hrls_rows.stop // HALF)
+                for i, means in zip(halves, low, strict=True):
+                    _draw_towards(fitted[i], means[:, rows])
         for planes, layer in zip(fitted, layers, strict=False):
             if layer in self._ranges:
                 np.clip(planes, *self._ranges[layer], out=planes)
@@ -516,34 +588,11 @@ class _Band:
         core = in_hrls_pixels(self._core, self._scale)
         return planes_of(mirrored(image, self._alignment.hr_data_window, core))
 
-    def _fit_layers(self, noisy: Array, chosen: Sequence[int], fitted: Array) -> None:
-        """Fit some layers to the fused beauty.
-
-        Args:
-            noisy: all layers (layers, 3, h, w) at low resolution.
-            chosen: those to fit.
-            fitted: gets them, (layers, 3, h, w), over the core. Those without light stay as they are.
-        """
-        lit = [i for i in chosen if noisy[i].any()]
-
-        def fit(part: slice) -> None:
-            # NumPy's settings for errors belong to the thread.
-            with np.errstate(over="ignore", invalid="ignore"):
-                for i in lit[part]:
-                    fit_layer(noisy[i], fitted[i])
-
-        def fit_layer(layer: Array, out: Array) -> None:
-            lines, means = self._fit.lines(layer)
-            # The renders around bound the fit: where it mixes two surfaces, it would leave their range. Where a rare
-            # light has no sample by chance, the mean over pixels that look alike is the bound. This ends two LRHS
-            # pixels before LAYER_REACH, because the bounds are interpolated.
-            near_light = grown(np.any(layer != 0, axis=0), LAYER_REACH // self._scale - 2)
-            lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
-            highest = np.where(near_light & (highest < means * np.float32(NO_SAMPLE)), means, highest)
-            self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty_core, out)
-
-        if lit:
-            for_row_blocks(fit, len(lit), self._beauty_core.size)
+    def _half_over_area(self, layer: AdditiveLayer) -> Array:
+        """A layer at half of the resolution, as planes over the area."""
+        half = self._scale // HALF
+        area, grid = (in_hrls_pixels(window, half) for window in (self._area, self._alignment.grid))
+        return planes_of(self._half_light[layer][area.slices(grid)])
 
     def _renders_of(self, job: PassJob) -> list[Array]:
         """The layers of the HRLS, and of the LRHS if it has some, see :func:`dimmed`. Empty if they were not read."""
@@ -581,6 +630,74 @@ class _Band:
         lights = (layers.sum(axis=(0, 1), dtype=np.float64), self._low_beauty.sum(axis=0, dtype=np.float64))
         ours, fused = (np.log(light + 3 * self._dark) for light in lights)
         return np.exp(-np.square((ours - fused) / LIGHT_SPREAD)).astype(np.float32)
+
+
+def _draw_towards(image: Array, means: Array) -> None:
+    """Change a fitted layer (3, h, w), so that its means over 2 x 2 pixels are half-way to ``means``, the layer as the
+    network has fused it: the geometric mean of both.
+
+    A fit mixes lamps that are as bright and a few pixels apart, and the light of one would leak into the layer of the
+    other. The network tells them apart, but has more noise than the fit.
+    """
+
+    def work(rows: slice) -> None:
+        part = image[:, rows]
+        half = slice(rows.start // HALF, -(-rows.stop // HALF))
+        found = downsampled(part, HALF)
+        wanted = means[:, half]
+        factors = np.sqrt(wanted / np.maximum(found, np.float32(1e-6) * wanted + np.finfo(np.float32).tiny))
+        factors[found <= 0] = 1
+        part *= factors.repeat(HALF, axis=1).repeat(HALF, axis=2)
+
+    for_row_blocks(work, image.shape[1], image[:, 0].size, multiple=HALF)
+
+
+class _Fit:
+    """What layers of a band are fitted to, at one resolution.
+
+    Args:
+        beauty: the fused one, (3, h, w).
+        guides: planes (guides, h, w) in units of their spread.
+        scale: layers have 1/scale of this resolution.
+        steps: see :data:`oiio_msspl.fusion.line_fit.STEPS`.
+        rows: of the layers, that are wanted.
+    """
+
+    def __init__(self, beauty: Array, guides: Array, scale: int, steps: Sequence[int], rows: slice) -> None:
+        self._scale = scale
+        low = downsampled(guides, scale)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._lines = LineFit(downsampled(beauty, scale), low, steps)
+        self._nearby = LinesNearby(low, guides, scale, rows)
+        self._beauty = self._nearby.phases(beauty[:, rows.start * scale : rows.stop * scale])
+
+    def fit_layers(self, layers: Sequence[Array], results: Sequence[Array], *, few_samples: bool = False) -> None:
+        """Fit layers to the fused beauty.
+
+        Args:
+            layers: (3, h, w) each, at their own resolution.
+            results: get the wanted rows, (3, h, w) each.
+            few_samples: the layers are as rendered, so pixels may have no sample of a light by chance.
+        """
+
+        def fit(part: slice) -> None:
+            # NumPy's settings for errors belong to the thread.
+            with np.errstate(over="ignore", invalid="ignore"):
+                for layer, out in zip(layers[part], results[part], strict=True):
+                    fit_layer(layer, out)
+
+        def fit_layer(layer: Array, out: Array) -> None:
+            lines, means = self._lines.lines(layer)
+            # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
+            lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
+            if few_samples:
+                # Where a rare light has no sample by chance, the mean over pixels that look alike is the bound. This
+                # ends two LRHS pixels before LAYER_REACH, because the bounds are interpolated.
+                near_light = grown(np.any(layer != 0, axis=0), LAYER_REACH // self._scale - 2)
+                highest = np.where(near_light & (highest < means * np.float32(NO_SAMPLE)), means, highest)
+            self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty, out)
+
+        for_row_blocks(fit, len(layers), self._beauty.size)
 
 
 def _is_black(render: ReadableRender, layer: str, area: Window) -> bool:

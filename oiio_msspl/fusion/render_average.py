@@ -42,6 +42,9 @@ NEAR_OBJECTS, FEW = 8, 0.125
 #: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided
 #: by the root of the product. That is a factor of 5.
 OTHER_BRIGHTNESS = np.float32(4 / np.sqrt(5))
+#: There, a neighbour counts less by this, too. It lacks some pixels, so the noise changes from pixel to pixel, and the
+#: network takes single noisy pixels for detail.
+BESIDE_HIDDEN = np.float32(0.7)
 #: Memory for each pixel of the rows that are averaged at a time, beside their features.
 BYTES_PER_PIXEL = 44
 #: With more channels, as passes have, bands have fewer rows.
@@ -261,7 +264,7 @@ class _Band:
             trusted = trust if trusted is None else np.minimum(trusted, trust)
             counted = trusted if path.moved_objects is None else trusted * self._far_from(path.moved_objects)
             hidden = grown(share < 1, 2)
-            counted = counted * np.where(hidden, self._as_bright(lrhs), np.float32(1))
+            counted = counted * np.where(hidden, BESIDE_HIDDEN * self._as_bright(lrhs), np.float32(1))
             weight = from_grid(self._alignment, counted, self._area) * valid
             self._high.add(high.below(self._rows.start), weight[self._rows])
             place = self._low_place.slices(self._grid)

@@ -113,8 +113,7 @@ def fuse_frame_passes(
                 progress=progress,
             )
         fused.replaced = fused.passes.pixels
-        if session.layer_session is not None:
-            session.layer_session.release_memory()
+        session.release_layer_memory()
 
 
 class Progress:

@@ -16,13 +16,15 @@ WEIGHTS = Path(__file__).parent / "weights"
 MEASURED = WEIGHTS / "measured.csv"
 #: The family of models of each quality. From the first to the last, pictures get better and take more time.
 QUALITIES = {"fast": "joint-small", "balanced": "joint", "best": "joint-large"}
+#: The model that fuses two renders of one size, for passes at half of the frame's resolution. ``-spread`` may follow.
+MEAN_MODEL = "mean"
 #: The name that stands for the default quality.
 AUTO, DEFAULT_QUALITY = "auto", "balanced"
 
 
 def shipped_models() -> dict[str, Path]:
-    """Name (``paper-x4``) -> ONNX file of each model inside the package."""
-    return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx"))}
+    """Name (``paper-x4``) -> ONNX file of each model for pairs inside the package."""
+    return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx")) if not path.stem.endswith("-x1")}
 
 
 def measured() -> dict[str, dict[str, float]]:
@@ -89,5 +91,8 @@ def load_model(scale: int, name: str | None = None, device: str = "cpu", threads
     path = find_model(scale, name)
     # The best models would take too long for every layer
     of_layers = {WEIGHTS / f"{QUALITIES['best']}{noise}-x{scale}.onnx": noise for noise in ("", SPREAD)}
-    layers = find_model(scale, QUALITIES["fast"] + of_layers[path]) if path in of_layers else None
-    return Session(path, device, threads, layers=layers)
+    if path not in of_layers:
+        return Session(path, device, threads)
+    family = QUALITIES["fast"] + of_layers[path]
+    half = WEIGHTS / f"{MEAN_MODEL}{of_layers[path]}-x1.onnx" if scale == 2 else find_model(scale // 2, family)
+    return Session(path, device, threads, layers=find_model(scale, family), half_layers=half)

@@ -68,7 +68,7 @@ class Contract:
     name: str
     """Short name, e.g. ``paper-x4``."""
     scale: int
-    """Upsampling factor s: 2, 4 or 8."""
+    """Upsampling factor s: 2, 4 or 8; 1 for a model that fuses two renders of one size."""
     alignment: int = 1
     """Height and width of the LRHS input are multiples of this many pixels."""
     overlap: int = 24
@@ -190,6 +190,6 @@ class Contract:
                 f"{source}: an overlap of {contract.overlap} is no multiple of its alignment, {contract.alignment}; "
                 "export it again"
             )
-        if contract.scale not in SCALES:
-            raise InputError(f"{source}: scale {contract.scale} is none of {SCALES}")
+        if contract.scale not in (1, *SCALES):
+            raise InputError(f"{source}: scale {contract.scale} is none of {(1, *SCALES)}")
         return contract

@@ -38,6 +38,7 @@ class Session:
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
         layers: ONNX file of the model that fuses single layers of passes; None if no network does.
+        half_layers: the same for layers at half of the frame's resolution, and half of the scale.
 
     Raises:
         InputError: no model; no contract; a device that this onnxruntime was not built for or that cannot start; or a
@@ -51,6 +52,7 @@ class Session:
         threads: int = 0,
         *,
         layers: Path | None = None,
+        half_layers: Path | None = None,
     ) -> None:
         require_device(device)
         file = file_for(Path(path), device)
@@ -70,7 +72,7 @@ class Session:
                 f"{path}: has the inputs {', '.join(inputs)[:99]} and the outputs {', '.join(self._outputs)[:99]}, not "
                 f"{', '.join(self.contract.inputs)} and fused; export it again"
             )
-        self.path, self.layers = Path(path), layers
+        self.path, self.layers, self.half_layers = Path(path), layers, half_layers
         self.device, self.threads = device, threads
         self.seconds = 0.0
         """Time spent in :meth:`run` so far."""
@@ -116,6 +118,19 @@ class Session:
         if self.layers is None:
             return None
         return Session(self.layers, self.device, self.threads)
+
+    @functools.cached_property
+    def half_layer_session(self) -> Session | None:
+        """The same for layers at half of the frame's resolution."""
+        if self.half_layers is None:
+            return None
+        return Session(self.half_layers, self.device, self.threads)
+
+    def release_layer_memory(self) -> None:
+        """:meth:`release_memory` of the models of single layers, if they were loaded."""
+        for name in ("layer_session", "half_layer_session"):
+            if (session := vars(self).get(name)) is not None:
+                session.release_memory()
 
     def run(
         self,

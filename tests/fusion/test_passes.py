@@ -60,9 +60,11 @@ def write_pair(
     return paths
 
 
-@pytest.fixture(params=["fit", "network"])
-def model(request, bilinear_models):
-    """A model whose passes are fitted, and one whose passes a network fuses."""
+@pytest.fixture(params=["fit", "network", "half"])
+def model(request, bilinear_models, monkeypatch):
+    """A model whose passes are fitted, and one whose passes a network fuses, at full or at half of the resolution."""
+    if request.param == "half":
+        monkeypatch.setattr(passes, "MOST_AT_FULL_SIZE", 0)
     return str(bilinear_models[4]) if request.param == "fit" else "best"
 
 
@@ -182,6 +184,43 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
         assert done == count == pass_steps(beauty.alignment, result.sets, by_network=fuser is not None)
     errors = [np.abs(each - clean["light_a"]).mean() for each in found]
     assert errors[1] < 0.7 * errors[0] if low else errors[1] == errors[0]
+
+
+@pytest.mark.parametrize("scale", [2, 4, 8])
+@pytest.mark.parametrize("count", [5, 6])
+def test_many_light_groups_are_fused_at_half_of_the_resolution(tmp_path, scale, count):
+    """They are nearer to the truth than without a network, in a frame whose size is no multiple of the scale."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
+    surface = 0.2 + 0.6 * ((x // 9 + y // 7) % 2)[..., None] * np.ones(3)
+    spots = [np.exp(-((x - WIDTH * i / count) ** 2 + (y - 40) ** 2) / 900)[..., None] for i in range(count)]
+    clean = {f"light_{i}": (surface * spot).astype(np.float32) for i, spot in enumerate(spots)}
+    rng, files = np.random.default_rng(0), []
+    for name, factor in (("lr", scale), ("hr", 1)):
+        size = -(-HEIGHT // factor), -(-WIDTH // factor)
+        albedo = np.pad(surface, ((0, -HEIGHT % factor), (0, -WIDTH % factor), (0, 0)), "edge")
+        channels, total = rgb(downsample(albedo.astype(np.float32), factor), "albedo."), 0
+        for layer_name, values in clean.items():
+            padded = np.pad(values, ((0, -HEIGHT % factor), (0, -WIDTH % factor), (0, 0)), "edge")
+            noisy = downsample(padded, factor) * rng.gamma(factor**2, 1 / factor**2, (*size, 1)).astype(np.float32)
+            channels |= rgb(noisy, f"{layer_name}.")
+            total = total + noisy
+        files.append(write_exr(tmp_path / f"{name}.exr", channels | rgb(total)))
+    pair = [map_render(open_exr(file)) for file in files]
+    session = load_model(scale, "best", threads=1)
+    beauty, errors = fuse(*pair, session, clean_aovs=True), []
+    for fuser in (None, layer_fuser(session, beauty)):
+        result = fuse_passes(
+            *pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, guides=beauty.clean_aovs, fuse_layers=fuser
+        )
+        found = {
+            each.name: np.stack([result.pixels.get(c, 0, HEIGHT) for c in each.channels], axis=-1)
+            for each in result.sets[0].layers
+        }
+        assert_sum([each.astype(np.float64) for each in found.values()], beauty.rgb.astype(np.float64))
+        errors.append(np.mean([np.abs(found[name] - clean[name]).mean() for name in clean]))
+    at_full_size, at_half_size = (vars(session).get(name) for name in ("layer_session", "half_layer_session"))
+    assert (at_full_size is None) == (count == 6) and (at_half_size is None) == (count == 5)
+    assert errors[1] < errors[0]
 
 
 def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):

@@ -10,7 +10,7 @@ from oiio_msspl.jobs.openjd import make_job
 from oiio_msspl.jobs.sequence import find_shot
 from oiio_msspl.jobs.shot_checks import model_of_shot
 from oiio_msspl.jobs.temporal import TemporalOptions, _is_slow, plan_temporal
-from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.catalogue import load_model, shipped_models
 from tests.conftest import noisy, picture, read_bits, rgb, write_exr
 from tests.fusion.test_noise import spread
 
@@ -69,13 +69,21 @@ def test_a_job_s_model_has_as_many_neighbours_as_one_run(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("name", "layers"),
-    [("best", "joint-small-x4"), ("joint-large-spread", "joint-small-spread-x4"), ("balanced", None)],
+    ("name", "scale", "layers", "half"),
+    [
+        ("best", 2, "joint-small-x2", "mean-x1"),
+        ("best", 4, "joint-small-x4", "joint-small-x2"),
+        ("joint-large-spread", 2, "joint-small-spread-x2", "mean-spread-x1"),
+        ("joint-large-spread", 8, "joint-small-spread-x8", "joint-small-spread-x4"),
+        ("balanced", 4, None, None),
+    ],
 )
-def test_only_the_best_quality_has_a_network_for_single_layers(name, layers):
+def test_only_the_best_quality_has_a_network_for_single_layers(name, scale, layers, half):
     """It copes with spread noise where the model of the beauty does."""
-    found = load_model(4, name, threads=1).layer_session
-    assert (found and found.name) == layers
+    session = load_model(scale, name, threads=1)
+    found = session.layer_session, session.half_layer_session
+    assert [each and each.name for each in found] == [layers, half]
+    assert "mean-x1" not in shipped_models()  # it is for no pair
 
 
 def test_a_model_is_taken_as_it_is_named(tmp_path, caplog):

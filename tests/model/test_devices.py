@@ -26,6 +26,7 @@ CPU, CUDA = "CPUExecutionProvider", "CUDAExecutionProvider"
 #: Files for GPUs, relative to the folder of the weights.
 FAMILIES = tuple(family + noise for family in ("joint-small", "joint", "joint-large") for noise in ("", "-spread"))
 GPU_FILES = [f"gpu/{family}-x{scale}.onnx" for family in FAMILIES for scale in SCALES]
+GPU_FILES += ["gpu/mean-x1.onnx", "gpu/mean-spread-x1.onnx"]
 
 
 def test_a_gpu_gets_the_file_that_was_made_for_it(tmp_path):

@@ -9,8 +9,8 @@ everywhere, which takes longest. ``--pair`` measures all sets of a rendered pair
 ``datagen.cycles.passes``: some of its layers are black, or are so in parts.
 
 Ours reads the layers from the files. OIDN gets them as arrays in memory, without those that are black. The methods take
-turns; the median of all rounds counts, after one that does not. With ``--quality best``, a network fuses each layer.
-:mod:`benchmarks.passes` measures accuracy, on frames that are much smaller.
+turns; the median of all ``--rounds`` counts, after one that does not. With ``--quality best``, a network fuses each
+layer. :mod:`benchmarks.passes` measures accuracy, on frames that are much smaller.
 """
 
 from __future__ import annotations
@@ -48,7 +48,6 @@ from oiio_msspl.model.session import Session
 LAYERS = 8
 BEAUTY, OURS = "beauty", "ours"
 PLAIN, PREFILTERED = "OIDN on each layer", "OIDN on each layer, prefiltered once"
-ROUNDS = 3
 
 
 def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[MappedRender, MappedRender]:
@@ -137,6 +136,7 @@ def main() -> None:
     parser.add_argument("--scale", type=int, default=2)
     parser.add_argument("--pair", type=Path, nargs=2, metavar=("LR.exr", "HR.exr"), help="a rendered pair instead")
     parser.add_argument("--models", nargs="+", default=["balanced", "best"])
+    parser.add_argument("--rounds", type=int, default=3)
     results.add_option(parser)
     args = parser.parse_args()
     width, height = (int(v) for v in args.size.split("x"))
@@ -148,7 +148,7 @@ def main() -> None:
             lr, hr = write_pair(Path(folder), width, height, args.scale)
         scale, window = align(lr, hr).scale, hr.data_window
         calls = methods(lr, hr, [load_model(scale, model) for model in args.models])
-        for _ in range(ROUNDS + 1):
+        for _ in range(args.rounds + 1):
             for key, call in calls.items():
                 start = time.perf_counter()
                 call()

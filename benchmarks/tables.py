@@ -512,6 +512,13 @@ def passes() -> str:
     return f"{passes_benchmark.layout(rows)}\nMeans over all layers of these scenes: {scenes}.\n"
 
 
+def passes_half() -> str:
+    """Light groups that a network fuses at half of the resolution."""
+    rows = results.read("passes_half")
+    scenes = ", ".join(dict.fromkeys(row["scene"] for row in rows if row["scene"] != results.MEAN))
+    return f"{passes_benchmark.layout(rows)}\nMeans over all light groups of these scenes: {scenes}.\n"
+
+
 def passes_spread() -> str:
     """The same where the pixel filter has spread the noise, without the methods that are worse than others there."""
     rows = results.read("passes_spread")
@@ -531,15 +538,17 @@ def single_passes() -> str:
 
 
 def passes_time() -> str:
-    """Time of fused passes on a frame of real size: light everywhere, at x2 on two processors and at x4, and a rendered
-    frame."""
-    tables = ("runtime_passes", "runtime_passes_vnni", "runtime_passes_x4", "runtime_passes_cycles")
+    """Time of fused passes on a frame of real size: light everywhere, at x2 on three processors and at x4, and a
+    rendered frame."""
+    kinds = ("", "_vnni", "_avx2", "_x4", "_cycles")
+    tables = [f"runtime_passes{kind}" for kind in kinds]
     return "\n".join(runtime_passes.layout(results.read(table)) for table in tables)
 
 
 def temporal_time() -> str:
     """Time of shots whose frames are averaged with their neighbours."""
-    return runtime_temporal.layout(results.read("runtime_temporal"))
+    tables = ("runtime_temporal", "runtime_temporal_avx2")
+    return "\n".join(runtime_temporal.layout(results.read(table)) for table in tables)
 
 
 def temporal_time_of_passes() -> str:
@@ -594,7 +603,7 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         pair_checks,
     ),
     ROOT / "docs/guide/gpu.md": (gpu_times,),
-    ROOT / "docs/design/passes.md": (passes, single_passes, passes_spread, passes_time),
+    ROOT / "docs/design/passes.md": (passes_half, passes, single_passes, passes_spread, passes_time),
     ROOT / "docs/design/temporal.md": (temporal_passes, temporal_time, temporal_time_of_passes, temporal_counts),
 }
 

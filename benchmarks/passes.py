@@ -27,7 +27,7 @@ the albedo and the normal:
 
 ``--spread`` is for renders whose pixel filter has spread the noise. It takes the models for such noise.
 
-``--half`` measures only what says what half of the resolution costs, for light groups.
+``--half`` measures light groups alone: at full and at half of the resolution, fitted, and by OIDN at its best.
 
 Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
 
@@ -95,7 +95,7 @@ STORED_PEER = "OIDN, prefiltered, stored"
 COMPONENTS = "components"
 #: Column of the gain -> over which method.
 GAINS = {"gain": PEER, "gain_split": SPLIT_PEER, "gain_stored": STORED_PEER}
-#: The way of many light groups, and the methods beside it with ``--half``.
+#: How many light groups are fused, and what ``--half`` compares.
 AT_HALF = "msspl, best, at half size"
 BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
 #: Methods in the table of single layers.
@@ -162,18 +162,15 @@ def methods(
     def ours(low: MappedRender, model: str, *, half: bool = False) -> Array:
         frame, session = fused[model]
         with patch("oiio_msspl.fusion.passes.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
-            return ours_of(low, frame, session)
-
-    def ours_of(low: MappedRender, frame: FusedFrame, session: Session) -> Array:
-        made = fuse_passes(
-            low,
-            hr,
-            frame.rgb,
-            frame.alignment,
-            [layers],
-            guides=frame.clean_aovs,
-            fuse_layers=layer_fuser(session, frame),
-        )
+            made = fuse_passes(
+                low,
+                hr,
+                frame.rgb,
+                frame.alignment,
+                [layers],
+                guides=frame.clean_aovs,
+                fuse_layers=layer_fuser(session, frame),
+            )
         assert not made.refused
         height = hr.data_window.height
         planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
@@ -374,7 +371,9 @@ def main() -> None:
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
-    parser.add_argument("--half", action="store_true", help="measure only what half of the resolution costs")
+    parser.add_argument(
+        "--half", action="store_true", help="compare light groups at full and at half of the resolution"
+    )
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     results.add_option(parser)
     args = parser.parse_args()

@@ -636,8 +636,8 @@ def _draw_towards(image: Array, means: Array) -> None:
     """Change a fitted layer (3, h, w), so that its means over 2 x 2 pixels are half-way to ``means``, the layer as the
     network has fused it: the geometric mean of both.
 
-    A fit mixes lamps that are as bright and a few pixels apart, and the light of one would leak into the layer of the
-    other. The network tells them apart, but has more noise than the fit.
+    A fit can't tell apart two lamps that are equally bright and a few pixels apart, so the light of one would leak into
+    the layer of the other. The network can, but its result has more noise than the fit.
     """
 
     def work(rows: slice) -> None:

@@ -15,14 +15,14 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.arrays import HALF_MAX, Array, repair
-from oiio_msspl.colour import converted, same_space, space_of
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_separate, check_target
 from oiio_msspl.exr.preview import SOFTWARE, write_png
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
-from oiio_msspl.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, relmse_map, ssim
+from oiio_msspl.image.arrays import HALF_MAX, Array, repair
+from oiio_msspl.image.colour import converted, same_space, space_of
+from oiio_msspl.image.metrics import RELMSE_GHARBI, SSIM_WINDOW, psnr, relmse, relmse_map, ssim
 from oiio_msspl.model.contract import SCALES
 
 #: The "Software" entry of error maps. It differs from that of previews, because fusing deletes old previews.
@@ -30,7 +30,7 @@ ERROR_MAP_SOFTWARE = f"{SOFTWARE} compare"
 
 
 def scores(image: Array, reference: Array) -> dict[str, float]:
-    """All measures of :mod:`oiio_msspl.metrics`.
+    """All measures of :mod:`oiio_msspl.image.metrics`.
 
     Args:
         image, reference: scene linear, (height, width, 3).

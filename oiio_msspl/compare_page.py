@@ -33,15 +33,15 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import HALF_MAX, Array, repair
-from oiio_msspl.colour import REC709, converted, space_of
 from oiio_msspl.compare import Comparison, error_colours, error_levels, in_space_of, upsample_bicubic
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate, check_target, replacing
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.image.arrays import HALF_MAX, Array, repair
+from oiio_msspl.image.colour import REC709, converted, space_of
+from oiio_msspl.image.metrics import psnr, relmse
 
 TEMPLATE = "compare_page.html"
 #: The comment of the template in whose place the data stand.

@@ -18,11 +18,11 @@ from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.motion import MotionSource, find_motion
-from oiio_msspl.fusion.noise import is_noise_spread
-from oiio_msspl.fusion.sums import check_sum
-from oiio_msspl.fusion.tile_features import SIGNED_FEATURES
+from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.motion.source import MotionSource, find_motion
+from oiio_msspl.fusion.passes.sums import check_sum
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.features import SIGNED_FEATURES
 from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
 from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model

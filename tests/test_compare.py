@@ -6,7 +6,6 @@ import OpenEXR
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.compare import (
     error_map,
     note_on_spaces,
@@ -22,7 +21,8 @@ from oiio_msspl.compare import (
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.preview import is_our_preview, old_preview
 from oiio_msspl.exr.reader import ExrFile
-from oiio_msspl.metrics import RELMSE_GHARBI, relmse
+from oiio_msspl.image.colour import ACESCG, REC709, conversion
+from oiio_msspl.image.metrics import RELMSE_GHARBI, relmse
 from tests.conftest import downsample, picture, rgb, write_exr
 
 

@@ -12,11 +12,11 @@ import numpy as np
 import OpenEXR
 import pytest
 
-from oiio_msspl.colour import ACESCG, REC709, conversion, srgb
 from oiio_msspl.compare import error_map, open_comparison, upsample_bicubic
 from oiio_msspl.compare_page import from_codes, pack, to_codes, write_page
 from oiio_msspl.errors import InputError
-from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.image.colour import ACESCG, REC709, conversion, srgb
+from oiio_msspl.image.metrics import psnr, relmse
 from tests.browser import BROWSER, dump_dom
 from tests.conftest import downsample, noisy, picture, rgb, write_exr
 from tests.exr.sources import behind_a_deep_part

@@ -32,8 +32,8 @@ EXAMPLES = ROOT / "examples"
 PAGES = [
     ROOT / "README.md",
     EXAMPLES / "README.md",
-    ROOT / "benchmarks/README.md",
-    ROOT / "datagen/README.md",
+    ROOT / "research/benchmarks/README.md",
+    ROOT / "research/datagen/README.md",
     *sorted((ROOT / "docs/guide").glob("*.md")),
     *sorted((ROOT / "docs/design").glob("*.md")),
 ]
@@ -48,10 +48,10 @@ NOT_RUN = {
     "blender": "needs Blender",
     "dask": "runs until it is stopped; tests/jobs/test_dask_cluster.py starts a scheduler and workers",
     "deadline": "needs a farm",
-    "python -m training": "needs rendered views and hours",
-    "python -m datagen": "renders for hours",
-    "python -m benchmarks": "needs rendered scenes and an hour",
-    "python datagen/": "needs a renderer",
+    "python -m research.training": "needs rendered views and hours",
+    "python -m research.datagen": "renders for hours",
+    "python -m research.benchmarks": "needs rendered scenes and an hour",
+    "python research/datagen/": "needs a renderer",
 }
 #: An option and its value -> the same.
 NOT_RUN_WITH = {"--scheduler": "needs a running Dask scheduler", "--device cuda": "needs a GPU"}
@@ -60,9 +60,9 @@ OUTPUTS = ("-o", "--bundle", "--report", "--error-map", "--html")
 #: Packages that pages install beside those of pyproject.toml.
 OTHER_PACKAGES = {
     "onnxruntime-gpu": "takes the place of onnxruntime",
-    "bpy": "datagen.cycles, in an environment of its own",
-    "pillow": "datagen.cycles, in an environment of its own",
-    "pyluxcore": "datagen/luxcore_pair.py, in an environment of its own",
+    "bpy": "research.datagen.cycles, in an environment of its own",
+    "pillow": "research.datagen.cycles, in an environment of its own",
+    "pyluxcore": "research/datagen/luxcore_pair.py, in an environment of its own",
 }
 
 

@@ -12,7 +12,7 @@ import traceback
 import typer
 
 from oiio_msspl.errors import explain, printable
-from oiio_msspl.parallel import end_pools
+from oiio_msspl.image.parallel import end_pools
 
 
 def run(app: typer.Typer) -> None:

@@ -2,7 +2,7 @@
 """Additive sets: layers of a file that sum to its beauty, such as light groups.
 
 The table of renderers and the user's ``--sum`` name candidates. Whether a candidate really sums to the beauty is
-measured by :mod:`oiio_msspl.fusion.sums`.
+measured by :mod:`oiio_msspl.fusion.passes.sums`.
 """
 
 from __future__ import annotations

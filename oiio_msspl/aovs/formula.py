@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from oiio_msspl.arrays import Array
-from oiio_msspl.colour import luminance
 from oiio_msspl.exr.reader import Channel
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.colour import luminance
 
 #: Kinds of variance that can be used only if the samples per pixel are known.
 NEEDS_SPP = ("per_sample", "relative", "second_moment")

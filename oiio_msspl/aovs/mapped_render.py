@@ -14,11 +14,11 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.motion import MotionLayers
-from oiio_msspl.arrays import Array, blank, unload
-from oiio_msspl.colour import REC709, ColourSpace
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.reader import Channel, ExrFile
 from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.image.arrays import Array, blank, unload
+from oiio_msspl.image.colour import REC709, ColourSpace
 
 #: Rows that :meth:`MappedRender.load` reads at a time: the decoded channels stand beside the features made of them.
 ROWS_PER_LOAD = 256

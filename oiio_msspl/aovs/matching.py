@@ -22,11 +22,11 @@ from oiio_msspl.aovs.mapping import check_mapping
 from oiio_msspl.aovs.motion import find_motion_layers
 from oiio_msspl.aovs.renderers import detect_renderer, samples_per_pixel, view_layer_of
 from oiio_msspl.aovs.views import Beauty, choose_beauty, find_beauties
-from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Window
+from oiio_msspl.image.arrays import Array
 
 #: Bands of rows that tell whether normals are signed, and rows in each.
 _BANDS_OF_NORMALS, _ROWS_PER_BAND = 8, 8

@@ -2,7 +2,7 @@
 """Layers about the movement of surfaces: motion vectors, position and depth.
 
 The table of renderers names the layers, and the format in which a renderer usually writes its vectors. Manuals leave
-too much open to believe that format: :mod:`oiio_msspl.fusion.motion` verifies it on two frames of the shot.
+too much open to believe that format: :mod:`oiio_msspl.fusion.motion.source` verifies it on two frames of the shot.
 """
 
 from __future__ import annotations

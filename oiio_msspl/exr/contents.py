@@ -11,12 +11,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import HALF_MAX, Array
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layer_by_channel, matches_layer
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.replaced import DTYPES, ReplacedChannels
 from oiio_msspl.exr.write_options import DEFAULT_COMPRESSION, LOSSLESS, WriteOptions
+from oiio_msspl.image.arrays import HALF_MAX, Array
 
 
 @dataclass(frozen=True)

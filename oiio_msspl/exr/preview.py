@@ -12,13 +12,13 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array
-from oiio_msspl.colour import REC709, ColourSpace, conversion, srgb
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
-from oiio_msspl.parallel import one_ahead
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.colour import REC709, ColourSpace, conversion, srgb
+from oiio_msspl.image.parallel import one_ahead
 
 Pixels = NDArray[np.uint8]
 

@@ -18,11 +18,11 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array, unload
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_encodable
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, StripCache, StripKey, strip_rows
+from oiio_msspl.image.arrays import Array, unload
 
 # OpenImageIO's own limits protect programs that read whole files: 1024 channels, and an image as large as the memory.
 # Files with thousands of light groups are larger. This module reads by rectangle, so it needs no limit to the image.

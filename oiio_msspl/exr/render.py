@@ -10,7 +10,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from oiio_msspl.arrays import Array, unload
+from oiio_msspl.image.arrays import Array, unload
 
 #: The layers that a render in memory may have, with their channels. :mod:`oiio_msspl.aovs.features` states their units.
 CHANNELS = {"rgb": 3, "albedo": 3, "normal": 3, "diffuse": 3, "specular": 3, "variance": 1, "alpha": 1}

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import FLOAT_MAX, HALF_MAX, Array, reserve
 from oiio_msspl.exr.reader import Channel
+from oiio_msspl.image.arrays import FLOAT_MAX, HALF_MAX, Array, reserve
 
 #: NumPy's type of each pixel type.
 DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.uint32}

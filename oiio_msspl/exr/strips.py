@@ -15,7 +15,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import blank, unload
+from oiio_msspl.image.arrays import blank, unload
 
 #: Rows of a strip, which is at least one chunk. OpenImageIO decodes chunks in parallel; one chunk has 16 rows for ZIP,
 #: 32 for PIZ and DWAA, 256 for DWAB.

@@ -18,7 +18,6 @@ import numpy as np
 import OpenImageIO as oiio
 from numpy.typing import NDArray
 
-from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import not_written, replacing
 from oiio_msspl.exr.contents import FileContents, FusedPixels, dropped_channels, stored_type
@@ -36,7 +35,8 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.single_part import check_single_part, write_single_part
 from oiio_msspl.exr.strips import ROWS_PER_STRIP
 from oiio_msspl.exr.write_options import OPTIONS, WriteOptions
-from oiio_msspl.parallel import one_ahead
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.parallel import one_ahead
 
 
 def write_fused(

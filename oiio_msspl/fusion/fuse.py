@@ -12,13 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.arrays import HALF_MAX, Array, Mask, blank, unload
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.alignment import Alignment, align
-from oiio_msspl.fusion.alpha import alpha_as_colour, fuse_alpha
-from oiio_msspl.fusion.guards import (
+from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair
+from oiio_msspl.fusion.passes.fuse import FusedPasses, LayerFuser
+from oiio_msspl.fusion.tiles.alignment import Alignment, align
+from oiio_msspl.fusion.tiles.alpha import alpha_as_colour, fuse_alpha
+from oiio_msspl.fusion.tiles.features import RepairCounts, TilePair, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.guards import (
     FAR,
     LAYER_REACH,
     EmptyRegions,
@@ -28,10 +30,7 @@ from oiio_msspl.fusion.guards import (
     is_noise_free,
     lit_window,
 )
-from oiio_msspl.fusion.pair_checks import HrlsAverages, bounded_luminance, check_pair
-from oiio_msspl.fusion.passes import FusedPasses, LayerFuser
-from oiio_msspl.fusion.tile_features import RepairCounts, TilePair, read_lrhs, read_tile
-from oiio_msspl.fusion.tiling import (
+from oiio_msspl.fusion.tiles.tiling import (
     MAX_MEMORY,
     Tile,
     aligned_grid,
@@ -41,11 +40,12 @@ from oiio_msspl.fusion.tiling import (
     sample_bands,
     strips_memory,
 )
+from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, blank, unload
+from oiio_msspl.image.parallel import half_of_the_threads, limit_threads, one_ahead
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import half_of_the_threads, limit_threads, one_ahead
 
 
 @dataclass
@@ -69,8 +69,8 @@ class FusedFrame:
     hrls_luminance: Array = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
     frames: Array | None = None
-    """(height, width, 1): how many frames were averaged, see :class:`oiio_msspl.fusion.temporal.Accumulated`; None for
-    a frame that was fused alone."""
+    """(height, width, 1): how many frames were averaged, see
+    :class:`oiio_msspl.fusion.neighbours.results.Accumulated`; None for a frame that was fused alone."""
     clipped: int = 0
     """Values of ``rgb`` that were too bright for half; 0 for float32."""
     negative: dict[str, int] = field(default_factory=dict)
@@ -174,9 +174,9 @@ def fuse_layers(
         session: a model for the scale of the pair.
         alignment: of the pairs.
         exposure: that of the frame's beauty, because networks tell light from noise by its brightness.
-        reach: see :class:`oiio_msspl.fusion.guards.EmptyRegions`.
+        reach: see :class:`oiio_msspl.fusion.tiles.guards.EmptyRegions`.
 
-    The caller limits the threads of NumPy, see :func:`oiio_msspl.parallel.limit_threads`.
+    The caller limits the threads of NumPy, see :func:`oiio_msspl.image.parallel.limit_threads`.
 
     Yields:
         The fused layers, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files, if they
@@ -285,14 +285,14 @@ class _PreparedTile:
     target: Window
     """The part of the HRLS's data window that the tile contributes."""
     empty: Mask | None
-    """See :meth:`oiio_msspl.fusion.guards.EmptyRegions.mask`."""
+    """See :meth:`oiio_msspl.fusion.tiles.guards.EmptyRegions.mask`."""
     pair: TilePair
     """With alpha, albedo and normal of the HRLS only."""
     lrhs: Images | None = None
     """Inputs of the model; None for a tile that is empty everywhere."""
     hrls: Images | None = None
     lights: Array | None = None
-    """See :func:`oiio_msspl.fusion.guards.bright_lights`."""
+    """See :func:`oiio_msspl.fusion.tiles.guards.bright_lights`."""
     noise_free: bool = False
     """There is no noise to remove: the HRLS is the result."""
     aovs: tuple[str, ...] = ()

@@ -12,8 +12,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.tiling import MAX_MEMORY
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
+from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.frame_checks import check_frame_memory, memory_to_write
 from oiio_msspl.jobs.frame_passes import Progress, steps_of
 from oiio_msspl.jobs.inputs import InputOptions
@@ -21,7 +22,6 @@ from oiio_msspl.jobs.model_choice import resolve_auto
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame, is_sequence
 from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.parallel import limit_threads
 
 
 def fuse_files(

@@ -7,9 +7,9 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, check_layout
-from oiio_msspl.fusion.alignment import Alignment, align
 from oiio_msspl.fusion.fuse import memory_to_fuse, result_bytes
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, require_memory
+from oiio_msspl.fusion.tiles.alignment import Alignment, align
+from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, require_memory
 from oiio_msspl.model.session import Session
 
 

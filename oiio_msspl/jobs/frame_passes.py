@@ -10,17 +10,17 @@ import numpy as np
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels, stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, layer_fuser, tile_count
-from oiio_msspl.fusion.passes import fuse_passes, pass_steps
-from oiio_msspl.fusion.tiling import strips_memory
+from oiio_msspl.fusion.passes.fuse import fuse_passes, pass_steps
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.tiling import strips_memory
+from oiio_msspl.image.arrays import HALF_MAX
+from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import limit_threads
 
 
 def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
@@ -86,7 +86,7 @@ def fuse_frame_passes(
         write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
         max_memory: bytes that the process should stay below.
         progress: called with (steps done, steps in all) of this part of the work.
-        averaged: see :func:`oiio_msspl.fusion.passes.fuse_passes`.
+        averaged: see :func:`oiio_msspl.fusion.passes.fuse.fuse_passes`.
 
     Raises:
         InputError: pixels can't be decoded.

@@ -10,18 +10,18 @@ from typing import TYPE_CHECKING, TypeVar
 
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.arrays import Array, Mask, kept
 from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.motion import FLOW, MotionFrame
-from oiio_msspl.fusion.render_average import RenderPair, lacking_passes, shared_noise
-from oiio_msspl.fusion.temporal import accumulate
-from oiio_msspl.fusion.warp import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Placed, Step, near_borders
+from oiio_msspl.fusion.motion.source import FLOW, MotionFrame
+from oiio_msspl.fusion.neighbours.path import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Placed, Step, near_borders
+from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes, shared_noise
+from oiio_msspl.fusion.neighbours.results import accumulate
+from oiio_msspl.image.arrays import Array, Mask, kept
+from oiio_msspl.image.parallel import in_parallel
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.temporal import Temporal
 from oiio_msspl.model.session import Session
-from oiio_msspl.parallel import in_parallel
 
 if TYPE_CHECKING:
     from oiio_msspl.jobs.stages import LoadedFrame
@@ -36,7 +36,7 @@ SAME_SEED = "have the same noise, which no average removes; let the renderer cha
 LARGEST_READ = 1 << 22
 
 #: Vectors to a neighbour, where they can be believed, where objects have moved that they do not follow, and where they
-#: change, as :class:`oiio_msspl.fusion.warp.Step` has them.
+#: change, as :class:`oiio_msspl.fusion.neighbours.path.Step` has them.
 Way = tuple[Array | None, Mask | None, Mask | None, Mask | None]
 #: The ways to the neighbours whose renders are averaged: those before a frame, and those after it.
 Neighbours = tuple[Sequence[Step[RenderPair]], Sequence[Step[RenderPair]]]
@@ -274,7 +274,7 @@ class FrameWindow:
 
     @property
     def _tolerance(self) -> float:
-        """See :attr:`oiio_msspl.fusion.warp.Step.tolerance`."""
+        """See :attr:`oiio_msspl.fusion.neighbours.path.Step.tolerance`."""
         motion = self._temporal.motion
         return ROUND_TRIP_OF_FLOW if motion is not None and motion.kind == FLOW else ROUND_TRIP
 

@@ -11,15 +11,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
-from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.preview import old_preview, write_preview
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
 from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.image.arrays import HALF_MAX
+from oiio_msspl.image.parallel import in_background
 from oiio_msspl.jobs.report import FrameReport, provenance
-from oiio_msspl.parallel import in_background
 
 
 def write_frame(

@@ -15,10 +15,10 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import aov_files
-from oiio_msspl.colour import REC709, SPACES, ColourSpace, encoding_of, named_space, same_space, space_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import layer_by_channel
 from oiio_msspl.exr.reader import ExrFile, open_exr
+from oiio_msspl.image.colour import REC709, SPACES, ColourSpace, encoding_of, named_space, same_space, space_of
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class InputOptions:
     hr_spp: float | None = None
     """Samples per pixel of the HRLS; None to read them from its header."""
     colourspace: str | None = None
-    """Linear RGB space of both renders, see :func:`oiio_msspl.colour.named_space`; None to read it from the headers,
-    and to take linear Rec. 709 if they do not say."""
+    """Linear RGB space of both renders, see :func:`oiio_msspl.image.colour.named_space`; None to read it from the
+    headers, and to take linear Rec. 709 if they do not say."""
     sums: tuple[str, ...] = ()
     """The user's additive sets, as ``NAME=a+b+c*d``."""
     map_file: Path | None = None

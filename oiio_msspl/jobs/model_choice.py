@@ -5,8 +5,8 @@ from __future__ import annotations
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.fusion.alignment import align
-from oiio_msspl.fusion.noise import is_noise_spread
+from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.model.catalogue import DEFAULT_QUALITY, QUALITIES, family_of, for_spread_noise
 from oiio_msspl.model.contract import SPREAD
 

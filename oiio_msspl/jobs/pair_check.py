@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from oiio_msspl.errors import InputError
-from oiio_msspl.fusion.pair_checks import BOTH_BLACK, check_renders
+from oiio_msspl.fusion.checks.pair import BOTH_BLACK, check_renders
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.report import merged
 from oiio_msspl.jobs.views import find_other_views
@@ -45,7 +45,7 @@ class PairCheck:
 
 
 def check_files(lr: str | Path, hr: str | Path, inputs: InputOptions = InputOptions()) -> PairCheck:
-    """Check whether two files show the same frame, see :func:`oiio_msspl.fusion.pair_checks.check_pair`.
+    """Check whether two files show the same frame, see :func:`oiio_msspl.fusion.checks.pair.check_pair`.
 
     Args:
         lr, hr: the low-resolution and the high-resolution render.

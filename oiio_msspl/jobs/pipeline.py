@@ -13,12 +13,12 @@ from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.image.parallel import limit_threads, submit
 from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.view_windows import ViewWindows
-from oiio_msspl.parallel import limit_threads, submit
 
 
 def run_pipeline(

@@ -15,10 +15,11 @@ from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.layers import Layer
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.alignment import Alignment
 from oiio_msspl.fusion.fuse import result_bytes
-from oiio_msspl.fusion.motion import VECTORS, MotionSource
-from oiio_msspl.fusion.render_average import USUAL_CHANNELS
+from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
+from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.frame_checks import require_frame_memory
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import map_pair
@@ -27,7 +28,6 @@ from oiio_msspl.jobs.sequence import Frame
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import AUTO, Temporal, TemporalOptions, shares
 from oiio_msspl.model.catalogue import family_of
-from oiio_msspl.parallel import limit_threads
 
 
 def beside(output: Path, suffix: str) -> Path:

@@ -19,7 +19,8 @@ from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.atomic import remove_leftovers
 from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.tiling import MAX_MEMORY
+from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
+from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.dask_cluster import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
@@ -29,7 +30,6 @@ from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport
 from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.model.devices import require_device
-from oiio_msspl.parallel import limit_threads
 
 if TYPE_CHECKING:
     from dask.distributed import Client

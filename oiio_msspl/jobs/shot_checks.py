@@ -10,8 +10,8 @@ from pathlib import Path
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import check_model
+from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
 from oiio_msspl.jobs.frame_passes import check_passes
 from oiio_msspl.jobs.inputs import InputOptions, map_pair

@@ -16,7 +16,6 @@ from pathlib import Path
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.arrays import Array, Mask, kept
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.exr.contents import stored_type
@@ -24,11 +23,12 @@ from oiio_msspl.exr.preview import is_our_preview
 from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
-from oiio_msspl.fusion.pass_plan import pass_features
-from oiio_msspl.fusion.render_average import RenderPair, average_renders, lacking_passes
-from oiio_msspl.fusion.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.fusion.neighbours.renders import RenderPair, average_renders, lacking_passes
+from oiio_msspl.fusion.passes.plan import pass_features
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, MAX_MEMORY
+from oiio_msspl.image.arrays import Array, Mask, kept
 from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
 from oiio_msspl.jobs.frame_memory import FrameMemory, is_large, light_features
 from oiio_msspl.jobs.frame_passes import check_passes, fuse_frame_passes, sets_to_fuse, uses_clean_aovs
@@ -64,7 +64,7 @@ class LoadedFrame:
     """The stages with what belongs to this view: its neighbours, the layers that are written of it, and the memory that
     other views take."""
     vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
-    """Motion vectors that are read with the pixels, see :class:`oiio_msspl.fusion.motion.MotionFrame`."""
+    """Motion vectors that are read with the pixels, see :class:`oiio_msspl.fusion.motion.source.MotionFrame`."""
     others: OtherViews = field(default_factory=OtherViews)
     """Views beside the first one that are fused by themselves. Their pixels are read then."""
 

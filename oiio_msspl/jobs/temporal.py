@@ -17,13 +17,13 @@ from pathlib import Path
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionField, read_format
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.arrays import has_many_pixels
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.motion import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.fusion.render_average import memory_to_average
-from oiio_msspl.fusion.temporal import memory_to_accumulate
+from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
+from oiio_msspl.fusion.neighbours.renders import memory_to_average
+from oiio_msspl.fusion.neighbours.results import memory_to_accumulate
+from oiio_msspl.image.arrays import has_many_pixels
 from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
 from oiio_msspl.jobs.model_choice import family_for_layers
 from oiio_msspl.jobs.sequence import Frame, Shot

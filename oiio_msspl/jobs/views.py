@@ -16,14 +16,14 @@ from typing import NamedTuple
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.views import name_of
-from oiio_msspl.arrays import HALF_MAX
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.alignment import align
 from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
-from oiio_msspl.fusion.tiling import require_memory
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.tiling import require_memory
+from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.jobs.frame_passes import fuse_frame_passes, sets_to_fuse
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
 from oiio_msspl.jobs.report import FrameReport, report_on

@@ -28,7 +28,7 @@ def shipped_models() -> dict[str, Path]:
 
 
 def measured() -> dict[str, dict[str, float]]:
-    """Accuracy and time of the shipped models, by name, as ``benchmarks.tables`` wrote them.
+    """Accuracy and time of the shipped models, by name, as ``research.benchmarks.tables`` wrote them.
 
     PSNR in dB and RelMSE are means of the development scenes. The time is a multiple of Open Image Denoise's. What was
     not measured is absent.

@@ -13,8 +13,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from oiio_msspl.arrays import Array
 from oiio_msspl.errors import InputError
+from oiio_msspl.image.arrays import Array
 
 if TYPE_CHECKING:
     import onnxruntime

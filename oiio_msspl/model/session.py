@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
-from oiio_msspl.arrays import planes
 from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.image.arrays import planes
+from oiio_msspl.image.parallel import check_threads
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
 from oiio_msspl.model.encoding import default_value
 from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.runtime import CPU, convolutions, load_network, release_memory
-from oiio_msspl.parallel import check_threads
 
 log = logging.getLogger(__name__)
 

@@ -8,7 +8,7 @@ import pytest
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.sums import check_sum
+from oiio_msspl.fusion.passes.sums import check_sum
 from tests.conftest import SHARED, needs_shared, rgb, write_exr
 
 SIZE = (8, 6)

@@ -31,7 +31,7 @@ def test_files_of_the_add_on_are_gpl_and_import_nothing_of_the_core():
 
 
 def test_every_file_that_imports_bpy_is_gpl():
-    folders = ("oiio_msspl", "cli", "nuke_gizmo", "blender_addon", "benchmarks", "training", "datagen", "tests")
+    folders = ("oiio_msspl", "cli", "nuke_gizmo", "blender_addon", "research", "tests")
     for path in (path for folder in folders for path in (ROOT / folder).rglob("*.py")):
         if imported_modules(path) & {"bpy", "bl_ext"}:
             assert path.read_text(encoding="utf-8").startswith(GPL), path

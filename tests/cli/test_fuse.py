@@ -283,7 +283,7 @@ def test_a_signal_that_interrupts_the_start_of_a_thread_does_not_keep_the_progra
     code = """
 import sys, threading, typer
 from msspl_cli.errors import run
-from oiio_msspl import parallel
+from oiio_msspl.image import parallel
 app = typer.Typer()
 start = threading.Thread.start
 

@@ -9,10 +9,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.colour import srgb
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.preview import SOFTWARE, check_view, is_our_preview, write_png, write_preview
 from oiio_msspl.exr.render import Window
+from oiio_msspl.image.colour import srgb
 
 
 def png(path):

@@ -8,7 +8,7 @@ from oiio_msspl import find_model, fuse, map_render, open_exr
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Render, Window
-from oiio_msspl.fusion import tiling
+from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture, rgb, write_exr

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 
 from oiio_msspl import Render, fuse
-from oiio_msspl.arrays import box_downsample
-from oiio_msspl.colour import srgb
-from oiio_msspl.fusion import tiling
 from oiio_msspl.fusion.fuse import tile_count
+from oiio_msspl.fusion.tiles import tiling
+from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.colour import srgb
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture
-from tests.fusion.test_noise import spread
+from tests.fusion.checks.test_spread_noise import spread
 
 SCALES = (2, 4, 8)
 

@@ -4,15 +4,15 @@
 import pytest
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot, open_exr
-from oiio_msspl.arrays import box_downsample
-from oiio_msspl.fusion.motion import VECTORS, MotionSource
+from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
+from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.jobs.openjd import make_job
 from oiio_msspl.jobs.sequence import find_shot
 from oiio_msspl.jobs.shot_checks import model_of_shot
 from oiio_msspl.jobs.temporal import TemporalOptions, _is_slow, plan_temporal
 from oiio_msspl.model.catalogue import load_model, shipped_models
 from tests.conftest import noisy, picture, read_bits, rgb, write_exr
-from tests.fusion.test_noise import spread
+from tests.fusion.checks.test_spread_noise import spread
 
 
 def write_pair(folder, name, sigma, extra=None):

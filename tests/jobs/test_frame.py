@@ -13,7 +13,7 @@ import pytest
 from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_files
 from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.fusion.tiling import MAX_MEMORY
+from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.jobs import frame_writing, stages
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.sequence import Frame

@@ -5,10 +5,10 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from oiio_msspl.colour import ACESCG, REC709, conversion
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.preview import write_preview
 from oiio_msspl.exr.render import Window
+from oiio_msspl.image.colour import ACESCG, REC709, conversion
 from oiio_msspl.jobs.frame import fuse_files
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.pair_check import check_files

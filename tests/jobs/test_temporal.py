@@ -11,13 +11,14 @@ import time
 import numpy as np
 import pytest
 
-from oiio_msspl import InputError, InputOptions, fuse_shot, map_render, open_exr, parallel
+from oiio_msspl import InputError, InputOptions, fuse_shot, map_render, open_exr
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.layers import layers_of
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.motion import FLOW, VECTORS
-from oiio_msspl.fusion.tiling import MAX_MEMORY
+from oiio_msspl.fusion.motion.source import FLOW, VECTORS
+from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
+from oiio_msspl.image import parallel
 from oiio_msspl.jobs import frame_memory, frame_window, stages
 from oiio_msspl.jobs.frame_memory import FrameMemory
 from oiio_msspl.jobs.frame_window import FrameWindow
@@ -298,7 +299,7 @@ def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bili
     loaded = []
     real = stages.Stages._load
     monkeypatch.setattr(stages.Stages, "_load", lambda *arguments: loaded.append(real(*arguments)) or loaded[-1])
-    monkeypatch.setattr("oiio_msspl.arrays.MOST_PIXELS", 10)
+    monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 10)
     if place == "disk":
         monkeypatch.setattr(frame_memory, "_vector_bytes", lambda render, channels: 1 << 32)
     else:
@@ -495,7 +496,7 @@ def test_products_of_light_and_colour_are_averaged_as_products(tmp_path, bilinea
 def test_passes_of_chunks_are_those_of_one_run_bit_for_bit(shot_with_passes, bilinear_models, monkeypatch):
     shot, model = shot_with_passes, bilinear_models[4]
     run(shot, model, "one run", "4")
-    monkeypatch.setattr("oiio_msspl.arrays.MOST_PIXELS", 1)  # frames wait in temporary files
+    monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 1)  # frames wait in temporary files
     run(shot, model, "chunk", "4", frames="1004-1006")
     chunk, one_run = (contents(shot / name) for name in ("chunk", "one run"))
     assert len(chunk) == 3 and chunk.items() <= one_run.items()
@@ -548,7 +549,7 @@ def test_the_order_of_a_part_begins_with_its_neighbours():
 
 
 def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monkeypatch):
-    monkeypatch.setattr("oiio_msspl.arrays.MOST_PIXELS", 100)
+    monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 100)
     run(shot, bilinear_models[4], "on disk")
     assert contents(shot / "on disk") == contents(shot / "whole")
     window = Window(0, 0, 4096, 2160)

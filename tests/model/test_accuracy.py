@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import Render, Session, find_model, fuse
-from oiio_msspl.metrics import psnr, relmse
+from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import shipped_models
 
 #: PSNR in dB and RelMSE that each model had on the frame of ``tests/data``.

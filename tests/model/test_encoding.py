@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 
 from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL
-from oiio_msspl.arrays import repair
-from oiio_msspl.colour import srgb
+from oiio_msspl.image.arrays import repair
+from oiio_msspl.image.colour import srgb
 from oiio_msspl.model import encoding
 from oiio_msspl.model.encoding import NOISY, decode_radiance, encode_radiance, find_exposure
 from tests.conftest import noisy, picture
@@ -68,7 +68,7 @@ def test_small_lamps_do_not_darken_a_frame_to_the_network(lamps):
 def test_a_sample_of_a_large_frame_gives_its_exposure(monkeypatch):
     scene = noisy(picture(256, 256), 4)
     whole = find_exposure(scene)
-    monkeypatch.setattr("oiio_msspl.arrays.LARGE_SAMPLE", 1000)
+    monkeypatch.setattr("oiio_msspl.image.arrays.LARGE_SAMPLE", 1000)
     assert find_exposure(scene) == pytest.approx(whole, rel=1e-3)
 
 

@@ -9,8 +9,8 @@ import pytest
 from oiio_msspl import Render, Session, find_model, fuse, fuse_files
 from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, NORMAL, RGB, SPECULAR
 from oiio_msspl.aovs.matching import map_render
-from oiio_msspl.arrays import box_downsample
 from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import WEIGHTS, shipped_models
 from oiio_msspl.model.contract import SCALES
@@ -68,7 +68,7 @@ def test_it_denoises_no_worse_than_open_image_denoise(family, scale, spp_of_albe
     """Its error is at most OIDN's, and 1.1 times that at x8, whose LRHS has 17 x 25 pixels, and at x2 with a noisy
     albedo. The sides are no multiples of the alignment, and the result stays in the range of the renders."""
     pytest.importorskip("pyoidn")
-    from benchmarks.oidn import denoise
+    from research.benchmarks.oidn import denoise
 
     clean = picture(136, 200)
     normal = np.broadcast_to(np.float32([0.6, -0.8, 0.0]), clean.shape)

@@ -15,7 +15,7 @@ NAMES = {"mean-x1": "joint-small-x2", "mean-spread-x1": "joint-small-spread-x2"}
 
 @pytest.mark.parametrize("name", NAMES)
 def test_the_files_are_those_that_are_cut_from_the_model_for_pairs(name):
-    mean_model = pytest.importorskip("training.mean_model").mean_model
+    mean_model = pytest.importorskip("research.training.mean_model").mean_model
     for path in (WEIGHTS / f"{NAMES[name]}.onnx", gpu_file(WEIGHTS / f"{NAMES[name]}.onnx")):
         shipped = onnx.load(path.with_name(f"{name}.onnx"), load_external_data=False)
         assert shipped.SerializeToString(deterministic=True) == mean_model(path).SerializeToString(deterministic=True)

@@ -15,7 +15,7 @@ import typer
 from msspl_cli import console, options
 from msspl_cli.shot_printer import ShotPrinter
 from oiio_msspl.errors import InputError
-from oiio_msspl.parallel import MOST_THREADS
+from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -20,7 +20,7 @@ from oiio_msspl.exr.atomic import (
     remove_left_folders,
     remove_leftovers,
 )
-from oiio_msspl.parallel import MOST_THREADS
+from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
     from oiio_msspl.jobs.rendered_shot import RenderedShot

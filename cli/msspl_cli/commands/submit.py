@@ -62,10 +62,10 @@ def submit(
     """
     given, passed_on = _parse([*context.args, *(() if output is None else ("--output", output))])
     options.set_up_logging(given["verbose"], given["quiet"])
+    from oiio_msspl.image.parallel import limit_threads
     from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import format_frames
     from oiio_msspl.jobs.shot_checks import check_first_pair, check_temporal, check_wanted_outputs
-    from oiio_msspl.parallel import limit_threads
 
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")

@@ -1,0 +1,168 @@
+# SPDX-License-Identifier: Apache-2.0
+"""How the framing of one picture differs from another's: shift and zoom, found by least squares.
+
+The method is Lucas and Kanade 1981, coarse to fine. It finds the shift and zoom whose first-order effect on the LRHS
+explains the difference best. Two pictures of one frame may also differ by a tone curve, since noise changes the mean of
+display values, and by a blur, since pixel filters differ. Both are fitted along with shift and zoom, as a polynomial of
+the LRHS and its Laplacian. The gradients are those of the LRHS, so noise of the HRLS makes the estimate vary and does
+not bias it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.image.arrays import Array, box_downsample, interpolate, quantile
+from oiio_msspl.image.filters import blurred
+
+#: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
+FRAMING_CORRELATION = 0.8
+#: It must also explain the first share of the difference that is left after tone curve and blur, because noise looks
+#: like a shift where a picture has few edges. In a large picture, noise explains less: so many pixels suffice.
+MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.3, 2000
+#: A difference must be this many standard errors from none.
+CERTAIN = 8.0
+#: The frame is cut into this many parts along each side. Each part is left out once to estimate standard errors.
+JACKKNIFE_PARTS = 6
+#: Side of the central area, in LRHS pixels, in which the framing is compared.
+AREA = 1024
+#: Pictures with a shorter side, in LRHS pixels, have too few edges to judge.
+SMALLEST = 44
+#: Smaller pictures are not searched for shifts of several pixels: at a quarter of their size little is left.
+SMALLEST_COARSE = 80
+#: Largest zoom that is looked for.
+LARGEST_ZOOM_SEARCHED = 0.1
+
+
+@dataclass(frozen=True)
+class Framing:
+    """How the HRLS's picture lies over the LRHS's. All numbers are 0 where the difference is not certain."""
+
+    x: float = 0.0
+    """Shift to the right in LRHS pixels."""
+    y: float = 0.0
+    """Shift down in LRHS pixels."""
+    zoom: float = 0.0
+    """By how much larger the HRLS's picture is: 0.03 for 3 %."""
+    zoom_at_edge: float = 0.0
+    """Pixels of the LRHS by which the zoom moves the edge of the area in which it was measured."""
+
+
+def find_framing(low: Array, high: Array) -> Framing:
+    """Compare two pictures (h, w) of luminance, LRHS and HRLS."""
+    if min(low.shape) < SMALLEST:
+        return Framing()
+    low, high = central_area(low), central_area(high)
+    grey = quantile(low[low > 0], 0.5) if low.any() else 1.0
+    # Map radiance to [0, 1], so neither fireflies nor black pixels dominate.
+    low, high = (blurred(v / (v + grey), 2) for v in (low, high))
+    if not (np.isfinite(low).all() and np.isfinite(high).all()):
+        return Framing()  # radiance near the limit of float32
+    starts = [np.zeros(3)]
+    if min(low.shape) >= SMALLEST_COARSE:
+        coarse = _fit(blurred(downsample_4(low), 2), blurred(downsample_4(high), 2), np.zeros(3)).estimate * 4
+        # A start less than half a pixel away would lead to the same result.
+        if np.abs(coarse).max() >= 0.5:
+            starts.append(np.clip(coarse, -12, 12))
+    fit = max((_fit(low, high, start) for start in starts), key=lambda fit: fit.explained)
+    if fit.correlation < FRAMING_CORRELATION or fit.explained < min(MIN_EXPLAINED, MIN_EXPLAINED_PIXELS / low.size):
+        return Framing()
+    x, y, at_edge = np.where(np.abs(fit.estimate) > CERTAIN * fit.error, fit.estimate, 0)
+    return Framing(float(x), float(y), float(at_edge / (max(low.shape) / 2)), float(at_edge))
+
+
+@dataclass(frozen=True)
+class _Fit:
+    estimate: NDArray[np.float64]
+    """Shift x, y, and the zoom's displacement at the edge of the longer side; in pixels."""
+    error: NDArray[np.float64]
+    """Standard error of ``estimate``."""
+    explained: float
+    """Share of the squared difference that shift and zoom explain, of what tone curve and blur leave."""
+    correlation: float
+
+
+def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
+    """Refine an estimate: repeated least squares over it, gain and offset, with the LRHS moved each time."""
+    height, width = low.shape
+    half = max(low.shape) / 2
+    across, down = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) / np.float32(half) for n in (width, height))
+    # Shift and zoom together leave some rows and columns to compare.
+    largest = np.full(3, (min(low.shape) / 2 - 5) / 2).clip(max=(np.inf, np.inf, LARGEST_ZOOM_SEARCHED * half))
+    estimate = np.clip(start, -largest, largest)
+    for _ in range(8):
+        moved = _move(low, estimate / (1, 1, half))
+        margin = int(np.abs(estimate[:2]).max() + abs(estimate[2])) + 3
+        inner = slice(margin, -margin)
+        gy, gx = np.gradient(moved)
+        zoom = gx * across + gy * down[:, None]
+        blur = blurred(moved, 2) - moved
+        known = [-gx, -gy, -zoom, moved, np.square(moved), blur, np.ones_like(moved)]
+        planes = np.stack([*known, high - moved])[:, inner, inner]
+        # For each part of the frame, the products of all planes with all planes. Double precision, because the planes
+        # are nearly linearly dependent.
+        flat = (part.reshape(len(planes), -1).astype(np.float64) for part in parts(planes))
+        dots = np.stack([part @ part.T for part in flat])
+        squares, products = dots[:, :-1, :-1], dots[:, :-1, -1]
+        total = squares.sum(0) + 1e-9 * squares.sum(0).trace() * np.eye(len(known))  # solvable without any gradient
+        step = np.linalg.pinv(total, hermitian=True) @ products.sum(0)
+        estimate = np.clip(estimate + np.clip(step[:3], -1, 1), -largest, largest)
+        if np.abs(step[:3]).max() < 0.01:
+            break
+    inverses = np.linalg.pinv(total - squares, hermitian=True)
+    without_part = (inverses @ (products.sum(0) - products)[..., None])[:, :3, 0]
+    error = jackknife_error(without_part)
+    residual = float(dots[:, -1, -1].sum() - step @ products.sum(0))
+    explained = 1 - residual / max(_unmoved_residual(low, high, inner), 1e-30)
+    a, b = (v[inner, inner] - v[inner, inner].mean() for v in (moved, high))
+    correlation = float(np.mean(a * b)) / max(float(a.std() * b.std()), 1e-12)
+    return _Fit(estimate, error, explained, correlation)
+
+
+def _unmoved_residual(low: Array, high: Array, inner: slice) -> float:
+    """Squared difference within rows and columns that a tone curve and a blur of the LRHS do not explain."""
+    known = [low, np.square(low), blurred(low, 2) - low, np.ones_like(low)]
+    planes = np.stack([*known, high - low])[:, inner, inner].reshape(5, -1).astype(np.float64)
+    dots = planes @ planes.T
+    coefficients = np.linalg.lstsq(dots[:4, :4], dots[:4, 4], rcond=None)[0]
+    return float(dots[4, 4] - coefficients @ dots[:4, 4])
+
+
+def _move(values: Array, by: NDArray[np.float64]) -> Array:
+    """Move a picture (h, w) by (x, y) to the right and down, zoomed around its centre; the edge pixel is repeated."""
+    for axis, distance in ((1, by[0]), (0, by[1])):
+        middle = (values.shape[axis] - 1) / 2
+        positions = (np.arange(values.shape[axis]) - middle - distance) / (1 + by[2]) + middle
+        values = interpolate(values, positions, axis)
+    return values
+
+
+def central_area(values: Array) -> Array:
+    """The middle of a picture (h, w), at most `AREA` pixels wide and high."""
+    return values[central_slices(values.shape)]
+
+
+def central_slices(shape: tuple[int, int]) -> tuple[slice, slice]:
+    """Rows and columns of the middle of a picture, at most `AREA` of each."""
+    height, width = (slice(max(0, n - AREA) // 2, min(n, (n + AREA) // 2)) for n in shape)
+    return height, width
+
+
+def parts(values: Array) -> list[Array]:
+    """Cut planes (..., h, w) into the parts for the jackknife."""
+    rows = np.array_split(values, JACKKNIFE_PARTS, -2)
+    return [part for row in rows for part in np.array_split(row, JACKKNIFE_PARTS, -1)]
+
+
+def jackknife_error(without_part: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Standard error of an estimate, from the estimates (n, ...) that leave out one of n parts each."""
+    return np.sqrt((len(without_part) - 1) * without_part.var(axis=0))
+
+
+def downsample_4(values: Array) -> Array:
+    """Mean of 4 x 4 pixels; incomplete blocks at the end are left out."""
+    height, width = (n // 4 for n in values.shape)
+    return box_downsample(values[: height * 4, : width * 4], 4)

@@ -1,0 +1,409 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checks whether two renders show the same frame, at the LRHS's resolution.
+
+`research.benchmarks.pair_checks` measures how many wrong pairs each check notices, and how many right pairs it doubts.
+"""
+
+from __future__ import annotations
+
+import itertools
+from functools import reduce
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.checks.colours import different_colours
+from oiio_msspl.fusion.checks.edges import foreign_aovs
+from oiio_msspl.fusion.checks.framing import central_slices, find_framing, jackknife_error, parts
+from oiio_msspl.fusion.tiles.alignment import Alignment, align
+from oiio_msspl.fusion.tiles.features import RepairCounts, TilePair, in_hrls_pixels, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.tiling import Tile
+from oiio_msspl.image.arrays import Array, box_downsample, planes_of, quantile
+from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.parallel import for_row_blocks, in_background
+
+#: Two renders hardly show the same frame if the correlation of their log luminance is below this. Matching pairs with
+#: clean references reach 0.83 to 0.99, one lit almost only by fireflies 0.31, different scenes -0.2 to 0.25.
+LOW_CORRELATION = 0.3
+#: Exposures differ if the ratio of the mean luminances, without the brightest percent, exceeds this. Matching pairs
+#: reach at most 1.21.
+EXPOSURE_RATIO = 4 / 3
+#: Framings differ if the shift exceeds this in HRLS pixels, because the paper's nearest-neighbour LRHS is half a pixel
+#: off by its nature, and this in LRHS pixels.
+MAX_SHIFT = (0.75, 0.5)
+#: Or if the zoom moves the edge of the frame by more LRHS pixels than this.
+MAX_ZOOM_AT_EDGE = 0.8
+#: A difference of exposure must be this many standard errors from none.
+CERTAIN = 6.0
+#: Brighter pixels count as this bright, because sums of squares over a frame would overflow float32.
+BRIGHTEST = np.float32(1e15)
+#: Groups of blocks show different things: the side of a block in LRHS pixels, how many blocks the group has along each
+#: side, and the mean of t^2 from which on it counts. Groups of matching views reach 12.9, 8.2 and 9.8.
+BLOCK_GROUPS = ((4, 2, 16.0), (4, 3, 11.0), (8, 2, 12.0))
+#: No single block counts for more than this t.
+LARGEST_T = 6.0
+#: Pixel filters of different widths move light across edges: this share of a block's contrast is no difference.
+FILTER_SHARE = 0.1
+#: Side of the blocks, in LRHS pixels, over which noise and colours are summed.
+BLOCK = 4
+#: The LRHS shares the HRLS's noise if, in three of four blocks, they differ by less than this share of the HRLS's
+#: noise. Independent renders differ by both renders' noise, so by more than one.
+SHARED_NOISE = 0.75
+#: A block has noise if its RMS is this share of the block's brightness.
+NOISY = 0.01
+#: With fewer noisy blocks nothing is said of noise.
+MIN_NOISY_BLOCKS = 64
+#: The LRHS is the HRLS's nearest pixels if this share of its noisy pixels equal an HRLS pixel.
+EQUAL_PIXELS = 0.5
+#: A render is black by chance if no more pixels of the other one are lit: so many. Around a rectangle, also this share
+#: of them.
+MOST_BY_CHANCE, REGION = 64, 0.05
+#: The warning for a pair that fits, and shows nothing.
+BOTH_BLACK = "both renders are black (or NaN) everywhere: the result is black"
+#: Pixels of the HRLS that :func:`check_renders` reads at a time.
+PIXELS_PER_READ = 1024 * 1024
+
+
+class HrlsAverages:
+    """The HRLS at the LRHS's resolution, and how both differ; filled tile by tile.
+
+    Attributes:
+        rgb: luminance (h, w) over the grid of the alignment.
+        albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
+        normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
+            none.
+        normal_noise: how long that difference would be, root mean square, by the noise of the normals alone; None as
+            above.
+        blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
+            difference of luminance, and how large it would be by the noise of the HRLS alone.
+        noisy_pixels, equal_pixels: LRHS pixels over which the HRLS is noisy, and those of them that equal one of its
+            pixels.
+        is_lost: whether the HRLS's beauty is NaN in all tiles, so that its averages are those of the LRHS.
+    """
+
+    def __init__(self, alignment: Alignment) -> None:
+        self.alignment = alignment
+        grid = alignment.grid
+        self.rgb = np.zeros((grid.height, grid.width), np.float32)
+        rows, columns = central_slices(self.rgb.shape)
+        self._centre = Window(columns.start, rows.start, columns.stop, rows.stop).shift(grid.x0, grid.y0)
+        self.albedo: Array | None = None
+        self.normal_edges: Array | None = None
+        self.normal_noise: Array | None = None
+        self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
+        self.noisy_pixels = self.equal_pixels = 0
+        self.is_lost = True
+
+    def add(self, pair: TilePair) -> None:
+        """Add the core of a tile."""
+        self.is_lost &= pair.hrls_is_lost
+        rows, columns = pair.core
+        area, grid = pair.lrhs_area, self.alignment.grid
+        core = Window(columns.start, rows.start, columns.stop, rows.stop).shift(area.x0, area.y0)
+        self._add_beauty(pair.lrhs[RGB][pair.core], _hrls_pixels(pair, RGB, core), core.shift(-grid.x0, -grid.y0))
+        centre = core.intersect(self._centre)
+        if centre.width and centre.height:
+            self._add_aovs(pair, centre)
+
+    def _add_aovs(self, pair: TilePair, window: Window) -> None:
+        """Fill ``albedo`` and ``normal_edges`` over a part of the central area."""
+        target, size = window.slices(self._centre), (self._centre.height, self._centre.width)
+        if ALBEDO in pair.hrls:
+            if self.albedo is None:
+                self.albedo = np.zeros(size, np.float32)
+            self.albedo[target] = luminance(box_downsample(_hrls_pixels(pair, ALBEDO, window), pair.scale))
+        if NORMAL in pair.hrls:
+            if self.normal_edges is None or self.normal_noise is None:
+                self.normal_edges, self.normal_noise = np.zeros(size, np.float32), np.zeros(size, np.float32)
+            pixels = _hrls_pixels(pair, NORMAL, window)
+            self.normal_noise[target] = _noise_of_edges(pixels, pair.scale)
+            self.normal_edges[target] = _edge_lengths(box_downsample(pixels, pair.scale))
+
+    def _add_beauty(self, low: Array, high: Array, place: Window) -> None:
+        """Fill ``rgb``, and sum ``blocks``.
+
+        Args:
+            low, high: colours of both renders (h, w, 3) and (s*h, s*w, 3).
+            place: of the LRHS's pixels in the grid.
+        """
+        scale = self.alignment.scale
+        phases = list(itertools.product(range(scale), repeat=2))
+        averages = self.rgb[place.y0 : place.y1, place.x0 : place.x1]
+        values = np.empty((8, *low.shape[:2]), np.float32)
+        counts: list[tuple[int, int]] = []
+
+        def work(rows: slice) -> None:
+            colour = np.minimum(low[rows], BRIGHTEST)
+            samples = np.minimum(high[rows.start * scale : rows.stop * scale], BRIGHTEST)
+            mean = box_downsample(samples, scale)
+            averages[rows] = luminance(mean)
+            pixels, grey = luminance(samples), luminance(colour)
+            expected = box_downsample(_noise_variance(pixels), scale // 2) / np.float32(scale**2)
+            # Black pixels are equal in any two renders where light is rare.
+            noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
+            nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
+            equal = noisy & (nearest <= 1e-3 * grey)
+            counts.append((int(np.count_nonzero(noisy)), int(np.count_nonzero(equal))))
+            values[:3, rows], values[3:6, rows] = planes_of(colour), planes_of(mean)
+            values[6, rows], values[7, rows] = np.square(averages[rows] - grey), expected
+
+        for_row_blocks(work, len(low), high[0].size * scale)
+        self.noisy_pixels += sum(noisy for noisy, _ in counts)
+        self.equal_pixels += sum(equal for _, equal in counts)
+        sums: NDArray[Any] = values
+        for axis, (start, stop) in ((1, (place.y0, place.y1)), (2, (place.x0, place.x1))):
+            first = np.maximum(np.arange(start // BLOCK * BLOCK, stop, BLOCK) - start, 0)
+            sums = np.add.reduceat(sums, first, axis).astype(np.float64)
+        top, left = place.y0 // BLOCK, place.x0 // BLOCK
+        self.blocks[top : top + sums.shape[1], left : left + sums.shape[2]] += sums.transpose(1, 2, 0)
+
+
+def _edge_lengths(normal: Array) -> Array:
+    """Length of the difference of normals (h, w, 3) to the next pixels, to the right and down, (h, w)."""
+    squares = np.zeros(normal.shape[:2], np.float32)
+    for plane in planes_of(normal):
+        squares[:-1] += np.square(np.diff(plane, axis=0))
+        squares[:, :-1] += np.square(np.diff(plane, axis=1))
+    return np.sqrt(squares)
+
+
+def _noise_of_edges(pixels: Array, scale: int) -> Array:
+    """How long :func:`_edge_lengths` would be by the noise of the HRLS's normals (s*h, s*w, 3) alone, root mean square,
+    (h, w)."""
+    result = np.empty([side // scale for side in pixels.shape[:2]], np.float32)
+
+    def work(rows: slice) -> None:
+        block = pixels[rows.start * scale : rows.stop * scale]
+        variance = reduce(np.add, planes_of(_noise_variance(block)))
+        # Means over scale x scale pixels, in two differences of two of them each.
+        result[rows] = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
+
+    for_row_blocks(work, len(result), pixels[0].size * scale)
+    return result
+
+
+def _noise_variance(pixels: Array) -> Array:
+    """Variance by noise (h / 2, w / 2, ...) of the pixels (h, w, ...), over 2 x 2 of them each.
+
+    Gradients and straight edges cancel out of a diagonal difference, and the variance of noise is a quarter.
+    """
+    quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
+    variance: Array = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
+    return variance
+
+
+def _hrls_pixels(pair: TilePair, feature: str, window: Window) -> Array:
+    """A feature of the HRLS over a window of LRHS pixels inside the tile."""
+    return pair.hrls[feature][in_hrls_pixels(window, pair.scale).slices(pair.hrls_area)]
+
+
+def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
+    """Check whether two renders show the same frame, without fusing them.
+
+    Args:
+        lr, hr: files with their layers mapped, or renders in memory.
+
+    Returns:
+        Warnings of :func:`check_pair`.
+
+    Raises:
+        InputError: the pair does not fit together, or can't be read.
+    """
+    alignment = align(lr, hr)
+    grid, counts = alignment.grid, RepairCounts()
+    lrhs = read_lrhs(lr, alignment, grid, [RGB], counts)
+    averages = HrlsAverages(alignment)
+    rows = max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))
+    for top in range(grid.y0, grid.y1, rows):
+        band = Window(grid.x0, top, grid.x1, min(top + rows, grid.y1))
+        averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL], counts))
+    return check_pair(bounded_luminance(lrhs[RGB]), averages, lr.name, hr.name)
+
+
+def bounded_luminance(rgb: Array) -> Array:
+    """Luminance of repaired colours, at most `BRIGHTEST`: (..., 3) to (...)."""
+    return np.minimum(luminance(rgb), BRIGHTEST)
+
+
+def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
+    """Check whether two renders show the same frame.
+
+    Args:
+        low: luminance of the LRHS (h, w) over the grid of the alignment, see :func:`bounded_luminance`.
+        hrls: averages of all tiles.
+        lr_name, hr_name: what messages call the renders.
+
+    Returns:
+        Warnings, one sentence each.
+
+    Raises:
+        InputError: one render is black, most likely a wrong layer, and the other is not: more of it is lit than by
+            chance.
+    """
+    high, alignment = hrls.rgb, hrls.alignment
+    if not low.any() and not high.any():
+        return [BOTH_BLACK]
+    if hrls.is_lost:
+        raise _black_beauty(hr_name, lr_name)
+    for name, values, other, lit in ((lr_name, low, hr_name, high), (hr_name, high, lr_name, low)):
+        if not values.any():
+            if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
+                raise _black_beauty(name, other)
+            return []  # a dark frame in which few samples find the light
+    warnings = []
+    for name, values, other, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
+        if _is_region(values, lit):
+            warnings.append(
+                f"the {name} is black outside of a rectangle, where the {other} is lit: was a render region on?"
+            )
+    framing = in_background(lambda: find_framing(low, high))
+    foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
+    if _shares_noise(hrls):
+        warnings.append(
+            "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
+            "with more spp, and not made by scaling the HRLS down"
+        )
+    ratio, certain = _brightness_ratio(low, high)
+    if not 1 / EXPOSURE_RATIO < ratio < EXPOSURE_RATIO and certain:
+        warnings.append(f"the HRLS is {ratio:.3g} times as bright as the LRHS: are exposure and view layer the same?")
+    correlation = _log_correlation(hrls)
+    if correlation < LOW_CORRELATION:
+        warnings.append(
+            f"the two renders hardly look alike (correlation {correlation:.2f}): are they the same frame and camera?"
+        )
+        return warnings
+    colours = different_colours(hrls.blocks[..., :3].reshape(-1, 3), hrls.blocks[..., 3:6].reshape(-1, 3))
+    if colours is not None:
+        warnings.append(f"{colours}: write both in the same colour space")
+    warnings += [
+        f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
+        for aov in foreign()
+    ]
+    scale, grid, found = alignment.scale, alignment.grid, framing()
+    x, y = found.x * scale, found.y * scale
+    if max(abs(x), abs(y)) > max(MAX_SHIFT[0], MAX_SHIFT[1] * scale):
+        warnings.append(
+            f"the HRLS is shifted against the LRHS by {abs(x):.1f} pixels to the {'right' if x > 0 else 'left'} and "
+            f"{abs(y):.1f} pixels {'down' if y > 0 else 'up'}: are camera, crop and overscan the same?"
+        )
+    if abs(found.zoom_at_edge) > MAX_ZOOM_AT_EDGE:
+        tighter = "HRLS" if found.zoom > 0 else "LRHS"
+        warnings.append(
+            f"the {tighter} is framed {100 * abs(found.zoom):.1f} % tighter than the other render: are focal length, "
+            "crop and overscan the same?"
+        )
+    if not warnings and (place := _different_place(low, high)) is not None:
+        x, y = (start + scale * at for start, at in zip((grid.x0 * scale, grid.y0 * scale), place, strict=True))
+        warnings.append(
+            f"the two renders show different things, most of all around HRLS pixel ({x}, {y}): are they "
+            "the same frame, with the same lights and objects?"
+        )
+    return warnings
+
+
+def _black_beauty(name: str, other: str) -> InputError:
+    return InputError(
+        f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
+        "check which layer it is (--map rgb=LAYER)"
+    )
+
+
+def _is_region(values: Array, other: Array) -> bool:
+    """Whether a picture (h, w) is black around a rectangle, though the other one is not."""
+    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
+    outside = np.ones(values.shape, np.bool_)
+    # The other render's filter may reach further.
+    outside[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3] = False
+    lit = np.count_nonzero(other[outside])
+    return bool(lit > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
+
+
+def _shares_noise(hrls: HrlsAverages) -> bool:
+    """Whether the LRHS is the HRLS scaled down, by averaging pixels or by keeping some of them."""
+    colours, difference, expected = hrls.blocks[..., :6], hrls.blocks[..., 6], hrls.blocks[..., 7]
+    brightness = colours.sum(axis=-1) / 6
+    noisy = expected * BLOCK**2 > np.square(NOISY * brightness)
+    if int(np.count_nonzero(noisy)) < max(MIN_NOISY_BLOCKS, int(np.count_nonzero(brightness)) // 4):
+        return False
+    shares = difference[noisy] / expected[noisy]
+    scaled_down = float(np.quantile(shares, 0.75)) < SHARED_NOISE
+    return scaled_down or hrls.equal_pixels > EQUAL_PIXELS * max(hrls.noisy_pixels, 1)
+
+
+def _log_correlation(hrls: HrlsAverages) -> float:
+    """Pearson correlation of the log brightness of blocks: noise averages out, framing stays.
+
+    1 if there is no framing to compare, because the blocks of either render differ by little more than noise.
+    """
+    low, high = hrls.blocks[..., :3].sum(axis=-1), hrls.blocks[..., 3:6].sum(axis=-1)
+    logs = [np.log(v + 1e-3 * v.mean() + 1e-20).ravel() for v in (low, high)]
+    noise = float(np.mean(9 * hrls.blocks[..., 7] / np.square(high + 1e-3 * high.mean() + 1e-20)))
+    if low.size < MIN_NOISY_BLOCKS or min(v.var() for v in logs) < max(1e-6, 5 * noise):
+        return 1.0
+    return float(np.corrcoef(*logs)[0, 1])
+
+
+def _brightness_ratio(low: Array, high: Array) -> tuple[float, bool]:
+    """How many times as bright the HRLS is, and whether that is more than noise."""
+    # Fireflies dominate a plain mean. So only pixels count that are not in the brightest percent of either render.
+    lit = (low > 0) | (high > 0)
+    ordinary = lit & (low <= quantile(low[lit], 0.99)) & (high <= quantile(high[lit], 0.99))
+    low_sums, high_sums = (
+        np.array([part.sum(dtype=np.float64) for part in parts(v * ordinary)]) + 1e-30 for v in (low, high)
+    )
+    log_ratio = np.log(high_sums.sum() / low_sums.sum())
+    without_part = [sums.sum() - sums for sums in (low_sums, high_sums)]
+    error = jackknife_error(np.log(np.maximum(without_part[1], 1e-30) / np.maximum(without_part[0], 1e-30)))
+    return float(np.exp(log_ratio)), bool(abs(log_ratio) > CERTAIN * error)
+
+
+def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
+    """Where (x, y), in LRHS pixels, the two pictures differ by more than noise explains; None if nowhere.
+
+    A paired t-test for each block: what both pictures show cancels out, and a single firefly has a t of about 1,
+    however bright it is. The mean of t^2 over neighbouring blocks is 1 for noise. A thing that moved stands out from
+    it, and from the frame's median, which a difference of the whole frame raises as well.
+    """
+    floor = 0.05 * quantile((low + high).ravel(), 0.5)
+    means = {size: _block_means(low, high, size) for size in {size for size, _, _ in BLOCK_GROUPS}}
+    for size, side, different in BLOCK_GROUPS:
+        if min(low.shape) < size * side:
+            continue
+        low_mean, high_mean, low_square, difference_square = means[size]
+        difference = low_mean - high_mean
+        deviation = np.sqrt(np.maximum(difference_square - np.square(difference), 0))
+        contrast = np.sqrt(np.maximum(low_square - np.square(low_mean), 0))
+        # Two percent of the brightness do not count, even between renders without noise.
+        unimportant = 0.02 * ((low_mean + high_mean) / 2 + floor)
+        error = (deviation + FILTER_SHARE * contrast) / size + unimportant
+        t = np.minimum(np.abs(difference) / np.maximum(error, 1e-30), LARGEST_T)
+        groups = np.lib.stride_tricks.sliding_window_view(np.square(t), (side, side))
+        scores = groups.mean(axis=(-2, -1))
+        if scores.max() > different * max(1.0, float(np.median(scores))):
+            row, column = np.unravel_index(scores.argmax(), scores.shape)
+            y, x = np.unravel_index(groups[row, column].argmax(), (side, side))
+            return int((column + x) * size + size // 2), int((row + y) * size + size // 2)
+    return None
+
+
+def _block_means(low: Array, high: Array, size: int) -> NDArray[np.float64]:
+    """Means over blocks of size x size pixels: LRHS, HRLS, square of the LRHS and of the difference, 4 x (h/s, w/s).
+
+    In double precision, because a squared firefly overflows float32. Incomplete blocks at the end are left out.
+    """
+    height, width = (n // size for n in low.shape)
+    means = np.empty((4, height, width))
+
+    def work(rows: slice) -> None:
+        a, b = (v[rows, : width * size].astype(np.float64) for v in (low, high))
+        for mean, values in zip(means, (a, b, np.square(a), np.square(a - b)), strict=True):
+            row_sums = reduce(np.add, (values[y::size] for y in range(size)))
+            sums = reduce(np.add, (row_sums[:, x::size] for x in range(size)))
+            np.divide(sums, size**2, out=mean[rows.start // size : rows.stop // size])
+
+    for_row_blocks(work, height * size, 4 * width * size, multiple=size)
+    return means

@@ -1,0 +1,106 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Whether a pixel filter has spread the noise of a pair over neighbouring pixels.
+
+Some renderers add each sample to all pixels that the filter reaches. Noise of neighbouring pixels is then alike, and
+denoisers that learnt from independent pixels take it for detail.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, read_features, read_lrhs
+from oiio_msspl.image.arrays import Array, box_downsample
+from oiio_msspl.image.colour import luminance
+from oiio_msspl.model.encoding import encode_radiance, find_exposure
+
+#: Side of the blocks in which neighbouring pixels are compared; and of a sample of the frame, in LRHS pixels.
+BLOCK, SAMPLE = 8, 32
+#: Samples along each side of the frame.
+SAMPLES = 3
+#: Blocks with noise that a judgement needs.
+FEWEST = 4
+#: Bytes of decoded rows that neighbouring samples share.
+CACHE_BYTES = 256 << 20
+#: Noise is spread if neighbouring pixels of the HRLS, and of the difference between both renders, correlate by more.
+#: A box filter or importance sampling has 0 in both; Mitsuba's default, a Gaussian, has 0.3 and at least 0.04.
+SPREAD_HRLS, SPREAD_DIFFERENCE = 0.15, 0.02
+
+
+def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool | None:
+    """Whether the noise of neighbouring pixels is alike in both renders. None if there is hardly any noise, as in a
+    black frame.
+
+    The HRLS alone does not tell: fine texture also makes neighbours alike. Texture is the same in both renders and
+    cancels in the difference of the LRHS and the averaged HRLS, noise does not. So both must correlate. Small samples
+    all over the frame are read.
+    """
+    scale, found = alignment.scale, []
+    with hr.cache_strips(CACHE_BYTES):
+        for window in _samples(alignment.grid):
+            low = read_lrhs(lr, alignment, window, [RGB], RepairCounts())[RGB]
+            area = in_hrls_pixels(window, scale)
+            high = read_features(hr, area, alignment.hr_data_window, [RGB])[RGB]
+            exposure = find_exposure(low)
+            mean, low, high = (
+                encode_radiance(luminance(image)[..., None], exposure)[..., 0]
+                for image in (box_downsample(high, scale), low, high)
+            )
+            found.append((_correlations(high), _correlations(low - mean)))
+    hrls, difference = (np.concatenate(parts) for parts in zip(*found, strict=True))
+    if min(len(hrls), len(difference)) < FEWEST:
+        return None
+    return bool(np.median(hrls) > SPREAD_HRLS and np.median(difference) > SPREAD_DIFFERENCE)
+
+
+def _samples(grid: Window) -> list[Window]:
+    """Squares of at most ``SAMPLE`` pixels, evenly spread over the grid, each once."""
+
+    def starts(first: int, side: int) -> list[int]:
+        size = min(SAMPLE, side)
+        return sorted({first + round(i * (side - size) / (SAMPLES - 1)) for i in range(SAMPLES)})
+
+    width, height = min(SAMPLE, grid.width), min(SAMPLE, grid.height)
+    return [
+        Window(x, y, x + width, y + height) for y in starts(grid.y0, grid.height) for x in starts(grid.x0, grid.width)
+    ]
+
+
+def _correlations(image: Array) -> NDArray[np.float64]:
+    """Correlation of neighbouring pixels in each block of an image (h, w), without the block's smooth course."""
+    rows, columns = (side // BLOCK for side in image.shape)
+    blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
+    residual = (blocks.reshape(-1, BLOCK**2).astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
+    residual = residual[residual.var(axis=(1, 2)) > 1e-8]  # black and blown-out blocks have no noise
+    return _neighbours(residual) - _neighbours_of_white_noise()
+
+
+def _neighbours(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
+    across = (blocks[:, :, 1:] * blocks[:, :, :-1]).mean(axis=(1, 2))
+    down = (blocks[:, 1:] * blocks[:, :-1]).mean(axis=(1, 2))
+    result: NDArray[np.float64] = (across + down) / 2 / np.square(blocks).mean(axis=(1, 2))
+    return result
+
+
+@functools.cache
+def _without_course() -> NDArray[np.float64]:
+    """The matrix that removes the best-fitting quadratic polynomial from a flattened block."""
+    y, x = (np.mgrid[:BLOCK, :BLOCK] - (BLOCK - 1) / 2).reshape(2, -1)
+    basis, _ = np.linalg.qr(np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1))
+    return np.eye(BLOCK**2) - basis @ basis.T
+
+
+@functools.cache
+def _neighbours_of_white_noise() -> float:
+    """The correlation of neighbours that removing the polynomial gives independent pixels."""
+    covariance = _without_course().reshape((BLOCK,) * 4)
+    i = np.arange(BLOCK - 1)
+    across = np.mean([covariance[y, i, y, i + 1] for y in range(BLOCK)])
+    down = np.mean([covariance[i, x, i + 1, x] for x in range(BLOCK)])
+    return float((across + down) / 2 / np.diag(_without_course()).mean())

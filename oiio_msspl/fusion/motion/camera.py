@@ -1,0 +1,212 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Movement of the picture by the camera alone: from the camera's matrices in the headers, and positions or depth.
+
+Renderers disagree on what their matrices mean, and some write a matrix under the wrong name. So each is tried: the
+right one projects the positions of a frame onto the pixels that hold them. Without positions, the right one makes
+albedo and normals of two frames agree.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.fusion.motion.guides import FramePair
+from oiio_msspl.fusion.motion.vectors import sample_linear
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.parallel import for_row_blocks
+
+#: Header attributes that hold such a matrix, in lower case: by Arnold, Karma, Mantra and RenderMan.
+MATRICES = ("worldtoscreen", "worldtondc", "np", "worldtocamera", "nl")
+#: Pixels by which a matrix is judged.
+SAMPLES = 4096
+#: A matrix is right if positions land this close to their pixel, in pixels. A single sample lies anywhere in it.
+CLOSE = 0.75
+#: With depth instead of positions, a matrix must fit so many times as well as no motion.
+MARGIN = 1.5
+
+
+@dataclass(frozen=True)
+class Projection:
+    """What the pixels of a frame have told about a matrix."""
+
+    attribute: str
+    """Name of the header attribute."""
+    divisor: int
+    """Column by which the first two are divided: 3 of a matrix to the screen, 2 of one to the camera."""
+    scale: tuple[float, float]
+    shift: tuple[float, float]
+    """pixel = projected * scale + shift, in x and y."""
+    depth: str = ""
+    """How positions follow from depth, for frames without them: it is measured along the ``axis`` or the ``ray``."""
+
+    def matrix(self, render: MappedRender) -> NDArray[np.float32] | None:
+        """The matrix of a frame, for row vectors; None if its header has none."""
+        return _matrix(render, self.attribute)
+
+    def project(self, positions: Array, matrix: NDArray[np.float32]) -> Array:
+        """Where positions (..., 3) lie in the frame: (..., 2), x and y in pixels; NaN behind the camera."""
+        seen = positions @ matrix[:3] + matrix[3]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            result: Array = seen[..., :2] / seen[..., self.divisor : self.divisor + 1]
+        return result * np.array(self.scale, np.float32) + np.array(self.shift, np.float32)
+
+
+def find_projection(pair: FramePair) -> Projection | None:
+    """How the matrices of a shot are to be read; None if there are none, or none fits.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    if not any(key.lower() in MATRICES for key in pair.first.metadata):
+        return None
+    return _by_position(pair.first) if pair.first.motion.position else _by_depth(pair)
+
+
+def _by_position(render: MappedRender) -> Projection | None:
+    """The matrix of the header that projects positions onto their pixels."""
+    assert render.motion.position is not None
+    window = render.data_window
+    positions = render.file.read(render.motion.position, window)
+    good = np.isfinite(positions).all(axis=-1) & (positions != 0).any(axis=-1)
+    y, x = np.nonzero(good)
+    if len(x) < 64:
+        return None
+    chosen = np.linspace(0, len(x) - 1, min(len(x), SAMPLES)).astype(np.int64)
+    points = positions[y[chosen], x[chosen]]
+    pixels = np.stack([x[chosen] + window.x0, y[chosen] + window.y0], axis=-1).astype(np.float32)
+    for name in MATRICES:
+        for attribute in (key for key in render.metadata if key.lower() == name):
+            matrix = _matrix(render, attribute)
+            if matrix is not None and (found := _fit(attribute, matrix, points, pixels)):
+                return found
+    return None
+
+
+def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Projection) -> tuple[Array, Mask]:
+    """Vectors to a neighbour (h, w, 2) as if all surfaces stood still, and where there are any (h, w).
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window = render.data_window
+    vectors = np.zeros((window.height, window.width, 2), np.float32)
+    known = np.zeros(vectors.shape[:2], np.bool_)
+    here, there = projection.matrix(render), projection.matrix(neighbour)
+    positions = _positions(render, projection)
+    if here is None or there is None or positions is None:
+        return vectors, known
+    distances = np.empty(known.shape, np.float32)
+
+    def work(rows: slice) -> None:
+        points = positions[rows]
+        y, x = np.mgrid[rows.start : rows.stop, 0 : window.width].astype(np.float32)
+        limit = np.hypot(render.display_window.width, render.display_window.height)
+        with np.errstate(invalid="ignore"):  # NumPy's settings for errors belong to the thread
+            now = projection.project(points, here)
+            way = projection.project(points, there) - now
+            distances[rows] = np.hypot(now[..., 0] - x - window.x0, now[..., 1] - y - window.y0)
+            known[rows] = (np.hypot(way[..., 0], way[..., 1]) < limit) & (points != 0).any(axis=-1)
+        vectors[rows] = np.where(known[rows, :, None], way, 0)
+
+    for_row_blocks(work, window.height, window.width * 12)
+    # A lens that zooms changes the scale, which a matrix to the camera alone does not say.
+    if not known.any() or np.median(distances[known]) > CLOSE:
+        known[:] = False
+        vectors[:] = 0
+    return vectors, known
+
+
+def _by_depth(pair: FramePair) -> Projection | None:
+    """The matrix to the screen, and the kind of depth, that make the guides of both frames agree."""
+    frame = pair.first.display_window
+    best, best_left = None, 1.0
+    for attribute in (key for key in pair.first.metadata if key.lower() in MATRICES):
+        for (low, high), up, depth in itertools.product(((-1, 1), (0, 1)), (True, False), ("axis", "ray")):
+            x, y = frame.width / (high - low), frame.height / (high - low)
+            shift = (frame.x0 - 0.5 - low * x, frame.y0 - 0.5 + (high * y if up else -low * y))
+            projection = Projection(attribute, 3, (x, -y if up else y), shift, depth)
+            left = _left(pair, *camera_vectors(pair.first, pair.second, projection))
+            if left < best_left:
+                best, best_left = projection, left
+    return best if best_left * MARGIN < 1 else None
+
+
+def _left(pair: FramePair, vectors: Array, known: Mask) -> float:
+    """What is left of the differences between both frames' guides, geometric mean; 1 without motion."""
+    step = pair.reduction
+    rows, columns = (slice(s.start + step // 2, s.stop, step) for s in pair.window.slices(pair.first.data_window))
+    vectors, known = vectors[rows, columns] / np.float32(step), known[rows, columns]
+    left = []
+    for guide in pair.guides:
+        here, there = guide.images
+        height, width = here.shape[:2]
+        steep = guide.steepness[0]
+        use = known[:height, :width] & (steep > 0) & (steep >= np.quantile(steep, 0.75))
+        still = np.abs(there - here).mean(axis=-1)[use]
+        if use.any() and np.median(still) > 0:
+            y, x = np.nonzero(use)
+            way = vectors[y, x]
+            found = sample_linear(there, x + way[:, 0], y + way[:, 1])
+            left.append(float(np.median(np.abs(found - here[use]).mean(axis=-1)) / np.median(still)))
+    return float(np.exp(np.mean(np.log(np.maximum(left, 1e-9))))) if left else 1.0
+
+
+def _positions(render: MappedRender, projection: Projection) -> Array | None:
+    """World positions (h, w, 3) of the pixels, read or computed from depth; None if the frame has neither."""
+    window = render.data_window
+    if not projection.depth:
+        return render.file.read(render.motion.position, window) if render.motion.position else None
+    attribute = next((key for key in render.metadata if key.lower() in ("worldtocamera", "nl")), "")
+    screen, camera = projection.matrix(render), _matrix(render, attribute)
+    if screen is None or camera is None or render.motion.depth is None or np.linalg.matrix_rank(camera) < 4:
+        return None
+    depth = render.file.read([render.motion.depth], window)
+    y, x = np.mgrid[window.y0 : window.y1, window.x0 : window.x1].astype(np.float32)
+    across, up = (
+        (pixels - np.float32(shift)) / np.float32(scale)
+        for pixels, scale, shift in zip((x, y), projection.scale, projection.shift, strict=True)
+    )
+    # Seen from the camera, a point appears at (across, up) if it is at right angles to both normals.
+    to_world = np.linalg.inv(camera.astype(np.float64))
+    columns = (to_world @ screen)[:3].astype(np.float32)
+    normals = [columns[:, axis] - place[..., None] * columns[:, 3] for axis, place in enumerate((across, up))]
+    ray = np.cross(normals[0], normals[1])
+    ray *= np.sign(ray @ columns[:, 3:])  # forward
+    length = np.abs(ray[..., 2:]) if projection.depth == "axis" else np.linalg.norm(ray, axis=-1, keepdims=True)
+    with np.errstate(all="ignore"):
+        ray *= np.abs(depth) / length
+    points: Array = ray @ to_world[:3, :3].astype(np.float32) + to_world[3, :3].astype(np.float32)
+    points[~(np.isfinite(depth[..., 0]) & (depth[..., 0] != 0))] = 0
+    return points
+
+
+def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:
+    """A matrix of the header. OpenEXR and OpenImageIO store it for row vectors."""
+    try:
+        values = np.array(render.metadata.get(attribute), np.float32).reshape(4, 4)
+    except (TypeError, ValueError):
+        return None
+    return values if np.isfinite(values).all() else None
+
+
+def _fit(attribute: str, matrix: NDArray[np.float32], points: Array, pixels: Array) -> Projection | None:
+    """The scale and shift with which a matrix projects points (n, 3) onto pixels (n, 2); None if no such fit."""
+    seen = points @ matrix[:3] + matrix[3]
+    divisor = 2 if np.allclose(matrix[:, 3], (0, 0, 0, 1)) else 3
+    if np.abs(seen[:, divisor]).min() < 1e-9:
+        return None
+    projected = (seen[:, :2] / seen[:, divisor : divisor + 1]).astype(np.float64)
+    use = np.ones(len(points), np.bool_)
+    for _ in range(4):  # edges of surfaces, where positions are mixtures, drop out
+        fits = [np.polyfit(projected[use, axis], pixels[use, axis], 1) for axis in (0, 1)]
+        wrong = np.hypot(*(projected[:, axis] * fits[axis][0] + fits[axis][1] - pixels[:, axis] for axis in (0, 1)))
+        use = wrong <= max(2 * float(np.median(wrong)), 1e-3)
+    if np.median(wrong) > CLOSE:
+        return None
+    (scale_x, shift_x), (scale_y, shift_y) = fits
+    return Projection(attribute, divisor, (float(scale_x), float(scale_y)), (float(shift_x), float(shift_y)))

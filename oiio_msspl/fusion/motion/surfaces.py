@@ -1,0 +1,138 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Does a pixel show another surface in a neighbouring frame? The albedo and the normals of both tell.
+
+Without motion vectors, nothing else says that an object has moved in front of a surface, or away from it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.filters import grown, sum_3x3
+from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.image.sampling import nearest_indices
+
+#: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of what pixels of
+#: one surface differ by. That is the surface's texture and noise.
+DIFFERENCE, MULTIPLE = 0.03, 3.0
+#: The surface is another one if so many of 3 x 3 pixels differ. Single ones are noise.
+PIXELS = 4
+#: Rows and columns around a pixel that decide on it.
+REACH = 4
+#: Pixels that are compared at a time, which bounds memory.
+PIXELS_AT_ONCE = 1 << 22
+
+
+def other_surfaces(
+    here: ReadableRender, there: ReadableRender, names: Sequence[str], vectors: Array | None, known: Mask
+) -> Mask:
+    """Where a frame shows another surface than its neighbour, (h, w) over its data window, or lies beside such a pixel.
+
+    Args:
+        here, there: the frame and its neighbour.
+        names: layers of both that have no light, such as the albedo. Without any, no surface is another one.
+        vectors: to the place of each surface in the neighbour, (h, w, 2) in HRLS pixels; None if it is the same place.
+        known: which of them can be believed, (h, w). The others are not compared.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window, height = here.data_window, here.data_window.height
+    result = np.zeros(known.shape, np.bool_)
+    rows = max(PIXELS_AT_ONCE // max(window.width, 1), 8 * REACH)
+    for top in range(0, height if names else 0, rows):
+        last = min(top + rows, height)
+        around = slice(max(top - REACH, 0), min(last + REACH, height))
+        area = Window(window.x0, window.y0 + around.start, window.x1, window.y0 + around.stop)
+        if vectors is None and window == there.data_window:
+            found, compared = _layers(there, names, area), known[around]
+        else:
+            way = np.zeros((area.height, area.width, 2), np.float32) if vectors is None else vectors[around]
+            found, compared = _at_places(there, names, area, way, known[around])
+        other = _differ(_layers(here, names, area), found, compared)
+        result[top:last] = other[top - around.start :][: last - top]
+        for render in (here, there):
+            render.unload()
+    return result
+
+
+def _at_places(
+    render: ReadableRender, names: Sequence[str], area: Window, vectors: Array, known: Mask
+) -> tuple[list[Array], Mask]:
+    """Layers of a frame at the pixels that vectors of an area lead to, and which of these are known and lie in it."""
+    window = render.data_window
+    x = np.arange(area.x0, area.x1, dtype=np.float32) + vectors[..., 0]
+    y = np.arange(area.y0, area.y1, dtype=np.float32)[:, None] + vectors[..., 1]
+    inside = (x > window.x0 - 0.5) & (x < window.x1 - 0.5) & (y > window.y0 - 0.5) & (y < window.y1 - 0.5) & known
+    ends = (np.rint(y[inside].min()), np.rint(y[inside].max())) if inside.any() else (window.y0, window.y0)
+    first, last = (min(max(int(end), window.y0), window.y1 - 1) for end in ends)
+    place = Window(window.x0, first, window.x1, last + 1)
+    nearest = nearest_indices(x - place.x0, y - place.y0, (place.height, place.width))
+    layers = _layers(render, names, place)
+    return [image.reshape(-1, image.shape[-1]).take(nearest, axis=0) for image in layers], inside
+
+
+def _layers(render: ReadableRender, names: Sequence[str], window: Window) -> list[Array]:
+    layers = render.read(window, names)
+    return [layers[name] for name in names]
+
+
+def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Mask:
+    """Where layers (h, w, c) show another surface, or lie beside such a pixel, (h, w)."""
+    height, width = compared.shape
+    result = np.empty((height, width), np.bool_)
+
+    def work(rows: slice) -> None:
+        first, last, _ = rows.indices(height)
+        around = slice(max(first - REACH, 0), min(last + REACH, height))
+        other = np.zeros((around.stop - around.start, width), np.bool_)
+        for one, two in zip(here, there, strict=True):
+            one, two = _planes(one[around]), _planes(two[around])
+            limit = np.maximum(_roughness(one), _roughness(two))
+            limit *= np.float32(MULTIPLE)
+            limit += np.float32(DIFFERENCE)
+            differs = (_distance(one, two) > limit) & compared[around]
+            other |= sum_3x3(differs.astype(np.float32)) >= PIXELS
+        result[rows] = grown(other)[first - around.start :][: last - first]
+
+    for_row_blocks(work, height, width)
+    return result
+
+
+def _planes(image: Array) -> Array:
+    """(h, w, c) as (c, h, w). NaN and infinities become 0."""
+    planes = np.moveaxis(image, -1, 0).copy(order="C")
+    if not np.isfinite([planes.min(), planes.max()]).all():
+        planes[~np.isfinite(planes)] = 0
+    return planes
+
+
+def _roughness(planes: Array) -> Array:
+    """What neighbouring pixels of one surface differ by, mean of 3 x 3 pixels (h, w): of two neighbours on opposite
+    sides, at least one lies on the surface of the pixel."""
+    total = np.zeros(planes.shape[1:], np.float32)
+    for steps, sums in (
+        (_distance(planes[:, 1:], planes[:, :-1]), total),
+        (_distance(planes[:, :, 1:], planes[:, :, :-1]).T, total.T),
+    ):
+        if len(steps):
+            sums[1:-1] += np.minimum(steps[1:], steps[:-1])
+            sums[0] += steps[0]
+            sums[-1] += steps[-1]
+    result = sum_3x3(total)
+    result /= 9
+    return result
+
+
+def _distance(one: Array, two: Array) -> Array:
+    """Length of the difference of (c, h, w), (h, w)."""
+    total = np.zeros(one.shape[1:], np.float32)
+    for a, b in zip(one, two, strict=True):
+        step = a - b
+        step *= step
+        total += step
+    return np.sqrt(total, out=total)

@@ -1,0 +1,206 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Motion vectors as this package uses them: decoded, judged pixel by pixel, and inverted.
+
+The convention: a vector (x, y) in HRLS pixels, x to the right and y down, leads from a pixel to the place of its
+surface in another frame. Pixels count in the display window, so frames may have different data windows.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.motion import MotionFormat
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.parallel import for_row_blocks
+
+#: Shorter vectors are no movement, in pixels.
+NO_MOTION = 1e-3
+#: Vectors that change by more than this from pixel to pixel can't be followed, in pixels. Whether the way there and
+#: back ends at its pixel would depend on how places are rounded to pixels.
+UNEVEN = 0.25
+#: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
+INVERSION_ROUNDS, INVERSION_ERROR = 3, 0.5
+
+
+def channels_to_read(render: MappedRender, channels: tuple[Channel, Channel]) -> list[Channel]:
+    """The channels that :func:`judged_vectors` needs: two with vectors, and the alpha."""
+    return [*channels, *([render.alpha] if render.alpha else [])]
+
+
+def judged_vectors(
+    render: MappedRender, stored: Array, channels: tuple[Channel, Channel], form: MotionFormat, pixels: ReadableRender
+) -> tuple[Array, Mask]:
+    """Motion vectors over the data window, and where they can be believed.
+
+    Args:
+        render: the frame.
+        stored: :func:`channels_to_read` over its data window, (h, w, 2 or 3).
+        channels: the two that hold the vectors.
+        form: how they are stored.
+        pixels: the frame's features.
+
+    Returns:
+        Vectors (h, w, 2), 0 where they can't be believed; and where they can (h, w): they are finite, shorter than the
+        frame, not clamped, alpha is not 0, they do not change too fast, see :func:`_uneven`, and they are not zeros of
+        a background, see :func:`_doubtful_zeros`.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    window, frame = render.data_window, render.display_window
+    alpha = stored[..., 2] if render.alpha else None
+    vectors, known = decode(stored[..., :2], form, frame.width, frame.height, alpha)
+    inside = window.intersect(render.file.parts[channels[0].part].data_window)
+    if inside != window:  # beyond the part's data window nothing is stored
+        rendered = np.zeros_like(known)
+        rendered[inside.slices(window)] = True
+        known &= rendered
+    known &= ~_doubtful_zeros(pixels, vectors, known)
+    known &= ~_uneven(vectors)
+    vectors[~known] = 0
+    return vectors, known
+
+
+def decode(
+    stored: Array, form: MotionFormat, width: int, height: int, alpha: Array | None = None
+) -> tuple[Array, Mask]:
+    """Vectors in pixels, x right and y down, from stored values (h, w, 2); and where they can be believed.
+
+    Args:
+        stored: as the renderer wrote them.
+        form: how.
+        width, height: of the display window.
+        alpha: (h, w); None if the render has none.
+    """
+    vectors = np.empty(stored.shape, np.float32)
+    known = np.empty(stored.shape[:2], np.bool_)
+
+    def work(rows: slice) -> None:
+        good = np.ones(known[rows].shape, np.bool_) if alpha is None else alpha[rows] > 0
+        squares = np.zeros(good.shape, np.float32)
+        with np.errstate(all="ignore"):
+            for i, factor in enumerate(form.pixels_per_unit(width, height)):
+                values = stored[rows, :, i]
+                if form.offset:  # encoded as a colour, so the ends of its range may stand for anything beyond
+                    good &= (values > 0) & (values < 2 * form.offset)
+                if form.premultiplied and alpha is not None:
+                    values = values / alpha[rows]
+                values = (values - np.float32(form.offset)) * np.float32(factor)
+                vectors[rows, :, i] = values
+                squares += np.square(values)
+            known[rows] = good & (squares < width**2 + height**2)  # false for NaN and infinities, too
+
+    for_row_blocks(work, len(stored), stored[0].size)
+    return vectors, known
+
+
+def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask:
+    """Where a vector of 0 may mean that the renderer knows none.
+
+    Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
+    surfaces do not move either.
+    """
+    still = known & _all_planes(np.abs(vectors) < NO_MOTION)
+    surface = known
+    normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
+    if normal is not None:
+        surface = known & ~_all_planes(normal == 0)
+    count = np.count_nonzero(surface)
+    camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count
+    return np.zeros_like(known) if camera_stands else still
+
+
+def _uneven(vectors: Array) -> Mask:
+    """Where vectors change by more than ``UNEVEN`` on both sides of a pixel, in the same direction: on what turns fast.
+
+    At the border of two surfaces, they change on one side. On a surface as thin as a pixel, they change and change
+    back.
+    """
+    motion = np.ascontiguousarray(vectors).view(np.complex64)[..., 0]
+    result = np.zeros(motion.shape, np.bool_)
+    for turned, found in ((motion, result), (motion.T, result.T)):
+        with np.errstate(all="ignore"):  # vectors that are not believed may have any values
+            steps = np.diff(turned, axis=0)
+            fast = np.abs(steps) > UNEVEN
+            found[1:-1] |= fast[1:] & fast[:-1] & ((steps[1:] * steps[:-1].conj()).real > 0)
+    return result
+
+
+def _all_planes(mask: Mask) -> Mask:
+    """Where a mask (h, w, c) is true in all channels: several times as fast as NumPy's ``all`` along the last axis."""
+    return functools.reduce(np.logical_and, np.moveaxis(mask, -1, 0))
+
+
+def invert(own: Array, other: Array, other_known: Mask, window: Window, other_window: Window) -> tuple[Array, Mask]:
+    """The vectors to a neighbour, from those that lead from the neighbour to this frame.
+
+    The surface of pixel p is at the place q of the neighbour where q + other(q) = p. The iteration q <- p - other(q)
+    finds it (Chen et al. 2008, "A simple fixed-point approach to invert a deformation field").
+
+    Args:
+        own: this frame's vectors to its other neighbour (h, w, 2): where the movement is even, their opposite is right,
+            so the iteration starts there. Zeros do, too.
+        other, other_known: vectors of the neighbour, and where they are known.
+        window, other_window: data windows of this frame and of the neighbour.
+
+    Returns:
+        Vectors (h, w, 2), and where the way there and back ends at its pixel.
+    """
+    height, width = own.shape[:2]
+    vectors = np.zeros_like(own)
+    known = np.zeros((height, width), np.bool_)
+    shift_x, shift_y = window.x0 - other_window.x0, window.y0 - other_window.y0
+
+    def work(rows: slice) -> None:
+        y, x = np.mgrid[rows.start : rows.stop, 0:width].astype(np.float32)
+        way = -own[rows]
+        for _ in range(INVERSION_ROUNDS):
+            way = -sample_linear(other, x + way[..., 0] + shift_x, y + way[..., 1] + shift_y)
+        at_x, at_y = x + way[..., 0] + shift_x, y + way[..., 1] + shift_y
+        back = sample_linear(other, at_x, at_y) + way
+        vectors[rows] = way
+        inside = (at_x >= -0.5) & (at_y >= -0.5) & (at_x <= other.shape[1] - 0.5) & (at_y <= other.shape[0] - 0.5)
+        known[rows] = (
+            inside & (np.hypot(back[..., 0], back[..., 1]) < INVERSION_ERROR) & nearest_values(other_known, at_x, at_y)
+        )
+
+    for_row_blocks(work, height, width * 8)
+    vectors[~known] = 0
+    return vectors, known
+
+
+def sample_linear(image: Array, x: Array, y: Array) -> Array:
+    """Bilinear samples of an image (h, w, c) at pixel positions; its edge is repeated outside."""
+    height, width, channels = image.shape
+    # Two floats are fetched as one complex number, which takes half as long.
+    pixels = np.ascontiguousarray(image).reshape(-1, channels)
+    pixels = pixels.view(np.complex64) if channels == 2 else pixels
+    x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
+    left, top = x.astype(np.int32), y.astype(np.int32)
+    u, v = (x - left)[..., None], (y - top)[..., None]
+    corner = top * width + left
+    right, down = (left < width - 1).astype(np.int32), np.where(top < height - 1, np.int32(width), np.int32(0))
+    result = pixels.take(corner, 0)
+    result += (pixels.take(corner + right, 0) - result) * u
+    corner += down
+    below = pixels.take(corner, 0)
+    below += (pixels.take(corner + right, 0) - below) * u
+    result += (below - result) * v
+    samples: Array = result.view(np.float32)
+    return samples
+
+
+def nearest_values(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:
+    """The pixels (h, w) that are nearest to these positions."""
+    height, width = image.shape
+    rows = np.clip(np.rint(y), 0, height - 1).astype(np.int32)
+    columns = np.clip(np.rint(x), 0, width - 1).astype(np.int32)
+    result: Mask = image[rows, columns]
+    return result

@@ -1,0 +1,82 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A frame in bands of rows, which bounds the memory of averaging, and planes at the LRHS's resolution and back."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import TypeVar
+
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.features import mirrored
+from oiio_msspl.image.arrays import Array, box_downsample, upsample_linear
+from oiio_msspl.image.parallel import two_at_a_time
+from oiio_msspl.model.contract import SCALES
+
+T = TypeVar("T")
+
+#: Bands are worked on two at a time. Two together have at most so many pixels, which bounds memory, unless they have
+#: fewer rows than that each: the rows around a band are computed twice.
+BAND_PIXELS, BAND_ROWS = 1 << 22, 128
+#: The rows of a band are a multiple of every scale.
+ROW_MULTIPLE = max(SCALES)
+#: Rows and columns around a pixel that decide on it, beside what interpolation needs.
+REACH = 28
+
+
+def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], weight: float = 1.0) -> list[T]:
+    """The results of ``work(core, area)`` for each band, from top to bottom; two are computed at the same time.
+
+    ``core`` has the rows of the data window that are to be computed, ``area`` also those around that decide on them.
+
+    Args:
+        weight: how many times as much memory as usual a pixel takes. Bands have fewer rows then.
+    """
+    window, scale = alignment.hr_data_window, alignment.scale
+    halo, rows = -(-REACH // scale) * scale + 2 * scale, _band_rows(window, weight)
+    bands = []
+    for top in range(alignment.grid.y0 * scale, alignment.grid.y1 * scale, rows):
+        core = Window(window.x0, max(top, window.y0), window.x1, min(top + rows, window.y1))
+        area = Window(core.x0, max(top - halo, window.y0), core.x1, min(top + rows + halo, window.y1))
+        bands.append((core, area))
+    return two_at_a_time(lambda band: work(*band), bands)
+
+
+def _band_rows(window: Window, weight: float) -> int:
+    pairs = -(-window.width * window.height // BAND_PIXELS)
+    rows = -(-window.height // max(2 * pairs, 1))
+    if weight > 1:
+        rows = int((rows + 2 * REACH) / weight) - 2 * REACH
+    return -(-max(rows, BAND_ROWS) // ROW_MULTIPLE) * ROW_MULTIPLE
+
+
+def rows_in_bands(window: Window, weight: float = 1.0) -> int:
+    """The most rows of the areas of :func:`for_bands` that are worked on at the same time, in this data window."""
+    halos = 4 * REACH
+    return min(window.height + halos, 2 * (_band_rows(window, weight) + halos))
+
+
+def grid_rows(alignment: Alignment, area: Window) -> slice:
+    """The rows of the grid that an area of the data window covers."""
+    grid, scale = alignment.grid, alignment.scale
+    return slice(area.y0 // scale - grid.y0, -(-area.y1 // scale) - grid.y0)
+
+
+def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
+    """A plane (h, w) over ``area`` at the LRHS's resolution, over the width of the grid."""
+    whole = _whole_pixels(alignment, area)
+    if whole != area:
+        plane = mirrored(plane, area, whole)
+    return box_downsample(plane, alignment.scale)
+
+
+def from_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
+    """A plane over :func:`grid_rows` of ``area`` at full resolution, (h, w) over ``area``."""
+    whole = _whole_pixels(alignment, area)
+    return upsample_linear(plane, alignment.scale, slice(0, len(plane)))[area.slices(whole)]
+
+
+def _whole_pixels(alignment: Alignment, area: Window) -> Window:
+    """An area, widened to whole LRHS pixels over the width of the grid."""
+    grid, scale = alignment.grid, alignment.scale
+    return Window(grid.x0 * scale, area.y0 // scale * scale, grid.x1 * scale, -(-area.y1 // scale) * scale)

@@ -1,0 +1,253 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The features of a tile: read from both renders, repaired, and mirrored where the tile reaches beyond the frame."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import NORMAL, RGB
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.tiling import Tile
+from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, box_downsample, enlarged, filled, interpolate, repair
+from oiio_msspl.image.filters import max_3x3
+
+Indices = NDArray[np.int64]
+T = TypeVar("T", bound=np.generic)
+
+#: Features that may be negative.
+SIGNED_FEATURES = {NORMAL}
+#: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
+#: render, but for rare light (:mod:`oiio_msspl.fusion.tiles.guards`). The LRHS is the mean of s x s HRLS pixels, so
+#: s^2 would be the exact bound without noise; 64 leaves room for the noise of the LRHS.
+FIREFLY_FACTOR = 64.0
+
+
+@dataclass
+class RepairCounts:
+    """How many values of a render were changed, by feature."""
+
+    repaired: dict[str, int] = field(default_factory=dict)
+    """NaN or infinite."""
+    negative: dict[str, int] = field(default_factory=dict)
+    """Negative and set to 0: colours out of gamut, in files that are otherwise sound."""
+
+    def add(self, feature: str, values: Array, changed: Mask) -> None:
+        """Count values; ``changed`` is the mask of :func:`oiio_msspl.image.arrays.repair`."""
+        broken = int(np.count_nonzero(~np.isfinite(values)))
+        for counts, count in ((self.repaired, broken), (self.negative, int(np.count_nonzero(changed)) - broken)):
+            if count:
+                counts[feature] = counts.get(feature, 0) + count
+
+
+@dataclass
+class TilePair:
+    """The features of both renders over one tile."""
+
+    lrhs: dict[str, Array]
+    """Features (h, w, c) over the tile's area."""
+    hrls: dict[str, Array]
+    """Features (s*h, s*w, c) over the tile's area."""
+    scale: int
+    lrhs_area: Window
+    """The tile's area in LRHS pixels."""
+    hrls_area: Window
+    """The tile's area in HRLS pixels."""
+    hrls_target: Window
+    """The part of the HRLS's data window that the tile contributes."""
+    core: tuple[slice, slice]
+    """Rows and columns of ``lrhs`` that the tile contributes and that are inside the alignment's grid."""
+    inside: tuple[slice, slice]
+    """Rows and columns of ``lrhs`` that are inside the alignment's grid. The others only fill up the tile's size."""
+    hrls_is_lost: bool = False
+    """The HRLS's beauty is broken in all pixels, so it is filled from the LRHS alone."""
+
+
+def read_tile(
+    tile: Tile,
+    lrhs: dict[str, Array],
+    grid: Window,
+    hr: ReadableRender,
+    alignment: Alignment,
+    features: Iterable[str],
+    counts: RepairCounts,
+) -> TilePair:
+    """Read both renders over a tile.
+
+    Where the beauty of one render is broken, it gets the light of the other one.
+
+    Args:
+        lrhs: features of the LRHS over ``grid``, see :func:`read_lrhs`.
+        features: names of the HRLS's features to read.
+        counts: repaired values of the HRLS; those of the tile's core are added.
+    """
+    scale = alignment.scale
+    area, core = in_hrls_pixels(tile.area, scale), in_hrls_pixels(tile.core, scale)
+    window = tile.area.slices(grid)
+    broken: dict[str, Mask] = {}
+    low = {name: values[window] for name, values in lrhs.items()}
+    hrls = read_features(hr, area, alignment.hr_data_window, features, counts=counts, counted=core, broken=broken)
+    lost = _infinite(hrls[RGB])
+    if lost.any():
+        lost &= ~_as_bright(low[RGB]).repeat(scale, axis=0).repeat(scale, axis=1)
+    if RGB in broken:
+        lost |= broken[RGB]
+    if lost.any():
+        hrls[RGB] = np.where(lost[..., None], enlarged(low[RGB], scale), hrls[RGB])
+    lost_below = _infinite(low[RGB])
+    if lost_below.any():
+        means = box_downsample(hrls[RGB], scale)
+        low[RGB] = np.where((lost_below & ~_as_bright(means))[..., None], means, low[RGB])
+    return TilePair(
+        lrhs=low,
+        hrls=hrls,
+        scale=scale,
+        lrhs_area=tile.area,
+        hrls_area=area,
+        hrls_target=core.intersect(alignment.hr_data_window),
+        core=tile.core.intersect(alignment.grid).slices(tile.area),
+        inside=tile.area.intersect(alignment.grid).slices(tile.area),
+        hrls_is_lost=bool(lost.all()),
+    )
+
+
+def _infinite(rgb: Array) -> Mask:
+    """Where pixels (h, w) of a repaired beauty were infinite: as bright as half floats can be."""
+    return np.logical_or.reduce([rgb[..., c] == HALF_MAX for c in range(3)])
+
+
+def _as_bright(rgb: Array) -> Mask:
+    """Where pixels of one render (h, w, 3), or those beside them, confirm an infinite pixel of the other one.
+
+    A lamp that overflows half floats is bright in both renders. A sample or a bucket that failed is not.
+    """
+    return max_3x3(rgb).max(axis=-1) >= HALF_MAX / FIREFLY_FACTOR
+
+
+def read_lrhs(
+    lr: ReadableRender,
+    alignment: Alignment,
+    grid: Window,
+    features: Iterable[str],
+    counts: RepairCounts,
+    *,
+    exact: bool = False,
+) -> dict[str, Array]:
+    """Read features of the LRHS over ``grid``, those that it has.
+
+    Each grid pixel gets the LRHS pixel that is nearest to where its HRLS pixels are in the frame, on average. Where an
+    odd size was rounded, that is off by half an LRHS pixel at most. To interpolate would be exact, but neighbouring
+    pixels would share their noise, and networks take such noise for texture. Behind the last whole LRHS pixel, where
+    the HRLS is mirrored, the LRHS is interpolated.
+
+    Args:
+        counts: repaired values are added here.
+        exact: interpolate everywhere, for what compares both renders.
+    """
+    data, scale = alignment.lr_data_window, alignment.scale
+    hrls_rows, hrls_columns = _mirrored_pixels(in_hrls_pixels(grid, scale), alignment.hr_data_window)
+    rows = np.clip(_lrhs_positions(hrls_rows, scale, alignment.stretch[1], exact), data.y0, data.y1 - 1)
+    columns = np.clip(_lrhs_positions(hrls_columns, scale, alignment.stretch[0], exact), data.x0, data.x1 - 1)
+    y0, x0 = int(np.floor(rows.min())), int(np.floor(columns.min()))
+    stored = Window(x0, y0, int(np.ceil(columns.max())) + 1, int(np.ceil(rows.max())) + 1)
+    layers = read_features(lr, stored, data, features, counts=counts, counted=stored)
+    return {name: interpolate(interpolate(v, rows - y0, 0), columns - x0, 1) for name, v in layers.items()}
+
+
+def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float, exact: bool) -> NDArray[np.float64]:
+    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is; unless ``exact``, a whole
+    pixel where these are not mirrored."""
+    groups = hrls_pixels.reshape(-1, scale)
+    positions = (groups.mean(axis=1) + 0.5) / scale * stretch - 0.5
+    in_place = (groups[:, 0] % scale == 0) & (groups[:, -1] - groups[:, 0] == scale - 1)
+    return positions if exact else np.where(in_place, np.rint(positions), positions)
+
+
+def read_features(
+    render: ReadableRender,
+    window: Window,
+    data_window: Window,
+    features: Iterable[str] | None = None,
+    *,
+    counts: RepairCounts | None = None,
+    counted: Window | None = None,
+    broken: dict[str, Mask] | None = None,
+) -> dict[str, Array]:
+    """Read and repair features over a window. Beyond the data window the picture is mirrored.
+
+    Repeating the last pixel would turn its noise into lines, which networks take for texture. Pixels that are NaN or
+    minus infinity are filled from those around (:func:`oiio_msspl.image.arrays.filled`).
+
+    Args:
+        window, data_window: both relative to the top left of the display window, as all windows here.
+        features: names of features; all if None. Those that the render lacks are left out.
+        counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
+        broken: gets a mask (h, w) of the pixels that were filled, for each feature that has some.
+    """
+    rows, columns = _mirrored_pixels(window, data_window)
+    stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
+    layers = render.read(stored.shift(render.display_window.x0, render.display_window.y0), features)
+    result = {}
+    for name, values in layers.items():
+        repaired, bad = repair(values, signed=name in SIGNED_FEATURES)
+        if bad is not None and counts is not None and counted is not None:
+            inside = counted.intersect(stored).slices(stored)
+            counts.add(name, values[inside], bad[inside])
+        missing = None if bad is None else np.any(np.isnan(values) | np.isneginf(values), axis=-1)
+        if missing is not None and missing.any():
+            repaired = filled(repaired, missing)
+            if broken is not None:
+                broken[name] = _at(missing, rows - stored.y0, columns - stored.x0)
+        result[name] = _at(repaired, rows - stored.y0, columns - stored.x0)
+    return result
+
+
+def mirrored(image: NDArray[T], inside: Window, window: Window) -> NDArray[T]:
+    """An image (h, w, ...) over ``inside`` at the pixels of another window, mirrored where that reaches beyond."""
+    rows, columns = _mirrored_pixels(window, inside)
+    return _at(image, rows - inside.y0, columns - inside.x0)
+
+
+def _at(values: NDArray[T], rows: Indices, columns: Indices) -> NDArray[T]:
+    """Some rows and columns of an image (h, w, ...), in the same layout in memory."""
+    for axis, indices in enumerate((rows, columns)):
+        lines = values.swapaxes(0, axis)
+        # Nearly all lines follow each other. To copy these together is faster than to take each one.
+        starts = np.flatnonzero(np.diff(indices, prepend=indices[0] - 2) != 1)
+        lengths = np.diff(starts, append=len(indices))
+        start, length = starts[lengths.argmax()], lengths.max()
+        run = slice(indices[start], indices[start] + length)
+        if length == len(indices):
+            values = lines[run].swapaxes(0, axis)
+            continue
+        chosen = np.empty_like(lines, shape=(len(indices), *lines.shape[1:]))
+        chosen[start : start + length] = lines[run]
+        for part in (slice(0, start), slice(start + length, None)):
+            chosen[part] = lines[indices[part]]
+        values = chosen.swapaxes(0, axis)
+    return values
+
+
+def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
+    """The rows and the columns of ``inside`` that a window shows if the picture is mirrored at the sides of
+    ``inside``."""
+    return (
+        _mirrored_line(np.arange(window.y0, window.y1), inside.y0, inside.y1),
+        _mirrored_line(np.arange(window.x0, window.x1), inside.x0, inside.x1),
+    )
+
+
+def _mirrored_line(pixels: Indices, start: int, stop: int) -> Indices:
+    """The pixels from ``start`` to ``stop`` that these indices show if the line is mirrored at both ends."""
+    length = stop - start
+    offsets = (pixels - start) % (2 * length)
+    return start + np.minimum(offsets, 2 * length - 1 - offsets)
+
+
+def in_hrls_pixels(window: Window, scale: int) -> Window:
+    return Window(window.x0 * scale, window.y0 * scale, window.x1 * scale, window.y1 * scale)

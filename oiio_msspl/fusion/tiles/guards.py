@@ -1,0 +1,269 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Guards around the network: fireflies are dimmed, lights stay whole, empty regions stay empty, noise-free tiles pass
+through."""
+
+from __future__ import annotations
+
+from functools import reduce
+from typing import TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
+from oiio_msspl.errors import MssplError
+from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TilePair
+from oiio_msspl.image.arrays import Array, Mask, box_downsample
+from oiio_msspl.image.filters import all_within, grown, max_3x3, neighbours
+from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.model.encoding import encode_radiance
+from oiio_msspl.model.session import Session
+
+T = TypeVar("T", bound=np.generic)
+
+#: LRHS pixels on a side of the squares in which rare light is looked for, and the share of their pixels that it reaches
+#: at most. What reaches more is a surface or a lamp.
+_SQUARE, _RARE = 8, 0.25
+#: A tile has no noise to remove if its renders differ nowhere by more than this, log-encoded: half a step of an 8-bit
+#: picture.
+NOISE_FREE = 1 / 512
+#: Exposed radiance above which light that both renders show is that of the HRLS. Noise is hardly ever so bright in
+#: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
+LIGHT = 4096.0
+
+
+def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
+    """Limit the brightness of both renders to what the other one allows.
+
+    Returns:
+        The LRHS's colour (h, w, 3), and the HRLS's features with its radiance limited.
+    """
+    lrhs_rgb, hrls = pair.lrhs[RGB], pair.hrls
+    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale), pair)
+    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb, pair), pair.scale)
+    dimmed = {name: _limit(hrls[name], hrls_limit, pair.scale) for name in RADIANCE_FEATURES if name in hrls}
+    return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
+
+
+def _as_wide_as_hrls(limit: Array, scale: int) -> Array:
+    """(h, w, c) to (h, s*w, c). Each channel is contiguous, as in the HRLS: NumPy then compares them three times as
+    fast."""
+    return limit.transpose(2, 0, 1).repeat(scale, axis=2).transpose(1, 2, 0)
+
+
+def _limit(hrls: Array, limit: Array, scale: int) -> Array:
+    """HRLS values (s*h, s*w, c), at most the limit (h, s*w, c) of their LRHS pixel."""
+    result = np.empty_like(hrls)
+
+    def work(rows: slice) -> None:
+        limits = limit[rows.start // scale : rows.stop // scale]
+        for y in range(scale):
+            np.minimum(hrls[rows][y::scale], limits, out=result[rows][y::scale])
+
+    for_row_blocks(work, len(hrls), hrls[0].size, multiple=scale)
+    return result
+
+
+def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
+    """The colour of pixels with radiance above ``LIGHT`` divided by the exposure, where both renders have it.
+
+    Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
+    light, and its rim would be too bright. It is as bright as in the HRLS, and at most as bright as the brightest of
+    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that. The LRHS then
+    has more light than the clipped HRLS, and the difference is spread over the clipped pixels: evenly, or in the
+    proportions of the HRLS, whichever gives a pixel more. Pixel filters move light between neighbours, so both are
+    counted over 3 x 3 LRHS pixels. A pixel that is more than twice as bright as the clipped pixels are on average is a
+    firefly in a lamp. The light around it is spread evenly.
+
+    Args:
+        lrhs_rgb, hrls_rgb: (h, w, 3) and (s*h, s*w, 3), scene linear, without fireflies (:func:`dim_fireflies`).
+
+    Returns:
+        (s*h, s*w, 3), scene linear; 0 where all channels are darker. None if no pixel is as bright.
+    """
+    least = np.float32(LIGHT / exposure)
+    if hrls_rgb.max() <= least:
+        return None
+    scale = len(hrls_rgb) // len(lrhs_rgb)
+    clipped_share = box_downsample((hrls_rgb > least).astype(np.float32), scale)
+    clipped = box_downsample(np.minimum(hrls_rgb, least), scale)
+    with np.errstate(over="ignore", invalid="ignore"):  # a limit that overflows is no limit
+        excesses = [np.maximum(mean - clipped, 0) for mean in (lrhs_rgb, box_downsample(hrls_rgb, scale))]
+        light, own, share = (reduce(np.add, neighbours(values)) for values in (*excesses, clipped_share))
+        even = least + light / np.maximum(share, np.float32(1 / scale**2))
+        limit = np.maximum(max_3x3(lrhs_rgb), even)
+        factor = np.nan_to_num(np.minimum(light / np.maximum(own, np.float32(1e-30)), 1))
+        blocks = hrls_rgb.reshape(len(lrhs_rgb), scale, -1, scale, 3)
+        factor[(max_3x3(blocks.max(axis=(1, 3))) - least) * share > 2 * own] = 0
+        # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
+        most = lrhs_rgb * np.float32(FIREFLY_FACTOR)
+    agreed = np.empty_like(hrls_rgb)
+
+    def work(rows: slice) -> None:
+        part, place = hrls_rgb[rows], slice(rows.start // scale, rows.stop // scale)
+        in_proportion = least + (part - least) * repeated(factor[place], scale)
+        bound = np.minimum(np.maximum(repeated(limit[place], scale), in_proportion), repeated(most[place], scale))
+        np.minimum(part, bound, out=agreed[rows])
+
+    for_row_blocks(work, len(hrls_rgb), hrls_rgb[0].size, multiple=scale)
+    agreed[np.all(agreed <= least, axis=-1)] = 0
+    return agreed
+
+
+def _brightness_limit(rgb: Array, pair: TilePair) -> Array:
+    """The largest values that the other render may have, (h, w, 3): none where this render is black.
+
+    Where few samples find the light, all 3 x 3 pixels around may have missed it. So light that is rare, but in most
+    squares of pixels around, counts, too. A single sample of it may be s^2 times as bright as the mean of s x s.
+    """
+    brightest = max_3x3(rgb)
+    with np.errstate(over="ignore"):  # a limit that overflows is no limit
+        limit = brightest * np.float32(FIREFLY_FACTOR)
+        rare = _rare_light(rgb, pair.lrhs_area.y0 % _SQUARE, pair.lrhs_area.x0 % _SQUARE)
+        limit = np.where(rare > limit, rare * np.float32(pair.scale**2), limit)
+        return np.where(brightest > 0, limit, np.float32(np.inf))
+
+
+def _rare_light(rgb: Array, top: int, left: int) -> Array:
+    """How bright the light is that reaches a few pixels in most of the 3 x 3 squares around each pixel, (h, w, 3).
+
+    Args:
+        top, left: rows and columns that the first square begins before the tile, so that tiles have the same squares.
+    """
+    height, width, channels = rgb.shape
+    rows, columns = (-(-side // _SQUARE) for side in (top + height, left + width))
+    lines = np.zeros((channels, rows, _SQUARE, columns * _SQUARE), np.float32)
+    inside = (slice(None), slice(top, top + height), slice(left, left + width))
+    lines.reshape(channels, -1, columns * _SQUARE)[inside] = rgb.transpose(2, 0, 1)
+    # The rows of a square are reduced before its columns: NumPy then works on whole rows of the picture.
+    sides = channels, rows, columns, _SQUARE
+    brightest = lines.max(axis=2).reshape(sides).max(axis=3)
+    least = (brightest / np.float32(FIREFLY_FACTOR)).repeat(_SQUARE, axis=2)[:, :, None]
+    reached = (lines > least).sum(axis=2, dtype=np.uint8).reshape(sides).sum(axis=3)
+    brightest[reached > _RARE * _SQUARE**2] = 0
+    around = np.pad(brightest, ((0, 0), (1, 1), (1, 1)), mode="edge")
+    nine = np.stack([around[:, y : y + rows, x : x + columns] for y in range(3) for x in range(3)])
+    light = np.median(nine, axis=0).repeat(_SQUARE, axis=1).repeat(_SQUARE, axis=2)
+    return light[inside].transpose(1, 2, 0)
+
+
+def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
+    """Whether the two renders of a tile agree so well that there is no noise to remove.
+
+    Args:
+        lrhs_rgb, hrls_rgb: their colour, scene linear.
+    """
+    # A few rows are enough to find noise; all rows are read only if these have none.
+    return all(_largest_difference(pair, lrhs_rgb, hrls_rgb, exposure, step) <= NOISE_FREE for step in (32, 1))
+
+
+def _largest_difference(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
+    """Largest log-encoded difference of the renders inside the grid, in one of ``step`` LRHS rows."""
+    rows = hrls_rgb.reshape(-1, pair.scale, *hrls_rgb.shape[1:])[pair.inside[0]][::step]
+    means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), pair.scale)
+    one, other = means[:, pair.inside[1]], lrhs_rgb[pair.inside][::step]
+    return float(np.abs(encode_radiance(one, exposure) - encode_radiance(other, exposure)).max())
+
+
+def check_finite(session: Session, *images: Array) -> None:
+    """Raise MssplError if the output of a network, whose input is always finite, is not.
+
+    A frame with repaired holes would look finished.
+    """
+    if not all(np.isfinite(image).all() for image in images):
+        raise MssplError(
+            f"{session.contract.name} on {session.provider} returned NaN or infinite values, so this frame is not "
+            "fused; try --device cpu or another --model"
+        )
+
+
+#: LRHS pixels around a surface that are black where it becomes black: as far as networks look.
+FAR = 15
+#: HRLS pixels around a surface over which a layer without light makes it black. Black layers are common, and a network
+#: leaves a trace of light in them.
+LAYER_REACH = 16
+
+
+class EmptyRegions:
+    """Where neither render has any light, not even around: the result is black there, and a transparent film stays
+    empty.
+
+    A dark surface may have no lit sample near. So a pixel that shows a surface is empty only where both renders are
+    black far around: a network spreads the light of a single sample that far, and black pixels in it would be holes.
+
+    The same holds for layers where light is rare. Few samples find a lamp that is out of focus, and the others find
+    the empty background behind it. If the lamp's layer were black there, the light that the beauty has would go to
+    other layers. In a beauty, rare light in front of an empty background is more often that of stars, and the space
+    between them stays black.
+
+    Args:
+        lrhs_rgb: the whole LRHS (h, w, 3).
+        reach: how far, in LRHS pixels. Tiles that overlap by less may differ at their borders.
+        of_layer: whether the pair shows a layer.
+    """
+
+    def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_layer: bool = False) -> None:
+        self._reach = reach
+        self._black = _is_zero(lrhs_rgb)
+        self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
+        self._has_rare_light = np.zeros_like(self._black)
+        if of_layer and self._black.any():
+            light = reduce(np.maximum, (lrhs_rgb[..., c : c + 1] for c in range(3)))
+            self._has_rare_light = grown(_rare_light(light, 0, 0) > 0, _SQUARE)
+
+    def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
+        """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
+
+        Args:
+            window: rows and columns of the tile's area in the whole LRHS.
+        """
+        if not self._black[window].any():
+            return None
+        black = _is_zero(pair.hrls[RGB])
+        empty = _holds_around(self._black[window], black, pair.scale)
+        no_surface = _shows_no_surface(pair.hrls) & ~repeated(self._has_rare_light[window], pair.scale)
+        far = self._black_far_around[window]
+        if far.any():
+            blocks = black.reshape(len(far), pair.scale, -1, pair.scale, 1)
+            far = far & all_within(np.logical_and.reduce(blocks, axis=(1, 3)), self._reach)
+        empty &= no_surface | repeated(far, pair.scale)
+        return empty
+
+
+def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
+    """The smallest rectangle with all pixels that are not black, and ``margin`` pixels around; None if all are.
+
+    Args:
+        rgb: (h, w, 3) over ``window``.
+    """
+    values = rgb.reshape(len(rgb), -1)  # NumPy is several times as fast along one axis as along two
+    rows = np.flatnonzero(values.any(axis=1))
+    if not rows.size:
+        return None
+    columns = np.flatnonzero(values[rows[0] : rows[-1] + 1].any(axis=0)) // rgb.shape[2]
+    x0, x1, y0, y1 = columns[0] - margin, columns[-1] + 1 + margin, rows[0] - margin, rows[-1] + 1 + margin
+    return Window(int(x0), int(y0), int(x1), int(y1)).shift(window.x0, window.y0)
+
+
+def _holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
+    """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
+    return repeated(reduce(np.logical_and, neighbours(lrhs)), scale) & hrls
+
+
+def repeated(lrhs: NDArray[T], scale: int) -> NDArray[T]:
+    """(h, w, c) to (s*h, s*w, c): each pixel becomes s x s equal ones."""
+    return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
+
+
+def _is_zero(values: Array) -> Mask:
+    """Where all channels of an image (h, w, c) are 0, (h, w, 1)."""
+    # NumPy is slow to reduce an axis as short as that of the channels.
+    return reduce(np.logical_and, (values[..., c : c + 1] == 0 for c in range(values.shape[-1])))
+
+
+def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
+    """Where alpha or normal is zero, or the albedo if there are neither, (h, w, 1); everywhere without any of these."""
+    names = [name for name in ("alpha", NORMAL) if name in hrls] or [name for name in (ALBEDO,) if name in hrls]
+    signs = [_is_zero(hrls[name]) for name in names]
+    return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)

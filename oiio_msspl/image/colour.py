@@ -1,0 +1,173 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Luminance, the sRGB display transform, and linear RGB spaces."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import OpenImageIO as oiio
+from numpy.typing import NDArray
+
+from oiio_msspl.image.arrays import Array
+
+#: Rec. 709 luminance weights of linear RGB.
+LUMINANCE_WEIGHTS = (0.2126, 0.7152, 0.0722)
+
+#: The cone responses of the Bradford chromatic adaptation (Lam 1985), which ACES and ICC use.
+_BRADFORD = np.array([[0.8951, 0.2664, -0.1614], [-0.7502, 1.7135, 0.0367], [0.0389, -0.0685, 1.0296]])
+
+
+@dataclass(frozen=True)
+class ColourSpace:
+    """A linear RGB space."""
+
+    name: str
+    chromaticities: tuple[float, ...]
+    """CIE xy of red, green, blue and white, as in an EXR's header: 8 values."""
+    aliases: tuple[str, ...] = ()
+    """Other names in headers and OpenColorIO configurations, in lower case."""
+
+
+_D65, _ACES_WHITE = (0.3127, 0.3290), (0.32168, 0.33767)
+
+REC709 = ColourSpace(
+    "lin_rec709",
+    (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, *_D65),
+    (
+        *("linear", "scene_linear", "lin_rec709_scene", "lin_srgb", "linear rec.709 (srgb)", "linear rec.709"),
+        *("linear srgb", "scene-linear rec.709-srgb", "utility - linear - srgb", "utility - linear - rec.709"),
+    ),
+)
+ACESCG = ColourSpace(
+    "acescg",
+    (0.713, 0.293, 0.165, 0.830, 0.128, 0.044, *_ACES_WHITE),
+    ("lin_ap1", "lin_ap1_scene", "ap1", "aces - acescg"),
+)
+ACES2065 = ColourSpace(
+    "aces2065-1",
+    (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, *_ACES_WHITE),
+    ("lin_ap0", "lin_ap0_scene", "ap0", "aces", "aces - aces2065-1"),
+)
+REC2020 = ColourSpace(
+    "lin_rec2020",
+    (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, *_D65),
+    ("lin_rec2020_scene", "linear rec.2020", "utility - linear - rec.2020"),
+)
+P3 = ColourSpace(
+    "lin_p3d65",
+    (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, *_D65),
+    ("lin_p3d65_scene", "linear p3-d65", "utility - linear - p3-d65"),
+)
+SPACES = (REC709, ACESCG, ACES2065, REC2020, P3)
+
+#: Names that files get which nobody gave a space, in lower case: OpenImageIO writes them by default.
+_INDEFINITE = ("", "linear", "scene_linear", "lin_rec709")
+#: Chromaticities are the same if none differs by more.
+_SAME = 0.003
+
+
+def luminance(rgb: Array) -> Array:
+    """Rec. 709 luminance of linear RGB: (..., 3) to (...).
+
+    The sum is written out. A matrix product rounds differently for pictures that lie differently in memory.
+    """
+    red, green, blue = (np.float32(weight) * rgb[..., i] for i, weight in enumerate(LUMINANCE_WEIGHTS))
+    return np.asarray(red + green + blue)
+
+
+def srgb(linear: Array) -> Array:
+    """Scene-linear values to sRGB in [0, 1], clipped: the display transform s(x) of the paper, section 5.1."""
+    x = np.clip(linear, 0.0, 1.0)
+    return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-12), 1 / 2.4) - 0.055).astype(
+        np.float32
+    )
+
+
+def converted(rgb: Array, source: ColourSpace, target: ColourSpace) -> Array:
+    """Linear colours (..., 3) of one space in another one; the same array if the two are the same."""
+    return rgb if same_space(source, target) else rgb @ conversion(source, target).T.astype(np.float32)
+
+
+def conversion(source: ColourSpace, target: ColourSpace) -> NDArray[np.float64]:
+    """The matrix (3, 3) that converts linear RGB: ``rgb @ matrix.T``. White stays white (Bradford adaptation)."""
+    to_cones = []
+    for space in (source, target):
+        matrix = _rgb_to_xyz(space.chromaticities)
+        cones = _BRADFORD @ matrix
+        to_cones.append(cones / (_BRADFORD @ matrix.sum(axis=1))[:, None])
+    return np.linalg.solve(to_cones[1], to_cones[0])
+
+
+def _rgb_to_xyz(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
+    """SMPTE RP 177: linear RGB to CIE XYZ, for a white of Y = 1."""
+    xy = np.array(chromaticities, dtype=np.float64).reshape(4, 2)
+    xyz = np.column_stack([xy, 1 - xy.sum(axis=1)]) / xy[:, 1:]
+    primaries = xyz[:3].T
+    matrix: NDArray[np.float64] = primaries * np.linalg.solve(primaries, xyz[3])
+    return matrix
+
+
+def named_space(name: str) -> ColourSpace | None:
+    """The linear space that a header, an option or OpenColorIO means by a name; None for any other.
+
+    A name that is not in the table is looked up in the configuration of ``$OCIO``, or in OpenImageIO's own.
+    """
+    wanted = name.strip().lower()
+    for space in SPACES:
+        if wanted in (space.name, *space.aliases):
+            return space
+    if not wanted:
+        return None
+    config = oiio.ColorConfig()
+    return next((space for space in SPACES if config.equivalent(name, space.name)), None)
+
+
+def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
+    """The linear space that an EXR's header declares; None if it declares none.
+
+    ``chromaticities`` comes first, because it is OpenEXR's own attribute. ``oiio:ColorSpace`` counts only with a
+    definite name.
+    """
+    values = metadata.get("chromaticities")
+    if isinstance(values, tuple) and len(values) == 8 and all(isinstance(v, float) and np.isfinite(v) for v in values):
+        found: tuple[float, ...] = values
+        for space in SPACES:
+            if _alike(found, space.chromaticities):
+                return space
+        degenerate = min(abs(v) for v in found[1::2]) < 1e-6 or abs(np.linalg.det(_edges(found))) < 1e-4
+        name = f"the space with the chromaticities {', '.join(f'{value:.4g}' for value in found)}"
+        return None if degenerate else ColourSpace(name, found)
+    name = str(metadata.get("oiio:ColorSpace") or "")
+    return None if name.lower() in _INDEFINITE else named_space(name)
+
+
+def encoding_of(metadata: Mapping[str, Any]) -> str:
+    """The name of the encoding that an EXR's header declares if it is not linear, such as ``srgb_rec709_scene``; empty
+    otherwise, and for names that neither ``$OCIO`` nor OpenImageIO knows."""
+    name = str(metadata.get("oiio:ColorSpace") or "")
+    if not name or named_space(name) is not None:
+        return ""
+    greys = oiio.ImageBuf(np.array([[[0.1] * 3, [0.2] * 3]], np.float32))
+    linear = oiio.ImageBufAlgo.colorconvert(greys, name, "scene_linear")
+    if linear.geterror():
+        return ""
+    dark, bright = np.asarray(linear.get_pixels(oiio.FLOAT))[0]
+    return "" if np.allclose(bright, 2 * dark, rtol=1e-3) else name
+
+
+def same_space(one: ColourSpace, other: ColourSpace) -> bool:
+    """Whether two spaces are the same, but for the rounding of headers."""
+    return _alike(one.chromaticities, other.chromaticities)
+
+
+def _alike(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
+    return bool(np.allclose(one, other, rtol=0, atol=_SAME))
+
+
+def _edges(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
+    """Two edges (2, 2) of the triangle of the primaries."""
+    red, green, blue = np.array(chromaticities, dtype=np.float64).reshape(4, 2)[:3]
+    return np.stack([green - red, blue - red])

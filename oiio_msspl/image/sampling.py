@@ -1,0 +1,132 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Samples images at positions between pixels."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.parallel import for_row_blocks
+
+#: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer ones blur with every frame.
+SHARPNESS = -1.0
+#: Pixels of a block are interpolated together, unless fewer than this share of them lie between pixels.
+MOST_CHOSEN = 0.8
+
+
+def nearest_indices(x: Array, y: Array, size: tuple[int, int]) -> NDArray[np.intp]:
+    """Return the flat indices of the pixels nearest to positions in an image of ``size`` (height, width)."""
+    height, width = size
+    # 32 bits: four times as fast as to convert floats to 64 bits.
+    column = np.clip(np.rint(x), 0, width - 1).astype(np.int32)
+    row = np.clip(np.rint(y), 0, height - 1).astype(np.int32)
+    return row * np.intp(width) + column
+
+
+def sample_cubic(
+    images: Sequence[Array],
+    positions: Callable[[slice], tuple[Array, Array]],
+    size: tuple[int, int],
+    valid: Mask | None = None,
+) -> list[Array]:
+    """Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
+
+    Args:
+        images: (h, w, c) each, of one size.
+        positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of the images.
+        size: height and width of the result.
+        valid: where (height, width) the result counts, which saves time elsewhere; everywhere if None.
+
+    Returns:
+        (*size, c) each; their channels are contiguous in memory.
+    """
+    rows_in, columns_in = images[0].shape[:2]
+    counts = [image.shape[-1] for image in images]
+    padded = np.empty((sum(counts), rows_in + 4, columns_in + 4), np.float32)
+    for target, image in zip(np.split(padded, np.cumsum(counts)[:-1]), images, strict=True):
+        target[:, 2:-2, 2:-2] = np.moveaxis(image, -1, 0)
+    padded[:, :2, 2:-2], padded[:, -2:, 2:-2] = padded[:, 2:3, 2:-2], padded[:, -3:-2, 2:-2]
+    padded[..., :2], padded[..., -2:] = padded[..., 2:3], padded[..., -3:-2]
+    planes = padded.reshape(len(padded), -1)
+    even = [plane.min() == plane.max() for plane in planes]
+    stride = columns_in + 4
+    height, width = size
+    result = np.empty((len(padded), height, width), np.float32)
+
+    def work(rows: slice) -> None:
+        x, y = positions(rows)
+        x = np.clip(x, -1, columns_in - 0.01)
+        y = np.clip(y, -1, rows_in - 0.01)
+        left, top = np.floor(x), np.floor(y)
+        # The pixel above and to the left of the four nearest ones.
+        first = (top.astype(np.intp) + 1) * stride + left.astype(np.intp) + 1
+        right, down = x - left, y - top
+        between = (right != 0) | (down != 0)
+        if valid is not None:
+            between &= valid[rows]
+        chosen: NDArray[np.intp] | None = None
+        if np.count_nonzero(between) < MOST_CHOSEN * between.size:
+            chosen, pixel = np.flatnonzero(between), first + (stride + 1)
+            right, down, first = right.take(chosen), down.take(chosen), first.take(chosen)
+        cubic = _Cubic(right, down, first, stride)
+        for plane, is_even, out in zip(planes, even, result[:, rows], strict=True):
+            if is_even:
+                out[:] = plane[0]
+            elif chosen is None:
+                cubic.sample(plane, out)
+            else:
+                # "wrap" makes NumPy write straight into the result; no index needs it.
+                plane.take(pixel, out=out, mode="wrap")
+                out.reshape(-1)[chosen] = cubic.sample(plane, np.empty(chosen.shape, np.float32))
+
+    for_row_blocks(work, height, 2 * width)  # the dozen arrays of a block then nearly fit into a core's cache
+    return [np.moveaxis(part, 0, -1) for part in np.split(result, np.cumsum(counts)[:-1])]
+
+
+class _Cubic:
+    """Keys' cubic at some positions of planes.
+
+    Args:
+        right, down: how far the positions lie beyond a pixel, from 0 to 1.
+        first: flat indices of the pixels above and to the left of that one.
+        stride: pixels in a row of a plane.
+    """
+
+    def __init__(self, right: Array, down: Array, first: NDArray[np.intp], stride: int) -> None:
+        self._across, self._down, self._first, self._stride = _keys(right), _keys(down), first, stride
+        self._buffers = np.empty((4, *first.shape), np.float32)
+
+    def sample(self, plane: Array, out: Array) -> Array:
+        """Fill ``out`` with the samples of a plane (n), and return it."""
+        line, low, high, values = self._buffers
+        # NumPy's settings for errors belong to the thread. The caller sorts out what is not finite.
+        with np.errstate(over="ignore", invalid="ignore"):
+            for i, weight_y in enumerate(self._down):
+                for j, weight_x in enumerate(self._across):
+                    pixels = values if j else line
+                    plane[i * self._stride + j :].take(self._first, out=pixels, mode="wrap")
+                    if (i, j) == (1, 1):
+                        low[:] = high[:] = pixels
+                    elif {i, j} <= {1, 2}:
+                        np.minimum(low, pixels, out=low)
+                        np.maximum(high, pixels, out=high)
+                    pixels *= weight_x
+                    if j:
+                        line += pixels
+                if i:
+                    line *= weight_y
+                    out += line
+                else:
+                    np.multiply(line, weight_y, out=out)
+            return np.clip(out, low, high, out=out)
+
+
+def _keys(t: Array) -> list[Array]:
+    """Weights of the four pixels around a position that lies ``t`` beyond the second one (Keys 1981)."""
+    a = np.float32(SHARPNESS)
+    near = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (t, 1 - t)]
+    far = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + t, 2 - t)]
+    return [far[0], near[0], near[1], far[1]]

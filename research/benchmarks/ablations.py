@@ -1,0 +1,213 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
+
+    python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/ablations.csv
+
+As in the paper, the HRLS has 1 spp, the LRHS has far more (all ``lr`` passes of a view, 256 spp at x4), and the branch
+that is not varied reads colour only. For every row a reduced network of the paper's architecture is trained from
+scratch, for the same few steps on the same batches, and scored on the validation views. Rows can be compared with each
+other, not with the shipped models. The LRHS's AOVs come from the ``hr`` passes that are not in the HRLS. Rows that the
+table already has are kept.
+
+    python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/growth.csv --only "growth rate*"
+    --steps 300
+
+trains the whole network with either growth rate that the paper may mean.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import functools
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.optim.lr_scheduler import LambdaLR
+
+from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
+from oiio_msspl.compare import upsample_bicubic
+from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.metrics import psnr, relmse
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
+from research.benchmarks import results
+from research.datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
+from research.training import losses
+from research.training.data import to_tensor
+from research.training.encoding import log_decode, packed
+from research.training.paper import HRLS_CHANNELS, MultiResolutionFusion
+
+REDUCED = {"channels": 32, "growth": 16, "groups": 2, "blocks": 3}
+BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
+#: Batches that are drawn per scale. Every row trains on them repeatedly.
+POOL = 400
+#: Features by the tables' names; each entry includes those before it.
+LAYERS = {
+    "RGB": [RGB],
+    "and albedo": [ALBEDO],
+    "and normal": [NORMAL],
+    "and diffuse, specular": [DIFFUSE, SPECULAR],
+}
+NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
+#: The paper's upper bound of radiance.
+CLIP = 100.0
+
+
+@dataclass(frozen=True)
+class Variant:
+    """One row of the tables."""
+
+    name: str
+    scale: int = 4
+    lrhs: str = RGB
+    hrls: str = RGB
+    loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
+    network: Mapping[str, int] = field(default_factory=lambda: REDUCED)
+    """Sizes of the network that are not the whole one's."""
+
+
+def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda output, reference: loss(*(log_decode(values).clamp(0.0, CLIP) for values in (output, reference)))
+
+
+def _robust(beta: float) -> Callable[[Tensor, Tensor], Tensor]:
+    return lambda output, reference: losses.robust(output, reference, beta)
+
+
+VARIANTS = [
+    Variant("both RGB, l1"),
+    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != RGB),
+    *(Variant(f"LRHS: {name}", lrhs=name) for name in (NONE, ALL)),
+    *(Variant(f"robust loss, beta {beta:g}", loss=_robust(beta)) for beta in (0.01, 0.1, 1.0)),
+    Variant("l1 of linear radiance", loss=_in_linear(losses.l1)),
+    Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
+    *(Variant(f"x{scale}, HRLS: {name}", scale, hrls=name) for scale in (2, 8) for name in (NONE, ALL)),
+]
+#: The whole network, which reads what the models that ship do.
+GROWTH_RATES = [Variant(f"growth rate {rate}", hrls=ALL, network={"growth": rate}) for rate in (32, 64)]
+
+
+@dataclass(frozen=True)
+class Pair:
+    """One crop of one view, encoded; channels in the order of :data:`oiio_msspl.aovs.features.HRLS_FEATURES`."""
+
+    lrhs: np.ndarray
+    """(h, w, 16)"""
+    hrls: np.ndarray
+    """(s*h, s*w, 16)"""
+    target: np.ndarray
+    """(s*h, s*w, 3), linear"""
+    exposure: float
+
+
+def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
+    """A crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
+    rows, columns = slice(top, top + patch), slice(left, left + patch)
+    colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
+    exposure = find_exposure(colour)
+    low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
+
+    others = [p for p in range(len(view.hr)) if p != chosen]
+    low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
+    low[..., :3] = colour[low_rows, low_columns]
+    high = read_hrls(view, [chosen], rows, columns)[0]
+    encoded = (packed(split_features(passes), exposure) for passes in (low, high))
+    return Pair(*encoded, as_float32(view.ref[rows, columns]), exposure)
+
+
+def channels_of(name: str) -> Tensor:
+    """Mask (1, 16, 1, 1) of the channels that a branch reads."""
+    names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
+    read = {feature for layers in names for feature in LAYERS[layers]}
+    return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
+
+
+@functools.lru_cache(maxsize=1)  # some GB; VARIANTS are sorted by scale
+def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Batches of LRHS, HRLS and target, encoded."""
+    rng = np.random.default_rng(0)
+    batches = []
+    for _ in range(POOL):
+        pairs = []
+        for view in (views[i] for i in rng.integers(len(views), size=BATCH)):
+            top, left = 8 * rng.integers((view.ref.shape[0] - PATCH) // 8 + 1, size=2)
+            pairs.append(pair_of(view, scale, int(top), int(left), PATCH, int(rng.integers(len(view.hr)))))
+        stacks = (
+            [pair.lrhs for pair in pairs],
+            [pair.hrls for pair in pairs],
+            [encode_radiance(pair.target, pair.exposure) for pair in pairs],
+        )
+        lrhs, hrls, target = (to_tensor(np.stack(images), torch.device("cpu")) for images in stacks)
+        batches.append((lrhs, hrls, target))
+    return batches
+
+
+def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
+    """A network after ``steps`` training steps."""
+    torch.manual_seed(0)
+    network = MultiResolutionFusion(variant.scale, **variant.network, lrhs_channels=HRLS_CHANNELS)
+    network.to(memory_format=torch.channels_last)
+    optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
+    low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
+    batches = pool(views, variant.scale)
+    schedule = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / steps)))  # constant, then linear to zero
+    for step in range(steps):
+        lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
+        with torch.autocast("cpu", torch.bfloat16, enabled=bfloat16):
+            output = network(lrhs * low_mask, hrls * high_mask)
+        optimizer.zero_grad(set_to_none=True)
+        variant.loss(output.float(), target).backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+    return network
+
+
+@torch.inference_mode()
+def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
+    """Mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
+    found = []
+    for view in views:
+        height, width = view.ref.shape[:2]
+        pair = pair_of(view, variant.scale, 0, 0, height, 0)
+        lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
+        fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
+        reference = pair.target * pair.exposure
+        bicubic = upsample_bicubic(decode_radiance(pair.lrhs[..., :3], 1.0), width, height)
+        images = (decode_radiance(fused.numpy(), 1.0), bicubic)
+        found.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
+    return dict(zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(found, axis=0).tolist(), strict=True))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("views", type=Path, help="folder of views")
+    parser.add_argument("--table", type=Path, required=True, help="table to write or complete")
+    parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
+    parser.add_argument("--only", metavar="PATTERN", help="rows whose name matches, the growth rates' included")
+    parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16", help="(default: %(default)s)")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    rows = results.read(args.table) if args.table.exists() else []
+    folder = Folder(args.views)
+    views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
+    effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
+    done = {row["name"] for row in rows}
+    every = [*VARIANTS, *GROWTH_RATES]
+    chosen = [each for each in every if fnmatch.fnmatch(each.name, args.only)] if args.only else VARIANTS
+    for variant in chosen:
+        if variant.name not in done:
+            network = train(variant, views, args.steps, bfloat16=args.precision == "bf16")
+            row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
+            print(row, flush=True)
+            rows.append(row)
+            results.write(args.table, rows)
+
+
+if __name__ == "__main__":
+    main()

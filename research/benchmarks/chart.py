@@ -1,0 +1,169 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Accuracy against time, from the tables of `research.benchmarks.quality`, `research.benchmarks.runtime` and
+`research.benchmarks.render_time`.
+
+    python -m research.benchmarks.chart -o docs/chart.html              # every scene; needs only a browser
+    python -m research.benchmarks.chart -o docs/images/chart.png        # the mean of the scenes
+
+There is a panel for each average spp. Left and up is better: axes of errors point downwards. Methods whose time was not
+measured are left out.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import statistics
+from pathlib import Path
+from typing import Any
+
+from oiio_msspl.model.contract import SPREAD
+from research.benchmarks import quality, results
+from research.benchmarks.results import MEAN
+from research.benchmarks.runtime import SAME_WORK
+from research.benchmarks.scenes import NOISY_REFERENCE
+
+TEMPLATE = Path(__file__).parent / "chart_template.html"
+MEASURES = ("psnr", "relmse", "flip")
+PEERS = (
+    "OIDN, same samples",
+    "OIDN prefiltered, same samples",
+    "OIDN on the HRLS",
+    "OIDN prefiltered on the HRLS",
+    "OIDN fast on the HRLS",
+)
+#: How a series of models ends if most samples are in the HRLS, as far as that was measured.
+UNEVEN = ", most samples in the HRLS"
+
+
+def data() -> dict[str, Any]:
+    """What is drawn.
+
+    Returns:
+        ``measures``, column -> title. ``machine``, the processor. ``scenes``, name -> title. ``spp``, the averages.
+        ``cost``, scene -> seconds for one sample in each of 1024 x 1024 pixels. ``series``: for each its ``name``,
+        whether it is a ``peer``, and its ``points``, each with ``method``, ``spp``, ``seconds`` for 1024 x 1024
+        pixels, and for each scene its ``values`` in the order of the measures.
+    """
+    rows = results.read("quality")
+    found = results.index(rows, *quality.KEYS)
+    times = results.index(results.read("runtime_vnni"), "method")
+    cost = {row["scene"]: row["hrls_s"] for row in results.read("render_time_vnni")}
+    cost[MEAN] = round(statistics.fmean(value for name, value in cost.items() if name not in NOISY_REFERENCE), 4)
+    names = [MEAN, *(name for name in dict.fromkeys(row["scene"] for row in rows) if name in cost and name != MEAN)]
+
+    def point(timed: str, method: str, spp: int) -> dict[str, Any]:
+        measured = {name: found[name, spp, method] for name in names if (name, spp, method) in found}
+        values = {name: [row[measure] for measure in MEASURES] for name, row in measured.items()}
+        return {"method": method, "spp": spp, "seconds": times[timed]["seconds"], "values": values}
+
+    families: dict[str, list[str]] = {}
+    for name in times:
+        if "-x" in str(name) and SPREAD not in str(name):
+            families.setdefault(str(name).rpartition("-x")[0], []).append(str(name))
+    series = []
+    for family, members in families.items():
+        even = [point(name, name, spp) for spp in quality.AVERAGES for name in members]
+        uneven = [
+            point(name, f"{name}, {division}", spp)
+            for spp in quality.AVERAGES
+            if (division := _largest_share(found, members, spp))
+            for name in members
+        ]
+        series += [{"name": family, "points": even}, {"name": family + UNEVEN, "points": uneven}]
+    for peer in PEERS:
+        if SAME_WORK[peer] in times:
+            points = [point(SAME_WORK[peer], peer, spp) for spp in quality.AVERAGES]
+            series.append({"name": peer, "peer": True, "points": points})
+    return {
+        "measures": {measure: quality.MEASURES[measure][0] for measure in MEASURES},
+        "machine": next(iter(times.values()))["machine"],
+        "scenes": {name: _scene_title(name, names) for name in names},
+        "spp": quality.AVERAGES,
+        "cost": cost,
+        "series": [one for one in series if one["points"]],
+    }
+
+
+def _largest_share(found: dict[Any, Any], members: list[str], spp: int) -> str | None:
+    """The division with the most samples in the HRLS that was measured for all of these models."""
+    divisions = [f"{more}:{less}" for more, less in reversed(quality.UNEVEN)]
+    return next((d for d in divisions if all((MEAN, spp, f"{name}, {d}") in found for name in members)), None)
+
+
+def _scene_title(name: str, names: list[str]) -> str:
+    if name == MEAN:
+        return f"mean of {len({*names} - {MEAN} - NOISY_REFERENCE)} scenes"
+    return f"{name} (noisy reference)" if name in NOISY_REFERENCE else name
+
+
+def page(shown: dict[str, Any]) -> str:
+    """An HTML page that holds the data and draws it."""
+    return TEMPLATE.read_text().replace("DATA", json.dumps(shown, separators=(",", ":")))
+
+
+def draw(shown: dict[str, Any], path: Path) -> None:
+    """A picture of the mean: a row for each measure, a column for each average spp, against the method's own time."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+    from matplotlib.ticker import LogLocator
+
+    colours = dict(zip(_families(shown), ("#009E73", "#0072B2", "#D55E00", "#CC79A7"), strict=True))
+    markers = dict(zip(PEERS, "*XDPd", strict=True))
+    measures, averages = shown["measures"], shown["spp"]
+    size = (4.2 * len(averages), 3.5 * len(measures))
+    figure, axes = plt.subplots(len(measures), len(averages), figsize=size, sharex=True, sharey="row", squeeze=False)
+    for row, (line, (measure, title)) in enumerate(zip(axes, measures.items(), strict=True)):
+        for axis, spp in zip(line, averages, strict=True):
+            for series in shown["series"]:
+                points = [point for point in series["points"] if point["spp"] == spp]
+                x, y = [p["seconds"] for p in points], [p["values"][MEAN][row] for p in points]
+                if series.get("peer"):
+                    style = {"marker": markers[series["name"]], "color": "black", "markersize": 8, "linestyle": "none"}
+                    axis.plot(x, y, label=series["name"], **style)
+                elif series["name"].endswith(UNEVEN):
+                    axis.plot(x, y, "--^", color=colours[series["name"].removesuffix(UNEVEN)], lw=1, markersize=4)
+                else:
+                    axis.plot(x, y, "-o", color=colours[series["name"]], label=series["name"], lw=1)
+                    for point, place in zip(points, zip(x, y, strict=True), strict=True):
+                        label = point["method"].rpartition("-")[2]
+                        axis.annotate(label, place, (4, 4), textcoords="offset points", fontsize=8)
+            axis.set_xscale("log")
+            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.xaxis.set_major_formatter("{x:g}")
+            axis.xaxis.set_minor_formatter("")
+            axis.grid(True, which="both", alpha=0.25)
+            if row == 0:
+                axis.set_title(f"{spp} spp on average")
+            if measure != "psnr":
+                axis.set_yscale("log")
+            if row == len(measures) - 1:
+                axis.set_xlabel("seconds for 1024 x 1024")
+        line[0].set_ylabel(title)
+        if measure != "psnr":
+            line[0].invert_yaxis()
+    figure.suptitle(f"Accuracy against time on {shown['machine']}: mean of the scenes (left and up is better)")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
+    figure.tight_layout(rect=(0, 0.05, 1, 1))
+    figure.savefig(path, dpi=110)
+
+
+def _families(shown: dict[str, Any]) -> list[str]:
+    return [s["name"] for s in shown["series"] if not s.get("peer") and not s["name"].endswith(UNEVEN)]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, required=True, help="an HTML page, or a PNG, SVG or PDF picture")
+    args = parser.parse_args()
+    if args.output.suffix == ".html":
+        args.output.write_text(page(data()))
+    else:
+        draw(data(), args.output)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,195 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Milliseconds a frame on an NVIDIA GPU: our models, and Open Image Denoise (OIDN) on its CUDA device.
+
+    python -m research.benchmarks.gpu --table research/benchmarks/results/gpu.csv
+
+Inputs and outputs lie in the GPU's memory, so no copies are timed; ``with_copies_ms`` has them for our models. OIDN is
+called plainly, with the small networks ("fast"), and as its documentation recommends (albedo and normal prefiltered).
+``floor_ms`` is the least time that the convolutions of a model could take: the larger one of their operations over the
+rate of a large half-float matrix product, and of their inputs and outputs over the rate of a large copy, both measured
+here.
+"""
+
+from __future__ import annotations
+
+import argparse
+import statistics
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+#: Height and width of the frames. The second is 1080p, padded to what the models take.
+SIZES = ((1024, 1024), (1088, 1920))
+MODELS = ("joint-small-x2", "joint-x2", "joint-large-x2", "joint-small-x4", "joint-x4", "joint-large-x4")
+OIDN = {"OIDN fast": "fast", "OIDN": "high", "OIDN prefiltered": "high"}
+REPEATS = 20
+
+
+def median_ms(call: Callable[[], Any], wait: Callable[[], Any]) -> float:
+    """Median time of a call after three others."""
+    times = []
+    for repeat in range(REPEATS + 3):
+        wait()
+        before = time.perf_counter()
+        call()
+        wait()
+        if repeat >= 3:
+            times.append(time.perf_counter() - before)
+    return 1000 * statistics.median(times)
+
+
+def ceilings() -> tuple[float, float]:
+    """Operations and bytes a second of the GPU: of a product of half-float matrices, and of a copy."""
+    import torch
+
+    a, b = (torch.randn(8192, 8192, device="cuda", dtype=torch.float16) for _ in range(2))
+    source = torch.randn(2**29, device="cuda")
+    target = torch.empty_like(source)
+    product = median_ms(lambda: a @ b, torch.cuda.synchronize)
+    copy = median_ms(lambda: target.copy_(source), torch.cuda.synchronize)
+    return 2 * 8192**3 / product * 1000, 2 * source.nbytes / copy * 1000
+
+
+def convolution_work(path: Path, sizes: dict[str, int]) -> tuple[float, float]:
+    """Operations of a model's convolutions, and the bytes that they read and write in half floats, for a frame.
+
+    Args:
+        sizes: values of the graph's symbolic dimensions.
+    """
+    import onnx
+
+    model = onnx.load(path)
+    for value in model.graph.input:
+        for dimension in value.type.tensor_type.shape.dim:
+            if dimension.dim_param:
+                dimension.dim_value = sizes[dimension.dim_param]
+    del model.graph.value_info[:]
+    inferred = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
+    values = (*inferred.value_info, *inferred.input, *inferred.output)
+    shapes = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in values}
+    shapes |= {tensor.name: list(tensor.dims) for tensor in inferred.initializer}
+    operations = transferred = 0.0
+    for node in inferred.node:
+        if node.op_type == "Conv":
+            taken, kernel, given = (shapes[name] for name in (*node.input[:2], node.output[0]))
+            operations += 2 * np.prod(kernel) * np.prod(given[2:])
+            transferred += 2 * (np.prod(taken) + np.prod(kernel) + np.prod(given))
+    return operations, transferred
+
+
+def time_model(name: str, height: int, width: int) -> dict[str, float]:
+    """Times of one of our models for a frame, and the work of its convolutions."""
+    import onnxruntime as ort
+    import torch
+
+    from oiio_msspl.model.catalogue import WEIGHTS
+    from oiio_msspl.model.devices import GPU_FOLDER
+
+    path = WEIGHTS / GPU_FOLDER / f"{name}.onnx"
+    ort.preload_dlls()
+    options = ort.SessionOptions()
+    options.log_severity_level = 3
+    options.enable_mem_pattern = False
+    network = ort.InferenceSession(str(path), options, providers=["CUDAExecutionProvider", "CPUExecutionProvider"])
+    if "CUDAExecutionProvider" not in network.get_providers():
+        raise SystemExit(f"{name}: onnxruntime can't use CUDA: {network.get_providers()}")
+    scale = int(name.rpartition("x")[2])
+    sizes = {"H": height, "W": width, "h": height // scale, "w": width // scale}
+    rng = np.random.default_rng(0)
+    feed, binding = {}, network.io_binding()
+    for given in network.get_inputs():
+        shape = [sizes[side] if isinstance(side, str) else side for side in given.shape]
+        scalar = 1.0 if given.name == "exposure" else 0.5
+        feed[given.name] = rng.random(shape, np.float32) if shape else np.asarray(scalar, np.float32)
+        value = ort.OrtValue.ortvalue_from_numpy(feed[given.name], "cuda" if shape else "cpu", 0)
+        binding.bind_ortvalue_input(given.name, value)
+    binding.bind_output("fused", "cuda")
+    on_gpu = median_ms(lambda: network.run_with_iobinding(binding), torch.cuda.synchronize)
+    copies = median_ms(lambda: network.run(["fused"], feed), torch.cuda.synchronize)
+    operations, transferred = convolution_work(path, sizes)
+    return {"ms": on_gpu, "with_copies_ms": copies, "gflop": operations / 1e9, "gbyte": transferred / 1e9}
+
+
+def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
+    """Time of OIDN's filters for a frame."""
+    import pyoidn
+
+    device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CUDA)
+    device.commit()
+    rng = np.random.default_rng(0)
+    buffers = {}
+
+    def image(key: str) -> Any:
+        """A picture in the GPU's memory."""
+        if key not in buffers:
+            pixels = rng.random((height, width, 3), np.float32)
+            buffers[key] = pyoidn.Buffer(device, pixels.nbytes, storage=pyoidn.OIDN_STORAGE_DEVICE)
+            buffers[key].write(0, pixels.nbytes, pixels)
+        return buffers[key]
+
+    def built(inputs: dict[str, str], output: str, **flags: bool) -> Any:
+        """A filter that reads and writes the named pictures."""
+        oidn_filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
+        oidn_filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{OIDN[name].upper()}"))
+        for role, key in {**inputs, "output": output}.items():
+            oidn_filter.set_image(role, image(key), pyoidn.OIDN_FORMAT_FLOAT3, width, height)
+        for flag, value in flags.items():
+            oidn_filter.set_bool(flag, value)
+        oidn_filter.set_float("inputScale", 1.0)
+        oidn_filter.commit()
+        return oidn_filter
+
+    layers = ("albedo", "normal")
+    filters = []
+    if name == "OIDN prefiltered":
+        filters = [built({layer: layer}, f"clean {layer}") for layer in layers]
+        inputs = {layer: f"clean {layer}" for layer in layers}
+    else:
+        inputs = {layer: layer for layer in layers}
+    filters.append(built({"color": "color", **inputs}, "result", hdr=True, cleanAux=bool(filters)))
+
+    def run() -> None:
+        for each in filters:
+            each.execute_async()
+
+    elapsed = median_ms(run, device.wait)
+    if error := device.get_error():
+        raise SystemExit(f"{name}: {error}")
+    return {"ms": elapsed}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m research.benchmarks.gpu",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--table", type=Path, help="CSV file to write")
+    args = parser.parse_args()
+    import torch
+
+    operations, transfer = ceilings()
+    card = torch.cuda.get_device_name()
+    print(f"{card}: {operations / 1e12:.0f} TFLOP/s, {transfer / 1e12:.2f} TB/s")
+    lines = ["card,size,method,ms,with_copies_ms,of_oidn,gflop,gbyte,floor_ms"]
+    for height, width in SIZES:
+        rows = {name: time_oidn(name, height, width) for name in OIDN}
+        rows |= {name: time_model(name, height, width) for name in MODELS}
+        for name, row in rows.items():
+            floor = 1000 * max(row["gflop"] * 1e9 / operations, row["gbyte"] * 1e9 / transfer) if "gflop" in row else 0
+            figures = [
+                row["ms"], row.get("with_copies_ms"), row["ms"] / rows["OIDN"]["ms"], row.get("gflop"),
+                row.get("gbyte"), floor or None,
+            ]  # fmt: skip
+            cells = ["" if figure is None else f"{figure:.4g}" for figure in figures]
+            lines.append(",".join([card, f"{width} x {height}", name, *cells]))
+            print(lines[-1], flush=True)
+    if args.table:
+        args.table.write_text("\n".join(lines) + "\n")
+
+
+if __name__ == "__main__":
+    main()

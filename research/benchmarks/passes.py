@@ -1,0 +1,406 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
+
+    python -m research.benchmarks.passes PASSES --table research/benchmarks/results/passes.csv
+    python -m research.benchmarks.passes PASSES --spread --table research/benchmarks/results/passes_spread.csv
+    python -m research.benchmarks.passes PASSES --half --table research/benchmarks/results/passes_half.csv
+    python -m research.benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
+
+PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datagen.cycles.passes``. The methods, all but
+the first two with the albedo and the normal:
+
+- "HRLS": the layers as they are rendered.
+- "ratio": the fused beauty, divided as the noisy layers of the HRLS divide theirs.
+- "OIDN": Open Image Denoise on each layer of the HRLS, the plain call. Its layers do not sum to a denoised beauty.
+- "OIDN, rescaled": the same, scaled so that they sum to the fused beauty.
+- "OIDN, prefiltered, rescaled": the same with the call that OIDN's documentation recommends.
+- "OIDN, prefiltered, stored": the same, but light of a layer that is stored as light and colour is left out where the
+  colour is black, because no file can hold it. The layers are then scaled to the sum.
+- "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
+  so that they sum to the beauty that OIDN makes of this render.
+- "OIDN, every second pixel, rescaled": with ``--spread``, the recommended call on every second pixel, see
+  :mod:`research.benchmarks.every_second_pixel`.
+- "msspl": :mod:`oiio_msspl.fusion.passes.fuse`.
+- "msspl, HRLS alone": the same without the layers of the LRHS.
+- "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
+- "msspl, best, at half size": the same at half of the frame's resolution, as if the set had many layers.
+
+``--spread`` is for renders whose pixel filter has spread the noise. It takes the models for such noise.
+
+``--half`` measures light groups alone: at full and at half of the resolution, fitted, and by OIDN at its best.
+
+Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
+
+Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
+part of the sum, but is not scored: every method has a high PSNR there.
+
+"Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
+"Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
+beauty, as a multiple of OIDN's plain call on the beauty. The gain is the PSNR of a method minus that of one of `GAINS`,
+with a 95 % interval by :mod:`research.benchmarks.versus`; a win is a layer with more PSNR than that of `PEER`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import re
+import time
+from collections.abc import Callable, Collection, Iterator, Mapping
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+
+from oiio_msspl import FusedFrame, Session, fuse
+from oiio_msspl.aovs.additive_sets import LIGHT_GROUPS, AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.formula import FeatureFormula
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.atomic import replacing
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.fuse import layer_fuser
+from oiio_msspl.fusion.passes.fuse import DARKEST_COLOUR, fuse_passes
+from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.colour import srgb
+from oiio_msspl.image.metrics import psnr, relmse
+from oiio_msspl.model.catalogue import load_model
+from oiio_msspl.model.contract import SPREAD
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
+from research.benchmarks import results
+from research.benchmarks.every_second_pixel import places, without_grid
+from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
+from research.benchmarks.results import MEAN, Row
+from research.benchmarks.versus import cell, with_interval
+
+SCALES, SPP = (2, 4), (1, 2)
+KEYS = ("scene", "set", "spp", "method")
+#: Calls of OIDN before the one that is the unit of time: the first one loads its network.
+WARM_UP = 2
+#: In the column `layer`: the mean of all layers.
+ALL = "all"
+#: Share of the beauty's light that a scored layer has at least.
+FAINT = 0.01
+#: The model of each quality that is measured.
+BALANCED, BEST = "joint", "joint-large"
+#: What the gain is measured against.
+PEER = "OIDN, prefiltered, rescaled"
+#: The same for noise that a pixel filter has spread.
+SPLIT_PEER = "OIDN, every second pixel, rescaled"
+#: The same as a file can hold it.
+STORED_PEER = "OIDN, prefiltered, stored"
+#: The set whose layers are products of light and colour in some renderers.
+COMPONENTS = "components"
+#: Column of the gain -> over which method.
+GAINS = {"gain": PEER, "gain_split": SPLIT_PEER, "gain_stored": STORED_PEER}
+#: How many light groups are fused, and what ``--half`` compares.
+AT_HALF = "msspl, best, at half size"
+BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
+#: Methods in the table of single layers.
+IN_LAYERS = ("HRLS", "ratio", "OIDN", "OIDN, rescaled", PEER, "msspl-x2", "msspl-x2, best", "msspl-x4, best")
+#: Methods in the table of renders whose pixel filter has spread the noise.
+WITH_SPREAD_NOISE = ("HRLS", PEER, SPLIT_PEER, "msspl-x2", "msspl-x2, best", "msspl-x4", "msspl-x4, best")
+
+
+def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
+    """The layers of a set, (layers, h, w, 3)."""
+    pixels = with_layers(render, layers).read(render.data_window, layer_keys(layers))
+    return np.stack([np.maximum(pixels[name], 0) for name in layer_keys(layers)])
+
+
+def rescaled(layers: Array, beauty: Array) -> Array:
+    """Layers that sum to the beauty, in the ratio of these."""
+    total = layers.sum(axis=0)
+    return layers * np.where(total > 0, beauty / np.where(total > 0, total, 1), 0)
+
+
+def colours_of(render: MappedRender, layers: AdditiveSet) -> Array:
+    """What the stored light of each layer is multiplied by, (layers, h, w, 3): 1 in a layer that is no product."""
+    formulas = {str(i): FeatureFormula((x.factor,)) for i, x in enumerate(layers.layers) if x.factor}
+    pixels = replace(render, features=formulas, alpha=None).read(render.data_window, list(formulas))
+    ones = np.ones((render.data_window.height, render.data_window.width, 3), np.float32)
+    return np.stack([pixels.get(str(i), ones) for i in range(len(layers.layers))])
+
+
+def methods(
+    lr: MappedRender,
+    hr: MappedRender,
+    fused: Mapping[str, tuple[FusedFrame, Session]],
+    layers: AdditiveSet,
+    ordinary: MappedRender | None = None,
+    *,
+    spread: bool = False,
+) -> Iterator[tuple[str, Callable[[], Array]]]:
+    """The name of each method, and a function that computes the layers.
+
+    Args:
+        fused: the fused frame of each model, and the model.
+        ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
+        spread: a pixel filter has spread the noise.
+    """
+    noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
+    guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
+    beauty = fused[BEST][0].rgb
+
+    def plain() -> Array:
+        return np.maximum([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy], np.float32(0))
+
+    def recommended(noisy: Array, guides: Mapping[str, Array]) -> Array:
+        clean = prefiltered({name: guides[name] for name in (ALBEDO, NORMAL)})
+        return np.maximum([denoise_with_clean(layer, clean) for layer in noisy], np.float32(0))
+
+    def on_every_second_pixel() -> Array:
+        joined = np.empty_like(noisy)
+        for place in places():
+            joined[:, *place] = recommended(noisy[:, *place], {name: image[place] for name, image in guides.items()})
+        exposure = find_exposure(beauty)
+        encoded = (encode_radiance(layer, exposure) for layer in joined)
+        return np.stack([decode_radiance(without_grid(layer), exposure) for layer in encoded])
+
+    def ours(low: MappedRender, model: str, *, half: bool = False) -> Array:
+        frame, session = fused[model]
+        with patch("oiio_msspl.fusion.passes.fuse.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
+            made = fuse_passes(
+                low,
+                hr,
+                frame.rgb,
+                frame.alignment,
+                [layers],
+                guides=frame.clean_aovs,
+                fuse_layers=layer_fuser(session, frame),
+            )
+        assert not made.refused
+        height = hr.data_window.height
+        planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]
+        return colours * np.moveaxis(np.asarray(planes, np.float32), 1, -1)
+
+    yield "HRLS", lambda: noisy
+    yield "ratio", lambda: rescaled(noisy, beauty)
+    yield "OIDN", plain
+    yield "OIDN, rescaled", lambda: rescaled(plain(), beauty)
+    yield PEER, lambda: rescaled(recommended(noisy, guides), beauty)
+    if spread:
+        yield SPLIT_PEER, lambda: rescaled(on_every_second_pixel(), beauty)
+    if layers.name == COMPONENTS:
+        yield STORED_PEER, lambda: rescaled(recommended(noisy, guides) * (colours >= DARKEST_COLOUR), beauty)
+    if ordinary is not None:
+        theirs = layers_of(ordinary, layers_like(ordinary, layers))
+        pixels = ordinary.load().layers
+        total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
+        yield "OIDN, ordinary render", lambda: rescaled(recommended(theirs, pixels), total)
+    yield "msspl", lambda: ours(lr, BALANCED)
+    yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]), BALANCED)
+    yield "msspl, best", lambda: ours(lr, BEST)
+    if layers.name == LIGHT_GROUPS:
+        yield AT_HALF, lambda: ours(lr, BEST, half=True)
+
+
+def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
+    """The set of another file with the same name and layers."""
+    names = [layer.name for layer in layers.layers]
+    found = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
+    return next(found)
+
+
+def regraded(layers: Array) -> Array:
+    """The beauty with the first layer switched off, and four times the light of the second one."""
+    grades = np.array([0, 4, *[1] * (len(layers) - 2)], np.float32)
+    return np.einsum("i,ihwc->hwc", grades, layers)
+
+
+def fused_frames(
+    lr: MappedRender, hr: MappedRender, scale: int, noise: str = ""
+) -> dict[str, tuple[FusedFrame, Session]]:
+    """The fused frame of each model, and the model. That of single layers is loaded, too.
+
+    Args:
+        noise: the ending of the models' names.
+    """
+    sessions = {model: load_model(scale, model + noise) for model in (BALANCED, BEST)}
+    sessions[BEST].layer_session  # noqa: B018 - loads it
+    return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
+
+
+def picture(folder: Path, output: Path) -> None:
+    """Write a WebP: the light groups of a scene as rendered, fused and as they should be; below them the regraded
+    beauty."""
+    from PIL import Image
+
+    lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in ("lr_x4_32spp", "hr_2spp", "ref"))
+    layers = hr.additive_sets[0]
+    made = dict(methods(lr, hr, fused_frames(lr, hr, 4), layers))
+    columns = [made["HRLS"](), made["msspl"](), layers_of(reference, reference.additive_sets[0])]
+    rows = [*zip(*columns, strict=True), tuple(regraded(column) for column in columns)]
+    shown = np.concatenate([np.concatenate([srgb(image) for image in row], axis=1) for row in rows], axis=0)
+    with replacing(output, overwrite=True) as temporary:
+        Image.fromarray((shown * 255 + 0.5).astype(np.uint8)).save(temporary, format="WEBP", quality=80)
+
+
+def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
+    """A row for each layer that is bright enough, and their mean with the regraded picture."""
+    light = reference.sum(axis=(1, 2, 3))
+    rows: list[Row] = [
+        {"layer": name, "psnr": psnr(layer, truth), "relmse": relmse(layer, truth)}
+        for name, layer, truth, share in zip(names, layers, reference, light / light.sum(), strict=True)
+        if share >= FAINT
+    ]
+    graded, truth = regraded(layers), regraded(reference)
+    errors = np.mean((srgb(graded) - srgb(truth)) ** 2, axis=-1).ravel()
+    worst = np.sort(errors)[-len(errors) // 100 :].mean()
+    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}
+    regrade = {"regraded_psnr": psnr(graded, truth), "regraded_relmse": relmse(graded, truth)}
+    return [{"layer": ALL, **means, **regrade, "worst_psnr": float(-10 * np.log10(worst))}, *rows]
+
+
+def timed(function: Callable[[], Array]) -> tuple[Array, float]:
+    """The result and the time of a call."""
+    start = time.perf_counter()
+    result = function()
+    return result, time.perf_counter() - start
+
+
+def measure(
+    folder: Path,
+    scale: int,
+    spp: int,
+    known: Collection[tuple[object, ...]] = (),
+    *,
+    spread: bool = False,
+    half: bool = False,
+) -> list[Row]:
+    """One scene: rows for each set and method, without those whose `KEYS` are known; with ``half``, for `BESIDE_HALF`
+    of light groups alone, else for all but `AT_HALF`."""
+    names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
+    lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
+    other = folder / f"hr_{2 * spp}spp.exr"
+    ordinary = map_render(open_exr(other)) if other.exists() else None
+    fused = fused_frames(lr, hr, scale, SPREAD if spread else "")
+    pixels = hr.load().layers
+    plain = [timed(lambda: denoise(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]))[1] for _ in range(WARM_UP + 1)]
+    oidn_seconds = plain[-1]
+    rows = []
+    for layers in hr.additive_sets:
+        if half and layers.name != LIGHT_GROUPS:
+            continue
+        clean = layers_of(reference, layers_like(reference, layers))
+        for name, function in methods(lr, hr, fused, layers, ordinary, spread=spread):
+            if name not in BESIDE_HALF if half else name == AT_HALF:
+                continue
+            title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
+            key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
+            if tuple(key.values()) in known:
+                continue
+            result, seconds = timed(function)
+            total, *each = scores(result, clean, [layer.name for layer in layers.layers])
+            seconds = 0.0 if name == "HRLS" else seconds / oidn_seconds
+            rows += [key | total | {"time": seconds}, *(key | row for row in each)]
+    return rows
+
+
+def means(rows: list[Row]) -> list[Row]:
+    """Means over the scenes, of the methods that were measured on each, and the gain over `PEER`."""
+    found = []
+    totals = [row for row in rows if row["layer"] == ALL]
+    for key in dict.fromkeys(tuple(row[k] for k in KEYS[1:]) for row in totals):
+        same = [row for row in totals if tuple(row[k] for k in KEYS[1:]) == key]
+        if len(same) < sum((row["set"], row["spp"], row["method"]) == (*key[:2], PEER) for row in totals):
+            continue
+        numbers = {k: float(np.mean([row[k] for row in same])) for k, v in same[0].items() if isinstance(v, float)}
+        mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
+        for column, peer in GAINS.items():
+            peers = {r["scene"]: r for r in totals if (r["set"], r["spp"], r["method"]) == (*key[:2], peer)}
+            if peers.keys() == {row["scene"] for row in same}:
+                gains = np.array([row["psnr"] - peers[row["scene"]]["psnr"] for row in same])
+                mean |= dict(zip((column, f"{column}_low", f"{column}_high"), with_interval(gains), strict=True))
+        ours, theirs = (_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER))
+        won = [row["psnr"] > theirs[layer]["psnr"] for layer, row in ours.items()]
+        found.append(mean | {"wins": sum(won), "layers": len(won)})
+    return found
+
+
+def _single_layers(rows: list[Row], key: tuple[object, ...]) -> dict[tuple[str, str], Row]:
+    """The rows of single layers of a set, spp and method, by scene and layer."""
+    same = (row for row in rows if tuple(row[k] for k in KEYS[1:]) == key and row["layer"] != ALL)
+    return {(row["scene"], row["layer"]): row for row in same}
+
+
+def layout(rows: list[Row]) -> str:
+    """The means, as a table with the columns that were measured."""
+    titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
+    titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
+    formats = {key: "{:.4f}" if "relmse" in key else "{:.2f}" for key in titles}
+    shown = [row for row in rows if row["scene"] == MEAN]
+    body = [
+        [row["set"], str(row["spp"]), row["method"], *(formats[key].format(row[key]) for key in titles)]
+        for row in shown
+    ]
+    head = ["set", "spp", "method", *titles.values()]
+    for column, peer in GAINS.items():
+        if not any(column in row for row in shown):
+            continue
+        head.append(f"gain over {peer}, dB")
+        for line, row in zip(body, shown, strict=True):
+            gain = tuple(row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
+            line.append("" if gain[0] is None else cell(gain, "+.2f"))
+    head.append("better on")
+    for line, row in zip(body, shown, strict=True):
+        line.append(f"{row['wins']:.0f} of {row['layers']:.0f}")
+    return results.markdown(head, body)
+
+
+def layout_of_layers(rows: list[Row]) -> str:
+    """PSNR and RelMSE of single layers, means over the scenes that have them. Lamps in groups count as one layer."""
+    single = [row for row in rows if row["scene"] != MEAN and row["layer"] != ALL]
+    kinds = {row["layer"]: re.sub(r"_\d+$", "", row["layer"]) for row in single}
+    body = []
+    for name, spp, kind in dict.fromkeys((row["set"], row["spp"], kinds[row["layer"]]) for row in single):
+        same = [row for row in single if (row["set"], row["spp"], kinds[row["layer"]]) == (name, spp, kind)]
+        cells = []
+        for method in IN_LAYERS:
+            scores = [(row["psnr"], row["relmse"]) for row in same if row["method"] == method]
+            cells.append("{:.2f}, {:.4f}".format(*np.mean(scores, axis=0)))
+        count = sum(row["method"] == PEER for row in same)
+        body.append([name, str(spp), kind, str(count), *cells])
+    return results.markdown(["set", "spp", "layer", "number", *IN_LAYERS], sorted(body))
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("passes", type=Path)
+    parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
+    parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
+    parser.add_argument(
+        "--half", action="store_true", help="compare light groups at full and at half of the resolution"
+    )
+    parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
+    results.add_option(parser)
+    args = parser.parse_args()
+    scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
+    if args.picture:
+        picture(args.passes / scenes[0], args.picture)
+        return
+    rows: list[Row] = []
+    for scene in scenes:
+        for spp in SPP:
+            for scale in SCALES:
+                known = {tuple(row[k] for k in KEYS) for row in rows}
+                # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
+                rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
+                print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
+        if args.table:
+            add(args.table, rows)
+    print(layout(means(rows)))
+
+
+def add(table: Path, rows: list[Row]) -> None:
+    """Put rows of scenes into a table, whose means are computed anew."""
+    old = [row for row in results.read(table) if row["scene"] != MEAN] if table.exists() else []
+    keys = (*KEYS, "layer")
+    together = list((results.index(old, *keys) | results.index(rows, *keys)).values())
+    results.write(table, together + means(together))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,290 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cases: what can go wrong with a pair. There is one function for each group."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import cache
+
+import numpy as np
+
+from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, NORMAL, OPTIONAL_FEATURES, RGB, SPECULAR, VARIANCE
+from oiio_msspl.exr.render import Render
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.model.encoding import MAX_RADIANCE
+from research.benchmarks.stability import analytic
+from research.benchmarks.stability.bases import Analytic, Base, Pair, seeded
+
+#: The group in which both renders show different things, by a mistake of the user.
+DISAGREE = "LRHS and HRLS disagree"
+
+
+@dataclass(frozen=True, eq=False)
+class Case:
+    name: str
+    pair: Pair
+    clean: Pair | None = None
+    """The pair before it was disturbed; None for a scene that is hard as it is."""
+    factor: float = 1.0
+    """The result should be the one for ``clean``, times this."""
+
+
+def changed(render: Render, **layers: Array | None) -> Render:
+    """A render with other layers; None removes one."""
+    return Render.from_arrays(render.name, **{k: v for k, v in {**render.layers, **layers}.items() if v is not None})
+
+
+def scaled(pair: Pair, factor: float) -> Pair:
+    """A pair with all light multiplied by a factor."""
+    powers = dict.fromkeys((RGB, DIFFUSE, SPECULAR), 1) | {VARIANCE: 2}
+    lr, hr = (
+        changed(r, **{k: v * np.float32(factor ** powers[k]) for k, v in r.layers.items() if k in powers})
+        for r in (pair.lr, pair.hr)
+    )
+    return Pair(lr, hr, pair.reference * np.float32(factor))
+
+
+def with_pixels(render: Render, value: float, share: float, layers: tuple[str, ...] = (RGB,)) -> Render:
+    """A render in which a share of the pixels, at least one and none at the border, has a value in some layers."""
+    height, width = render.layers[RGB].shape[:2]
+    rng = seeded("pixels", value, share, height)
+    count = max(1, round(share * height * width))
+    rows, columns = rng.integers(2, height - 2, count), rng.integers(2, width - 2, count)
+    result = {}
+    for name in layers:
+        if name in render.layers:
+            result[name] = render.layers[name].copy()
+            result[name][rows, columns] = value
+    return changed(render, **result)
+
+
+def mean_light(pair: Pair) -> float:
+    return float(pair.reference.mean())
+
+
+# Groups for any base
+
+
+def fireflies(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale)
+    for value in (1e3, 1e6):
+        hot = value * mean_light(clean)
+        lobes = (RGB, SPECULAR)
+        hr, lr = with_pixels(clean.hr, hot, 1e-3, lobes), with_pixels(clean.lr, hot, 1e-3)
+        size = f"{value:.0e}".replace("e+0", "e")
+        yield Case(f"0.1 % of the HRLS, {size} times the mean", Pair(clean.lr, hr, clean.reference), clean)
+        yield Case(f"0.1 % of the LRHS, {size} times the mean", Pair(lr, clean.hr, clean.reference), clean)
+
+
+def broken_values(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale)
+    every = (RGB, *OPTIONAL_FEATURES)
+    for name, value in (("NaN", np.nan), ("Inf", np.inf), ("-Inf", -np.inf), ("-1", -1.0)):
+        hr = with_pixels(clean.hr, value, 1e-3, every)
+        yield Case(f"{name} in 0.1 % of the HRLS, all layers", Pair(clean.lr, hr, clean.reference), clean)
+    for name, value in (("NaN", np.nan), ("Inf", np.inf)):
+        lr = with_pixels(clean.lr, value, 1e-3)
+        yield Case(f"{name} in 0.1 % of the LRHS", Pair(lr, clean.hr, clean.reference), clean)
+    holed = {k: v.copy() for k, v in clean.hr.layers.items()}
+    height = clean.hr.data_window.height
+    for values in holed.values():
+        values[height // 4 : height // 4 + height // 8, height // 2 : height // 2 + height // 8] = np.nan
+    yield Case("a bucket of the HRLS all NaN", Pair(clean.lr, changed(clean.hr, **holed), clean.reference), clean)
+
+
+def exposure(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale)
+    for stops in (-10, -5, 5, 10):
+        yield Case(f"2^{stops}", scaled(clean, 2.0**stops), clean, factor=2.0**stops)
+
+
+def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
+    """One bright pixel. In ``clean`` it is one pixel further left."""
+    clean = base.pair(scale)
+    value = 1e4 * mean_light(clean)
+
+    def at(render: Render, column: int) -> Render:
+        rgb = render.layers[RGB].copy()
+        rgb[rgb.shape[0] // 3, column] = value
+        return changed(render, rgb=rgb)
+
+    middle = clean.hr.data_window.width // 2
+    yield Case(
+        "in the HRLS, moved by one pixel",
+        Pair(clean.lr, at(clean.hr, middle + 1), clean.reference),
+        Pair(clean.lr, at(clean.hr, middle), clean.reference),
+    )
+    yield Case(
+        "in the LRHS, moved by one pixel",
+        Pair(at(clean.lr, middle // scale + 1), clean.hr, clean.reference),
+        Pair(at(clean.lr, middle // scale), clean.hr, clean.reference),
+    )
+
+
+def layers(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale, 4)  # 4 spp: with 1 there is no variance to remove
+    for name in OPTIONAL_FEATURES:
+        yield Case(f"no {name}", Pair(clean.lr, changed(clean.hr, **{name: None}), clean.reference), clean)
+    bare = changed(clean.hr, **dict.fromkeys(OPTIONAL_FEATURES))
+    yield Case("none at all", Pair(clean.lr, bare, clean.reference), clean)
+
+
+def garbage(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale, 4)
+    have = clean.hr.layers
+    rng = seeded("garbage")
+    noise = rng.random(have[RGB].shape, dtype=np.float32)
+    turned = {k: np.ascontiguousarray(have[k][::-1, ::-1]) for k in (ALBEDO, NORMAL)}
+    for name, layers in {
+        "albedo of noise": {ALBEDO: noise},
+        "normal of noise": {NORMAL: 2 * noise - 1},
+        "albedo and normal exchanged": {ALBEDO: have[NORMAL], NORMAL: have[ALBEDO]},
+        "albedo and normal of another frame": turned,
+        "albedo and normal 0": {k: np.zeros_like(noise) for k in turned},
+        "albedo 1000 times too large": {ALBEDO: have[ALBEDO] * 1000},
+        "diffuse and specular of noise": {DIFFUSE: noise, SPECULAR: noise[::-1]},
+        "every layer of noise": {k: rng.random(have[k].shape, dtype=np.float32) for k in OPTIONAL_FEATURES},
+    }.items():
+        yield Case(name, Pair(clean.lr, changed(clean.hr, **layers), clean.reference), clean)
+
+
+def variance(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale, 4)
+    true = clean.hr.layers[VARIANCE]
+    for name, values in {
+        "constant": np.full_like(true, true.mean()),
+        "0 everywhere": np.zeros_like(true),
+        "10000 times too large": true * 1e4,
+        "10000 times too small": true * 1e-4,
+        "of another frame": np.ascontiguousarray(true[::-1, ::-1]),
+    }.items():
+        yield Case(name, Pair(clean.lr, changed(clean.hr, variance=values), clean.reference), clean)
+
+
+def unusual_spp(base: Base, scale: int) -> Iterator[Case]:
+    clean = base.pair(scale)
+    for name, hr_spp, lr_spp in (
+        ("LRHS 2", 1, 2),
+        ("HRLS 8, LRHS 2", 8, 2),
+        ("HRLS 64", 64, None),
+        ("HRLS 64, LRHS 2", 64, 2),
+        ("LRHS 1024", 1, 1024),
+    ):
+        try:
+            yield Case(name, base.pair(scale, hr_spp, lr_spp), clean)
+        except LookupError:
+            continue
+
+
+def footprints(base: Base, scale: int) -> Iterator[Case]:
+    yield Case("point: nearest-neighbour LRHS", base.pair(scale, nearest=True), base.pair(scale))
+
+
+def overflow(base: Base, scale: int) -> Iterator[Case]:
+    """Light beyond 65504, the largest half float."""
+    clean = base.pair(scale)
+    bright = scaled(clean, 4 * MAX_RADIANCE / float(np.quantile(clean.reference, 0.999)))
+    with np.errstate(over="ignore"):
+        lr, hr = (
+            changed(r, **{k: v.astype(np.float16).astype(np.float32) for k, v in r.layers.items()})
+            for r in (bright.lr, bright.hr)
+        )
+    truth = np.minimum(bright.reference, MAX_RADIANCE)  # the largest value that such a file can hold
+    yield Case("a frame that reaches 4 times the largest half", Pair(lr, hr, truth), Pair(bright.lr, bright.hr, truth))
+
+
+ANYWHERE: dict[str, Callable[[Base, int], Iterator[Case]]] = {
+    "fireflies": fireflies,
+    "NaN, Inf, negative": broken_values,
+    "exposure": exposure,
+    "a hot pixel moves": hot_pixel,
+    "missing layers": layers,
+    "garbage layers": garbage,
+    "wrong variance": variance,
+    "spp outside training": unusual_spp,
+    "pixel footprint": footprints,
+    "16-bit overflow": overflow,
+}
+
+
+# Groups with scenes of their own
+
+
+@cache
+def room(size: int) -> Analytic:
+    """The analytic base. The groups for any base use it, too."""
+    return Analytic("room", analytic.room(size))
+
+
+def lights(size: int, scale: int) -> Iterator[Case]:
+    for radiance in (1e2, 1e4, 1e6):
+        made = Analytic(f"lights {radiance}", analytic.small_lights(size, radiance))
+        yield Case(f"small lights up to {radiance:.0e}".replace("e+0", "e"), made.pair(scale))
+    yield Case("visible emitters, one behind a grille", Analytic("emitters", analytic.emitters(size)).pair(scale))
+
+
+def dark(size: int, scale: int) -> Iterator[Case]:
+    name = "1 sample of 200 finds the light"
+    yield Case(name, Analytic("near black", analytic.near_black(size)).pair(scale))
+    traces = Analytic("near black", analytic.near_black(size, 1e-3))
+    yield Case(f"{name}, traces of 1e-3 to 1e-40 elsewhere", traces.pair(scale))
+
+
+def rare_light(size: int, scale: int) -> Iterator[Case]:
+    """A bound to the brightest sample around makes holes here: often there is no lit sample around."""
+    for samples in (20, 50):
+        made = Analytic(f"door ajar {samples}", analytic.door_ajar(size, 1 / samples))
+        yield Case(f"a room lit through a door ajar: 1 sample of {samples} is lit", made.pair(scale))
+    yield Case("a lamp seen through a slit", Analytic("slit", analytic.slit(size, 100.0)).pair(scale))
+    dim = Analytic("dark room", analytic.dark_room(size))
+    yield Case("a dark room at 1 spp", dim.pair(scale))
+    yield Case("a dark room, 1 spp in both", dim.pair(scale, 1, 1))
+
+
+def blur(size: int, scale: int) -> Iterator[Case]:
+    yield Case("depth of field", Analytic("depth of field", analytic.defocused(size)).pair(scale))
+    yield Case("motion blur", Analytic("motion blur", analytic.moving(size)).pair(scale))
+
+
+def detail(size: int, scale: int) -> Iterator[Case]:
+    yield Case("hairs of 0.1 to 0.8 pixels", Analytic("hairs", analytic.hairy(size)).pair(scale))
+    yield Case("glass that no layer sees through", Analytic("glass", analytic.glassy(size)).pair(scale))
+
+
+def filters(size: int, scale: int) -> Iterator[Case]:
+    base = room(size)
+    clean = base.pair(scale)
+    wide, low = analytic.blackman_harris(), analytic.blackman_harris(scale)
+    yield Case("Blackman-Harris in both", base.make(scale, hr_filter=wide, lr_filter=low), clean)
+    yield Case("Blackman-Harris LRHS, box HRLS", base.make(scale, lr_filter=low), clean)
+    yield Case("box LRHS, Blackman-Harris HRLS", base.make(scale, hr_filter=wide), clean)
+
+
+def disagreement(size: int, scale: int) -> Iterator[Case]:
+    """The HRLS is right. The LRHS shows something else."""
+    base = room(size)
+    clean = base.pair(scale)
+    other = analytic.hairy(size)
+    other = analytic.Scene(other.back[::-1, ::-1], other.front[::-1, ::-1], other.coverage[::-1, ::-1])
+    yield Case("another scene", base.make(scale, lr_scene=other), clean)
+    ball = analytic.room(size, ball=(0.41, 0.5))
+    yield Case("another frame: the ball 6 % further", base.make(scale, lr_scene=ball), clean)
+    for factor in (0.25, 0.67, 1.5, 4.0):
+        lr = changed(clean.lr, rgb=clean.lr.layers[RGB] * np.float32(factor))
+        yield Case(f"LRHS {factor:g} times as bright", Pair(lr, clean.hr, clean.reference), clean)
+    for pixels in sorted({1, 2, 3, scale, 2 * scale, 3 * scale}):
+        moved = analytic.moved(base.scene, pixels, pixels)
+        unit = f"{pixels} HRLS pixel{'s' * (pixels > 1)}"
+        yield Case(f"shifted by {unit}, x and y", base.make(scale, lr_scene=moved), clean)
+
+
+MADE: dict[str, Callable[[int, int], Iterator[Case]]] = {
+    "lights and emitters": lights,
+    "near-black": dark,
+    "rare light": rare_light,
+    "pixel filter": filters,
+    "depth of field, motion blur": blur,
+    "hair, glass": detail,
+    DISAGREE: disagreement,
+}

@@ -1,0 +1,137 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Sequences that are fused frame by frame and with their neighbours, beside OIDN's.
+
+    python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
+    python -m research.datagen.cycles.sequence SEQUENCES
+    python -m research.benchmarks.temporal SEQUENCES --table research/benchmarks/results/temporal.csv
+    python -m research.benchmarks.temporal SPREAD --spread --table research/benchmarks/results/temporal_spread.csv
+
+The things in ``cycles/slide`` move to the side alone, so its pixels don't tell which way y points. If the benchmark
+says so, give that sequence Blender's format, in one line::
+
+    --motion-format layer=Vector,channels=XY,to=previous,x=right,y=up,unit=pixels
+                   +layer=Vector,channels=ZW,to=next,x=left,y=down,unit=pixels
+
+:mod:`research.benchmarks.temporal.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import map_render, open_exr
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.image.colour import srgb
+from oiio_msspl.jobs.temporal import AUTO, TemporalOptions
+from research.benchmarks import results
+from research.benchmarks.results import Row
+from research.benchmarks.scenes import beauty
+from research.benchmarks.temporal.measures import flicker, jod, psnr, relmse, warp_error
+from research.benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
+from research.benchmarks.temporal.report import REFERENCE, details, film, layout, strip, summary
+from research.benchmarks.temporal.sequence import Sequence, load, without_vectors
+
+KEYS = ("sequence", "scale", "method")
+#: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
+DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(104, 216), slice(90, 250)), 160
+
+
+def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> Iterator[Row]:
+    """A row for each method, and one for the reference."""
+    truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
+    for method in made:
+        images = srgb(method.images)
+        by_frame = [psnr(image, halves) for image, *halves in zip(images, *truth, strict=True)]
+        row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
+        row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
+        row |= {"relmse": relmse(method.images, sequence.truth), **flicker(images, truth)}
+        if with_jod:
+            row["jod"] = jod(images, truth)
+        row["ewarp"] = warp_error(images, images, sequence.vectors, sequence.seen)
+        row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
+        yield row | {"motion": method.motion}
+    shares = {f"{name}_share": float(mask.mean()) for name, mask in sequence.masks.items()}
+    error = warp_error(*truth, sequence.vectors, sequence.seen)
+    yield {"sequence": sequence.name, "scale": 1, "method": REFERENCE, "ewarp": error} | shares
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("folder", type=Path, help="the sequences")
+    parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
+    parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
+    parser.add_argument(
+        "--without-vectors", action="store_true", help="leave the motion vectors of Mitsuba's sequences out"
+    )
+    parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
+    parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
+    parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
+    parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
+    parser.add_argument("--picture", type=Path, help="draw a PNG")
+    parser.add_argument("--film", type=Path, help="draw an animated WebP")
+    results.add_option(parser)
+    args = parser.parse_args()
+    try:
+        run(args)
+    except MssplError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure sequences. Their rows replace those of the same sequences and methods in the table.
+
+    Raises:
+        InputError: there are none, one is not complete, or a picture can't be written.
+    """
+    for path in (args.picture, args.film):
+        if path:
+            check_target(path, overwrite=True)
+    names = args.sequence or sorted(
+        f"{p.parent.parent.name}/{p.parent.name}" for p in args.folder.glob("*/*/hr.0001.exr")
+    )
+    if not names:
+        raise InputError(
+            f"{args.folder}: holds no sequences; make them with python -m research.benchmarks.render.sequences"
+        )
+    rows: list[Row] = []
+    for index, name in enumerate(names):
+        sequence = load(args.folder / name, args.motion_format)
+        options = TemporalOptions(args.temporal, args.motion_format)
+        with tempfile.TemporaryDirectory() as folder:
+            judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
+            made = list(all_methods(judged, options, args.methods, spread=args.spread))
+        of_sequence = list(measure(sequence, made, with_jod=args.jod))
+        print(layout(of_sequence) if args.methods == "*" else details(of_sequence), flush=True)
+        rows += of_sequence
+        if args.table:
+            results.merge(args.table, of_sequence, KEYS)
+        if index == 0 and (args.picture or args.film):
+            draw(args, sequence, made)
+    if args.methods == "*":
+        print(summary(rows))
+
+
+def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None:
+    """Draw a sequence."""
+    found = {each.method: each.images for each in made if each.scale in (1, DRAWN_SCALE)}
+    hrls = np.stack([beauty(map_render(open_exr(sequence.folder / f"hr.{n:04d}.exr"))) for n in sequence.numbers])
+    truth = (sequence.truth[0] + sequence.truth[1]) / 2
+    titles = {"HRLS": hrls, ALONE: found[ALONE], NEIGHBOURS: found[NEIGHBOURS], OIDN_BEST: found[OIDN_BEST]}
+    shown = {title: srgb(images) for title, images in (titles | {REFERENCE: truth}).items()}
+    if args.picture:
+        strip(args.picture, shown, FRAMES, CROP, ROW)
+    if args.film:
+        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, CROP)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

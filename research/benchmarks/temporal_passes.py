@@ -1,0 +1,98 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What neighbouring frames gain for passes: accuracy and flicker of light groups in a shot.
+
+    python -m research.benchmarks.temporal_passes --table research/benchmarks/results/temporal_passes.csv
+
+The shot is that of :mod:`research.benchmarks.runtime_temporal`: a wall past which the camera moves, lit by lamps. Its
+clean light is known. Flicker is the mean absolute difference of the error from one frame to the next, along the motion.
+"""
+
+from __future__ import annotations
+
+import argparse
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import fuse_shot
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.temporal import TemporalOptions
+from research.benchmarks import results
+from research.benchmarks.results import Row
+from research.benchmarks.runtime_temporal import OFF, STEP, clean_frame, write_shot
+
+SIZE, LAMPS = (320, 180), 4
+#: Frames at either end of the shot have fewer neighbours and are not scored.
+ENDS = 6
+
+
+def images_of(path: Path) -> list[Array]:
+    """Beauty and light groups of a frame, (h, w, 3) each."""
+    render = map_render(open_exr(path))
+    (lamps,) = render.additive_sets
+    pixels = with_layers(render, lamps).read(render.data_window, ["rgb", *layer_keys(lamps)])
+    return [pixels[name] for name in ("rgb", *layer_keys(lamps))]
+
+
+def scores(errors: Array) -> tuple[float, float]:
+    """PSNR in dB, and flicker, of errors (frames, h, w, 3)."""
+    moved = errors[1:, :, :-STEP] - errors[:-1, :, STEP:]
+    return float(-10 * np.log10(np.mean(errors**2))), float(np.abs(moved).mean())
+
+
+def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> list[Row]:
+    """A row for the beauty, and one for the mean of all passes."""
+    out = folder / f"{quality} {frames}"
+    out.mkdir()
+    report = fuse_shot(folder / "lr", folder / "hr", out, model=quality, temporal=TemporalOptions(frames))
+    if report.exit_code:
+        raise SystemExit(next(result.message for result in report.results.values() if result.message))
+    errors = []
+    for number in range(1 + ENDS, count + 1 - ENDS):
+        _, lights = clean_frame(number, count, *SIZE, LAMPS)
+        fused = images_of(out / f"hr.{number:04d}.exr")
+        errors.append([image - clean for image, clean in zip(fused, [sum(lights), *lights], strict=True)])
+    beauty, *passes = (scores(each) for each in np.swapaxes(np.array(errors), 0, 1))
+    found = {"beauty": beauty, "passes": np.mean(passes, axis=0)}
+    key: Row = {"scale": scale, "quality": quality, "temporal": frames}
+    return [
+        key | {"of": name, "psnr": float(psnr), "flicker": float(flicker)} for name, (psnr, flicker) in found.items()
+    ]
+
+
+def layout(rows: list[Row]) -> str:
+    """A line for each quality, with what the neighbours gain."""
+    alone = {(row["scale"], row["quality"], row["of"]): row for row in rows if row["temporal"] == OFF}
+    body = []
+    for row in rows:
+        single = alone[row["scale"], row["quality"], row["of"]]
+        if row is not single:
+            gain, ratio = row["psnr"] - single["psnr"], row["flicker"] / single["flicker"]
+            name = f"`--quality {row['quality']}`"
+            body.append([f"x{row['scale']}", name, row["of"], f"{row['psnr']:.2f}", f"{gain:+.2f}", f"{ratio:.2f}"])
+    return results.markdown(["scale", "", "of", "PSNR", "gained, dB", "flicker, of single frames'"], body)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--frames", type=int, default=18)
+    results.add_option(parser)
+    args = parser.parse_args()
+    rows: list[Row] = []
+    for scale in (2, 4):
+        with tempfile.TemporaryDirectory() as folder:
+            write_shot(Path(folder), args.frames, *SIZE, scale, LAMPS)
+            for quality in ("balanced", "best"):
+                for frames in (OFF, "auto"):
+                    rows += measure(Path(folder), args.frames, scale, quality, frames)
+    print(layout(rows))
+    if args.table:
+        results.write(args.table, rows)
+
+
+if __name__ == "__main__":
+    main()

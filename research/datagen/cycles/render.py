@@ -1,0 +1,225 @@
+# SPDX-License-Identifier: GPL-3.0-or-later
+"""Views of a scene as training files: choose cameras, render, write."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import bpy
+import numpy as np
+import OpenImageIO as oiio
+
+from oiio_msspl.model.contract import SCALES
+from research.datagen import quality, views
+
+from . import scenes
+from .assets import Assets
+
+_ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
+# By split: samples are added until a reference reaches the first PSNR [dB], up to the third figure times `ref_spp`. A
+# reference below the second PSNR is not used. Training references may be noisy: their noise has zero mean, and many
+# scenes help more than clean ones. Validation and test references must be clean.
+_REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
+_LIGHT_PASSES = (
+    "diffuse_direct",
+    "diffuse_indirect",
+    "diffuse_color",
+    "glossy_direct",
+    "glossy_indirect",
+    "glossy_color",
+)
+_FILTERS = {"BOX": "box", "BLACKMAN_HARRIS": "blackman-harris"}
+
+
+class Renderer:
+    """Cycles on the open scene, at frame 1. It renders into one scratch file."""
+
+    def __init__(self, scratch: Path, stage: scenes.Stage, threads: int) -> None:
+        self._file = scratch / "render.exr"
+        self._scene = scene = stage.scene
+        rng = stage.rng
+        scene.render.engine = "CYCLES"
+        c = scene.cycles
+        c.device = "CPU"
+        c.use_denoising = c.use_adaptive_sampling = c.use_animated_seed = False
+        c.sample_clamp_direct = c.sample_clamp_indirect = 0.0
+        c.caustics_reflective = c.caustics_refractive = stage.caustics
+        c.blur_glossy = 0.0 if rng.random() < 0.5 else 1.0  # "Filter Glossy": 1 is Blender's default
+        # Blender's default amounts to blue noise in final renders.
+        c.sampling_pattern = str(rng.choice(["BLUE_NOISE", "TABULATED_SOBOL"]))
+        c.max_bounces = int(rng.integers(8, 13))
+        limit = c.max_bounces if rng.random() < 0.5 else 4
+        c.diffuse_bounces = c.glossy_bounces = limit
+        c.transmission_bounces = c.max_bounces
+        c.volume_bounces = 2
+        r = scene.render
+        r.threads_mode, r.threads = "FIXED", threads
+        r.use_persistent_data = True
+        r.use_compositing = r.use_sequencer = False
+        r.resolution_percentage, r.dither_intensity = 100, 0.0
+        r.film_transparent = False
+        r.filepath = str(self._file)
+        image = r.image_settings
+        image.media_type, image.file_format = "MULTI_LAYER_IMAGE", "OPEN_EXR_MULTILAYER"
+        image.color_depth, image.exr_codec, image.use_exr_interleave = "32", "NONE", True
+        self.settings = {
+            "sampler": c.sampling_pattern.lower(), "bounces": c.max_bounces, "diffuse_bounces": limit,
+            "caustics": stage.caustics, "motion_blur": r.use_motion_blur,
+        }  # fmt: skip
+
+    def layers(self, on: bool) -> None:
+        """Switch all AOVs on, or all but the colour off."""
+        layer = self._scene.view_layers[0]
+        for name in _LIGHT_PASSES:
+            setattr(layer, f"use_pass_{name}", on)
+        layer.cycles.denoising_store_passes = on
+
+    def render(self, size: int, spp: int, seed: int, pixel_filter: str = "BOX") -> dict[str, np.ndarray]:
+        """Render; return AOVs (size, size, C) by Blender's names, scene-linear and finite."""
+        c = self._scene.cycles
+        c.samples, c.seed = spp, seed
+        c.pixel_filter_type, c.filter_width = pixel_filter, 1.5
+        self._scene.render.resolution_x = self._scene.render.resolution_y = size
+        bpy.ops.render.render(write_still=True)
+        buffer = oiio.ImageBuf(str(self._file))
+        if buffer.has_error:
+            raise RuntimeError(f"Cycles wrote no image: {buffer.geterror()}")
+        pixels = np.nan_to_num(buffer.get_pixels(oiio.FLOAT), nan=0.0, posinf=0.0, neginf=0.0)
+        found: dict[str, list[int]] = {}
+        for i, channel in enumerate(buffer.spec().channelnames):
+            found.setdefault(channel.split(".")[-2], []).append(i)
+        return {name: pixels[..., channels] for name, channels in found.items()}
+
+
+def features(layers: dict[str, np.ndarray]) -> np.ndarray:
+    """Colour, albedo, normal, diffuse, specular, (H, W, 15), composed as the package composes a Cycles file."""
+    diffuse = (layers["Diffuse Direct"] + layers["Diffuse Indirect"]) * layers["Diffuse Color"]
+    specular = (layers["Glossy Direct"] + layers["Glossy Indirect"]) * layers["Glossy Color"]
+    parts = [layers["Combined"][..., :3], layers["Denoising Albedo"], layers["Denoising Normal"], diffuse, specular]
+    return np.concatenate(parts, axis=-1)
+
+
+def _color(layers: dict[str, np.ndarray]) -> np.ndarray:
+    return layers["Combined"][..., :3]
+
+
+def find_cameras(renderer: Renderer, stage: scenes.Stage, seed: int, view: int) -> Iterator[dict[str, object]]:
+    """Yield random cameras that are not inside an object, in front of a bare wall or in the dark."""
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.default_rng([seed, view, attempt, scenes.VERSION])
+        camera = scenes.aim(stage, rng)
+        renderer.layers(True)
+        probe = renderer.render(32, 16, int(rng.integers(2**31)))
+        depth = probe["Denoising Depth"]
+        near = np.percentile(np.where(depth > 0, depth, 1e3), 10)  # metres; 0: background
+        if (near > 0.15 or stage.hazy) and quality.shows_something(features(probe)):
+            yield camera
+
+
+def _reference(
+    renderer: Renderer, rng: np.random.Generator, spp: int, pixel_filter: str, good: float, worst: float, steps: int
+) -> tuple[np.ndarray, int, float] | None:
+    """Render a reference: `spp` samples a pixel at a time, at most `steps` times, until its PSNR is `good`.
+
+    Returns:
+        The image (H, W, 3), its spp and its estimated sRGB PSNR; None if that is below `worst`.
+    """
+    halves, done = np.zeros((2, views.SIZE, views.SIZE, 3)), 0
+    while True:
+        for half in range(2):
+            halves[half] += (
+                spp / 2 * _color(renderer.render(views.SIZE, spp // 2, int(rng.integers(2**31)), pixel_filter))
+            )
+        done += spp
+        psnr = quality.psnr_of_mean(*halves * (2 / done))
+        if psnr > good or done >= steps * spp:
+            return (halves.sum(0) / done, done, psnr) if psnr > worst else None
+
+
+def render_view(
+    renderer: Renderer,
+    stage: scenes.Stage,
+    camera: dict[str, object],
+    seed: int,
+    view: int,
+    ref_spp: int,
+    filter_name: str | None,
+) -> dict[str, np.ndarray] | None:
+    """Render all arrays of one view, see :mod:`research.datagen.views`; None if the reference stays too noisy."""
+    rng = np.random.default_rng([seed, view, 7])
+    pixel_filter = "BLACKMAN_HARRIS" if seed % 4 == 3 else "BOX"
+    lr_filter = "BOX"
+    if filter_name is not None:
+        pixel_filter = lr_filter = next(each for each, name in _FILTERS.items() if name == filter_name)
+    # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
+    scales = (1,) if lr_filter == "BOX" else SCALES
+
+    good, worst, steps = _REFERENCE[views.split_of(seed)]
+
+    def some_seed() -> int:
+        return int(rng.integers(2**31))
+
+    renderer.layers(False)
+
+    def lrhs(scale: int, spp: int) -> np.ndarray:
+        return _color(renderer.render(views.SIZE // scale, scale**2 * spp, some_seed(), lr_filter))
+
+    lr = {scale: np.stack([lrhs(scale, spp) for spp in views.LR_SPP]) for scale in scales}
+    # The noise of the LR passes tells whether the reference can become clean enough.
+    passes = lr[scales[0]]
+    first = np.average(passes[:-1], axis=0, weights=views.LR_SPP[:-1])
+    samples = scales[0] ** 2 * sum(views.LR_SPP)
+    if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(steps * ref_spp / samples) < worst:
+        return None
+    found = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
+    if found is None:
+        return None
+    ref, spent, psnr = found
+    renderer.layers(True)
+    hr = np.stack([features(renderer.render(views.SIZE, 1, some_seed(), pixel_filter)) for _ in range(views.HR_PASSES)])
+    meta = {
+        "seed": f"cycles-{seed}",
+        "view": view,
+        "split": views.split_of(seed),
+        "generator": scenes.VERSION,
+        "kind": stage.kind,
+        "renderer": f"Blender {bpy.app.version_string} Cycles",
+        **renderer.settings,
+        "filter": _FILTERS[pixel_filter],
+        "lr_filter": _FILTERS[lr_filter],
+        "ref_spp": spent,
+        "ref_psnr": psnr,
+        "assets": sorted(stage.sources),
+        "camera": camera,
+    }
+    return views.pack(hr, lr, ref, rng, meta)
+
+
+def render_scene(
+    out: Path, seed: int, assets: Assets, count: int, ref_spp: int, threads: int, filter_name: str | None
+) -> tuple[int, str]:
+    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene.
+
+    Args:
+        filter_name: pixel filter of both renders. If None, the LRHS has a box filter, and the HRLS of every fourth
+            seed a wider one.
+    """
+    missing = [v for v in range(count) if not views.path_of(out, "cycles", seed, v).exists()]
+    if not missing:
+        return 0, "done before"
+    stage = scenes.build(seed, assets)
+    written = 0
+    shared = Path("/dev/shm")  # a RAM disk, on Linux
+    with tempfile.TemporaryDirectory(prefix="cycles-views-", dir=shared if shared.is_dir() else None) as scratch:
+        renderer = Renderer(Path(scratch), stage, threads)
+        for view in missing:
+            cameras = find_cameras(renderer, stage, seed, view)
+            renders = (render_view(renderer, stage, c, seed, view, ref_spp, filter_name) for c in cameras)
+            arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
+            if arrays is not None:
+                views.save(views.path_of(out, "cycles", seed, view), arrays)
+                written += 1
+    return written, stage.kind

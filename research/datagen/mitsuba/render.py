@@ -1,0 +1,127 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Views of a scene as training files: choose cameras, render, expose, write."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from itertools import islice
+from pathlib import Path
+
+import mitsuba as mi
+import numpy as np
+
+from oiio_msspl.model.contract import SCALES
+from research.datagen import quality, views
+
+from . import scenes
+from .assets import Assets
+from .trace import MAX_DEPTH, Camera, PixelFilter, blackman_harris, box, render_passes
+
+_ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
+_GOOD_REFERENCE, _WORST_REFERENCE = 27.0, 21.0  # dB, of the reference's own noise
+_BATCH = 16  # samples a pixel per wavefront: bounds the memory
+_WIDTHS = (
+    1.0,
+    3.2,
+)  # width of the Blackman-Harris filter in pixels; Blender's default is 1.5, other renderers use up to 3
+
+
+def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int, lit_share: float = 0.6) -> Iterator[Camera]:
+    """Yield random cameras that are not inside an object, in front of a bare wall or in the dark.
+
+    At 16 spp and 32 x 32 pixels, at least `lit_share` of the pixels must have light.
+    """
+    for attempt in range(_ATTEMPTS):
+        rng = np.random.default_rng([seed, view, attempt, scenes.VERSION])
+        camera = scenes.camera(plan, rng)
+        probe = render_passes(scene, camera, 32, 16, seed=int(rng.integers(2**31)))
+        if quality.shows_something(probe.mean(0), lit_share) and _distance(scene, camera) > 0.15:
+            yield camera
+
+
+def _distance(scene: mi.Scene, camera: Camera) -> float:
+    """The 10th percentile of the depths of a 16 x 16 grid of pixels, in metres."""
+    y, x = np.mgrid[0:16, 0:16].reshape(2, -1) / 16
+    rays = camera.rays(mi.Float(x), mi.Float(y), mi.Point2f(0.5))
+    t = scene.ray_intersect(rays).t.numpy()
+    return float(np.percentile(np.minimum(t, 1e3), 10))
+
+
+def _reference(
+    scene: mi.Scene, camera: Camera, spp: int, seed: int, pixel_filter: PixelFilter
+) -> tuple[np.ndarray, int, float] | None:
+    """Render a reference with `spp` samples a pixel, or with twice as many if it is still noisy.
+
+    Returns:
+        The image (H, W, 3), its spp and its estimated sRGB PSNR; None if the first samples show that it would stay
+        too noisy.
+    """
+    halves, done = np.zeros((2, views.SIZE, views.SIZE, 3)), 0
+
+    def psnr() -> float:
+        return quality.psnr_of_mean(*halves * (2 / done))
+
+    while True:
+        for half in range(2):
+            passes = render_passes(
+                scene, camera, views.SIZE, _BATCH, seed + done + half, layers=False, pixel_filter=pixel_filter
+            )
+            halves[half] += passes.sum(0, dtype=np.float64)
+        done += 2 * _BATCH
+        if done == 2 * _BATCH and psnr() + 10 * np.log10(2 * spp / done) < _WORST_REFERENCE:
+            return None
+        if done >= 2 * spp or (done >= spp and psnr() > _GOOD_REFERENCE):
+            return halves.sum(0) / done, done, psnr()
+
+
+def _lrhs(scene: mi.Scene, camera: Camera, scale: int, seed: int, pixel_filter: PixelFilter) -> np.ndarray:
+    """Render the `lr` passes at 1/scale of the resolution with scale² times the samples: (Q, H/s, W/s, 3)."""
+    size, more = views.SIZE // scale, {"layers": False, "pixel_filter": pixel_filter}
+    renders = (render_passes(scene, camera, size, scale**2 * n, seed + i, **more) for i, n in enumerate(views.LR_SPP))
+    return np.stack([passes.mean(0) for passes in renders])
+
+
+def render_view(
+    scene: mi.Scene, plan: scenes.Scene, camera: Camera, seed: int, view: int, ref_spp: int, filter_name: str
+) -> dict[str, np.ndarray] | None:
+    """Render all arrays of one view, see :mod:`research.datagen.views`; None if the reference stays too noisy."""
+    rng = np.random.default_rng([seed, view, 7])
+    # Each of the three independent renders gets 1000 seeds of its own.
+    base = [int(s) * 1000 for s in rng.choice(4_000_000, 3, replace=False)]
+    width = float(np.random.default_rng([seed, 8]).uniform(*_WIDTHS))  # the same for all views of a scene
+    pixel_filter = box if filter_name == "box" else blackman_harris(width)
+    found = _reference(scene, camera, ref_spp, base[0], pixel_filter)
+    if found is None:
+        return None
+    ref, ref_spp, psnr = found
+    hr = render_passes(scene, camera, views.SIZE, views.HR_PASSES, base[1], pixel_filter=pixel_filter)
+    # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
+    scales = (1,) if pixel_filter is box else SCALES
+    lr = {scale: _lrhs(scene, camera, scale, base[2] + 100 * scale, pixel_filter) for scale in scales}
+
+    meta = {
+        "seed": seed, "view": view, "split": views.split_of(seed), "generator": scenes.VERSION, "kind": plan.kind,
+        "renderer": f"Mitsuba {mi.__version__}, variant {mi.variant()}, own path tracer, {MAX_DEPTH} bounces",
+        "sampler": "independent", "filter": filter_name if pixel_filter is box else f"{filter_name} {width:.2f}",
+        "ref_spp": ref_spp, "ref_psnr": psnr,
+        "assets": sorted(plan.sources), "camera": camera.__dict__,
+    }  # fmt: skip
+    return views.pack(hr, lr, ref, rng, meta)
+
+
+def render_scene(out: Path, seed: int, assets: Assets, count: int, ref_spp: int, filter_name: str) -> tuple[int, str]:
+    """Render the missing ones of a scene's first `count` views; return how many were written and the kind of scene."""
+    missing = [v for v in range(count) if not views.path_of(out, "mitsuba", seed, v).exists()]
+    if not missing:
+        return 0, "done before"
+    scene, plan = scenes.build(seed, assets)
+    written = 0
+    for view in missing:
+        cameras = find_cameras(scene, plan, seed, view)
+        renders = (render_view(scene, plan, c, seed, view, ref_spp, filter_name) for c in cameras)
+        arrays = next((r for r in islice(renders, _RENDERS) if r is not None), None)
+        if arrays is None:
+            continue
+        views.save(views.path_of(out, "mitsuba", seed, view), arrays)
+        written += 1
+    return written, plan.kind

@@ -1,0 +1,77 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Checkpoints of training runs: write, read, and start another network from one.
+
+A checkpoint is a dictionary that ``torch.save`` wrote:
+
+* ``architecture`` and ``config``: the network's name and its constructor's arguments;
+* ``ema``: the averaged weights, which are exported;
+* ``network`` and ``optimizer``: the state of the run, if it is to continue;
+* ``training_spp``, ``provenance``: for the exported model's contract.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from research.training.networks import NETWORKS, Network
+from research.training.paper import MultiResolutionFusion
+
+State = dict[str, Any]
+log = logging.getLogger(__name__)
+
+#: Parts of a checkpoint that only a continued run needs.
+RUN_STATE = ("network", "optimizer", "best_gain")
+#: Parts of a parameter's name that older checkpoints have, and what they are called now.
+RENAMED = {"together.": "mean_denoiser.", ".more": ".extra"}
+
+
+def save(state: State, path: Path) -> None:
+    """Write a checkpoint whole or not at all, because a run may be killed at any time."""
+    partial = path.with_suffix(".partial")
+    torch.save(state, partial)
+    os.replace(partial, path)
+
+
+def read(path: Path) -> State:
+    """Read a checkpoint; parameters get their present names."""
+    state = torch.load(path, map_location="cpu", weights_only=True)
+    for key in ("ema", "network"):
+        if key in state:
+            state[key] = {_present_name(name): value for name, value in state[key].items()}
+    return state
+
+
+def _present_name(parameter: str) -> str:
+    for old, new in RENAMED.items():
+        parameter = parameter.replace(old, new)
+    return parameter
+
+
+def load(path: Path) -> tuple[Network, State]:
+    """The network of a checkpoint with its averaged weights, and the whole checkpoint."""
+    state = read(path)
+    network = NETWORKS[state["architecture"]](**state["config"])
+    network.load_state_dict(state["ema"])
+    return network.eval(), state
+
+
+def warm_start(network: Network, path: Path) -> None:
+    """Copy the averaged weights of another run that fit: all scales share the trunk, and stages by position.
+
+    Stages that the other network lacks start as resampling of their features. So the paper's network for a larger scale
+    starts as the one for the smaller scale followed by bilinear upsampling.
+    """
+    if isinstance(network, MultiResolutionFusion):
+        for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
+            deshuffle.reset_to_average()
+            shuffle.reset_to_bilinear(network.config["channels"])
+    state = read(path)
+    theirs, ours = state["ema"], network.state_dict()
+    fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
+    network.load_state_dict(ours | fitting)
+    log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)

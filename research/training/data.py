@@ -1,0 +1,562 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training pairs drawn at random from rendered views: which samples, which augmentations, and the loader of batches.
+
+On a CPU the views stay memory-mapped, and a worker process draws ahead of training. On a GPU they are loaded once, and
+the whole batch is augmented there, so that the GPU does not wait for the host.
+"""
+
+from __future__ import annotations
+
+import math
+import signal
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+from torch.utils.data import DataLoader, IterableDataset
+
+from oiio_msspl.aovs.features import (
+    ALBEDO,
+    DEFAULTS,
+    DIFFUSE,
+    HRLS_FEATURES,
+    NORMAL,
+    OPTIONAL_FEATURES,
+    RADIANCE_FEATURES,
+    RGB,
+    SPECULAR,
+    VARIANCE,
+)
+from oiio_msspl.image.colour import LUMINANCE_WEIGHTS
+from research.datagen.samples import MANTISSA, STEP
+from research.datagen.views import NO_REFERENCE, PASS_FEATURES, REF_CELLS, Array, Folder, SampleView, View
+from research.training.encoding import compress, exposure_of, luminance, pack, repair
+from research.training.ops import box_downsample
+from research.training.splat import Filtered, apply, draw_filter, filter_reference
+
+#: A batch by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w), all encoded, in
+#: channels-last memory. Some networks read further channels of the first two.
+Batch = dict[str, Tensor]
+
+#: Adds the further input channels of a network to an encoded pair, (h, w, 3) and (s*h, s*w, 16).
+Prepare = Callable[[Array, Array], tuple[Array, Array]]
+
+
+# How pairs are sampled
+
+#: Height and width of the HR patch for each scale, as in the paper.
+PAPER_PATCH = {2: 96, 4: 192, 8: 256}
+
+
+@dataclass(frozen=True)
+class Sampling:
+    """How training pairs are drawn: which renders they imitate, and the augmentations. Shares are probabilities."""
+
+    hrls_spp: tuple[float, ...] = (0.22, 0.2, 0.12, 0.2, 0.05, 0.06, 0.05, 0.1)
+    """Weights of 1, 2, 3, ... spp in the HRLS. Low spp is the difficult case, and the one that users have."""
+    lrhs_passes: tuple[float, ...] = (0.65, 0.2, 0.05, 0.05, 0.05)
+    """Weights of 1, 2, 3, ... ``lr`` passes in the LRHS."""
+    clip: float = math.inf
+    """Upper bound of radiance, as in the paper. The log encoding needs none."""
+    nearest: float = 0.15
+    """Share with the paper's nearest-neighbour LRHS instead of a box-filtered one."""
+    exposure_stops: float = 0.5
+    """Exposure jitter, plus or minus: inference may estimate the exposure from another crop or frame."""
+    gain_stops: float = 0.5
+    """Random gain per channel of radiance, plus or minus; the albedo stays."""
+    permute: float = 0.5
+    """Share with permuted colour channels of radiance and albedo."""
+    grey: float = 0.05
+    """Share with r = g = b in all radiance, because models also fuse single-channel layers."""
+    drop_each: float = 0.1
+    """Share in which an optional feature is missing, independently for each feature."""
+    drop_lobes: float = 0.5
+    """Share without diffuse and specular, which many renders lack."""
+    drop_variance: float = 0.7
+    """Share without the variance, which few renderers write."""
+    drop_all: float = 0.05
+    """Share with colour only."""
+    spread_noise: bool | None = None
+    """Of views with single samples: only pixel filters that spread noise, only others, or all (None)."""
+    uneven: float = 0.0
+    """Share of the pairs of views with single samples in which parts of both renders have all stored samples, as the
+    averaged frames of a shot have."""
+
+
+#: The paper's sampling, as far as its text describes it: crops only, all features, clipped, nearest-neighbour LRHS.
+PAPER_SAMPLING = Sampling(
+    hrls_spp=(1.0,) * 8,
+    clip=100.0,
+    nearest=1.0,
+    exposure_stops=0.0,
+    gain_stops=0.0,
+    permute=0.0,
+    grey=0.0,
+    drop_each=0.0,
+    drop_lobes=0.0,
+    drop_variance=0.0,
+    drop_all=0.0,
+)
+
+
+def spp_range(view: View | SampleView, sampling: Sampling, scale: int) -> dict[str, list[int]]:
+    """Lowest and highest spp of the pairs that :func:`draw` makes of a view, for the model's contract."""
+    samples = scale**2 if sampling.nearest < 1 else 1
+    return {
+        "hrls": [1, min(len(sampling.hrls_spp), len(view.hr))],
+        "lrhs": [max(2, int(view.lr_spp.min()) * samples), int(view.lr_spp.sum()) * samples],
+    }
+
+
+# One batch
+
+
+#: Rows and columns of a crop, in HRLS pixels.
+Area = tuple[slice, slice]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A pair that was drawn from a view: linear, without negative radiance."""
+
+    features: dict[str, Tensor]
+    """(patch, patch, channels) by name, of the HRLS"""
+    variance: Tensor | None
+    """(patch, patch), of the luminance of the HRLS; None if it has one sample a pixel"""
+    lrhs: Tensor
+    """(H/s, W/s, 3), of the whole view"""
+    target: Tensor
+    """(patch, patch, 3)"""
+
+
+def _draw_spp(spp: np.ndarray, sampling: Sampling, nearest: bool, rng: np.random.Generator) -> tuple[int, np.ndarray]:
+    """Samples per pixel of the HRLS, and the passes of the LRHS, whose spp are given."""
+    while True:
+        n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
+        k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
+        # Passes of few samples are more likely, because the LRHS should get the smaller part of all samples
+        passes = rng.choice(len(spp), min(k, len(spp)), replace=False, p=_normalised(tuple(1 / spp)))
+        # A nearest-neighbour LRHS needs more spp than the HRLS, as in the paper
+        if not nearest or spp[passes].sum() > n:
+            return n, passes
+
+
+@dataclass(frozen=True)
+class ViewTensors:
+    """The arrays of a view as tensors, see :mod:`research.datagen.views`."""
+
+    hr: Tensor
+    lr: dict[int, Tensor]
+    ref: Tensor
+    lr_spp: np.ndarray
+
+    @classmethod
+    def of(cls, view: View, device: torch.device) -> ViewTensors:
+        """On a CPU the tensors share the file's mapped memory."""
+
+        def on_device(array: np.ndarray) -> Tensor:
+            return torch.from_numpy(array).to(device)
+
+        lr = {scale: on_device(passes) for scale, passes in view.lr.items()}
+        return cls(on_device(view.hr), lr, on_device(view.ref), view.lr_spp)
+
+    def lrhs(self, passes: np.ndarray, scale: int, clip: float, *, nearest: bool) -> Tensor:
+        """As :func:`research.datagen.views.mean_lrhs`, clipped before pixels are averaged: (H/s, W/s, 3)."""
+        stored = self.lr[scale if scale in self.lr else 1]
+        weights = torch.from_numpy((self.lr_spp[passes] / self.lr_spp[passes].sum()).astype(np.float32))
+        mean = torch.einsum(
+            "p,phwc->hwc", weights.to(stored.device), repair(torch.stack([stored[p] for p in passes]))
+        ).clamp_max(clip)
+        if scale in self.lr:
+            return mean
+        if nearest:
+            return mean[scale // 2 :: scale, scale // 2 :: scale]
+        return box_downsample(mean.permute(2, 0, 1)[None], scale)[0].permute(1, 2, 0)
+
+    @property
+    def device(self) -> torch.device:
+        return self.ref.device
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in HRLS pixels."""
+        return self.ref.shape[0], self.ref.shape[1]
+
+    def draw(self, scale: int, area: Area, light: Tensor, sampling: Sampling, rng: np.random.Generator) -> Rendered:
+        """Draw the samples of a pair; its radiance is multiplied by ``light``, (3, 3)."""
+        nearest = rng.random() < sampling.nearest
+        n, lr_passes = _draw_spp(self.lr_spp, sampling, nearest, rng)
+        lrhs = self.lrhs(lr_passes, scale, sampling.clip, nearest=nearest)
+        passes = [self.hr[p, *area] for p in rng.permutation(len(self.hr))[:n]]
+        features = _split(repair(torch.stack(passes), signed=True))
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name].clamp(0.0, sampling.clip)
+        variance = luminance(features[RGB] @ light).var(dim=0) / n if n > 1 else None
+        features = {name: values.mean(dim=0) for name, values in features.items()}
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name] @ light
+        target = repair(self.ref[area]).clamp_max(sampling.clip)
+        return Rendered(features, variance, lrhs @ light, target @ light)
+
+
+@dataclass(frozen=True)
+class SampleTensors:
+    """The arrays of a view with single samples as tensors, see :mod:`research.datagen.samples`."""
+
+    arrays: dict[str, Tensor]
+    clean_reference: Tensor | None = None
+    """(1, 3, R*H, R*W), in place of the stored reference."""
+
+    @classmethod
+    def of(cls, view: SampleView, device: torch.device) -> SampleTensors:
+        """On a CPU the tensors share the file's mapped memory."""
+        arrays = {name: array for name, array in view.arrays.items() if name != "meta"}
+        signed = {name: a.view(np.int32) if a.dtype == np.uint32 else a for name, a in arrays.items()}
+        return cls({name: torch.from_numpy(array).to(device) for name, array in signed.items()})
+
+    @property
+    def device(self) -> torch.device:
+        return self.arrays["ref"].device
+
+    def noisy_reference(self) -> tuple[Tensor, Tensor, Tensor] | None:
+        """Colour, albedo and normal, (1, 3, R*H, R*W), of a reference that is to be denoised; else None."""
+        if "ref_albedo" not in self.arrays:
+            return None
+        albedo, normal = (self.arrays[f"ref_{name}"].float().movedim(-1, 0)[None] for name in (ALBEDO, NORMAL))
+        return _decode_radiance(self.arrays["ref"][None]), albedo / 255, normal / 127
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """Height and width in HRLS pixels."""
+        return self.arrays["color"].shape[1], self.arrays["color"].shape[2]
+
+    def read(self, name: str, samples: Tensor, rows: slice, columns: slice) -> Tensor:
+        """Some samples of an array in a crop: (k, C, h, w); places are (k, h, w, 2)."""
+        stored = self.arrays[name][samples, rows, columns]
+        layer = name.removeprefix("lr_")
+        if layer == "place":
+            return (stored.float() + 0.5) / 256
+        if layer == ALBEDO:
+            return stored.float().movedim(-1, 1) / 255
+        if layer == NORMAL:
+            return stored.float().movedim(-1, 1) / 127
+        return _decode_radiance(stored)
+
+    def draw(self, scale: int, area: Area, light: Tensor, sampling: Sampling, rng: np.random.Generator) -> Rendered:
+        """Draw a filter and the samples of a pair; its radiance is multiplied by ``light``, (3, 3).
+
+        Both renders and the reference have the same filter, the LRHS in its own pixels.
+        """
+        pixel_filter = draw_filter(rng, spread_noise=sampling.spread_noise)
+        lr_count = len(self.arrays["lr_color"])
+        n, lr_samples = _draw_spp(np.ones(lr_count), sampling, False, rng)
+        device = light.device
+        order = torch.from_numpy(rng.permutation(len(self.arrays["color"]))).to(device)
+        generator = torch.Generator(device).manual_seed(int(rng.integers(2**63)))
+
+        # The crop with as much around it as the filter reaches
+        height, width = self.size
+        wide = [
+            slice(max(side.start - pixel_filter.reach, 0), min(side.stop + pixel_filter.reach, size))
+            for side, size in zip(area, (height, width), strict=True)
+        ]
+        inner = (
+            slice(None),
+            *(slice(side.start - w.start, side.stop - w.start) for side, w in zip(area, wide, strict=True)),
+        )
+        names = {RGB: "color"} | {name: name for name in PASS_FEATURES if name != RGB}
+
+        def hrls(count: int) -> Filtered:
+            drawn = order[: pixel_filter.samples_for(count)]
+            layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
+            for name in RADIANCE_FEATURES:
+                layers[name] = _lit(layers[name], light)
+            place = self.read("place", drawn, *wide)
+            measure = luminance(layers[RGB].movedim(1, -1))
+            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, count, generator)
+
+        whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
+
+        def lrhs(samples: np.ndarray) -> Tensor:
+            chosen = torch.from_numpy(samples).to(device)
+            color = _lit(self.read("lr_color", chosen, *whole), light)
+            return apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator).mean
+
+        few = hrls(n)
+        features, variance, low = few.mean[inner], few.variance, lrhs(lr_samples)
+        has_variance = (n > 1 or pixel_filter.spreads_noise) and variance is not None
+        if sampling.uneven and rng.random() < sampling.uneven:
+            more = _random_parts(height, width, rng).to(device)
+            features = torch.where(more[area], hrls(len(order)).mean[inner], features)
+            coarse = more[::scale, ::scale][: low.shape[-2], : low.shape[-1]]
+            low = torch.where(coarse, lrhs(np.arange(lr_count)), low)
+            has_variance = False  # which parts have more samples is not known
+        features = _split(features.movedim(0, -1))
+        for name in RADIANCE_FEATURES:
+            features[name] = features[name].clamp(0.0, sampling.clip)
+
+        cells = [slice(w.start * REF_CELLS, w.stop * REF_CELLS) for w in wide]
+        if self.clean_reference is None:
+            ref = _decode_radiance(self.arrays["ref"][None, *cells])
+        else:
+            ref = self.clean_reference[:, :, *cells]
+        target = filter_reference(pixel_filter, _lit(ref, light)[0], REF_CELLS)[inner].movedim(0, -1)
+        return Rendered(
+            features,
+            variance[inner[1:]] if has_variance else None,
+            low.movedim(0, -1).clamp(0.0, sampling.clip),
+            target.clamp(0.0, sampling.clip),
+        )
+
+
+def _random_parts(height: int, width: int, rng: np.random.Generator, cell: int = 8) -> Tensor:
+    """A random part of an image, (H, W) of bool: where smooth noise is above a random one of its values. Its edges lie
+    on a grid of ``cell`` pixels, so that it is the same in an LRHS of every scale."""
+    noise = torch.from_numpy(rng.standard_normal((1, 1, 6, 6)).astype(np.float32))
+    cells = F.interpolate(noise, (-(-height // cell), -(-width // cell)), mode="bilinear")[0, 0]
+    chosen = cells > cells.flatten()[int(rng.integers(cells.numel()))]
+    return chosen.repeat_interleave(cell, 0).repeat_interleave(cell, 1)[:height, :width]
+
+
+def _decode_radiance(stored: Tensor) -> Tensor:
+    """As :func:`research.datagen.samples.decode`, with the channels second: (k, h, w) to (k, 3, h, w)."""
+    mantissas = torch.stack([stored >> shift & MANTISSA for shift in (0, 9, 18)], dim=1).float()
+    return mantissas * torch.exp2((stored >> 27 & 31).float() + math.log2(STEP))[:, None]
+
+
+def _lit(radiance: Tensor, light: Tensor) -> Tensor:
+    """Radiance (k, 3, h, w) @ light."""
+    return torch.einsum("kihw,ij->kjhw", radiance, light)
+
+
+def draw(
+    views: Sequence[ViewTensors | SampleTensors],
+    scale: int,
+    patch: int,
+    count: int,
+    rng: np.random.Generator,
+    sampling: Sampling,
+    prepare: Prepare | None = None,
+) -> Batch:
+    """Draw a batch of ``count`` pairs of ``patch`` x ``patch`` HRLS pixels.
+
+    Views, crops, spp, pixel filter, light, exposure and missing features differ within a batch. Mirroring and rotation
+    are those of the batch. ``prepare`` appends further channels to the renders' own.
+    """
+    # Views and crops
+    chosen = [views[i] for i in rng.choice(len(views), count)]
+    areas: list[Area] = []
+    for view in chosen:
+        top, left = (scale * int(rng.integers((size - patch) // scale + 1)) for size in view.size)
+        areas.append((slice(top, top + patch), slice(left, left + patch)))
+    device = chosen[0].device
+
+    def on_device(array: np.ndarray) -> Tensor:
+        return torch.from_numpy(np.asarray(array, dtype=np.float32)).to(device, non_blocking=True)
+
+    # Colour of the light, in linear radiance. The variance is computed afterwards, so that it has the same colour.
+    permutation = np.stack(
+        [np.eye(3)[rng.permutation(3) if rng.random() < sampling.permute else range(3)] for _ in chosen]
+    )
+    light = on_device(np.stack([_random_light(rng, sampling) for _ in chosen]) @ permutation)
+    renders = [
+        view.draw(scale, area, of_view, sampling, rng) for view, area, of_view in zip(chosen, areas, light, strict=True)
+    ]
+    features = {name: torch.stack([pair.features[name] for pair in renders]) for name in PASS_FEATURES}
+    features[ALBEDO] = features[ALBEDO].clamp_min(0.0) @ on_device(permutation)[:, None]
+    target = torch.stack([pair.target for pair in renders])
+    black = torch.zeros_like(target[0, ..., 0])
+    features[VARIANCE] = torch.stack([black if pair.variance is None else pair.variance for pair in renders])[..., None]
+
+    # Mirroring and rotation by quarter turns. Normals may be in any space, so each view gets a random rotation of them;
+    # it mirrors if the image is mirrored.
+    mirrored, turns = rng.random() < 0.5, int(rng.integers(4))
+    turn = on_device(np.stack([random_orthogonal(rng, -1 if mirrored else 1) for _ in chosen]))
+    features[NORMAL] = features[NORMAL] @ turn[:, None]
+
+    # Exposure, estimated from the whole LRHS as at inference
+    jitter = on_device(2.0 ** rng.uniform(-sampling.exposure_stops, sampling.exposure_stops, count))
+    exposure = torch.cat([exposure_of(pair.lrhs[None]) for pair in renders]) * jitter
+    hrls = pack(features, exposure)
+
+    # Missing features get their defaults
+    present = on_device(np.stack([_present(rng, sampling, has_variance=pair.variance is not None) for pair in renders]))
+    hrls = torch.lerp(on_device(_DEFAULTS), hrls, present[:, None, None])
+
+    low_areas = [tuple(slice(side.start // scale, side.stop // scale) for side in area) for area in areas]
+    crops = [pair.lrhs[area] for pair, area in zip(renders, low_areas, strict=True)]
+    lrhs = compress(torch.stack(crops), exposure)
+    if prepare is not None:
+        prepared = [prepare(*images) for images in zip(lrhs.cpu().numpy(), hrls.cpu().numpy(), strict=True)]
+        lrhs, hrls = (on_device(np.stack(images)) for images in zip(*prepared, strict=True))
+    pair = {"lrhs": lrhs, "hrls": hrls, "target": compress(target, exposure)}
+    return {
+        name: torch.rot90(image.flip(2) if mirrored else image, turns, (1, 2)).contiguous().permute(0, 3, 1, 2)
+        for name, image in pair.items()
+    }
+
+
+def turned(pair: Batch, rng: np.random.Generator) -> Batch:
+    """Pictures (N, c, H, W) of one place, mirrored and transposed at random.
+
+    If the picture is mirrored, so are its normals: those in ``hrls``, which are channels 6 to 8 in [-1, 1], and the
+    picture ``normal``, in [0, 1]. They may be in any space, so it does not matter along which axis.
+    """
+    flips = [axis for axis in (2, 3) if rng.random() < 0.5]
+    swaps = rng.random() < 0.5
+    result = {name: (each.flip(flips).transpose(2, 3) if swaps else each.flip(flips)) for name, each in pair.items()}
+    if (len(flips) + swaps) % 2:
+        for name, channel, middle in (("hrls", 6, 0.0), ("normal", 0, 0.5)):
+            if name in result:
+                result[name][:, channel] = 2 * middle - result[name][:, channel]
+    return {name: each.contiguous(memory_format=torch.channels_last) for name, each in result.items()}
+
+
+def _per_channel(values: dict[str, Any]) -> np.ndarray:
+    return np.concatenate([np.full(channels, values[name]) for name, channels in HRLS_FEATURES.items()])
+
+
+_DEFAULTS = _per_channel({RGB: 0.0} | DEFAULTS)
+
+
+def _split(passes: Tensor) -> dict[str, Tensor]:
+    """Split passes (..., 15), in the channel order of ``hr``, into named features."""
+    parts = passes.split([HRLS_FEATURES[name] for name in PASS_FEATURES], dim=-1)
+    return dict(zip(PASS_FEATURES, parts, strict=True))
+
+
+def _normalised(weights: tuple[float, ...]) -> np.ndarray:
+    return np.asarray(weights) / np.sum(weights)
+
+
+def _random_light(rng: np.random.Generator, sampling: Sampling) -> np.ndarray:
+    """A 3x3 matrix L that changes the colour of the light: radiance @ L."""
+    if rng.random() < sampling.grey:
+        return np.repeat(np.asarray(LUMINANCE_WEIGHTS)[:, None], 3, axis=1)
+    return np.diag(2.0 ** rng.uniform(-sampling.gain_stops, sampling.gain_stops, 3))
+
+
+def _present(rng: np.random.Generator, sampling: Sampling, *, has_variance: bool) -> np.ndarray:
+    """1 for each HRLS channel whose feature is present, 0 for the others."""
+    absence = dict.fromkeys(OPTIONAL_FEATURES, sampling.drop_each) | {VARIANCE: sampling.drop_variance}
+    present = {RGB: 1.0} | {name: float(rng.random() >= share) for name, share in absence.items()}
+    if rng.random() < sampling.drop_lobes:
+        present[DIFFUSE] = present[SPECULAR] = 0.0
+    if not has_variance:
+        present[VARIANCE] = 0.0
+    if rng.random() < sampling.drop_all:
+        present |= dict.fromkeys(OPTIONAL_FEATURES, 0.0)
+    return _per_channel(present)
+
+
+def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
+    """Uniformly random 3x3 rotation (determinant 1) or rotation with a reflection (-1)."""
+    q, r = np.linalg.qr(rng.standard_normal((3, 3)))
+    q *= np.sign(np.diag(r))  # makes the decomposition unique, and so q uniform
+    if np.linalg.det(q) * determinant < 0:
+        q[:, 0] *= -1
+    return q.astype(np.float32)
+
+
+# All batches
+
+
+class Batches(IterableDataset):
+    """Endless random batches of a folder's training views.
+
+    Args:
+        scales: of each batch, one of these at random.
+        patch: width and height of a patch in HRLS pixels.
+        batch: pairs per batch.
+        prepare: returns the function that adds a network's further channels; called in the process that draws.
+        rescan_seconds: how often to look for new views on a CPU. A GPU keeps the views that it has loaded.
+    """
+
+    def __init__(
+        self,
+        folder: Path,
+        scales: tuple[int, ...],
+        patch: int,
+        batch: int,
+        sampling: Sampling,
+        seed: int,
+        device: torch.device,
+        prepare: Callable[[], Prepare | None] | None = None,
+        rescan_seconds: float = 120,
+    ) -> None:
+        self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
+        self.seed, self.device, self.prepare, self.rescan_seconds = seed, device, prepare, rescan_seconds
+
+    @torch.no_grad()
+    def __iter__(self) -> Iterator[Batch]:
+        folder, prepare = Folder(self.folder), self.prepare and self.prepare()
+        rng = np.random.default_rng(self.seed)
+        while True:
+            views = view_tensors(folder, "train", self.device)
+            deadline = time.monotonic() + self.rescan_seconds
+            while self.device.type != "cpu" or time.monotonic() < deadline:
+                scale = int(rng.choice(self.scales))
+                yield draw(views, scale, self.patch, self.batch, rng, self.sampling, prepare)
+            folder.scan()
+
+    def loader(self) -> DataLoader:
+        """Load batches: on a CPU four ahead of training, in a process of their own."""
+        if self.device.type != "cpu":
+            return DataLoader(self, batch_size=None)
+        return DataLoader(
+            self,
+            batch_size=None,
+            num_workers=1,
+            prefetch_factor=4,
+            multiprocessing_context="spawn",  # a fork would copy locked locks of other threads
+            worker_init_fn=_ignore_interrupts,
+        )
+
+
+def _ignore_interrupts(_: int) -> None:
+    """Ctrl-C reaches all processes; training ends the worker after its last checkpoint."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewTensors | SampleTensors]:
+    """The views of a split as tensors on a device, those with single samples too."""
+    passes = [ViewTensors.of(view, device) for view in folder.split(split)]
+    return [*passes, *(SampleTensors.of(view, device) for view in folder.sample_views(split))]
+
+
+def fixed_batches(
+    views: Path,
+    split: str,
+    scales: Sequence[int],
+    patch: int,
+    batch: int,
+    prepare: Prepare | None = None,
+    rng: np.random.Generator | None = None,
+    sampling: Sampling = Sampling(),
+    *,
+    without_reference: bool = False,
+) -> Iterator[Batch]:
+    """Endless batches on the CPU that are the same in every call, for calibration, pruning and the like.
+
+    Args:
+        without_reference: also of views that have none; their targets are not to be read.
+    """
+    rng, folder, device = rng or np.random.default_rng(0), Folder(views), torch.device("cpu")
+    tensors = view_tensors(folder, split, device)
+    if without_reference:
+        tensors += view_tensors(folder, NO_REFERENCE, device)
+    while True:
+        with torch.no_grad():
+            pairs = draw(tensors, int(rng.choice(scales)), patch, batch, rng, sampling, prepare)
+        yield pairs
+
+
+def to_tensor(image: Array, device: torch.device) -> Tensor:
+    """(N, H, W, C) to (N, C, H, W) in channels-last memory, without a copy on the CPU."""
+    return torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).to(device, non_blocking=True)

@@ -1,0 +1,162 @@
+# SPDX-License-Identifier: Apache-2.0
+"""PyTorch versions of the package's encodings: log-encoded radiance, the PU curve, exposure, the stack of features.
+
+The NumPy versions are those of inference; tests hold the two together.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional as F
+
+from oiio_msspl.aovs.features import ALBEDO, DEFAULTS, HRLS_FEATURES, NORMAL, RADIANCE_FEATURES, RGB, VARIANCE
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.colour import LUMINANCE_WEIGHTS
+from oiio_msspl.model.encoding import BLOCK, KEY, MAX_ALBEDO, MAX_RADIANCE, MIN_BLOCKS, MU, NO_LIGHT, NOISY
+from research.training.pu_curve import (
+    BOUNDS,
+    EXPONENT,
+    FACTOR,
+    LOG_FACTOR,
+    LOG_OFFSET,
+    LOG_SHIFT,
+    OFFSET,
+    PU_MAX,
+    SLOPE,
+    pu_encode,
+)
+
+#: Factor of the logarithm, which makes a log-encoded radiance of 1 a 1.
+LOG_SCALE = 1.0 / math.log1p(MU)
+
+
+# Log-encoded radiance, what every network reads and writes
+
+
+def log_encode(radiance: Tensor) -> Tensor:
+    """Exposed radiance >= 0 to log-encoded radiance, as :func:`oiio_msspl.model.encoding.encode_radiance`."""
+    return torch.log1p(MU * radiance) * LOG_SCALE
+
+
+def log_decode(encoded: Tensor) -> Tensor:
+    """Inverse of :func:`log_encode`, as :func:`oiio_msspl.model.encoding.decode_radiance`."""
+    return torch.expm1(encoded / LOG_SCALE) / MU
+
+
+# The PU curve, what Open Image Denoise's networks read and write
+
+
+def log_to_pu(encoded: Tensor) -> Tensor:
+    """Log-encoded radiance to PU-encoded radiance in [0, 1], as :func:`research.training.pu_curve.pu_encode`."""
+    radiance = log_decode(encoded.float()).clamp(0.0, MAX_RADIANCE)
+    low, middle = BOUNDS
+    power = FACTOR * radiance.clamp_min(low) ** EXPONENT + OFFSET
+    curve = torch.where(radiance <= middle, power, LOG_FACTOR * torch.log(radiance + LOG_SHIFT) + LOG_OFFSET)
+    return torch.where(radiance <= low, SLOPE * radiance, curve) / PU_MAX
+
+
+def pu_to_log(encoded: Tensor) -> Tensor:
+    """Inverse of :func:`log_to_pu`, as :func:`research.training.pu_curve.pu_decode`."""
+    curve = encoded * PU_MAX
+    low, middle = (pu_encode(np.asarray(BOUNDS)) * PU_MAX).tolist()
+    # The branches are bounded: an infinity that torch.where discards would still make its gradient NaN.
+    power = ((curve.clamp(low, middle) - OFFSET) / FACTOR) ** (1 / EXPONENT)
+    logarithm = torch.exp((curve.clamp_min(middle) - LOG_OFFSET) / LOG_FACTOR) - LOG_SHIFT
+    radiance = torch.where(curve <= middle, power, logarithm)
+    return log_encode(torch.where(curve <= low, curve / SLOPE, radiance))
+
+
+# Renders
+
+
+def luminance(rgb: Tensor) -> Tensor:
+    """Rec. 709 luminance of (..., 3) linear RGB: (...)."""
+    return rgb @ rgb.new_tensor(LUMINANCE_WEIGHTS)
+
+
+def srgb(exposed: Tensor) -> Tensor:
+    """Exposed radiance to sRGB values in [0, 1]."""
+    exposed = exposed.clamp(0.0, 1.0)
+    return torch.where(exposed <= 0.0031308, 12.92 * exposed, 1.055 * exposed.clamp_min(0.0031308) ** (1 / 2.4) - 0.055)
+
+
+def from_srgb(encoded: Tensor) -> Tensor:
+    """Inverse of :func:`srgb`."""
+    return torch.where(encoded <= 0.04045, encoded / 12.92, ((encoded.clamp_min(0.0) + 0.055) / 1.055) ** 2.4)
+
+
+def repair(values: Tensor, *, signed: bool = False) -> Tensor:
+    """Stored half floats as finite float32, non-negative unless ``signed``."""
+    values = torch.nan_to_num(values.float(), nan=0.0, posinf=MAX_RADIANCE, neginf=-MAX_RADIANCE)
+    return values if signed else values.clamp_min(0.0)
+
+
+def exposure_of(lrhs: Tensor) -> Tensor:
+    """Exposure of each image of a batch (N, h, w, 3), as :func:`oiio_msspl.model.encoding.find_exposure`: (N,)."""
+    y = luminance(lrhs)
+    lit = torch.where(y > 0, y, torch.nan).flatten(1)
+    bright = lit.nanquantile(0.99, dim=1, keepdim=True)
+    exposure = KEY / _log_mean(lit, NO_LIGHT * bright)
+    rows, columns = (side // BLOCK for side in y.shape[1:])
+    if rows * columns >= MIN_BLOCKS:
+        shares = torch.minimum(y, bright[..., None]) / bright[..., None]
+        light, squares = (F.avg_pool2d(values, BLOCK).flatten(1) for values in (shares, shares * shares))
+        levels = torch.where(squares > 0, squares / light, torch.nan)
+        levels = torch.where(levels >= NO_LIGHT, levels, torch.nan)
+        mean = _log_mean(levels, torch.zeros_like(bright))
+        most = NOISY / (torch.minimum(levels.nanquantile(0.5, dim=1), mean) * bright[:, 0])
+        exposure = torch.fmin(exposure, most)  # where no block is lit, it is NaN
+    return torch.nan_to_num(exposure, nan=1.0)
+
+
+def _log_mean(lit: Tensor, darkest: Tensor) -> Tensor:
+    """Log-mean (N,) of the luminances (N, n) that are not below ``darkest`` (N, 1), nor NaN."""
+    lit = torch.where(lit >= darkest, lit, torch.nan)
+    offset = 1e-4 * lit.nanmedian(dim=1, keepdim=True).values
+    return torch.exp(torch.log(lit + offset).nanmean(dim=1))
+
+
+def compress(radiance: Tensor, exposure: Tensor) -> Tensor:
+    """Scene-linear (N, H, W, C), with an exposure (N,) for each image, to log-encoded radiance."""
+    return log_encode((radiance * exposure[:, None, None, None]).clamp(0.0, MAX_RADIANCE))
+
+
+def exposed_feature(name: str, values: Tensor, exposure: Tensor) -> Tensor:
+    """A feature of :mod:`oiio_msspl.aovs.features` in the range that networks know, in linear values.
+
+    Radiance is multiplied by the exposure. A variance becomes a standard deviation, which is a radiance. Albedo and
+    normal are clipped.
+    """
+    if name == VARIANCE:
+        values = values.clamp_min(0.0).sqrt()
+    if name in (*RADIANCE_FEATURES, VARIANCE):
+        return (values * exposure).clamp(0.0, MAX_RADIANCE)
+    return values.clamp(0.0, MAX_ALBEDO) if name == ALBEDO else values.clamp(-1.0, 1.0)
+
+
+def encoded_feature(name: str, exposed: Tensor) -> Tensor:
+    """A feature of :func:`exposed_feature` as networks read it: radiance and deviation are log-encoded."""
+    return exposed if name in (ALBEDO, NORMAL) else log_encode(exposed)
+
+
+def pack(features: dict[str, Tensor], exposure: Tensor) -> Tensor:
+    """Encode all features of an HRLS, (N, H, W, C) each, and stack them in the schema's order: (N, H, W, 16). A missing
+    feature gets its default."""
+    factors, rgb = exposure[:, None, None, None], features[RGB]
+    stack = [
+        encoded_feature(name, exposed_feature(name, features[name], factors))
+        if name in features
+        else rgb.new_full((*rgb.shape[:3], count), DEFAULTS[name])
+        for name, count in HRLS_FEATURES.items()
+    ]
+    return torch.cat(stack, dim=-1)
+
+
+def packed(features: dict[str, Array], exposure: float) -> Array:
+    """:func:`pack` for NumPy's arrays of one HRLS, (H, W, C)."""
+    tensors = {name: torch.from_numpy(np.ascontiguousarray(values))[None] for name, values in features.items()}
+    return pack(tensors, torch.tensor([exposure]))[0].numpy()

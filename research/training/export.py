@@ -1,0 +1,251 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Export a checkpoint's averaged weights as an ONNX file: a whole model with its contract.
+
+    python -m research.training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
+    python -m research.training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
+    python -m research.training.export JOINT.pt --scale 2 --name joint-x2 -o joint-x2.onnx --int8 VIEWS --overlap 48
+    python -m research.training.export LARGE.pt --scale 2 4 8 --name joint-large -o joint-large --int8 VIEWS --overlap
+    48 32 16
+
+``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
+computation. ``--int8`` computes convolutions in 8 bits (:mod:`research.training.quantise`). Files of several scales
+share their
+weights, in ``NAME.weights``. ``-x2`` and so on are then added to ``--name``, and ``-x2.onnx`` to the output.
+"""
+
+from __future__ import annotations
+
+import argparse
+import copy
+import datetime
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import onnx
+import torch
+from onnx import helper, numpy_helper
+from onnxscript import opset18
+from torch import nn
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.model.contract import SCALES, SPREAD, Contract
+from research.datagen.views import Folder
+from research.training import export_checks
+from research.training.checkpoints import load
+from research.training.joint import FEATURES, SIZES, JointFusion
+from research.training.mean_denoiser import ALIGNMENT, MeanDenoiser, with_denoised_mean
+from research.training.networks import Network, denoiser_of
+from research.training.oidn import provenance
+from research.training.paper import MultiResolutionFusion
+from research.training.quantise import joint
+from research.training.quantise.layers import Networks, quantised, varied
+from research.training.tracing import IR_VERSION, shuffle, traced, unshuffle
+from research.training.whole_model import CHECKPOINTS, quantised_denoiser, save, whole_model
+
+#: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
+#: frame itself, and with room for the rows that are decoded for the next tiles.
+MEMORY = {"paper": 1000, "joint-small": 700, "joint": 800, "joint-large": 1160}
+
+#: Smaller tensors, such as biases, stay float32.
+HALF_ELEMENTS = 256
+
+#: Inputs of a joint network.
+Pair = tuple[torch.Tensor, torch.Tensor]
+
+
+def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
+    """The contract of a checkpoint's network for one of its scales."""
+    denoiser = denoiser_of(network, scale)
+    # Tiles begin on the grid of the denoiser's lowest level, too, so that it divides a tile as it divides the frame.
+    alignment = ALIGNMENT if denoiser else network.multiple // scale
+    features = {}
+    if isinstance(network, JointFusion):
+        # At x2 the average of four HRLS pixels still has noise, and the LRHS's AOVs halve it. At x4 and x8 the average
+        # of 16 or 64 pixels has little, and the LRHS's AOVs differ from it where the pixel filter is not a box.
+        features = {"lrhs": [RGB, *((ALBEDO, NORMAL) if scale == 2 else ())], "hrls": list(FEATURES)}
+    return Contract(
+        **features,
+        denoiser=denoiser,
+        bytes_per_pixel=MEMORY[name.rpartition("-x")[0].removesuffix(SPREAD)],
+        name=name,
+        scale=scale,
+        alignment=alignment,
+        overlap=overlap,
+        training_spp=state["training_spp"][str(scale)],
+        provenance=state["provenance"]
+        | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()}
+        | (provenance(SIZES[network.size][0]) if isinstance(network, JointFusion) else {}),
+    )
+
+
+def network_example(network: Network, scale: int, alignment: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Random ``lrhs`` and ``hrls``, as a network reads them."""
+    lrhs = torch.rand(1, network.lrhs_channels, 4 * alignment, 6 * alignment)
+    return lrhs, torch.rand(1, network.hrls_channels, 4 * alignment * scale, 6 * alignment * scale)
+
+
+def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
+    """The denoiser of both renders' mean for a value of ``Contract.denoiser``. Where it is not the network's own, it is
+    that of `joint`, or of `joint-spread`."""
+    if network.mean_denoiser is None or network.denoiser(SCALES[0]) != mode:
+        loaded, _ = load(CHECKPOINTS / ("joint_spread.pt" if network.spread else "joint.pt"))
+        assert isinstance(loaded, JointFusion)
+        network = loaded
+    assert network.mean_denoiser is not None
+    return network.mean_denoiser
+
+
+# Graph
+
+
+@torch.inference_mode()
+def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx.ModelProto:
+    """Export a network that needs no calibration.
+
+    Inputs are ``lrhs`` and ``hrls``, encoded; outputs ``fused``, log-encoded, and, except for the paper's network,
+    ``log_error``. The batch size is 1; height and width are any multiples of the contract's alignment.
+    """
+    scale, alignment = contract.scale, contract.alignment
+    inputs = network_example(network, scale, alignment)
+    aten = torch.ops.aten
+    module: nn.Module
+    if isinstance(network, MultiResolutionFusion):
+        module, outputs = _with_onnx_channel_order(network), ["fused"]
+        translations = {aten.pixel_unshuffle.default: _space_to_depth}
+    else:
+        module, outputs = network, ["fused", "log_error"]
+        translations = {aten.pixel_unshuffle.default: unshuffle, aten.pixel_shuffle.default: shuffle}
+    model = traced(module, inputs, ["lrhs", "hrls"], outputs, alignment, translations)
+    if half:
+        _store_as_half(model.graph)
+    model.ir_version = IR_VERSION
+    onnx.checker.check_model(model, full_check=True)
+    return model
+
+
+@torch.inference_mode()
+def mixing_of(network: JointFusion, contract: Contract) -> onnx.ModelProto:
+    """The graph of :class:`research.training.quantise.joint.Blend` for a joint network."""
+    scale, alignment = contract.scale, contract.alignment
+    lrhs, hrls = network_example(network, scale, alignment)
+    levels = range(scale.bit_length())
+    sizes = [[network.heads[level].out_channels, *(side >> level for side in hrls.shape[2:])] for level in levels]
+    image = hrls[:, :3]
+    inputs = (lrhs, image, image.clone(), image.clone(), [torch.rand(1, *size) for size in sizes])
+    names = [*joint.Blend.inputs, *(f"logits{level}" for level in levels)]
+    return traced(joint.Blend(network.size).eval(), inputs, names, ["fused"], alignment)
+
+
+@torch.inference_mode()
+def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Sequence[Pair]) -> list[onnx.ModelProto]:
+    """Export a joint network with 8-bit convolutions for several scales, as :func:`to_onnx`.
+
+    The graphs have the same weights. They are calibrated on pairs of the network's inputs, of all these scales.
+    """
+    layers: Networks | None = None
+    if network.layers is not None:
+        images = varied([hrls for _, hrls in pairs])
+        layers, clean = quantised(network.layers, images)
+        pairs = [
+            (lrhs, torch.cat([image[:, :3], albedo, 2 * normal - 1], dim=1))
+            for (lrhs, _), image, (albedo, normal) in zip(pairs, images, clean, strict=True)
+        ]
+    fit = joint.fitted(network, max(contract.scale for contract in contracts), pairs)
+    return [joint.to_onnx(fit, each.scale, mixing_of(network, each), layers) for each in contracts]
+
+
+def _space_to_depth(x, downscale_factor: int):
+    """Pixel unshuffle as one operator instead of the exporter's dozen."""
+    return opset18.SpaceToDepth(x, blocksize=downscale_factor)
+
+
+def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionFusion:
+    """Return a copy whose deshuffle convolutions read SpaceToDepth's channel order instead of PyTorch's."""
+    network = copy.deepcopy(network)
+    with torch.no_grad():
+        for stage in network.deshuffle:
+            weight = stage.conv.weight  # (C', C * row * column, 3, 3)
+            outputs, inputs, *kernel = weight.shape
+            reordered = weight.reshape(outputs, inputs // 4, 4, *kernel).transpose(1, 2).reshape_as(weight)
+            weight.copy_(reordered.clone())
+    return network
+
+
+def _store_as_half(graph: onnx.GraphProto) -> None:
+    """Replace float32 weights by half floats and a Cast, which ONNX Runtime folds when it loads the file."""
+    casts = []
+    for tensor in graph.initializer:
+        if tensor.data_type == onnx.TensorProto.FLOAT and np.prod(tensor.dims) >= HALF_ELEMENTS:
+            name = tensor.name
+            values = numpy_helper.to_array(tensor).astype(np.float16)
+            tensor.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
+            casts.append(helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT))
+    nodes = [*casts, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("--scale", type=int, nargs="+", help="scales to export, of a network for several")
+    parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
+    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("--half", action="store_true", help="store weights as half floats")
+    parser.add_argument(
+        "--int8", type=Path, metavar="VIEWS", help="compute convolutions in 8 bits, calibrated on these views"
+    )
+    parser.add_argument(
+        "--overlap", type=int, nargs="+", default=[24], help="LRHS pixels that tiles share on each side, for each scale"
+    )
+    parser.add_argument(
+        "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on these views"
+    )
+    args = parser.parse_args()
+
+    network, state = load(args.checkpoint)
+    scales = args.scale or ([network.scale] if isinstance(network, MultiResolutionFusion) else [])
+    if not scales:
+        raise SystemExit("this network serves several scales; choose some with --scale")
+    if args.measure_overlap:
+        views = Folder(args.measure_overlap).split("validation")[:8]
+        for overlap, difference in export_checks.measure_overlap(network, scales[0], views).items():
+            print(f"overlap {overlap}: {difference:.2g}")
+    if not args.output:
+        return
+    names = {scale: f"-x{scale}" if len(scales) > 1 else "" for scale in scales}
+    if len(args.overlap) not in (1, len(scales)):
+        raise SystemExit("--overlap: give one number, or one for each scale")
+    overlaps = args.overlap * (len(scales) // len(args.overlap))
+    contracts = [
+        contract_of(network, each, args.name + end, overlap, state)
+        for (each, end), overlap in zip(names.items(), overlaps, strict=True)
+    ]
+    files = [args.output.with_name(f"{args.output.name}{end}.onnx") if end else args.output for end in names.values()]
+    denoiser: MeanDenoiser | None = None
+    if isinstance(network, JointFusion):
+        if not args.int8:
+            raise SystemExit("a joint network can only be exported with --int8")
+        if len({each.denoiser for each in contracts}) > 1:
+            raise SystemExit("--scale: these scales have other denoisers of both renders' mean; export each alone")
+        denoiser = denoiser_for(network, contracts[0].denoiser)
+        pairs = joint.calibration_pairs(args.int8, scales, with_denoised_mean(denoiser), spread=network.spread)
+        graphs = joint_to_onnx(network, contracts, pairs)
+    else:
+        graphs = [to_onnx(network, each, half=args.half) for each in contracts]
+    models = {
+        file: whole_model(graph, each, quantised_denoiser(each.denoiser))
+        for file, graph, each in zip(files, graphs, contracts, strict=True)
+    }
+    save(models, args.name if len(scales) > 1 else "")
+    for file in files:
+        if args.half:
+            export_checks.check_casts(file)
+        export_checks.describe(file)
+        print(f"largest difference from PyTorch: {export_checks.parity(network, file, denoiser):.2g}")
+
+
+if __name__ == "__main__":
+    main()

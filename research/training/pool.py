@@ -1,0 +1,353 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Training pairs that are drawn ahead and kept on a GPU.
+
+    python -m research.training.pool VIEWS POOL --draws 6
+    python -m research.training.train --network joint --spread --scale 2 4 8 --pool POOL --data VIEWS --out RUN
+    --minutes 10 python -m research.training.pool VIEWS POOL_LARGE --draws 6 --denoise
+    research/training/checkpoints/joint{,_spread}.pt
+    python -m research.training.pool VIEWS POOL_TAUGHT --denoise JOINT{,_SPREAD}.pt --teach FIRST{,_SPREAD}.pt
+
+A GPU takes a step in less time than :func:`research.training.data.draw` takes for one pair. So a process of its own
+draws whole
+views some times each: other samples, filters, light and missing layers at each draw. It writes the pairs of a view into
+a file of POOL, and goes on with the views that a renderer adds, until it is stopped. Training keeps all pairs on the
+GPU. Each batch has crops of some of them, mirrored, turned, and with permuted colours.
+
+With ``--denoise``, pairs are those that the size ``large`` of `joint` reads: albedo, normal and the mean of both
+renders are denoised. Of views with single samples, every second pair then has noise that the pixel filter has spread.
+
+With ``--teach``, the target of a pair is no reference but what a :class:`Teacher` makes of both renders.
+
+References that were stored with their noise (:mod:`research.datagen.mitsuba.render_samples`) become the mean of the
+rendered and of a denoised one: half of the noise is left, and half of what a denoiser gets wrong.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import logging
+import os
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from oiio_msspl.aovs.features import HRLS_FEATURES
+from research.datagen.views import NO_REFERENCE, Folder, SampleView, View
+from research.training import checkpoints
+from research.training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
+from research.training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
+from research.training.joint import FEATURES, JointFusion
+from research.training.layer_denoisers import LayerDenoisers, untouched
+from research.training.mean_denoiser import denoise_mean
+from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet
+from research.training.render_mean import mean_and_noise
+
+log = logging.getLogger(__name__)
+
+#: Channels of the HRLS that pairs keep: those that `joint` reads.
+CHANNELS = sum(HRLS_FEATURES[name] for name in FEATURES)
+#: Widths of a view are cut to a multiple of this.
+ALIGNMENT = 128
+#: Share of the pairs in which parts of both renders have more samples.
+UNEVEN = 0.3
+#: Seconds between two looks for new files.
+RESCAN_SECONDS = 5.0
+
+#: Entry of a pair: whether the pixel filter has spread its noise.
+SPREAD_NOISE = "spread"
+
+Pair = dict[str, Tensor]
+M = TypeVar("M", bound=nn.Module)
+
+
+# Drawing
+
+
+class Denoisers:
+    """The networks that prepare pairs, and OIDN's large one, which denoises references and teaches.
+
+    Args:
+        joints: two ``joint`` networks, for independent noise and for spread noise. Their denoisers of both renders'
+            mean prepare pairs for the size ``large``; none for pairs of the other sizes.
+
+    Raises:
+        SystemExit: the networks are others.
+    """
+
+    def __init__(self, joints: Sequence[JointFusion], device: torch.device) -> None:
+        self.device = device
+        self.joints = [self.moved(joint) for joint in joints]
+        self.means = [joint.mean_denoiser for joint in self.joints if joint.mean_denoiser is not None]
+        if joints and (len(self.means) != 2 or [joint.spread for joint in joints] != [False, True]):
+            raise SystemExit("--denoise: give a joint network for independent noise, then one for spread noise")
+
+    @functools.cached_property
+    def layers(self) -> LayerDenoisers:
+        """The networks for albedo and normal."""
+        return self.moved(LayerDenoisers())
+
+    @functools.cached_property
+    def large(self) -> FineTunedUNet:
+        """OIDN's large network."""
+        return self.moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)))
+
+    def moved(self, network: M) -> M:
+        """A network without gradients, on the device."""
+        return network.requires_grad_(False).to(self.device, memory_format=torch.channels_last)
+
+    def denoised(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """A log-encoded colour, denoised with an albedo and a normal in [0, 1] that are free of noise."""
+        output = self.large.run(torch.cat([log_to_pu(colour), albedo, normal], dim=1))
+        return pu_to_log(output.float().clamp(0, 1))
+
+    def reference(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """The mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
+        exposure = exposure_of(colour.movedim(1, -1))
+        encoded = compress(colour.movedim(1, -1), exposure).movedim(-1, 1)
+        return 0.5 * (colour + log_decode(self.denoised(encoded, *self.layers(albedo, normal))) / exposure)
+
+    def prepared(self, lrhs: Tensor, hrls: Tensor, spread: bool) -> tuple[Tensor, Tensor]:
+        """The arguments of :meth:`JointFusion.fuse_prepared` for those of :meth:`JointFusion.forward`."""
+        return denoise_mean(self.means[spread], lrhs, hrls), self.layers.applied(hrls)
+
+
+class Teacher:
+    """Targets from the renders themselves: a weighted mean of what several networks make of them.
+
+    The networks err in different places, so their mean is better than each. One network that learns to reproduce it
+    from many pairs comes close, without their time (Hinton et al. 2015, *Distilling the knowledge in a neural
+    network*). It needs no reference, so views for it are rendered in a few seconds.
+
+    The members are ``joint`` (one quarter), OIDN's large network on the HRLS (one quarter), and a first network of the
+    size ``large`` (one half). OIDN has not learnt spread noise, so it is left out there.
+
+    Args:
+        denoisers: with two ``joint`` networks.
+        larges: two of the size ``large``, for independent noise and for spread noise.
+    """
+
+    def __init__(self, denoisers: Denoisers, larges: Sequence[JointFusion]) -> None:
+        if len(denoisers.means) != 2 or [large.size for large in larges] != ["large", "large"]:
+            raise SystemExit("--teach: give two networks of the size large, and --denoise")
+        self.denoisers, self.larges = denoisers, [denoisers.moved(large) for large in larges]
+
+    def target(self, lrhs: Tensor, hrls: Tensor, prepared: Tensor, spread: bool) -> Tensor:
+        """The mean (1, 3, s*H, s*W), log-encoded; the arguments are those of :meth:`JointFusion.fuse_prepared`, and
+        ``hrls`` with its albedo and normal as rendered."""
+        joint, _ = self.denoisers.joints[spread].fuse(lrhs, hrls)
+        first, _ = self.larges[spread].fuse_prepared(lrhs, prepared)
+        results = [joint, first, first]
+        if not spread:
+            results.append(self.denoisers.denoised(prepared[:, :3], prepared[:, 3:6], 0.5 * prepared[:, 6:9] + 0.5))
+        return log_encode(torch.stack([log_decode(result) for result in results]).mean(dim=0))
+
+
+@torch.no_grad()
+def draw_pairs(
+    view: View | SampleView,
+    scales: tuple[int, ...],
+    count: int,
+    device: torch.device,
+    denoisers: Denoisers | None = None,
+    teacher: Teacher | None = None,
+) -> list[Pair]:
+    """Draw a view ``count`` times: ``lrhs`` (7, h, w), ``hrls`` (9, s*h, s*w), ``target`` (3, s*h, s*w), half floats.
+
+    The LRHS has the mean of both renders and its noise, see :func:`research.training.render_mean.with_mean`. Or it is
+    (6, h, w),
+    with the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread. Without
+    ``denoisers``, references that were stored with their noise keep it. With a ``teacher``, targets are its own.
+    """
+    rng = np.random.default_rng([*view.path.name.encode(), count])
+    tensors: ViewTensors | SampleTensors
+    if isinstance(view, SampleView):
+        tensors = SampleTensors.of(view, device)
+        if denoisers is not None and (noisy := tensors.noisy_reference()) is not None:
+            tensors = replace(tensors, clean_reference=denoisers.reference(*noisy))
+    else:
+        tensors = ViewTensors.of(view, device)
+    patch = min(tensors.size) // ALIGNMENT * ALIGNMENT
+    prepares = denoisers is not None and bool(denoisers.means)
+    pairs = []
+    for index in range(count):
+        spread = prepares and isinstance(view, SampleView) and index % 2 == 1
+        sampling = Sampling(spread_noise=spread if prepares else None, uneven=UNEVEN)
+        batch = draw([tensors], int(rng.choice(scales)), patch, 1, rng, sampling)
+        lrhs, hrls = batch["lrhs"], batch["hrls"]
+        lrhs, hrls = torch.cat([lrhs, *mean_and_noise(lrhs, hrls)], dim=1), hrls[:, :CHANNELS]
+        target, rendered = batch["target"], hrls
+        if denoisers is not None and prepares:
+            lrhs, hrls = denoisers.prepared(lrhs, hrls, spread)
+        if teacher is not None:
+            target = teacher.target(lrhs, rendered, hrls, spread)
+        batch = {"lrhs": lrhs, "hrls": hrls, "target": target}
+        pair = {name: image[0].half().contiguous().cpu() for name, image in batch.items()}
+        if all(bool(image.isfinite().all()) for image in pair.values()):
+            pairs.append(pair | ({SPREAD_NOISE: torch.tensor(spread)} if prepares else {}))
+    return pairs
+
+
+def fill(
+    views: Path,
+    pool: Path,
+    scales: tuple[int, ...],
+    draws: int,
+    part: int,
+    parts: int,
+    device: torch.device,
+    denoisers: Denoisers,
+    teacher: Teacher | None = None,
+) -> None:
+    """Write the pairs of every ``parts``-th view of the training split, and wait for more.
+
+    Views without a reference are only drawn for a teacher.
+    """
+    folder = Folder(views)
+    pool.mkdir(parents=True, exist_ok=True)
+    while True:
+        views_of_samples = folder.sample_views("train")
+        if teacher is not None:
+            views_of_samples += folder.sample_views(NO_REFERENCE)
+        todo = [
+            view
+            for view in (*folder.split("train"), *views_of_samples)
+            if sum(view.path.name.encode()) % parts == part and not (pool / f"{view.path.name}.pt").exists()
+        ]
+        for view in todo:
+            file = pool / f"{view.path.name}.pt"
+            torch.save(draw_pairs(view, scales, draws, device, denoisers, teacher), file.with_suffix(".partial"))
+            os.replace(file.with_suffix(".partial"), file)
+            log.info("%s", file.name)
+        time.sleep(0 if todo else 1)
+        folder.scan()
+
+
+# Batches
+
+
+class PooledBatches:
+    """Endless random batches of the pairs of a folder, on a GPU.
+
+    Args:
+        pool: the folder that :func:`fill` writes.
+        scales: of each batch, one of these at random.
+        patch: width and height of a patch in HRLS pixels.
+        batch: pairs per batch.
+        spread: of pairs for the size ``large``, only those with spread noise, only the others, or all (None).
+    """
+
+    def __init__(
+        self,
+        pool: Path,
+        scales: tuple[int, ...],
+        patch: int,
+        batch: int,
+        seed: int,
+        device: torch.device,
+        *,
+        spread: bool | None = None,
+    ) -> None:
+        self.spread = spread
+        self.pool, self.scales, self.patch, self.batch, self.device = pool, scales, patch, batch, device
+        self.rng = np.random.default_rng(seed)
+        self.pairs: dict[int, list[Pair]] = {scale: [] for scale in scales}
+        self.loaded: set[Path] = set()
+
+    def load(self) -> None:
+        """Load the files that are new."""
+        for file in sorted(set(self.pool.glob("*.pt")) - self.loaded):
+            self.loaded.add(file)
+            for pair in torch.load(file, weights_only=True):
+                spread = pair.pop(SPREAD_NOISE, None)
+                if self.spread is not None:
+                    if spread is None:
+                        raise SystemExit(f"{file}: does not tell spread noise apart; draw pairs with --denoise")
+                    if self.spread != bool(spread):
+                        continue
+                scale = pair["hrls"].shape[-1] // pair["lrhs"].shape[-1]
+                if scale in self.pairs and pair["hrls"].shape[-1] >= self.patch:
+                    self.pairs[scale].append({name: image.to(self.device) for name, image in pair.items()})
+
+    def loader(self) -> Iterator[Batch]:
+        """Endless batches, see :data:`research.training.data.Batch`. Waits until the pool has a pair."""
+        looked = -RESCAN_SECONDS
+        while True:
+            if time.monotonic() - looked > RESCAN_SECONDS:
+                self.load()
+                looked = time.monotonic()
+            ready = [scale for scale in self.scales if self.pairs[scale]]
+            if not ready:
+                time.sleep(0.2)
+                self.load()
+                continue
+            yield self.draw(int(self.rng.choice(ready)))
+
+    def draw(self, scale: int) -> Batch:
+        """A batch of one scale."""
+        rng, pairs = self.rng, self.pairs[scale]
+        parts: dict[str, list[Tensor]] = {"lrhs": [], "hrls": [], "target": []}
+        for index in rng.integers(len(pairs), size=self.batch):
+            pair = pairs[index]
+            top, left = (int(rng.integers((side * scale - self.patch) // scale + 1)) for side in pair["lrhs"].shape[1:])
+            order = rng.permutation(3) if rng.random() < 0.5 else np.arange(3)
+            channels = torch.from_numpy(np.concatenate([order, order + 3, [6, 7, 8]])).to(self.device)
+            for name, image in pair.items():
+                step = 1 if name == "lrhs" else scale
+                crop = image[
+                    :, top * step : top * step + self.patch // (scale // step),
+                    left * step : left * step + self.patch // (scale // step),
+                ]  # fmt: skip
+                parts[name].append(crop[channels[: len(crop)]])
+        return turned({name: torch.stack(crops).float() for name, crops in parts.items()}, rng)
+
+
+def joint_networks(paths: Sequence[Path]) -> list[JointFusion]:
+    """The networks of checkpoints.
+
+    Raises:
+        SystemExit: one is no ``joint`` network.
+    """
+    networks = []
+    for path in paths:
+        network, _ = checkpoints.load(path)
+        if not isinstance(network, JointFusion):
+            raise SystemExit(f"{path}: not a joint network")
+        networks.append(network)
+    return networks
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        prog="python -m research.training.pool",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("views", type=Path, help="folder of training views")
+    parser.add_argument("pool", type=Path, help="folder for the pairs")
+    parser.add_argument("--scale", type=int, nargs="+", default=(2, 4, 2, 4, 8), help="drawn from these (2 4 2 4 8)")
+    parser.add_argument("--draws", type=int, default=6, help="pairs per view (%(default)s)")
+    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("I", "N"), help="draw part I of N")
+    parser.add_argument("--device", default="cuda")
+    parser.add_argument(
+        "--denoise", type=Path, nargs=2, default=(), metavar="JOINT", help="pairs for the size large, see above"
+    )
+    parser.add_argument(
+        "--teach", type=Path, nargs=2, default=(), metavar="LARGE", help="targets by a teacher with these, see above"
+    )
+    args = parser.parse_args()
+    torch.set_num_threads(1)
+    denoisers = Denoisers(joint_networks(args.denoise), torch.device(args.device))
+    teacher = Teacher(denoisers, joint_networks(args.teach)) if args.teach else None
+    fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, denoisers.device, denoisers, teacher)
+
+
+if __name__ == "__main__":
+    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s", datefmt="%H:%M:%S")
+    main()

@@ -1,0 +1,44 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Images as codes of 8 bits, which quantised networks read and return.
+
+Colours have a range of 2^30, which 8 bits cannot hold. So the PU-encoded range is cut into equal slices, and each slice
+has a channel that says how much of it is filled, from 0 to 255. The sum over the slices is the value.
+"""
+
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.model.encoding import encode_radiance
+from research.training.encoding import log_to_pu
+from research.training.pu_curve import pu_decode
+
+#: Slices of a colour channel at the input and at the output of the denoiser of both renders' mean.
+INPUT_SLICES, OUTPUT_SLICES = 3, 10
+#: Its input channels: three colours in slices, albedo, normal and noise.
+INPUT_CHANNELS = 3 * INPUT_SLICES + 7
+
+
+def sliced(values: Tensor, count: int) -> Tensor:
+    """Quantise values (N, C, H, W) in [0, 1] to codes of slices, (N, count * C, H, W)."""
+    slices = [(values * count - i).clamp(0, 1) for i in range(count)]
+    return torch.cat(slices, dim=1).mul(255).round()
+
+
+def denoiser_codes(colour: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+    """The input of the denoiser of both renders' mean, (N, INPUT_CHANNELS, h, w), see
+    :func:`research.training.render_mean.mean_of_renders`. The slices of each colour lie side by side."""
+    slices = sliced(log_to_pu(colour), INPUT_SLICES).unflatten(1, (INPUT_SLICES, 3)).transpose(1, 2).flatten(1, 2)
+    rest = torch.cat([albedo, 0.5 * normal + 0.5, noise], dim=1)
+    return torch.cat([slices, rest.mul(255).round().clamp(0, 255)], dim=1)
+
+
+@functools.cache
+def log_encoded_of_code(slices: int) -> Array:
+    """Log-encoded colours by the sum of the codes of all their slices: (255 * slices + 1,)."""
+    return encode_radiance(pu_decode(np.linspace(0, 1, 255 * slices + 1)).astype(np.float32), 1.0)

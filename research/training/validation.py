@@ -1,0 +1,76 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fixed pairs of validation views, and the scores of a network on them."""
+
+from __future__ import annotations
+
+import collections
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from oiio_msspl.image.metrics import psnr, relmse
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
+from research.datagen.views import Array, View, as_float32, mean_lrhs, read_hrls, split_features
+from research.training.data import Prepare, to_tensor
+from research.training.encoding import packed
+from research.training.networks import Network, run
+from research.training.ops import upsample
+
+
+@dataclass(frozen=True)
+class ValidationPair:
+    """The middle of a view with 1 spp in the HRLS and s^2 spp in the LRHS, the paper's (s^2 - 1)."""
+
+    lrhs: Array
+    """(h, w, 3), encoded, and the channels that :func:`research.training.networks.preparation` adds."""
+    hrls: Array
+    """(s*h, s*w, 16), encoded, and the channels that are added. One sample has no variance, so that is missing."""
+    reference: Array
+    """(s*h, s*w, 3), scene-linear."""
+    exposure: float
+
+    @classmethod
+    def centre(cls, view: View, scale: int, patch: int, prepare: Prepare | None = None) -> ValidationPair:
+        """Cut out the middle ``patch`` x ``patch`` pixels of a view."""
+        height, width, _ = view.ref.shape
+        top, left = (height - patch) // 2 // scale * scale, (width - patch) // 2 // scale * scale
+        rows, columns = slice(top, top + patch), slice(left, left + patch)
+        lrhs = mean_lrhs(view, [0], scale)
+        exposure = find_exposure(lrhs)
+        hrls = packed(split_features(read_hrls(view, [0], rows, columns)[0]), exposure)
+        lrhs = lrhs[top // scale : (top + patch) // scale, left // scale : (left + patch) // scale]
+        lrhs = encode_radiance(lrhs, exposure)
+        if prepare is not None:
+            lrhs, hrls = prepare(lrhs, hrls)
+        return cls(
+            lrhs=lrhs,
+            hrls=hrls,
+            reference=as_float32(view.ref[rows, columns]),
+            exposure=exposure,
+        )
+
+
+@torch.inference_mode()
+def evaluate(network: Network, pairs: Iterable[ValidationPair], device: torch.device) -> dict[str, float]:
+    """Mean sRGB PSNR and RelMSE of the network and of the bicubically upsampled LRHS over all pairs.
+
+    Images are exposed as for the network, because views have any brightness.
+    """
+    scores: dict[str, list[float]] = collections.defaultdict(list)
+    for pair in pairs:
+        fused, _ = run(network, to_tensor(pair.lrhs[None], device), to_tensor(pair.hrls[None], device))
+        output = decode_radiance(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
+        scale = pair.hrls.shape[0] // pair.lrhs.shape[0]
+        lrhs = decode_radiance(pair.lrhs[None, ..., :3], pair.exposure)
+        bicubic = upsample(to_tensor(lrhs, torch.device("cpu")), scale, "bicubic").clamp(min=0)
+        bicubic = bicubic[0].permute(1, 2, 0).numpy()
+        reference = pair.reference * pair.exposure
+        for prefix, image in (("", output), ("bicubic_", bicubic)):
+            score = psnr(image * pair.exposure, reference)
+            scores[prefix + "psnr"].append(score)
+            if not prefix:
+                scores[f"psnr_x{scale}"].append(score)
+            scores[prefix + "relmse"].append(relmse(image * pair.exposure, reference))
+    return {name: float(np.mean(values)) for name, values in scores.items()}

@@ -1,0 +1,255 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make the model that ships out of a network: a graph that reads and returns scene-linear images.
+
+A network reads and returns encoded images. Its model computes what comes before and after, too. So a GPU does all of
+it, and nothing waits for NumPy:
+
+1. expose, log-encode and stack the features of both renders,
+2. for `joint`: average both renders, and denoise their mean,
+3. run the network,
+4. decode the fused image, and divide it by the exposure.
+
+Inputs and outputs are those of :class:`oiio_msspl.model.contract.Contract`.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+import onnx
+import torch
+from onnx import TensorProto, helper
+from onnx.external_data_helper import set_external_data
+from torch import Tensor, nn
+
+from oiio_msspl.aovs.features import RGB
+from oiio_msspl.model.contract import DENOISERS, METADATA_KEY, Contract
+from oiio_msspl.model.encoding import MAX_ENCODED
+from research.training.encoding import encoded_feature, exposed_feature, log_decode, log_encode
+from research.training.quantise.codes import INPUT_SLICES, OUTPUT_SLICES, log_encoded_of_code
+from research.training.quantise.graph import Nodes
+from research.training.render_mean import Images, mean_of_renders
+from research.training.tracing import traced
+
+#: Prefixes of tensors in the graph of a model.
+NETWORK, DENOISER = "network.", "denoiser."
+CHECKPOINTS = Path(__file__).parent / "checkpoints"
+#: Tensors of fewer bytes, such as biases, stay in the graph.
+SMALL = 1024
+
+
+class Enter(nn.Module):
+    """What comes before the network, and before the denoiser.
+
+    Args:
+        contract: of the model.
+    """
+
+    def __init__(self, contract: Contract) -> None:
+        super().__init__()
+        self.contract = contract
+
+    def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
+        """
+        Args:
+            inputs: those of the contract, in its order.
+
+        Returns:
+            The encoded LRHS and HRLS, and with a denoiser the result of
+            :func:`research.training.render_mean.mean_of_renders`.
+        """
+        given = dict(zip(self.contract.inputs, inputs, strict=True))
+        lrhs, hrls = (
+            {name: exposed_feature(name, given[f"{render}.{name}"], given["exposure"]) for name in names}
+            for render, names in (("lrhs", self.contract.lrhs), ("hrls", self.contract.hrls))
+        )
+        encoded = log_encode(lrhs[RGB]), torch.cat([encoded_feature(*each) for each in hrls.items()], dim=1)
+        if not self.contract.denoiser:
+            return encoded
+        shares: Images = {name: given[f"share.{name}"] for name in self.contract.lrhs}
+        return *encoded, *mean_of_renders(lrhs, hrls, shares)
+
+
+class Leave(nn.Module):
+    """What comes after the network."""
+
+    def forward(self, encoded: Tensor, exposure: Tensor) -> Tensor:
+        """
+        Args:
+            encoded: the fused image (1, 3, H, W), log-encoded.
+            exposure: a number.
+
+        Returns:
+            The fused image, scene linear, finite and >= 0.
+        """
+        return log_decode(encoded.clamp(0.0, MAX_ENCODED)) / exposure
+
+
+class InTorch(nn.Module):
+    """A whole model in PyTorch, in 32 bits.
+
+    Args:
+        contract: of the model.
+        fuse: the network, which reads encoded images and returns the fused one first.
+        denoise: the denoiser of both renders' mean, if the contract has one.
+    """
+
+    def __init__(
+        self,
+        contract: Contract,
+        fuse: Callable[[Tensor, Tensor], Sequence[Tensor]],
+        denoise: Callable[..., Tensor] | None = None,
+    ) -> None:
+        super().__init__()
+        self.enter, self.fuse, self.denoise = Enter(contract), fuse, denoise
+
+    def forward(self, inputs: Mapping[str, Tensor]) -> Tensor:
+        """The fused image (1, 3, s*h, s*w), scene linear, for the inputs of the contract."""
+        lrhs, hrls, *mean = self.enter([inputs[name] for name in self.enter.contract.inputs])
+        if self.denoise is not None:
+            lrhs = torch.cat([lrhs, self.denoise(*mean)], dim=1)
+        return Leave()(self.fuse(lrhs, hrls)[0], inputs["exposure"])
+
+
+class _Whole(Nodes):
+    """The graph of a model."""
+
+    def __init__(self, network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> None:
+        super().__init__()
+        self._contract = contract
+        names = ["lrhs", "hrls", *(["colour", "noise", "albedo", "normal"] if denoiser is not None else [])]
+        inputs = example(contract, 4 * contract.alignment, 6 * contract.alignment)
+        enter = traced(Enter(contract), (list(inputs.values()),), list(inputs), names, contract.alignment)
+        self.embed(enter, "enter.", {name: f"encoded.{name}" for name in names})
+        lrhs, hrls, *mean = (f"encoded.{name}" for name in names)
+        if denoiser is not None:
+            self._denoise(denoiser, mean)
+            lrhs = self.add("Concat", [lrhs, "mean.denoised"], "encoded.both", axis=1)
+        self.embed(network, NETWORK, {"lrhs": lrhs, "hrls": hrls, "fused": "encoded.fused"})
+        ends = inputs["hrls.rgb"], inputs["exposure"]
+        leave = traced(Leave(), ends, ["encoded", "exposure"], ["fused"], contract.scale * contract.alignment)
+        self.embed(leave, "leave.", {"encoded": "encoded.fused"})
+        self._results = {each.name: each.type.tensor_type.shape.dim[1].dim_value for each in network.graph.output}
+
+    def _denoise(self, denoiser: onnx.ModelProto, images: list[str]) -> None:
+        """Add the denoiser of both renders' mean, in 8 bits or not."""
+        names = [value.name for value in denoiser.graph.input]
+        if names != ["layers"]:
+            self.embed(denoiser, DENOISER, {**dict(zip(names, images, strict=True)), "denoised": "mean.denoised"})
+            return
+        colour, noise, albedo, normal = images
+        half, step = self.constant("half", np.float32(0.5)), self.constant("step", np.float32(1 / 255))
+        normal = self.add("Add", [self.add("Mul", [normal, half], "mean.scaled"), half], "mean.shifted")
+        rest = [self.add("QuantizeLinear", [i, step, "zero"], f"{i}.codes") for i in (albedo, normal, noise)]
+        slices = self.add("Concat", self.slices(self.log_to_pu(colour), INPUT_SLICES), "mean.slices", axis=1)
+        # The slices of each colour lie side by side.
+        order = self.constant("by_colour", np.arange(3 * INPUT_SLICES).reshape(INPUT_SLICES, 3).T.ravel())
+        layers = self.packed([self.add("Gather", [slices, order], "mean.by_colour", axis=1), *rest], "mean.layers")
+        self.embed(denoiser, DENOISER, {"layers": layers, "codes": "mean.sums"})
+        self.constant("of_code", log_encoded_of_code(OUTPUT_SLICES))
+        pixels = self.look_up("of_code", "mean.sums", "mean.pixels")
+        self.add("Transpose", [pixels], "mean.denoised", perm=[0, 3, 1, 2])
+
+    def model(self) -> onnx.ModelProto:
+        info, contract = helper.make_tensor_value_info, self._contract
+        inputs = [
+            info(name, TensorProto.FLOAT, [1, count, *("hw" if name.startswith("lrhs") else "HW")] if count else [])
+            for name, count in contract.inputs.items()
+        ]
+        outputs = [info(name, TensorProto.FLOAT, [1, count, "H", "W"]) for name, count in self._results.items()]
+        model = self.finished(contract.name, inputs, outputs)
+        _share_equal_tensors(model.graph)
+        helper.set_model_props(model, {METADATA_KEY: contract.to_json()})
+        return model
+
+
+def _share_equal_tensors(graph: onnx.GraphProto) -> None:
+    """Keep one of several equal tensors, such as tables of curves."""
+    kept: dict[tuple[bytes, ...], str] = {}
+    names: dict[str, str] = {}
+    for tensor in list(graph.initializer):
+        if len(tensor.raw_data) < SMALL:
+            continue
+        key = tensor.raw_data, str(tensor.data_type).encode(), str(tensor.dims).encode()
+        names[tensor.name] = kept.setdefault(key, tensor.name)
+        if names[tensor.name] != tensor.name:
+            graph.initializer.remove(tensor)
+    for node in graph.node:
+        node.input[:] = [names.get(name, name) for name in node.input]
+
+
+def example(contract: Contract, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
+    """Random inputs of a contract, for an LRHS of height x width pixels."""
+    generator = torch.Generator().manual_seed(seed)
+    inputs = {}
+    for name, count in contract.inputs.items():
+        factor = 1 if name.startswith("lrhs") else contract.scale
+        shape = (1, count, height * factor, width * factor) if count else ()
+        inputs[name] = torch.rand(shape, generator=generator)
+    return inputs
+
+
+def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> onnx.ModelProto:
+    """The model of a network.
+
+    Args:
+        network: its inputs are ``lrhs`` and ``hrls``, encoded; outputs are ``fused``, log-encoded, and others, which
+            the model returns as they are.
+        contract: of the model.
+        denoiser: of both renders' mean, if the contract has one. Its input is ``layers`` and its output ``codes``
+            (:mod:`research.training.quantise.codes`), or images, with the output ``denoised``.
+    """
+    return _Whole(network, contract, denoiser).model()
+
+
+def denoiser_file(mode: str) -> str:
+    """Name, without its ending, of the files of a denoiser, a value of ``Contract.denoiser``."""
+    return mode.replace("mean", "mean_denoiser").replace("-", "_")
+
+
+def quantised_denoiser(mode: str) -> onnx.ModelProto | None:
+    """The denoiser in 8 bits for a value of ``Contract.denoiser``, as :mod:`research.training.quantise` has written
+    it."""
+    return onnx.load(CHECKPOINTS / f"{denoiser_file(mode)}.onnx") if mode else None
+
+
+def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
+    """Save models into one folder.
+
+    Those with the same denoiser share its weights, in a file beside them. So all of them must be exported again when
+    it has changed.
+
+    Args:
+        family: if not empty, the models share all other weights, too, in ``FAMILY.weights``.
+    """
+    (folder,) = {path.parent for path in models}
+    for mode in DENOISERS:
+        group = [model for model in models.values() if _contract(model).denoiser == mode]
+        if group:
+            _share_weights(group, folder / f"{denoiser_file(mode)}.weights", DENOISER)
+    if family:
+        _share_weights(list(models.values()), folder / f"{family}.weights", NETWORK)
+    for path, model in models.items():
+        onnx.save(model, path)
+
+
+def _contract(model: onnx.ModelProto) -> Contract:
+    return Contract.from_json(next(each.value for each in model.metadata_props if each.key == METADATA_KEY), "model")
+
+
+def _share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str) -> None:
+    """Move weights whose names begin with ``prefix`` into one file, equal ones once."""
+    places: dict[bytes, int] = {}
+    with file.open("wb") as out:
+        for model in models:
+            for tensor in model.graph.initializer:
+                data = tensor.raw_data
+                if len(data) < SMALL or not tensor.name.startswith(prefix):
+                    continue
+                if data not in places:
+                    places[data] = out.tell()
+                    out.write(data)
+                set_external_data(tensor, file.name, places[data], len(data))
+                tensor.ClearField("raw_data")

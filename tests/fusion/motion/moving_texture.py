@@ -1,0 +1,29 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A picture that moves from frame to frame, and the steps to its neighbours, for the tests of averaging."""
+
+import numpy as np
+
+from oiio_msspl.fusion.neighbours.path import Step
+
+HEIGHT, WIDTH, SCALE = 96, 128, 4
+
+
+def texture(shift=0.0):
+    """A smooth picture (h, w, 3), moved to the right by ``shift`` pixels."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    x = x - shift
+    grey = 0.5 + 0.2 * np.sin(x / 5) * np.cos(y / 7) + 0.1 * np.sin((x + y) / 11)
+    return (grey[..., None] * (1.0, 0.8, 0.6)).astype(np.float32)
+
+
+def rms(image, truth, part=slice(None)):
+    return float(np.sqrt(np.mean(np.square(image - truth)[part])))
+
+
+def still(frame):
+    return Step(frame, None, None, None, None)
+
+
+def moved(frame, x, y=0.0):
+    there = np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2))
+    return Step(frame, there, None, -there, None)

@@ -1,0 +1,39 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Pixels that are left out of the interpolation, because they need none, have the same bits as with it."""
+
+import numpy as np
+import pytest
+
+from oiio_msspl.image import sampling
+from oiio_msspl.image.sampling import sample_cubic
+
+HEIGHT, WIDTH = 40, 60
+
+
+def sample(monkeypatch, most_chosen, images, x, y, valid=None):
+    monkeypatch.setattr(sampling, "MOST_CHOSEN", most_chosen)
+    return sample_cubic(images, lambda rows: (x[rows], y[rows]), x.shape, valid)
+
+
+@pytest.mark.parametrize("moving", [0, 0.1, 0.5, 1])
+def test_pixels_that_lie_on_pixels_are_taken_as_they_are(monkeypatch, moving):
+    rng = np.random.default_rng(0)
+    images = [rng.random((HEIGHT, WIDTH, 3), np.float32), np.full((HEIGHT, WIDTH, 1), 0.3, np.float32)]
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH].astype(np.float32)
+    moves = rng.random(x.shape) < moving
+    x, y = (at + moves * rng.normal(0, 3, x.shape).astype(np.float32) for at in (x, y))
+    all_of_them, chosen = (sample(monkeypatch, most, images, x, y) for most in (0, 2))
+    for one, other, image in zip(all_of_them, chosen, images, strict=True):
+        assert np.array_equal(one, other)
+        assert np.array_equal(one[~moves], image[~moves])
+
+
+def test_only_valid_positions_are_interpolated(monkeypatch):
+    rng = np.random.default_rng(0)
+    image = rng.random((HEIGHT, WIDTH, 3), np.float32)
+    x, y = (rng.uniform(-2, side, (HEIGHT, WIDTH)).astype(np.float32) for side in (WIDTH, HEIGHT))
+    valid = rng.random(x.shape) < 0.3
+    (everywhere,) = sample(monkeypatch, 0.8, [image], x, y)
+    (found,) = sample(monkeypatch, 0.8, [image], x, y, valid)
+    assert np.array_equal(found[valid], everywhere[valid])
+    assert np.isin(found[~valid], image).all()

@@ -70,7 +70,7 @@ class FusedFrame:
     """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
     frames: Array | None = None
     """(height, width, 1): how many frames were averaged, see
-    :class:`oiio_msspl.fusion.neighbours.results.Accumulated`; None for a frame that was fused alone."""
+    :func:`oiio_msspl.fusion.neighbours.average.average_renders`; None for a frame that was fused alone."""
     clipped: int = 0
     """Values of ``rgb`` that were too bright for half; 0 for float32."""
     negative: dict[str, int] = field(default_factory=dict)

@@ -24,7 +24,8 @@ from oiio_msspl.exr.render import ReadableRender, Render
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
-from oiio_msspl.fusion.neighbours.renders import RenderPair, average_renders, lacking_passes
+from oiio_msspl.fusion.neighbours.average import average_renders
+from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
 from oiio_msspl.fusion.passes.plan import pass_features
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, MAX_MEMORY
@@ -262,13 +263,13 @@ class Stages:
         pair, frames, averaged = RenderPair(loaded.lr_pixels, loaded.hr_pixels), None, None
         if any(neighbours):
             passes = light_features(loaded.averaged_hr)
-            if any(lacking_passes(pair, step.frame) for steps in neighbours for step in steps):
+            if any(lacking_passes(pair, hop.frame) for hops in neighbours for hop in hops):
                 passes = []
-            means = average_renders(pair, *neighbours, [*_features_read(session), *passes])
-            pair, frames = RenderPair(means.lr, means.hr), means.frames
+            lr, hr, frames = average_renders(pair, *neighbours, [*_features_read(session), *passes])
+            pair = RenderPair(lr, hr)
             if passes:
                 on_disk = is_large(loaded.hr)
-                averaged = _kept(means.lr, on_disk=on_disk), _kept(means.hr, on_disk=on_disk)
+                averaged = _kept(lr, on_disk=on_disk), _kept(hr, on_disk=on_disk)
         fused = fuse(
             pair.lr,
             pair.hr,

@@ -21,8 +21,7 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.fusion.neighbours.renders import memory_to_average
-from oiio_msspl.fusion.neighbours.results import memory_to_accumulate
+from oiio_msspl.fusion.neighbours.average import memory_to_average_renders, memory_to_average_results
 from oiio_msspl.image.arrays import has_many_pixels
 from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
 from oiio_msspl.jobs.model_choice import family_for_layers
@@ -138,7 +137,9 @@ class Temporal:
         """
         if not self.count:
             return 0
-        working = max(memory_to_accumulate(window), memory_to_average(window, channels) if self.renders else 0)
+        working = memory_to_average_results(window)
+        if self.renders:
+            working = max(working, memory_to_average_renders(window, channels))
         return self.waiting(window, channels, scale) + working
 
     def waiting(self, window: Window, channels: int, scale: int) -> int:

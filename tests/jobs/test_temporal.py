@@ -523,7 +523,7 @@ def test_frames_are_fused_once_and_kept_as_long_as_needed(shot, bilinear_models,
 
 def test_averaging_uses_no_more_threads_than_allowed(shot, whole, bilinear_models, monkeypatch):
     seen = []
-    averaging = {stages: "average_renders", frame_window: "accumulate"}
+    averaging = {stages: "average_renders", frame_window: "average_results"}
     for module, name in averaging.items():
         real = getattr(module, name)
 

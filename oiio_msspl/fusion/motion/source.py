@@ -51,7 +51,11 @@ class MotionFrame:
     vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
     """What :meth:`MotionSource.vectors_of` returns, if the frame is in memory."""
     pixels: ReadableRender | None = None
-    """Its features, if they are in memory, with albedo and normal as far as there are any."""
+    """Features of the HRLS, if they are in memory, with albedo and normal where it has them."""
+    number: int = 0
+    """Of the frame in its shot."""
+    lr: MappedRender | None = None
+    """The LRHS; only :func:`oiio_msspl.fusion.neighbours.hops.find_hops` needs it."""
 
 
 @dataclass(frozen=True)
@@ -153,16 +157,6 @@ class MotionSource:
                 if len(lengths) == FEWEST and not is_silent(lengths[0]):
                     return True
         return False
-
-    @property
-    def same_both_ways(self) -> bool:
-        """Whether :meth:`moved_objects` finds the same on the way back if all pixels are known and windows equal."""
-        return self.kind == STATIC
-
-    @property
-    def reads_same_back(self) -> bool:
-        """Whether :meth:`read` finds the same on the way back if windows are equal."""
-        return self.kind == STATIC and not self.fields
 
     @property
     def reads_one_frame(self) -> bool:

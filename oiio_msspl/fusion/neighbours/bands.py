@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A frame in bands of rows, which bounds the memory of averaging, and planes at the LRHS's resolution and back."""
+"""Cuts a frame into bands of rows, which bounds memory, and brings planes to the LRHS's resolution and back."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from oiio_msspl.model.contract import SCALES
 
 T = TypeVar("T")
 
-#: Bands are worked on two at a time. Two together have at most so many pixels, which bounds memory, unless they have
-#: fewer rows than that each: the rows around a band are computed twice.
+#: Two bands are worked on at a time. Together they have at most this many pixels, unless a band would have fewer rows
+#: than ``BAND_ROWS``: the rows around a band are computed twice.
 BAND_PIXELS, BAND_ROWS = 1 << 22, 128
 #: The rows of a band are a multiple of every scale.
 ROW_MULTIPLE = max(SCALES)
-#: Rows and columns around a pixel that decide on it, beside what interpolation needs.
+#: Rows and columns around a pixel that decide on it, without those that interpolation needs.
 REACH = 28
 
 
 def for_bands(alignment: Alignment, work: Callable[[Window, Window], T], weight: float = 1.0) -> list[T]:
-    """The results of ``work(core, area)`` for each band, from top to bottom; two are computed at the same time.
+    """Call ``work(core, area)`` for each band, two at a time, and return the results from top to bottom.
 
-    ``core`` has the rows of the data window that are to be computed, ``area`` also those around that decide on them.
+    ``core`` has the rows of the data window that are to be computed, ``area`` also the rows around that decide on them.
 
     Args:
-        weight: how many times as much memory as usual a pixel takes. Bands have fewer rows then.
+        weight: how many times the usual memory a pixel takes. Bands have fewer rows then.
     """
     window, scale = alignment.hr_data_window, alignment.scale
     halo, rows = -(-REACH // scale) * scale + 2 * scale, _band_rows(window, weight)
@@ -51,19 +51,24 @@ def _band_rows(window: Window, weight: float) -> int:
 
 
 def rows_in_bands(window: Window, weight: float = 1.0) -> int:
-    """The most rows of the areas of :func:`for_bands` that are worked on at the same time, in this data window."""
+    """Return how many rows of a data window :func:`for_bands` works on at the same time, at most."""
     halos = 4 * REACH
     return min(window.height + halos, 2 * (_band_rows(window, weight) + halos))
 
 
-def grid_rows(alignment: Alignment, area: Window) -> slice:
-    """The rows of the grid that an area of the data window covers."""
+def grid_window(alignment: Alignment, area: Window) -> Window:
+    """Return the LRHS pixels that cover an area, over the width of the grid."""
     grid, scale = alignment.grid, alignment.scale
-    return slice(area.y0 // scale - grid.y0, -(-area.y1 // scale) - grid.y0)
+    return Window(grid.x0, area.y0 // scale, grid.x1, -(-area.y1 // scale))
+
+
+def grid_rows(alignment: Alignment, area: Window) -> slice:
+    """Return the rows of the grid that cover an area."""
+    return grid_window(alignment, area).slices(alignment.grid)[0]
 
 
 def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
-    """A plane (h, w) over ``area`` at the LRHS's resolution, over the width of the grid."""
+    """Average a plane (h, w) over ``area`` to the LRHS's resolution, over :func:`grid_window`."""
     whole = _whole_pixels(alignment, area)
     if whole != area:
         plane = mirrored(plane, area, whole)
@@ -71,12 +76,11 @@ def to_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
 
 
 def from_grid(alignment: Alignment, plane: Array, area: Window) -> Array:
-    """A plane over :func:`grid_rows` of ``area`` at full resolution, (h, w) over ``area``."""
+    """Interpolate a plane over :func:`grid_window` of ``area`` at full resolution, (h, w) over ``area``."""
     whole = _whole_pixels(alignment, area)
     return upsample_linear(plane, alignment.scale, slice(0, len(plane)))[area.slices(whole)]
 
 
 def _whole_pixels(alignment: Alignment, area: Window) -> Window:
-    """An area, widened to whole LRHS pixels over the width of the grid."""
-    grid, scale = alignment.grid, alignment.scale
-    return Window(grid.x0 * scale, area.y0 // scale * scale, grid.x1 * scale, -(-area.y1 // scale) * scale)
+    grid, scale = grid_window(alignment, area), alignment.scale
+    return Window(grid.x0 * scale, grid.y0 * scale, grid.x1 * scale, grid.y1 * scale)

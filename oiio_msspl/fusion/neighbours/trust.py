@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Has the light of a frame's neighbour changed?
+"""Tells whether the light of a frame's neighbour has changed.
 
 Both renders of a frame, `L` and `H`, are compared with those of a neighbour at the LRHS's resolution. They have
 independent noise, so the mean of the product of the two differences is the squared change of the light without the
@@ -7,6 +7,8 @@ noise of the renders. (Zheng et al. 2021 estimate errors from two independent bu
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,7 +21,7 @@ from oiio_msspl.image.filters import grown, max_3x3, means_around, sum_3x3
 #: The change is averaged over squares of two sizes, in HRLS pixels to each side. The small one finds the edge of a
 #: shadow, the large one a faint change of all the light.
 RADII = (14, REACH)
-#: The error that a fused frame has itself: the variance of the noise of this many HRLS pixels, averaged.
+#: The error of a fused frame is as large as the noise of the mean of this many HRLS pixels.
 PIXELS_AVERAGED = 80.0
 #: How many standard deviations of its own noise are subtracted from an estimated change.
 DOUBT = 0.5
@@ -29,9 +31,12 @@ LARGEST_DIFFERENCE = 3.0
 DARKEST = 0.02
 #: Relative squared difference below which two frames are equal.
 EQUAL = 1e-4
-#: A lamp shines in one frame alone where the mean of 3 x 3 LRHS pixels is so many times as bright as the brightest of
+#: A lamp shines in one frame alone where the mean of 3 x 3 LRHS pixels is this many times as bright as the brightest of
 #: them in the other frame.
 LAMP = 3.0
+
+#: See :meth:`Light.judge`.
+Judge = Callable[[Array, Array], Array]
 
 
 class Light:
@@ -40,11 +45,12 @@ class Light:
     Args:
         alignment: of the frame.
         lrhs, hrls: luminance of both renders (h, w) over the grid.
-        picture: luminance (h, w) over the grid by which differences are relative.
+        picture: luminance (h, w) over the grid that differences are relative to.
     """
 
     def __init__(self, alignment: Alignment, lrhs: Array, hrls: Array, picture: Array) -> None:
-        self._alignment = alignment
+        self.alignment = alignment
+        """Of the frame."""
         self.darkest = DARKEST * float(picture.mean(dtype=np.float64)) + 1e-30
         """Luminance that is added to the local brightness."""
         self._brightness = means_around(picture, [1])[0] + np.float32(self.darkest)
@@ -52,29 +58,36 @@ class Light:
         self._least, self._most = _bounds(lrhs, hrls)
         low, high = (render / self._brightness for render in self._renders)
         noise = np.square(np.clip((low - high) / 2, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE))
-        scale = alignment.scale
+        reaches = [max(1, round(radius / alignment.scale)) for radius in RADII]
         #: For each radius in LRHS pixels: the variance of the mean of both renders.
-        reaches = [max(1, round(r / scale)) for r in RADII]
         self._noise = dict(zip(reaches, means_around(noise, reaches), strict=True))
 
-    def trust(self, lrhs: Array, hrls: Array, area: Window) -> Array:
-        """How much a neighbour counts, from 0 to 1, (h, w) over :func:`grid_rows` of ``area``.
+    def judge(self, area: Window) -> Judge:
+        """Return the function that judges the neighbours on one side, from the nearest to the farthest.
 
-        Args:
-            lrhs, hrls: luminance of the neighbour's renders, (h, w) over the same rows. For a fused neighbour, its
-                luminance is both.
+        It takes the luminance of a neighbour's LRHS and HRLS (h, w) over the grid pixels of ``area``; for a fused
+        neighbour, its luminance is both. It returns how much the neighbour counts (h, w), from 0 to 1, and never more
+        than a nearer one: a light that has changed there has changed in the farther one.
         """
-        rows = grid_rows(self._alignment, area)
+        trust: Array | np.float32 = np.float32(1)
+
+        def judge(lrhs: Array, hrls: Array) -> Array:
+            nonlocal trust
+            trust = np.minimum(trust, self._trust(lrhs, hrls, grid_rows(self.alignment, area)))
+            return trust
+
+        return judge
+
+    def _trust(self, lrhs: Array, hrls: Array, rows: slice) -> Array:
+        """Return how much one neighbour counts, over some rows of the grid."""
         brightness = self._brightness[rows]
-        differences = [
-            np.clip((render[rows] - other) / brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
-            for render, other in zip(self._renders, (lrhs, hrls), strict=True)
-        ]
-        product = differences[0] * differences[1]
+        product = np.ones_like(brightness)
+        for own, render in zip(self._renders, (lrhs, hrls), strict=True):
+            product *= np.clip((own[rows] - render) / brightness, -LARGEST_DIFFERENCE, LARGEST_DIFFERENCE)
         trust = np.ones_like(product)
         for (reach, variance), mean in zip(self._noise.items(), means_around(product, list(self._noise)), strict=True):
             noise = variance[rows]
-            own_error = noise * np.float32(self._alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
+            own_error = noise * np.float32(self.alignment.scale**2 / PIXELS_AVERAGED) + np.float32(EQUAL)
             uncertainty = np.float32(DOUBT * 2 / (2 * reach + 1)) * noise
             change = np.maximum(mean - uncertainty - own_error, 0)
             np.minimum(trust, own_error / (own_error + change), out=trust)
@@ -88,7 +101,7 @@ class Light:
 
 
 def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
-    """How bright each 3 x 3 pixels (h, w) are at least, on average, and their brightest pixel at most.
+    """Return the mean of 3 x 3 pixels (h, w) in the darker render, and their brightest pixel in either render.
 
     A firefly is in one render alone. What is bright in both is a lamp, however small it is. Means over many pixels do
     not notice it, and a thousandth of its light is seen on a dark wall.
@@ -98,8 +111,12 @@ def _bounds(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
 
 
 def relative_difference(own: Array, other: Array, darkest: float) -> Array:
-    """The difference of two luminances, divided by the root of their product. At least ``darkest`` counts for each."""
-    own, other = (np.maximum(each, np.float32(darkest)) for each in (own, other))
+    """Return the difference of two luminances, divided by the root of their product.
+
+    Args:
+        darkest: luminance that each of them counts as at least.
+    """
+    own, other = (np.maximum(values, np.float32(darkest)) for values in (own, other))
     with np.errstate(over="ignore", under="ignore", divide="ignore"):  # the product could overflow, as the ratio may
         ratio = np.sqrt(own / other)
         return np.asarray(ratio - 1 / ratio, np.float32)

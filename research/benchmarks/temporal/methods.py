@@ -14,7 +14,8 @@ from oiio_msspl import map_render, open_exr
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.neighbours.renders import RenderPair, average_renders
+from oiio_msspl.fusion.neighbours.average import average_renders
+from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import InputOptions
@@ -89,9 +90,9 @@ def _by_scale(
         return replace(stages.read(frame), hr_pixels=full.load())
 
     def theirs(denoised: Callable[[ReadableRender], Array], loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
-        averaged = average_renders(RenderPair(loaded.lr_pixels, loaded.hr_pixels), *neighbours)
-        pair = RenderPair(averaged.lr, averaged.hr)
-        fused = FusedFrame(denoised(averaged.hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
+        lr, hr, _ = average_renders(RenderPair(loaded.lr_pixels, loaded.hr_pixels), *neighbours)
+        pair = RenderPair(lr, hr)
+        fused = FusedFrame(denoised(hr), None, None, pair.alignment, 1.0, {}, *pair.luminances)
         return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
 
     for quality, prefix in QUALITIES.items():

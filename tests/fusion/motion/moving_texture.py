@@ -1,9 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A picture that moves from frame to frame, and the steps to its neighbours, for the tests of averaging."""
+"""A picture that moves from frame to frame, and the hops to its neighbours, for the tests of averaging."""
 
 import numpy as np
 
-from oiio_msspl.fusion.neighbours.path import Step
+from oiio_msspl.fusion.motion.shot import Motion
+from oiio_msspl.fusion.neighbours.path import Hop
 
 HEIGHT, WIDTH, SCALE = 96, 128, 4
 
@@ -20,10 +21,15 @@ def rms(image, truth, part=slice(None)):
     return float(np.sqrt(np.mean(np.square(image - truth)[part])))
 
 
+def hop(frame, vectors=None, back=None, known=None, **more):
+    """A hop to a frame along vectors, and the way back."""
+    return Hop(frame, Motion(vectors, known, **more), Motion(back, **more))
+
+
 def still(frame):
-    return Step(frame, None, None, None, None)
+    return hop(frame)
 
 
 def moved(frame, x, y=0.0):
     there = np.broadcast_to(np.float32([x, y]), (HEIGHT, WIDTH, 2))
-    return Step(frame, there, None, -there, None)
+    return hop(frame, there, -there)

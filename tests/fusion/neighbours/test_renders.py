@@ -1,20 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Renders are averaged with those of neighbours where these show the same surface in the same light, nowhere else."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.neighbours import bands
-from oiio_msspl.fusion.neighbours.path import Step
-from oiio_msspl.fusion.neighbours.renders import RenderPair, average_renders, shared_noise
+from oiio_msspl.fusion.neighbours.average import average_renders as average
+from oiio_msspl.fusion.neighbours.renders import RenderPair, shared_noise
 from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.image.parallel import limit_threads
 from tests.conftest import rgb, write_exr
-from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
+from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, hop, moved, rms, still, texture
 
 NOISE = 0.5
+
+
+@dataclass
+class Averaged:
+    """What average_renders returns."""
+
+    lr: Render
+    hr: Render
+    frames: np.ndarray
+
+
+def average_renders(pair, before, after):
+    return Averaged(*average(pair, before, after))
 
 
 def pair_of(truth, seed, **more):
@@ -70,7 +85,7 @@ def test_pixels_do_not_share_their_noise():
 
 def test_what_no_neighbour_shows_keeps_every_bit():
     pair = pair_of(texture(), 1)
-    hidden = Step(pair_of(texture(), 2), None, np.zeros((HEIGHT, WIDTH), bool), None, None)
+    hidden = hop(pair_of(texture(), 2), known=np.zeros((HEIGHT, WIDTH), bool))
     lost = moved(pair_of(texture(), 3), 5.0 * WIDTH)
     result = average_renders(pair, [hidden], [lost])
     for name in ("lr", "hr"):
@@ -125,7 +140,7 @@ def test_a_lamp_that_is_wider_in_the_lrhs_leaves_no_ghost():
         low = pairs[-1].lr.layers["rgb"]
         y, x = (slice(part.start // SCALE - 1, part.stop // SCALE + 1) for part in place)
         low[y, x] = np.maximum(low[y, x], 5)
-    result = average_renders(pairs[0], [Step(pairs[1], ways[0], None, ways[1], None)], [])
+    result = average_renders(pairs[0], [hop(pairs[1], *ways)], [])
     ghost = np.s_[9:14, 7:11]
     assert result.lr.layers["rgb"][ghost].max() < 1.5 * pairs[0].lr.layers["rgb"][ghost].max()
 
@@ -194,8 +209,8 @@ def test_an_lrhs_that_was_rounded_is_averaged():
 
     for size in ((24, 32), (25, 33)):
         pairs = [odd(size) for _ in range(3)]
-        step = np.full((*truth.shape[:2], 2), 2.0, np.float32)
-        after = Step(pairs[2], step, None, -step, None)
+        way = np.full((*truth.shape[:2], 2), 2.0, np.float32)
+        after = hop(pairs[2], way, -way)
         result = average_renders(pairs[0], [still(pairs[1])], [after])
         for name in ("lr", "hr"):
             own, made = (getattr(pair, name).layers["rgb"] for pair in (pairs[0], result))
@@ -256,7 +271,7 @@ def test_rows_above_the_frame_are_averaged_like_others(monkeypatch):
 
     def result(rows):
         own, other = (RenderPair(raised(pair.lr, rows // SCALE), raised(pair.hr, rows)) for pair in pairs)
-        return average_renders(own, [], [Step(other, way, None, back, None)]).lr.layers["rgb"]
+        return average_renders(own, [], [hop(other, way, back)]).lr.layers["rgb"]
 
     assert np.allclose(result(0), result(HEIGHT), atol=1e-5)
 

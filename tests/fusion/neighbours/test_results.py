@@ -8,14 +8,15 @@ import pytest
 
 from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.motion.shot import ROUND_TRIP, ROUND_TRIP_OF_FLOW
+from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.fusion.neighbours import bands
-from oiio_msspl.fusion.neighbours.path import ROUND_TRIP, ROUND_TRIP_OF_FLOW, Step, near_borders
-from oiio_msspl.fusion.neighbours.results import accumulate
+from oiio_msspl.fusion.neighbours.average import average_results
 from oiio_msspl.fusion.neighbours.trust import relative_difference
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.image.colour import luminance
-from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture
+from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, hop, moved, rms, still, texture
 
 #: Deviation of the error of a fused frame, as a share of its light, and of a sample's noise.
 FUSED_ERROR, SAMPLE_NOISE = 0.03, 0.5
@@ -39,7 +40,7 @@ def frame_of(truth, seed, alpha=None, error=FUSED_ERROR):
 def test_four_still_neighbours_halve_the_error():
     truth = texture()
     frames = [frame_of(truth, seed) for seed in range(5)]
-    result = accumulate(frames[2], [still(frames[1]), still(frames[0])], [still(frames[3]), still(frames[4])])
+    result = average_results(frames[2], [still(frames[1]), still(frames[0])], [still(frames[3]), still(frames[4])])
     assert rms(result.rgb, truth) < 0.55 * rms(frames[2].rgb, truth)
     assert np.median(result.frames) > 4
 
@@ -47,10 +48,10 @@ def test_four_still_neighbours_halve_the_error():
 def test_neighbours_are_found_where_their_surfaces_are():
     frames = {n: frame_of(texture(1.7 * n), n + 5) for n in (-2, -1, 0, 1, 2)}
     before, after = ([moved(frames[n], 1.7 * np.sign(n)) for n in numbers] for numbers in ((-1, -2), (1, 2)))
-    result = accumulate(frames[0], before, after)
+    result = average_results(frames[0], before, after)
     inside = np.s_[:, 4:-4]
     assert rms(result.rgb, texture(), inside) < 0.6 * rms(frames[0].rgb, texture(), inside)
-    wrong = accumulate(frames[0], [still(frames[-1])], [still(frames[1])])
+    wrong = average_results(frames[0], [still(frames[-1])], [still(frames[1])])
     assert rms(wrong.rgb, texture(), inside) > 1.2 * rms(result.rgb, texture(), inside)
 
 
@@ -63,8 +64,8 @@ def test_another_mix_of_two_surfaces_hardly_counts():
     vectors[:, WIDTH // 2 :] = (0.5, 0)
     frame, neighbour = (frame_of(truth, seed, error=0) for seed in (1, 2))
     frame.rgb[edge], neighbour.rgb[edge] = 0.1, 0.3
-    steps = [Step(neighbour, motion, None, -motion, None) for motion in (np.zeros_like(vectors), vectors)]
-    without, with_borders = (accumulate(frame, [step], []).rgb[edge] - 0.1 for step in steps)
+    hops = [hop(neighbour, motion, -motion) for motion in (np.zeros_like(vectors), vectors)]
+    without, with_borders = (average_results(frame, [way], []).rgb[edge] - 0.1 for way in hops)
     assert 0 < 3 * with_borders.mean() < without.mean()
 
 
@@ -78,7 +79,7 @@ def test_the_rim_of_a_lamp_in_the_neighbour_leaves_no_ghost():
     back = none.copy()
     back[lamp] = (-40, 0)
     for vectors in (None, none):
-        result = accumulate(frame, [Step(neighbour, vectors, None, back, None)], [])
+        result = average_results(frame, [hop(neighbour, vectors, back)], [])
         assert (result.rgb[rim] < 1.1 * frame.rgb[rim]).all()
 
 
@@ -90,10 +91,11 @@ def test_borders_that_are_known_change_no_bit(monkeypatch):
     vectors = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     vectors[20:60, 30:80] = (0.2, 0.1)
     vectors[33, ::9] = 0.4
-    steps = [Step(neighbour, way, None, -way, None) for way in (vectors, vectors[::-1].copy())]
-    for step in steps:
-        known = replace(step, borders=near_borders(step.vectors, 0.25), back_borders=near_borders(step.back, 0.25))
-        assert np.array_equal(accumulate(frame, [step], []).rgb, accumulate(frame, [known], []).rgb)
+    hops = [hop(neighbour, way, -way) for way in (vectors, vectors[::-1].copy())]
+    for way in hops:
+        there, back = (replace(m, borders=near_borders(m.vectors, 0.25)) for m in (way.there, way.back))
+        known = replace(way, there=there, back=back)
+        assert np.array_equal(average_results(frame, [way], []).rgb, average_results(frame, [known], []).rgb)
 
 
 def test_borders_reach_one_pixel_to_each_side():
@@ -110,8 +112,8 @@ def test_a_way_back_that_misses_by_more_than_the_tolerance_does_not_count():
     frame, neighbour = frame_of(texture(), 1), frame_of(texture(), 2)
     vectors = np.zeros((HEIGHT, WIDTH, 2), np.float32)
     for tolerance, counts in ((ROUND_TRIP, False), (ROUND_TRIP_OF_FLOW, True)):
-        step = Step(neighbour, vectors, None, vectors + np.float32(0.5), None, tolerance)
-        assert np.array_equal(accumulate(frame, [step], []).rgb, frame.rgb) != counts
+        way = hop(neighbour, vectors, vectors + np.float32(0.5), tolerance=tolerance)
+        assert np.array_equal(average_results(frame, [way], []).rgb, frame.rgb) != counts
 
 
 @pytest.mark.parametrize("arrives", [True, False])
@@ -125,31 +127,26 @@ def test_a_thing_that_covers_what_stands_still_is_not_averaged(arrives):
     away[place] = (-40, 0)
     vectors, back = (none, away) if arrives else (away, none)
     for ways in ((vectors, back), tuple(way if way.any() else None for way in (vectors, back))):
-        result = accumulate(frame, [Step(neighbour, ways[0], None, ways[1], None)], [])
+        result = average_results(frame, [hop(neighbour, *ways)], [])
         assert np.array_equal(result.rgb[place], frame.rgb[place])
         assert not np.array_equal(result.rgb, frame.rgb)
 
 
 def test_without_neighbours_every_bit_stays():
     frame = frame_of(texture(), 1)
-    result = accumulate(frame, [], [])
+    result = average_results(frame, [], [])
     assert np.array_equal(result.rgb, frame.rgb) and (result.frames == 1).all()
 
 
 def test_a_frame_that_no_neighbour_shows_keeps_every_bit():
     frame = frame_of(texture(), 1)
-    hidden = Step(frame_of(texture(), 2), None, np.zeros((HEIGHT, WIDTH), bool), None, None)
+    hidden = hop(frame_of(texture(), 2), known=np.zeros((HEIGHT, WIDTH), bool))
     lost = moved(frame_of(texture(), 3), 5.0 * WIDTH)
-    there_only = Step(
-        frame_of(texture(), 4),
-        np.ones((HEIGHT, WIDTH, 2), np.float32),
-        None,
-        np.zeros((HEIGHT, WIDTH, 2), np.float32) + 9,
-        None,
-    )
-    result = accumulate(frame, [hidden], [lost])
+    there, back = np.ones((HEIGHT, WIDTH, 2), np.float32), np.zeros((HEIGHT, WIDTH, 2), np.float32) + 9
+    there_only = hop(frame_of(texture(), 4), there, back)
+    result = average_results(frame, [hidden], [lost])
     assert np.array_equal(result.rgb, frame.rgb)
-    assert np.array_equal(accumulate(frame, [there_only], []).rgb, frame.rgb)
+    assert np.array_equal(average_results(frame, [there_only], []).rgb, frame.rgb)
 
 
 @pytest.mark.parametrize("change", [0.0, 0.3, 2.0])
@@ -158,7 +155,7 @@ def test_light_that_changes_is_not_averaged(change):
     truth, other = texture(), texture()
     other[:, WIDTH // 2 :] *= change
     frames = [frame_of(truth, 1), frame_of(other, 2), frame_of(other, 3)]
-    result = accumulate(frames[0], [still(frames[1])], [still(frames[2])])
+    result = average_results(frames[0], [still(frames[1])], [still(frames[2])])
     changed = np.s_[:, WIDTH // 2 + 8 :]
     assert rms(result.rgb, truth, changed) < 1.1 * rms(frames[0].rgb, truth, changed)
     same = np.s_[:, : WIDTH // 4]
@@ -173,7 +170,7 @@ def test_a_small_lamp_that_is_on_in_one_frame_leaves_no_trace(on):
     lit[lamp] = 200
     truth, other = (lit, wall) if on else (wall, lit)
     frames = [frame_of(truth, 1), frame_of(other, 2), frame_of(other, 3)]
-    result = accumulate(frames[0], [still(frames[1])], [still(frames[2])])
+    result = average_results(frames[0], [still(frames[1])], [still(frames[2])])
     around = np.s_[38:45, 59:67]
     assert np.array_equal(result.rgb[around], frames[0].rgb[around])
     assert np.median(result.frames) > 2
@@ -182,14 +179,14 @@ def test_a_small_lamp_that_is_on_in_one_frame_leaves_no_trace(on):
 def test_light_that_has_changed_in_the_nearer_frame_has_in_the_farther_one():
     truth, dark = texture(), texture() * 0.2
     frames = [frame_of(truth, 1), frame_of(dark, 2), frame_of(truth, 3)]
-    result = accumulate(frames[0], [still(frames[1]), still(frames[2])], [])
+    result = average_results(frames[0], [still(frames[1]), still(frames[2])], [])
     assert np.median(result.frames) < 1.2
 
 
 def test_a_scaled_scene_gives_a_scaled_result():
     def result(factor):
         frames = [frame_of(texture() * np.float32(factor), seed) for seed in range(3)]
-        return accumulate(frames[1], [moved(frames[0], 0.4)], [moved(frames[2], -0.4)]).rgb
+        return average_results(frames[1], [moved(frames[0], 0.4)], [moved(frames[2], -0.4)]).rgb
 
     assert np.allclose(result(1024.0) / 1024, result(1.0), rtol=1e-5)
     assert np.isfinite(result(1e-20)).all() and np.isfinite(result(1e25)).all()
@@ -199,11 +196,11 @@ def test_alpha_is_averaged_with_the_same_weights():
     frames = [frame_of(texture(), seed) for seed in range(3)]
     for frame in frames:
         frame.alpha = frame.rgb[..., :1].copy()
-    result = accumulate(frames[1], [moved(frames[0], 0.3)], [moved(frames[2], -0.3)])
+    result = average_results(frames[1], [moved(frames[0], 0.3)], [moved(frames[2], -0.3)])
     assert np.array_equal(result.alpha, result.rgb[..., :1])
     without = frame_of(texture(), 4)
-    assert np.allclose(accumulate(frames[1], [still(without)], []).alpha, frames[1].alpha)
-    assert accumulate(without, [still(frames[1])], []).alpha is None
+    assert np.allclose(average_results(frames[1], [still(without)], []).alpha, frames[1].alpha)
+    assert average_results(without, [still(frames[1])], []).alpha is None
 
 
 def test_neighbours_may_have_other_data_windows():
@@ -216,12 +213,12 @@ def test_neighbours_may_have_other_data_windows():
         Render({"rgb": truth[4:20, 8:24]}, Window(8, 4, 24, 20), Window(0, 0, WIDTH // SCALE, HEIGHT // SCALE)),
         Render({"rgb": part.rgb}, window, Window(0, 0, WIDTH, HEIGHT)),
     )
-    result = accumulate(whole[0], [still(part)], [])
+    result = average_results(whole[0], [still(part)], [])
     outside = np.ones((HEIGHT, WIDTH), bool)
     outside[16:80, 32:96] = False
     assert np.array_equal(result.rgb[outside], whole[0].rgb[outside])
     assert rms(result.rgb, truth, np.s_[16:80, 32:96]) < 0.85 * rms(whole[0].rgb, truth, np.s_[16:80, 32:96])
-    assert rms(accumulate(part, [still(whole[0])], []).rgb, truth[16:80, 32:96]) < 0.85 * rms(
+    assert rms(average_results(part, [still(whole[0])], []).rgb, truth[16:80, 32:96]) < 0.85 * rms(
         part.rgb, truth[16:80, 32:96]
     )
 
@@ -237,7 +234,7 @@ def test_bands_of_rows_agree(monkeypatch, alpha):
     def result(rows):
         monkeypatch.setattr(bands, "BAND_ROWS", rows)
         monkeypatch.setattr(bands, "BAND_PIXELS", 1)
-        return accumulate(frames[1], [moved(frames[0], -0.7, 0.4)], [moved(frames[2], 0.7, -3.3)])
+        return average_results(frames[1], [moved(frames[0], -0.7, 0.4)], [moved(frames[2], 0.7, -3.3)])
 
     whole, parts = result(1024), result(16)
     assert np.allclose(whole.rgb, parts.rgb, rtol=1e-5) and np.allclose(whole.frames, parts.frames, rtol=1e-5)

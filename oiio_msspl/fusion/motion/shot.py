@@ -1,0 +1,111 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The motion between the frames of a shot: read once for each two frames, and kept as long as these are needed."""
+
+from __future__ import annotations
+
+from collections.abc import Collection
+from dataclasses import dataclass
+from functools import partial
+
+from oiio_msspl.errors import InputError
+from oiio_msspl.fusion.motion.source import FLOW, STATIC, MotionFrame, MotionSource
+from oiio_msspl.fusion.motion.vectors import near_borders
+from oiio_msspl.image.arrays import Array, Mask, kept
+from oiio_msspl.image.parallel import in_parallel
+
+#: A vector and the way back may differ by this, in HRLS pixels: by rounding, and by what vectors change within a pixel.
+#: Vectors of optical flow are estimates, so more is allowed.
+ROUND_TRIP, ROUND_TRIP_OF_FLOW = 0.25, 1.0
+#: The vectors of two frames with more pixels are read one after the other, because decoding takes several times their
+#: memory.
+LARGEST_READ = 1 << 22
+
+
+@dataclass(frozen=True)
+class Motion:
+    """Where the surfaces of a frame are in the frame before or after it."""
+
+    vectors: Array | None = None
+    """(h, w, 2) over the frame's data window: from a pixel to the place of its surface, in HRLS pixels, as (x, y) with
+    y downwards. None: every surface stays."""
+    known: Mask | None = None
+    """(h, w): which vectors can be believed; None if all can."""
+    moved_objects: Mask | None = None
+    """(h, w): where an object has moved that the vectors do not follow. Such pixels are not ``known``."""
+    borders: Mask | None = None
+    """(h, w): :func:`near_borders` of the vectors; None if they are not computed yet."""
+    tolerance: float = ROUND_TRIP
+    """How far the way back may miss the pixel, in HRLS pixels."""
+
+
+class ShotMotion:
+    """The motion between frames of a shot that follow each other, for one view.
+
+    Args:
+        source: how the motion is known.
+        with_borders: also keep the borders of surfaces, which the average of fused frames needs.
+    """
+
+    def __init__(self, source: MotionSource, *, with_borders: bool) -> None:
+        self._source, self._with_borders = source, with_borders
+        #: By the numbers of two frames: forwards and backwards; None if the vectors are 0 and can't be believed.
+        self._motions: dict[tuple[int, int], tuple[Motion, Motion] | None] = {}
+
+    def between(self, here: MotionFrame, there: MotionFrame) -> tuple[Motion, Motion]:
+        """Return the motion from a frame to the one before or after it, and back.
+
+        Raises:
+            InputError: pixels can't be decoded, or vectors are 0 everywhere although the picture moves.
+        """
+        # Always in the same order, so that pixels do not depend on which frame comes first.
+        first, second = (here, there) if here.number < there.number else (there, here)
+        pair = first.number, second.number
+        if pair not in self._motions:
+            motions = self._read(first, second)
+            zero = any(motion.vectors is None and _any_known(motion) for motion in motions)
+            self._motions[pair] = None if zero and not self._source.zeros_are_right(first, second) else motions
+        found = self._motions[pair]
+        if found is None:
+            raise InputError(f"motion vectors between frames {pair[0]} and {pair[1]} are 0, though the picture moves")
+        return found if first is here else (found[1], found[0])
+
+    def keep(self, numbers: Collection[int]) -> None:
+        """Forget the motion of all frames but these."""
+        self._motions = {pair: motions for pair, motions in self._motions.items() if set(pair) <= set(numbers)}
+
+    def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion]:
+        """Read the motion between two frames, forwards and backwards."""
+        source, window = self._source, first.hr.data_window
+        read, read_back = partial(source.read, first, second, 1), partial(source.read, second, first, -1)
+        stands = source.kind == STATIC and window == second.hr.data_window
+        if stands and not source.fields:
+            forth = back = read()
+        elif source.reads_one_frame and window.width * window.height <= LARGEST_READ:
+            forth, back = in_parallel(read, read_back)
+        else:
+            forth, back = read(), read_back()
+        moved = self._moved_objects(first, second, *forth)
+        # If the camera stands still, objects have moved at the same pixels of both frames.
+        same = stands and bool(forth[1].all() and back[1].all())
+        moved_back = moved if same or back is forth else self._moved_objects(second, first, *back)
+        motion = self._motion(*forth, moved)
+        return motion, motion if back is forth else self._motion(*back, moved_back)
+
+    def _moved_objects(self, here: MotionFrame, there: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
+        """Find objects that have moved and that the vectors do not follow; None if there are none."""
+        objects = self._source.moved_objects(here, there, vectors, known) if known.any() else None
+        return kept(objects) if objects is not None and objects.any() else None
+
+    def _motion(self, vectors: Array, known: Mask, moved_objects: Mask | None) -> Motion:
+        """Keep vectors as they wait for the frames that need them."""
+        tolerance = ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP
+        if moved_objects is not None:
+            known &= ~moved_objects
+        moves = vectors.any()
+        borders = kept(near_borders(vectors, tolerance)) if moves and self._with_borders else None
+        all_known = None if known.all() else kept(known)
+        return Motion(kept(vectors) if moves else None, all_known, moved_objects, borders, tolerance)
+
+
+def _any_known(motion: Motion) -> bool:
+    return motion.known is None or bool(motion.known.any())

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from oiio_msspl.exr.render import Render, Window
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.fusion.fuse import FusedFrame, fuse
-    from oiio_msspl.jobs.frame import fuse_files
+    from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.inputs import InputOptions
     from oiio_msspl.jobs.report import FrameReport
     from oiio_msspl.jobs.shot import fuse_shot
@@ -54,7 +54,7 @@ _MODULES = {
     "WriteOptions": "exr.write_options",
     "find_model": "model.catalogue",
     "fuse": "fusion.fuse",
-    "fuse_files": "jobs.frame",
+    "fuse_files": "jobs.files",
     "fuse_shot": "jobs.shot",
     "map_render": "aovs.matching",
     "open_exr": "exr.reader",

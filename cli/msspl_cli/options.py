@@ -18,7 +18,7 @@ from oiio_msspl.errors import InputError, printable
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.jobs.inputs import InputOptions
-    from oiio_msspl.jobs.temporal import TemporalOptions
+    from oiio_msspl.jobs.plan import TemporalOptions
 
 #: Bytes above which a size is a slip. Larger numbers are infinite as floats.
 LARGEST_MEMORY = 1 << 62
@@ -313,7 +313,7 @@ def make_temporal_options(frames: str, motion_format: str | None) -> TemporalOpt
     Raises:
         InputError: no such number of frames.
     """
-    from oiio_msspl.jobs.temporal import TemporalOptions
+    from oiio_msspl.jobs.plan import TemporalOptions
 
     return TemporalOptions(frames, motion_format)
 

@@ -1,110 +1,173 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The main job on one frame: fuse a pair of EXRs into one EXR and its preview."""
+"""A frame of a shot on its way from its files to its result, one record for each view."""
 
 from __future__ import annotations
 
-import time
-from collections.abc import Callable
-from dataclasses import replace
-from pathlib import Path
+import traceback
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from enum import IntEnum
 
-from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import check_target, remove_leftovers
-from oiio_msspl.exr.preview import check_view
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.errors import InputError, MssplError, explain
+from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
-from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.frame_checks import check_frame_memory, memory_to_write
-from oiio_msspl.jobs.frame_passes import Progress, steps_of
-from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.jobs.model_choice import resolve_auto
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.motion.source import MotionFrame
+from oiio_msspl.fusion.neighbours.renders import RenderPair
+from oiio_msspl.image.arrays import Array, Mask, kept
+from oiio_msspl.jobs.memory import ViewMemory
+from oiio_msspl.jobs.passes import Progress
+from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.report import FrameReport
-from oiio_msspl.jobs.sequence import Frame, is_sequence
-from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.timeline import Key
+from oiio_msspl.jobs.views import OtherViews
+from oiio_msspl.model.session import Session
 
 
-def fuse_files(
-    lr_path: str | Path,
-    hr_path: str | Path,
-    output: str | Path,
-    *,
-    inputs: InputOptions = InputOptions(),
-    write: WriteOptions = WriteOptions(),
-    model: str | None = None,
-    device: str = "cpu",
-    threads: int = 0,
-    max_memory: int = MAX_MEMORY,
-    preview_path: str | Path | None = None,
-    view_transform: str | None = None,
-    overwrite: bool = False,
-    progress: Callable[[int, int], None] | None = None,
-) -> FrameReport:
-    """Fuse a pair of EXR files.
+class State(IntEnum):
+    """How far a frame has come."""
 
-    Args:
-        lr_path, hr_path: the low-resolution, high-spp render and the high-resolution, low-spp render of one frame.
-        output: EXR to write.
-        inputs: mapping, view and spp of the two files. If it names no view, all views and view layers are fused.
-        write: layout, compression, pixel type and layers of the result.
-        model: a quality (``best``), a family of models (``paper``), a shipped model, or an ONNX file. None and ``auto``
-            are the default quality, see :func:`oiio_msspl.model.catalogue.find_model`.
-        device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`, such as ``cpu`` or ``cuda``.
-        threads: CPU threads; 0 for one on each core.
-        max_memory: bytes that the process should stay below. The result does not depend on it.
-        preview_path: PNG to write, or None.
-        view_transform: OpenColorIO view of the preview; None for the sRGB curve.
-        overwrite: replace existing files.
-        progress: called with (steps done, steps in all). A step is a tile, or a band of rows of a set of passes.
+    FOUND = 0
+    """Its files are known."""
+    READ = 1
+    """Its pair is open and mapped. Its pixels are in memory, if there is room."""
+    AVERAGED = 2
+    """Its renders are averaged with those of its neighbours."""
+    FUSED = 3
+    """The network has fused it."""
+    SETTLED = 4
+    """Its picture is averaged with those of its neighbours, and its passes are fused."""
+    WRITTEN = 5
+    """Its EXR is on the disk."""
 
-    Returns:
-        What was read, fused and written.
 
-    Raises:
-        InputError: a file, an option or the pair can't be used. Nothing was written.
-        MssplError: the EXR can't be written. Nothing was written.
-    """
-    start = time.perf_counter()
-    output = check_target(output, overwrite=overwrite)
-    if output.suffix.lower() != ".exr":
-        raise InputError(f"{output}: the result is an EXR; name it .exr")
-    if is_sequence(output):
-        raise InputError(f"{output}: is a pattern, but LR and HR are single files; name one file")
-    if preview_path is not None:
-        preview_path = check_target(preview_path, overwrite=overwrite)
-        if preview_path.suffix.lower() != ".png":
-            raise InputError(f"{preview_path}: the preview is a PNG; name it .png")
-        if view_transform is not None:
-            check_view(view_transform)
-    stages = Stages(
-        inputs=inputs,
-        write_options=write,
-        model=model,
-        device=device,
-        threads=threads,
-        max_memory=max_memory,
-        view_transform=view_transform,
-        overwrite=overwrite,
-        reads_ahead=False,
-    )
-    frame = Frame(0, Path(lr_path), Path(hr_path), output, preview_path)
-    loaded = stages.read(frame)
-    remove_leftovers(frame.targets)
-    lr, hr = loaded.lr, loaded.hr
-    # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
-    if memory_to_write(align(lr, hr), hr, write) <= max_memory:
-        stages = replace(stages, model=resolve_auto(lr, hr, model))
-    session = stages.session(loaded)
-    check_frame_memory(lr, hr, session, write, max_memory)
-    opened = time.perf_counter()
+class NoSuchView(InputError):
+    """A frame lacks a view that other frames of the shot have."""
 
-    if progress is not None:
-        progress = Progress(progress, steps_of([(lr, hr), *loaded.others.views], session, write))
-    others = stages.fuse_others(loaded, session, progress=progress)
-    alone = stages.fuse(loaded, session, ((), ()), progress)
-    report = stages.complete(alone, alone.fused, others=others, progress=progress)
-    session.release_memory()  # for the writer's cache
-    report.seconds |= {"read": opened - start, "fuse": time.perf_counter() - opened}
-    with limit_threads(threads):
-        stages.write(report, alone.fused)
-    return report
+
+@dataclass(eq=False)
+class ShotFrame:
+    """One view of a frame. ``state`` says which of its attributes are set."""
+
+    files: FrameFiles
+    view: str | None = None
+    """The name of a view beside the first one that is averaged with its neighbours; None for the first one."""
+    plan: ViewPlan = field(default_factory=ViewPlan)
+    state: State = State.FOUND
+    error: Exception | None = None
+    """Why it did not come further."""
+    warnings: list[str] = field(default_factory=list)
+    """What is wrong with its neighbours, one sentence each."""
+    seconds: dict[str, float] = field(default_factory=dict)
+    """Wall time by what it was spent on: ``read`` and ``fuse``."""
+
+    # From READ on
+    lr: MappedRender = field(init=False)
+    hr: MappedRender = field(init=False)
+    stored: tuple[MappedRender, MappedRender] = field(init=False)
+    """The pair as files, with the light of its passes if renders are averaged with those of neighbours."""
+    renders: RenderPair = field(init=False)
+    """What is averaged and fused: pixels in memory, or ``stored``."""
+    write: WriteOptions = field(init=False)
+    """What is written of this view."""
+    memory: ViewMemory | None = None
+    """The budget of this view's frames; None if there is only one frame."""
+    vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
+    """Motion vectors that were read with the pixels, see :class:`oiio_msspl.fusion.motion.source.MotionFrame`."""
+    others: OtherViews = field(default_factory=OtherViews)
+    """Of the first view: the views that are fused by themselves."""
+
+    # From AVERAGED on
+    averaged: RenderPair = field(init=False)
+    """The means over neighbours; ``renders`` if there are none. Given up when the frame is fused."""
+    means: tuple[Render, Render] | None = None
+    """What passes are fused from of both means; None if there are no neighbours, or no passes to fuse."""
+    frame_counts: Array | None = None
+    """(h, w, 1): how many frames each pixel is the mean of; None if there are no neighbours."""
+
+    session: Session = field(init=False)
+    """The model for the scale of the pair."""
+
+    # From FUSED on
+    fused: FusedFrame = field(init=False)
+    """As fused alone."""
+    replaced: ReplacedChannels | None = None
+    """Of the first view: the channels of ``others``, fused."""
+    other_reports: list[FrameReport] = field(default_factory=list)
+    """Of the first view: on ``others``."""
+
+    progress: Progress | None = None
+    """Joins the progress of the parts of the work, if somebody wants to know it."""
+
+    # From SETTLED on
+    picture: FusedFrame = field(init=False)
+    """What is written."""
+    report: FrameReport = field(init=False)
+    """Of the first view: on all views."""
+
+    @property
+    def number(self) -> int:
+        """The frame number."""
+        return self.files.number
+
+    @property
+    def key(self) -> Key:
+        """What a timeline knows this frame by."""
+        return self.files.number, self.view
+
+    @property
+    def held_bytes(self) -> int:
+        """Memory of other frames while this one is fused."""
+        return self.memory.held if self.memory else 0
+
+    @contextmanager
+    def attempt(self) -> Iterator[None]:
+        """Keep an exception of the block as the frame's error, so that other frames go on."""
+        try:
+            yield
+        except Exception as error:
+            traceback.clear_frames(error.__traceback__)  # or they would keep pixels
+            self.error = error
+
+    def require(self) -> None:
+        """Raise what went wrong with this frame."""
+        if self.error is not None:
+            raise self.error
+
+    def require_as_neighbour(self) -> None:
+        """Raise what went wrong with this frame, for a neighbour that is averaged with it.
+
+        Raises:
+            InputError: its files can't be used, so it is left out in every run.
+            MssplError: it has failed otherwise, such as for a full disk. Without it, the neighbour would have other
+                pixels than in another run.
+        """
+        if self.error is None or isinstance(self.error, InputError):
+            self.require()
+            return
+        raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
+
+    def motion_frame(self) -> MotionFrame:
+        """Return what is needed to follow its surfaces."""
+        rgb = self.fused.rgb if self.state >= State.FUSED else None
+        return MotionFrame(self.hr, rgb, self.vectors, self.renders.hr, self.number, self.lr)
+
+    def keep_result(self) -> None:
+        """Let the fused picture wait for its neighbours, in a temporary file if it is large."""
+        fused = self.fused
+        fused.rgb = kept(fused.rgb)
+        fused.alpha = None if fused.alpha is None else kept(fused.alpha)
+        fused.error = None if fused.error is None else kept(fused.error)
+
+    def forget_pixels(self) -> None:
+        """Give up the pixels of the renders. The files can still be read."""
+        self.renders = RenderPair(*self.stored)
+
+    def forget_all_but_picture(self) -> None:
+        """Give up what only this frame's own result needs."""
+        self.means = None
+        self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)

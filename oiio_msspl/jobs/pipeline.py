@@ -1,130 +1,132 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Frames through the three stages in this process: one is read and one written while another is fused.
+"""Takes the frames of a shot through this process: one is read and one is written while another is fused.
 
-The calling thread fuses. A second thread reads the next frame, and a third writes the previous one. Each stage holds
-at most one frame, and a frame that is fused waits at most for a few neighbours, so memory does not grow with the shot.
+The calling thread fuses, a second one reads, and a third one writes. Each holds at most one frame, and a fused frame
+waits for a few neighbours at most. So memory does not grow with the length of the shot.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import closing
+from types import TracebackType
 from typing import Any
 
-from oiio_msspl.errors import InputError
-from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.image.parallel import limit_threads, submit
-from oiio_msspl.jobs.frame_window import FusedAlone, Neighbours
+from oiio_msspl.jobs.existing import ExistingResults
+from oiio_msspl.jobs.frame import ShotFrame
 from oiio_msspl.jobs.report import FrameReport
-from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.stages import LoadedFrame, Stages
-from oiio_msspl.jobs.view_windows import ViewWindows
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.write import write_settled
+
+#: Called with a frame, and its report as a dict, the reason for its failure, or None if another run has fused it.
+Record = Callable[[FrameFiles, dict[str, Any] | Exception | None], None]
 
 
-def run_pipeline(
-    stages: Stages,
-    frames: list[Frame],
-    record: Callable[[Frame, dict[str, Any] | Exception | None], None],
-    save: Callable[[], None],
-) -> None:
-    """Take frames through the stages. However this ends, the frame that is being written is finished and recorded.
+def run_pipeline(run: ShotRun, record: Record, save: Callable[[], None] = lambda: None) -> None:
+    """Fuse and write the frames of a shot. However this ends, the frame that is being written is finished and recorded.
 
     Args:
-        stages: the stages and their settings.
-        frames: what to fuse, in this order.
-        record: called in the order of the frames, with a frame and its report as a dict, the reason for its failure,
-            or None if another run has fused it in the meantime.
+        run: the shot.
+        record: called in the order of the frames.
         save: called after each frame, when the frames before it are recorded.
 
     Raises:
         InputError: the model can't be loaded, which no other frame would change.
     """
-    writing: tuple[Frame, FrameReport, Future[None]] | None = None
-
-    def record_failure(frame: Frame, error: Exception) -> None:
-        # If another run has written the EXR in the meantime, the frame is complete, whatever failed here.
-        record(frame, None if stages.skips(frame) else error)
-
-    def finish_writing() -> None:
-        """Wait until the frame that is being written is on the disk, and record it."""
-        nonlocal writing
-        if writing is None:
-            return
-        frame, report, written = writing
-        error = written.exception()
-        if error is None:
-            record(frame, report.as_dict())
-        elif isinstance(error, Exception):
-            record_failure(frame, error)
-        else:
-            raise error
-        # Reset last: a signal may interrupt the lines above, and the frame is then recorded on the way out.
-        writing = None
-
-    def fuse(loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone | Exception:
-        session = stages.session(loaded)
-        try:
-            return loaded.stages.fuse(loaded, session, neighbours)
-        except Exception as error:
-            return error
-
-    def finish(frame: Frame, outcome: FusedAlone | Exception) -> None:
-        """Complete a frame that is fused, and hand it over to the writer; or record why it could not be."""
-        nonlocal writing
-        error = outcome if isinstance(outcome, Exception) else None
-        if error is None and stages.temporal.count and stages.skips(frame):
-            error = InputError("another run has fused it")
-        if isinstance(outcome, FusedAlone) and error is None:
-            try:
-                fused = window.accumulate(frame.number)
-                report = outcome.loaded.stages.complete(outcome, fused, window.others(frame.number))
-            except Exception as caught:
-                error = caught
-        # The previous frame is written before this one is handed over, so one is written at a time.
-        finish_writing()
-        if error is not None:
-            record_failure(frame, error)
-            return
-        # `writing` is set before the hand-over: a signal may arrive during the hand-over.
-        written: Future[None] = Future()
-        writing = frame, report, written
-        submit(writer, _write, stages, report, fused, written)
-
-    window = ViewWindows(stages.temporal, frames, fuse)
-    order = window.order()
     with (
-        limit_threads(stages.threads),
-        ThreadPoolExecutor(1, "read") as reader,
-        ThreadPoolExecutor(1, "write") as writer,
+        limit_threads(run.settings.threads),
+        closing(read_ahead(run)) as source,
+        Writer(run.existing, record, save) as writer,
     ):
-        reads = [submit(reader, stages.read_views, frame) for frame in order[:1]]
+        for views in source:
+            for frame in run.take(views):
+                writer.write(frame)
+                del frame  # or its pixels would be held while the next one is fused
+
+
+def read_ahead(run: ShotRun) -> Generator[list[ShotFrame]]:
+    """Yield the frames of a shot. Each is read while the caller works on the one before it."""
+    order = run.order
+    with ThreadPoolExecutor(1, "read") as reader:
+        reads = [submit(reader, run.read, files) for files in order[:1]]
         try:
-            for index, frame in enumerate(order):
-                reading = reads.pop()
-                reads += [submit(reader, stages.read_views, following) for following in order[index + 1 : index + 2]]
-                problem = reading.exception()
-                if problem is None and not stages.temporal.count and stages.skips(frame):
-                    problem = InputError("another run has fused it")  # is recorded as skipped
-                if not isinstance(problem, Exception | None):
-                    raise problem
-                for ready, result in window.add(frame.number, problem or reading.result()):
-                    finish(ready, result)
-                    save()
-                window.release()
-                del reading  # frees the frame's pixels before those of the next frame arrive
+            for files in [*order[1:], None]:
+                if not reads:
+                    return
+                views = reads.pop().result()
+                if files is not None:
+                    reads.append(submit(reader, run.read, files))
+                yield views
         finally:
             for reading in reads:
                 reading.cancel()
-            writer.shutdown()
-            if writing is not None and writing[2].done():  # not done means that it was never handed over
-                finish_writing()
 
 
-def _write(stages: Stages, report: FrameReport, fused: FusedFrame, written: Future[None]) -> None:
-    """Write a frame and settle ``written``."""
-    try:
-        stages.write(report, fused)
-    except BaseException as error:
-        written.set_exception(error)
-    else:
-        written.set_result(None)
+class Writer:
+    """Writes frames in a thread, one at a time, and records what became of each.
+
+    On leaving its ``with`` block, however that comes, the frame that is being written is finished and recorded.
+
+    Args:
+        existing: what becomes of results that exist.
+        record: called in the order of the frames, with a frame and its report as a dict, the reason for its failure, or
+            None if another run has fused it in the meantime.
+        save: called after each frame, when the frames before it are recorded.
+    """
+
+    def __init__(self, existing: ExistingResults, record: Record, save: Callable[[], None]) -> None:
+        self._existing, self._record, self._save = existing, record, save
+        self._pool = ThreadPoolExecutor(1, "write")
+        #: What is being written. The frame itself belongs to the thread, so that its pixels are freed as it ends.
+        self._writing: tuple[FrameFiles, FrameReport, Future[None]] | None = None
+
+    def __enter__(self) -> Writer:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, error: object, where: TracebackType | None) -> None:
+        self._pool.shutdown()
+        if self._writing is not None and self._writing[2].done():  # not done means that it was never handed over
+            self._finish()
+
+    def write(self, frame: ShotFrame) -> None:
+        """Hand over a frame that is settled, or that has failed."""
+        # The previous frame is written before this one is handed over, so one is written at a time.
+        self._finish()
+        if frame.error is not None:
+            self._record_failure(frame.files, frame.error)
+        else:
+            # `_writing` is set before the hand-over: a signal may arrive during the hand-over.
+            written: Future[None] = Future()
+            self._writing = frame.files, frame.report, written
+            submit(self._pool, self._write, frame, written)
+        self._save()
+
+    def _write(self, frame: ShotFrame, written: Future[None]) -> None:
+        try:
+            write_settled(frame, self._existing)
+        except BaseException as error:
+            written.set_exception(error)
+        else:
+            written.set_result(None)
+
+    def _finish(self) -> None:
+        """Wait until the frame that is being written is on the disk, and record it."""
+        if self._writing is None:
+            return
+        files, report, written = self._writing
+        error = written.exception()
+        if error is None:
+            self._record(files, report.as_dict())
+        elif isinstance(error, Exception):
+            self._record_failure(files, error)
+        else:
+            raise error
+        # Reset last: a signal may interrupt the lines above, and the frame is then recorded on the way out.
+        self._writing = None
+
+    def _record_failure(self, files: FrameFiles, error: Exception) -> None:
+        # If another run has written the EXR in the meantime, the frame is complete, whatever failed here.
+        self._record(files, None if self._existing.skips(files) else error)

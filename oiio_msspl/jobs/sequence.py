@@ -91,7 +91,7 @@ class Sequence:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameFiles:
     """One frame of a shot. ``lr`` or ``hr`` is None if that render is missing."""
 
     number: int
@@ -106,10 +106,10 @@ class Frame:
         """The files to write."""
         return [path for path in (self.output, self.preview) if path is not None]
 
-    def absolute(self) -> Frame:
+    def absolute(self) -> FrameFiles:
         """The same with absolute paths, for workers with other working directories."""
         lr, hr, preview = (None if path is None else path.absolute() for path in (self.lr, self.hr, self.preview))
-        return Frame(self.number, lr, hr, self.output.absolute(), preview)
+        return FrameFiles(self.number, lr, hr, self.output.absolute(), preview)
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ class Shot:
     lr: Sequence
     hr: Sequence
     output: Pattern
-    frames: list[Frame]
+    frames: list[FrameFiles]
 
     def target(self, number: int) -> Path:
         """The fused frame."""
@@ -161,7 +161,7 @@ def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | 
     low, high = _choose(lows, highs, Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
     pattern = _output_pattern(Path(output), high.pattern)
-    each = [Frame(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
+    each = [FrameFiles(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
     return Shot(low, high, pattern, each)
 
 

@@ -21,14 +21,16 @@ from oiio_msspl.exr.preview import check_view
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.dask_cluster import fuse_frames
+from oiio_msspl.jobs.checks import check_first_pair, check_output, make_output, model_of_shot
+from oiio_msspl.jobs.existing import ExistingResults
+from oiio_msspl.jobs.farm.dask import fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
-from oiio_msspl.jobs.sequence import Frame, find_shot
-from oiio_msspl.jobs.shot_checks import check_first_pair, check_output, known_result, make_output, model_of_shot
+from oiio_msspl.jobs.plan import AUTO, TemporalOptions, plan_temporal
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles, find_shot
+from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.model.devices import require_device
 
 if TYPE_CHECKING:
@@ -68,7 +70,7 @@ def fuse_shot(
         frames: numbers, or a range such as ``1001-1100x2``; None for all frames that exist.
         inputs, write, model, device, threads, max_memory, view_transform: as in :func:`oiio_msspl.fuse_files`.
         temporal: ``auto``, ``off``, or the number of frames before and after each frame that it is averaged with;
-            :class:`oiio_msspl.jobs.temporal.TemporalOptions` also say how motion is stored.
+            :class:`oiio_msspl.jobs.plan.TemporalOptions` also say how motion is stored.
         previews: write a PNG beside each EXR.
         overwrite: replace existing files.
         skip_existing: skip frames whose EXR exists. This resumes a run that was ended.
@@ -78,7 +80,7 @@ def fuse_shot(
         progress: called after each frame with its result and the report so far. Frames that are skipped, missing or
             blocked by an existing file come first.
         client: a client of a Dask cluster that sees the same files, see
-            :func:`oiio_msspl.jobs.dask_cluster.connect`. The cluster's workers fuse the frames, which then end in any
+            :func:`oiio_msspl.jobs.farm.dask.connect`. The cluster's workers fuse the frames, which then end in any
             order. None fuses in this process.
 
     Returns:
@@ -104,8 +106,8 @@ def fuse_shot(
         require_device(device)
     check_output(shot, inputs, model, [] if report_path is None else [report_path])
     with limit_threads(threads):
-        over_time = plan_temporal(shot, inputs, temporal, model, write)
-    report = ShotReport(shot, temporal=over_time.text, neighbours=over_time.count)
+        plan = plan_temporal(shot, inputs, temporal, model, write)
+    report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
     earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
     make_output(shot)
 
@@ -115,7 +117,7 @@ def fuse_shot(
         if progress is not None:
             progress(result, report)
 
-    def record(frame: Frame, outcome: dict[str, Any] | Exception | None) -> None:
+    def record(frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
         if isinstance(outcome, Exception):
             log.debug("frame %d", frame.number, exc_info=outcome)
             finish(result_of(frame, FAILED, *explain(outcome)))
@@ -132,22 +134,22 @@ def fuse_shot(
         except MssplError as error:
             log.warning("%s", error)
 
-    stages = Stages(
-        inputs=inputs,
-        write_options=write,
-        model=model,
-        device=device,
-        threads=threads,
-        max_memory=max_memory,
-        view_transform=view_transform,
-        overwrite=overwrite,
+    settings = Settings(
+        inputs,
+        write,
+        model,
+        device,
+        threads,
+        max_memory,
+        view_transform,
+        overwrite,
         skip_existing=skip_existing or update,
         update=update,
-        temporal=over_time,
     )
+    existing = ExistingResults(settings, plan)
     to_fuse = []
     for frame in shot.frames:
-        result = known_result(frame, shot, stages)
+        result = existing.known_result(frame, shot)
         if result is None:
             to_fuse.append(frame)
             continue
@@ -159,16 +161,16 @@ def fuse_shot(
         report.first = None  # the report of a result that is replaced
     if to_fuse:
         with limit_threads(threads):
-            stages = replace(stages, model=model_of_shot(shot, inputs, model))
+            settings = replace(settings, model=model_of_shot(shot, inputs, model))
     targets = [path for frame in shot.frames for path in (frame.output, frame.output.with_suffix(".png"))]
     remove_leftovers([*targets, report_path] if report_path else targets)
     try:
         if client is None:
-            run_pipeline(stages, to_fuse, record, save)
+            run_pipeline(ShotRun(settings, plan, to_fuse), record, save)
         else:
             for doubt in check_first_pair(to_fuse, inputs):
                 log.warning("%s", doubt)
-            for frame, outcome in fuse_frames(client, stages, to_fuse):
+            for frame, outcome in fuse_frames(client, settings, plan, to_fuse):
                 record(frame, outcome)
                 save()
             remove_leftovers(targets)  # of workers that died

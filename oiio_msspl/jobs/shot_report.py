@@ -15,7 +15,7 @@ from oiio_msspl._version import __version__
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
-from oiio_msspl.jobs.sequence import Frame, Shot
+from oiio_msspl.jobs.sequence import FrameFiles, Shot
 
 #: What is read of ``first_fused`` in an earlier report. A report of another version may lack some of it.
 FIRST_FUSED = {"frame", "renderer", "view", "scale", "model", "aovs", "notes", "passes"}
@@ -117,13 +117,13 @@ class ShotReport:
             temporary.write_text(json.dumps(self.as_dict(), indent=1) + "\n", encoding="utf-8")
 
 
-def result_of(frame: Frame, status: str, message: str = "", exit_code: int = 0, **more: Any) -> FrameResult:
+def result_of(frame: FrameFiles, status: str, message: str = "", exit_code: int = 0, **more: Any) -> FrameResult:
     """The result of a frame with its three paths filled in; ``more`` are other fields of :class:`FrameResult`."""
     lrhs, hrls = (None if path is None else str(path) for path in (frame.lr, frame.hr))
     return FrameResult(frame.number, status, message, exit_code, lrhs=lrhs, hrls=hrls, output=str(frame.output), **more)
 
 
-def fused_result(frame: Frame, frame_report: dict[str, Any], report: ShotReport) -> FrameResult:
+def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotReport) -> FrameResult:
     """The result of a fused frame. The first one becomes ``report.first``.
 
     Args:

@@ -24,8 +24,8 @@ from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import require_memory
 from oiio_msspl.image.arrays import HALF_MAX
-from oiio_msspl.jobs.frame_passes import fuse_frame_passes, sets_to_fuse
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
+from oiio_msspl.jobs.passes import fuse_frame_passes, sets_to_fuse
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.model.session import Session
 
@@ -127,7 +127,7 @@ def fuse_other_views(
         max_memory: bytes that the process should stay below.
         held: bytes of these that other frames need.
         progress: called with (steps done, steps in all) of each part of the work, see
-            :class:`oiio_msspl.jobs.frame_passes.Progress`.
+            :class:`oiio_msspl.jobs.passes.Progress`.
 
     Returns:
         The fused channels, None without other views; and a report on each view.

@@ -10,6 +10,9 @@ import time
 
 import numpy as np
 import pytest
+from oiio_msspl.jobs.frame_memory import FrameMemory
+from oiio_msspl.jobs.frame_window import FrameWindow
+from oiio_msspl.jobs.temporal import AUTO_COUNT, Temporal, TemporalOptions, plan_temporal, shares
 
 from oiio_msspl import InputError, InputOptions, fuse_shot, map_render, open_exr
 from oiio_msspl.aovs.mapped_render import MappedRender
@@ -20,10 +23,7 @@ from oiio_msspl.fusion.motion.source import FLOW, VECTORS
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image import parallel
 from oiio_msspl.jobs import frame_memory, frame_window, stages
-from oiio_msspl.jobs.frame_memory import FrameMemory
-from oiio_msspl.jobs.frame_window import FrameWindow
 from oiio_msspl.jobs.sequence import Frame, find_shot
-from oiio_msspl.jobs.temporal import AUTO_COUNT, Temporal, TemporalOptions, plan_temporal, shares
 from tests import shots
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.moving_plane import HEIGHT, positions, standing, texture, truck, vectors

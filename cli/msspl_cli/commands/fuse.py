@@ -210,7 +210,7 @@ def fuse(
     """
     options.set_up_logging(verbose, quiet)
     from oiio_msspl.exr.reader import use_threads
-    from oiio_msspl.jobs.frame import fuse_files
+    from oiio_msspl.jobs.files import fuse_files
     from oiio_msspl.jobs.sequence import check_exists, is_sequence
 
     for path in (lr, hr):
@@ -296,7 +296,7 @@ def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
     """A client of the Dask cluster that ``--scheduler`` names, or None without one."""
     if scheduler is None:
         return nullcontext()
-    from oiio_msspl.jobs.dask_cluster import connect
+    from oiio_msspl.jobs.farm.dask import connect
 
     return connect(scheduler)
 

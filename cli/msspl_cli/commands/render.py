@@ -4,6 +4,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -23,8 +24,8 @@ from oiio_msspl.exr.atomic import (
 from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
-    from oiio_msspl.jobs.rendered_shot import RenderedShot
-    from oiio_msspl.jobs.stages import Stages
+    from oiio_msspl.jobs.blender_source import RenderedShot
+    from oiio_msspl.jobs.settings import Settings
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -197,9 +198,9 @@ def render(
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
     from oiio_msspl.exr.reader import use_threads
-    from oiio_msspl.jobs.rendered_shot import RenderedShot, beside
-    from oiio_msspl.jobs.sequence import Frame
-    from oiio_msspl.jobs.stages import Stages
+    from oiio_msspl.jobs.blender_source import RenderedShot, beside
+    from oiio_msspl.jobs.sequence import FrameFiles
+    from oiio_msspl.jobs.settings import Settings
     from oiio_msspl.model.contract import SCALES
 
     if scale not in SCALES:
@@ -232,19 +233,19 @@ def render(
     write = options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes)
     model = options.choose_model(model, quality)
     use_threads(threads)
-    stages = Stages(
-        write_options=write,
+    settings = Settings(
+        write=write,
         model=model,
         device=device,
         threads=threads,
         max_memory=options.parse_bytes(max_memory),
         overwrite=overwrite,
     )
-    _load_model(stages, scale)
-    frames_of_shot = [Frame(number or 0, None, None, target.absolute()) for number, target in shot]
+    _load_model(settings, scale)
+    frames_of_shot = [FrameFiles(number or 0, None, None, target.absolute()) for number, target in shot]
     wanted = {target.absolute() for _, target in targets}
     fuser = RenderedShot(
-        stages, frames_of_shot, [each for each in frames_of_shot if each.output in wanted], over_time, keep=keep
+        settings, frames_of_shot, [each for each in frames_of_shot if each.output in wanted], over_time, keep=keep
     )
     job = {
         "scene": str(scene.absolute()),
@@ -287,20 +288,19 @@ def render(
         print(f"{output}: every frame exists")
 
 
-def _load_model(stages: Stages, scale: int) -> None:
+def _load_model(settings: Settings, scale: int) -> None:
     """Load the model of all frames.
 
     Raises:
         InputError: the model or the device can't be had. No frame was rendered for nothing.
     """
-    from oiio_msspl.jobs.frame_checks import require_outputs
-    from oiio_msspl.model.catalogue import family_of, load_model
+    from oiio_msspl.model.catalogue import family_of
 
-    session = load_model(scale, stages.model, stages.device, stages.threads)
+    settings = replace(settings, model=family_of(settings.model) or settings.model)
+    session = settings.load(scale)
     if session.contract.scale != scale:
-        raise InputError(f"--model {stages.model}: is for x{session.contract.scale}, but --scale is {scale}")
-    require_outputs(session, stages.write_options)
-    stages.sessions[scale, family_of(stages.model) or stages.model] = session
+        raise InputError(f"--model {settings.model}: is for x{session.contract.scale}, but --scale is {scale}")
+    settings.session(scale)  # refuses a model that does not make the layers that are asked for
 
 
 class _Reports:
@@ -348,7 +348,7 @@ class _Reports:
         self._bar.hide()
 
     def _report(self) -> None:
-        from oiio_msspl.jobs.rendered_shot import beside
+        from oiio_msspl.jobs.blender_source import beside
 
         while self._waiting and not self._fuser.waits(result := Path(self._waiting[0]["output"])):
             report = self._waiting.pop(0)

@@ -28,7 +28,7 @@ EXAMPLES = """[bold]Examples[/bold]
   deadline bundle submit job/
 """
 
-#: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.openjd.make_job` takes itself, or that every task has.
+#: Parameters of msspl-fuse that :func:`oiio_msspl.jobs.farm.openjd.make_job` takes itself, or that every task has.
 _TAKEN = {"lr", "hr", "output", "frames", "model", "quality", "map_file", "device", "view", "skip_existing"}
 #: Parameters of msspl-fuse that a job can't have: a task skips existing frames and reports to the farm.
 _REFUSED = {"overwrite", "report_file", "progress", "as_json", "scheduler"}
@@ -63,9 +63,9 @@ def submit(
     given, passed_on = _parse([*context.args, *(() if output is None else ("--output", output))])
     options.set_up_logging(given["verbose"], given["quiet"])
     from oiio_msspl.image.parallel import limit_threads
-    from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
+    from oiio_msspl.jobs.checks import check_first_pair, check_temporal, check_wanted_outputs
+    from oiio_msspl.jobs.farm.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import format_frames
-    from oiio_msspl.jobs.shot_checks import check_first_pair, check_temporal, check_wanted_outputs
 
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")

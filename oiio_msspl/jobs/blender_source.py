@@ -1,10 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Fuses the frames of a shot while Blender renders them. A frame waits until its neighbours are rendered."""
+"""Blender as a source of frames: each frame is fused as soon as its neighbours are rendered."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,13 +20,15 @@ from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.image.parallel import limit_threads
-from oiio_msspl.jobs.frame_checks import require_frame_memory
-from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
 from oiio_msspl.jobs.inputs import map_pair
+from oiio_msspl.jobs.memory import memory_to_average, require_frame_memory
 from oiio_msspl.jobs.model_choice import choose_model
-from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.stages import LoadedFrame, Stages
-from oiio_msspl.jobs.temporal import AUTO, Temporal, TemporalOptions, shares
+from oiio_msspl.jobs.plan import AUTO, ShotPlan, TemporalOptions, ViewPlan, reach_of
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.timeline import neighbours
+from oiio_msspl.jobs.write import write_settled
 from oiio_msspl.model.catalogue import family_of
 
 
@@ -52,7 +54,7 @@ class RenderedShot:
     few frames, however long the shot is.
 
     Args:
-        stages: how a frame is fused.
+        settings: how a frame is fused.
         shot: all frames, without their renders.
         wanted: those of ``shot`` that are to be written.
         options: how many neighbours each frame is averaged with.
@@ -64,47 +66,47 @@ class RenderedShot:
 
     def __init__(
         self,
-        stages: Stages,
-        shot: Sequence[Frame],
-        wanted: Sequence[Frame],
+        settings: Settings,
+        shot: Sequence[FrameFiles],
+        wanted: Sequence[FrameFiles],
         options: TemporalOptions,
         *,
         keep: bool = False,
     ) -> None:
-        self._stages, self._shot, self._wanted, self._keep = stages, shot, list(wanted), keep
+        self._settings, self._shot, self._wanted, self._keep = settings, shot, list(wanted), keep
         self._required = options.frames != AUTO
         #: Number of the frame that an error is about.
         self._at_work = 0
         #: Renders on the disk, by frame number.
-        self._renders: dict[int, Frame] = {}
+        self._renders: dict[int, FrameFiles] = {}
         #: Warnings about the frames that are written.
         self._warnings: dict[Path, list[str]] = {}
-        frames = {frame.number: frame for frame in shot}
+        frames = {files.number: files for files in shot}
         # Every neighbour must be rendered, so `best` takes no more of them than other models.
         count = options.count()
         length = f"{count} frame{'s' if count > 1 else ''}"
         text = f"with {length} before and after each, along the motion vectors of Cycles"
-        self._plan(Temporal(*shares(count, VECTORS), None, frames, text if count else ""))
+        # How Cycles stores vectors is read from the first frame.
+        self._plan = ShotPlan(frames, {None: ViewPlan(reach_of(count, VECTORS))}, text if count else "")
         if count and not any(number + 1 in frames for number in frames):
             self.fuse_alone("no two frames follow each other")
+        self._run: ShotRun | None = None
+        self._next: Iterator[FrameFiles] | None = None
 
-    def _plan(self, temporal: Temporal) -> None:
-        self._temporal = temporal
-        self._stages = replace(self._stages, temporal=temporal)
-        self._window = FrameWindow(temporal, self._wanted, self._fuse_frame)
-        self.order = self._window.order()
+    @property
+    def order(self) -> list[FrameFiles]:
         """The frames to render: those that are to be written, and their neighbours."""
-        self._next = iter(self.order)
+        return ShotRun(self._settings, self._plan, self._wanted).order
 
     @property
     def averages(self) -> bool:
         """Whether frames are averaged with their neighbours."""
-        return self._temporal.count > 0
+        return self._plan.count > 0
 
     @property
     def text(self) -> str:
         """How the shot is fused over time, in words; empty if the user has switched that off."""
-        return self._temporal.text
+        return self._plan.text
 
     def fuse_alone(self, reason: str) -> None:
         """Fuse every frame by itself. No frame has been fused yet.
@@ -113,8 +115,8 @@ class RenderedShot:
             InputError: the user has asked for neighbours.
         """
         if self._required:
-            raise InputError(f"--temporal {self._temporal.count}: {reason}")
-        self._plan(Temporal(text=f"frame by frame: {reason}"))
+            raise InputError(f"--temporal {self._plan.count}: {reason}")
+        self._plan = ShotPlan(text=f"frame by frame: {reason}")
 
     def check(self, size: tuple[int, int], layers: Sequence[str] | None, pixel_bytes: int) -> None:
         """Refuse a frame that could not be fused, before it is rendered.
@@ -127,15 +129,17 @@ class RenderedShot:
         Raises:
             InputError: the frame needs more memory than it may take, or a pattern of ``--passes`` matches no pass.
         """
-        write = self._stages.write_options
-        (session,) = self._stages.sessions.values()
+        write = self._settings.write
+        (session,) = self._settings.sessions.values()
         width, height = size
         scale = session.contract.scale
         window, grid = Window(0, 0, width, height), Window(0, 0, -(-width // scale), -(-height // scale))
         alignment = Alignment(scale, grid, grid, window)
-        held = result_bytes(alignment, error=write.error_layer) + self._temporal.memory(window, USUAL_CHANNELS, scale)
+        reach = self._plan.views[None].reach
+        held = result_bytes(alignment, error=write.error_layer)
+        held += memory_to_average(reach, window, USUAL_CHANNELS, scale)
         written = pixel_bytes * width * height if write.layout == "multilayer" else 0
-        require_frame_memory(alignment, session, write, self._stages.max_memory, layers=written, held=held)
+        require_frame_memory(alignment, session, write, self._settings.max_memory, layers=written, held=held)
         if layers is None or write.passes in ((), ("none",)):
             return
         sets = _cycles_sets(layers)
@@ -155,29 +159,53 @@ class RenderedShot:
         Raises:
             InputError, MssplError: a frame can't be fused. The message names it if there are several.
         """
-        frame = replace(next(self._next), lr=lr, hr=hr)
-        self._at_work = frame.number
+        if self._next is None:
+            self._next = iter(self.order)
+        files = replace(next(self._next), lr=lr, hr=hr)
+        self._at_work = files.number
         try:
-            with limit_threads(self._stages.threads):
-                if family_of(self._stages.model):  # all frames get the model that suits the first pair with noise
-                    family, told = choose_model(*map_pair(lr, hr, self._stages.inputs), self._stages.model)
-                    if told:
-                        self._stages = replace(self._stages, model=family)
-                loaded = self._read(frame)
-                for ready, outcome in self._window.add(frame.number, loaded):
-                    self._at_work = ready.number
-                    if isinstance(outcome, Exception):
-                        raise outcome
-                    self._write(ready, outcome)
+            with limit_threads(self._settings.threads):
+                self._take(files)
         except Exception as error:
             said, code = explain(error)
-            said = self._keep_failed(self._renders.get(self._at_work, frame), said)
+            said = self._keep_failed(self._renders.get(self._at_work, files), said)
             if len(self._shot) > 1:
                 said = f"frame {self._at_work}: {said}"
             raise (InputError if code == InputError.exit_code else MssplError)(said) from error
-        self._release()
+        self._discard()
 
-    def _keep_failed(self, frame: Frame, said: str) -> str:
+    def _take(self, files: FrameFiles) -> None:
+        """Fuse a frame that is rendered, and write each frame that has all its neighbours now."""
+        run = self._run = self._run or self._start(files)
+        assert files.lr is not None and files.hr is not None
+        if family_of(run.settings.model):  # all frames get the model that suits the first pair with noise
+            family, told = choose_model(*map_pair(files.lr, files.hr, run.settings.inputs), run.settings.model)
+            if told:
+                run.settings = replace(run.settings, model=family)
+        views = run.read(files)
+        views[0].require()
+        self._renders[files.number] = files
+        for frame in run.take(views):
+            self._at_work = frame.number
+            write_settled(frame, run.existing)
+            self._warnings[frame.files.output] = frame.report.warnings
+
+    def _start(self, files: FrameFiles) -> ShotRun:
+        """Start the shot with its first frame."""
+        plan = self._plan
+        if plan.count:
+            assert files.lr is not None and files.hr is not None
+            _, hr = map_pair(files.lr, files.hr, self._settings.inputs)
+            # The format need not be verified: Blender is known, and motion blur is off.
+            motion = MotionSource(VECTORS, plan.text, hr.motion.fields)
+            plan = replace(plan, views={None: ViewPlan(plan.views[None].reach, motion)})
+
+        def tell_frame(number: int) -> None:
+            self._at_work = number
+
+        return ShotRun(self._settings, plan, self._wanted, stops_at=tell_frame)
+
+    def _keep_failed(self, files: FrameFiles, said: str) -> str:
         """Keep the renders of a frame that can't be fused. The rest of the temporary files is deleted.
 
         Args:
@@ -186,12 +214,12 @@ class RenderedShot:
         Returns:
             The error, with the names of the files that are kept.
         """
-        assert frame.lr is not None and frame.hr is not None
-        renders = ((frame.lr, "lr", "the LRHS"), (frame.hr, "hr", "the HRLS"))
+        assert files.lr is not None and files.hr is not None
+        renders = ((files.lr, "lr", "the LRHS"), (files.hr, "hr", "the HRLS"))
         if not all(path.exists() for path, _, _ in renders):  # Blender wrote none, and the error says so
             return said
-        kept = {path: beside(frame.output, suffix) for path, suffix, _ in renders}
-        wanted = any(frame.output == each.output for each in self._wanted)
+        kept = {path: beside(files.output, suffix) for path, suffix, _ in renders}
+        wanted = any(files.output == frame.output for frame in self._wanted)
         if not wanted or (not self._keep and any(target.exists() for target in kept.values())):
             for path, _, name in renders:
                 said = said.replace(str(path), name)
@@ -209,39 +237,15 @@ class RenderedShot:
         """Warnings about a frame that is written."""
         return self._warnings.get(output, [])
 
-    def _read(self, frame: Frame) -> LoadedFrame:
-        if self._temporal.count and self._temporal.motion is None:
-            assert frame.lr is not None and frame.hr is not None
-            _, hr = map_pair(frame.lr, frame.hr, self._stages.inputs)
-            # The format need not be verified: Blender is known, and motion blur is off.
-            motion = MotionSource(VECTORS, self.text, hr.motion.fields)
-            self._temporal = replace(self._temporal, motion=motion)
-            self._stages = replace(self._stages, temporal=self._temporal)  # it reads the vectors with the pixels
-            self._window = FrameWindow(self._temporal, self._wanted, self._fuse_frame)
-        loaded = self._stages.read(frame)
-        self._renders[frame.number] = frame
-        return loaded
-
-    def _fuse_frame(self, loaded: LoadedFrame, neighbours: Neighbours) -> FusedAlone:
-        self._at_work = loaded.frame.number
-        return self._stages.fuse(loaded, self._stages.session(loaded), neighbours)
-
-    def _write(self, frame: Frame, alone: FusedAlone) -> None:
-        fused = self._window.accumulate(frame.number)
-        report = self._stages.complete(alone, fused)
-        self._stages.write(report, fused)
-        self._warnings[frame.output] = report.warnings
-
-    def _release(self) -> None:
-        """Forget the frames, and discard the renders, that no frame needs any more."""
-        self._window.release()
-        missing = [frame.number for frame in self._wanted if frame.output not in self._warnings]
-        needed = {each for number in missing for each in (number, *self._temporal.neighbours(number))}
+    def _discard(self) -> None:
+        """Delete the renders that no frame needs any more, or keep them beside the result."""
+        missing = [files.number for files in self._wanted if files.output not in self._warnings]
+        needed = {n for number in missing for n in (number, *neighbours(number, self._plan.count, self._plan.frames))}
         for number in self._renders.keys() - needed:
-            frame = self._renders.pop(number)
-            assert frame.lr is not None and frame.hr is not None
-            for path, suffix in ((frame.lr, "lr"), (frame.hr, "hr")):
-                if self._keep and frame.output in self._warnings:
-                    os.replace(path, beside(frame.output, suffix))
+            files = self._renders.pop(number)
+            assert files.lr is not None and files.hr is not None
+            for path, suffix in ((files.lr, "lr"), (files.hr, "hr")):
+                if self._keep and files.output in self._warnings:
+                    os.replace(path, beside(files.output, suffix))
                 else:
                     path.unlink()

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which neighbours the frames of a shot are fused with, and how their motion is known.
+"""Decides which neighbours the frames of a shot are averaged with, and how their motion is known.
 
 A frame depends on the frames up to ``count`` before and after it, and on nothing else. So a shot that is cut into
 chunks, or resumed, has the same pixels as one run: the neighbours of a chunk are fused again, and not written.
@@ -18,14 +18,12 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.motion import MotionField, read_format
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion.source import CAMERA, FLOW, NONE, STATIC, VECTORS, MotionSource, find_motion
-from oiio_msspl.fusion.neighbours.average import memory_to_average_renders, memory_to_average_results
-from oiio_msspl.image.arrays import has_many_pixels
 from oiio_msspl.jobs.inputs import InputOptions, map_other_hrls, map_pair
 from oiio_msspl.jobs.model_choice import family_for_layers
-from oiio_msspl.jobs.sequence import Frame, Shot
+from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.jobs.timeline import ALONE, Reach, Timeline, neighbours
 from oiio_msspl.jobs.views import find_other_views
 from oiio_msspl.model.catalogue import QUALITIES, family_of
 
@@ -45,11 +43,6 @@ MOST_RESULTS = 2
 MOST = 8
 #: Pairs of frames that are looked at to find out how motion is stored.
 LOOKED_AT = 3
-#: Bytes of a pixel: a fused frame with alpha and the expected error; a vector, whether it is believed, whether an
-#: object has moved that it does not follow, and whether it is at a border; and the averaged frame.
-FRAME_BYTES, VECTOR_BYTES, RESULT_BYTES = 20, 11, 20
-#: Bytes that luminance takes for each frame that is held: of an LRHS pixel for both renders, and of an HRLS pixel.
-LUMINANCE_BYTES, HRLS_LUMINANCE_BYTES = 8, 4
 
 
 @dataclass(frozen=True)
@@ -83,81 +76,55 @@ class TemporalOptions:
 
 
 @dataclass(frozen=True)
-class Temporal:
-    """How the frames of a shot are fused with their neighbours."""
+class ViewPlan:
+    """How the frames of one view are averaged with their neighbours."""
 
-    renders: int = 0
-    """The renders of so many frames before and after a frame are averaged with its own before they are fused."""
-    results: int = 0
-    """So many fused frames before and after a frame are then averaged with it."""
+    reach: Reach = ALONE
     motion: MotionSource | None = None
-    frames: Mapping[int, Frame] = field(default_factory=dict)
+    """How surfaces are followed from frame to frame; None if frames are fused alone."""
+
+
+@dataclass(frozen=True)
+class ShotPlan:
+    """How the frames of a shot are averaged with their neighbours."""
+
+    frames: Mapping[int, FrameFiles] = field(default_factory=dict)
     """Every frame of the shot that has both renders, whether it is to be fused or not."""
+    views: Mapping[str | None, ViewPlan] = field(default_factory=lambda: {None: ViewPlan()})
+    """The plan of the first view, None, and of the other views that are averaged. All depend on as many frames."""
     text: str = ""
     """One sentence for the user; empty if the user has switched it off."""
-    views: Mapping[str, Temporal] = field(default_factory=dict)
-    """The same for those views beside the first one that are averaged, too. All have the same ``count``."""
     looked_at: frozenset[str] = frozenset()
     """All views beside the first one that the plan is about. ``text`` says why some are fused frame by frame."""
 
     @property
     def count(self) -> int:
         """Frames before and after a frame that it depends on; 0 fuses each frame alone."""
-        return self.renders + self.results
+        return self.views[None].reach.frames
 
-    def neighbours(self, number: int, count: int | None = None) -> list[int]:
-        """The frames up to ``count`` before and after a frame, in order; all that it depends on if None. Behind a
-        missing frame there are none."""
-        found = []
-        for step in (-1, 1):
-            for offset in range(1, (self.count if count is None else count) + 1):
-                if number + step * offset not in self.frames:
-                    break
-                found.append(number + step * offset)
-        return sorted(found)
+    def timeline(self, wanted: Sequence[FrameFiles]) -> Timeline:
+        """Return who needs whom, if these frames are to be written."""
+        reach = {view: plan.reach for view, plan in self.views.items()}
+        return Timeline(self.frames, [files.number for files in wanted], reach)
 
-    def absolute(self) -> Temporal:
-        """The same with absolute paths, for workers with other working directories."""
-        views = {view: each.absolute() for view, each in self.views.items()}
-        return replace(self, frames={n: frame.absolute() for n, frame in self.frames.items()}, views=views)
+    def absolute(self) -> ShotPlan:
+        """Return the plan with absolute paths, for workers with other working directories."""
+        return replace(self, frames={n: files.absolute() for n, files in self.frames.items()})
 
     def files_beside(self, hr: Path) -> list[Path]:
-        """The files of the neighbours of the frame whose HRLS this is."""
-        number = next((n for n, frame in self.frames.items() if frame.hr == hr), None) if self.count else None
-        beside = [] if number is None else [self.frames[n] for n in self.neighbours(number)]
-        return [path for frame in beside for path in (frame.lr, frame.hr) if path is not None]
-
-    def memory(self, window: Window, channels: int, scale: int) -> int:
-        """Bytes that averaging takes, and what waits for it, without the pixels of renders that are in memory.
-
-        Args:
-            window: the HRLS's data window.
-            channels: of its features.
-            scale: of the pair.
-        """
-        if not self.count:
-            return 0
-        working = memory_to_average_results(window)
-        if self.renders:
-            working = max(working, memory_to_average_renders(window, channels))
-        return self.waiting(window, channels, scale) + working
-
-    def waiting(self, window: Window, channels: int, scale: int) -> int:
-        """The part of :meth:`memory` that is held while other views are averaged."""
-        pixels = window.width * window.height
-        in_memory = not has_many_pixels(window.height, window.width)
-        held = 2 * self.results * FRAME_BYTES + 4 * self.count * VECTOR_BYTES + 4 * channels * (self.renders > 0)
-        held += (2 * self.renders + 2) * HRLS_LUMINANCE_BYTES * (self.renders > 0)
-        luminance = LUMINANCE_BYTES * (2 * self.count + 2) * pixels // scale**2
-        return (held * in_memory + RESULT_BYTES) * pixels + luminance
+        """Return the renders of the neighbours of the frame whose HRLS this is."""
+        number = next((n for n, files in self.frames.items() if files.hr == hr), None) if self.count else None
+        numbers = [] if number is None else neighbours(number, self.count, self.frames)
+        paths = [path for n in numbers for path in (self.frames[n].lr, self.frames[n].hr)]
+        return [path for path in paths if path is not None]
 
     def missing(self, number: int) -> list[int]:
-        """The numbers next to a frame that lie within the shot, and of which a render is missing."""
+        """Return the numbers next to a frame that lie within the shot and lack a render."""
         if not self.count or not self.frames:
             return []
         first, last = min(self.frames), max(self.frames)
         near = range(number - self.count, number + self.count + 1)
-        return [each for each in near if first < each < last and each not in self.frames and each != number]
+        return [n for n in near if first < n < last and n not in self.frames and n != number]
 
 
 def _is_slow(model: str | None) -> bool:
@@ -172,7 +139,7 @@ def plan_temporal(
     options: TemporalOptions,
     model: str | None = None,
     write: WriteOptions = WriteOptions(),
-) -> Temporal:
+) -> ShotPlan:
     """Decide how a shot is fused over time. The decision depends on all files of the shot, not on the frames chosen.
 
     Each view and view layer has its own motion. If that of the first view is not known, all are fused frame by frame.
@@ -185,32 +152,32 @@ def plan_temporal(
         InputError: the user asks for neighbours, and nothing is known of the motion.
     """
     if options.frames == OFF:
-        return Temporal()
+        return ShotPlan()
     asked = options.frames != AUTO
     low, high = shot.lr.files, shot.hr.files
-    frames = {n: Frame(n, low[n], high[n], shot.target(n)) for n in sorted(low.keys() & high.keys())}
+    frames = {n: FrameFiles(n, low[n], high[n], shot.target(n)) for n in sorted(low.keys() & high.keys())}
     pairs = [n for n in frames if n + 1 in frames]
     if not pairs:
         if asked:
             raise InputError(f"--temporal {options.frames}: {shot.hr.pattern} has no two frames that follow each other")
-        return Temporal(text="frame by frame: no two frames follow each other")
+        return ShotPlan(text="frame by frame: no two frames follow each other")
     # Others come last: they are looked at if some of these can't be read.
     looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1], *pairs)))
     mapped = functools.cache(lambda number: _map_frame(frames[number], inputs))
     count = options.count(_family_of_shot(mapped, frames, model))
-    first = _plan(_motion_of(mapped, looked_at, inputs, options, required=asked), count, frames, asked=asked)
-    if not first.count:
-        return first
-    views, text = {}, first.text
-    others = _other_views(mapped, looked_at[:LOOKED_AT], inputs, write)
-    for label in others:
+    plan, text = _plan_view(_motion_of(mapped, looked_at, inputs, options, required=asked), count, asked=asked)
+    if plan is None:
+        return ShotPlan(text=text)
+    views: dict[str | None, ViewPlan] = {None: plan}
+    labels = _other_views(mapped, looked_at[:LOOKED_AT], inputs, write)
+    for label in labels:
         source = _motion_of(mapped, looked_at, inputs, options, label, required=False)
-        plan = _plan(source, count, frames, asked=asked)
-        if plan.count:
-            views[label] = plan
+        plan, reason = _plan_view(source, count, asked=asked)
+        if plan is None:
+            text += f"; {name_of(label)} {reason}"
         else:
-            text += f"; {name_of(label)} {plan.text}"
-    return replace(first, views=views, looked_at=frozenset(others), text=text)
+            views[label] = plan
+    return ShotPlan(frames, views, text, frozenset(labels))
 
 
 def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model: str | None) -> str | None:
@@ -224,15 +191,13 @@ def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model
     return family
 
 
-def _plan(source: MotionSource, count: int, frames: Mapping[int, Frame], *, asked: bool) -> Temporal:
-    """How one view is fused over time."""
+def _plan_view(source: MotionSource, count: int, *, asked: bool) -> tuple[ViewPlan | None, str]:
+    """Return the plan of one view, None if it is fused frame by frame, and a sentence about it."""
     if source.kind == NONE or (source.kind == FLOW and not asked):
         hint = "; --temporal 2 uses it all the same" if source.kind == FLOW else ""
-        return Temporal(text=f"frame by frame: {source.text}{hint}")
-    renders, results = shares(count, source.kind)
+        return None, f"frame by frame: {source.text}{hint}"
     frame_count = "one frame" if count == 1 else f"{count} frames"
-    text = f"with {frame_count} before and after each: {source.text}"
-    return Temporal(renders, results, source, frames, text)
+    return ViewPlan(reach_of(count, source.kind), source), f"with {frame_count} before and after each: {source.text}"
 
 
 def _other_views(
@@ -247,16 +212,16 @@ def _other_views(
     return list(views)
 
 
-def shares(count: int, kind: str) -> tuple[int, int]:
-    """How many neighbours on each side are averaged as renders, and how many as fused frames.
+def reach_of(count: int, kind: str) -> Reach:
+    """Return how many neighbours on each side are averaged as renders, and how many as fused pictures.
 
     Args:
-        count: of both together.
+        count: neighbours of both kinds together.
         kind: of the source of motion.
     """
-    # Optical flow is computed on fused frames, so their renders can't be averaged before.
+    # Optical flow is computed on fused pictures, so renders can't be averaged before.
     results = count if kind == FLOW else min(MOST_RESULTS, count - count // 2)
-    return count - results, results
+    return Reach(count - results, results)
 
 
 def _motion_of(
@@ -344,6 +309,6 @@ def _contradiction(found: Mapping[int, MotionSource], before: int, number: int, 
     return MotionSource(NONE, text)
 
 
-def _map_frame(frame: Frame, inputs: InputOptions) -> Pair:
-    assert frame.lr is not None and frame.hr is not None
-    return map_pair(frame.lr, frame.hr, inputs)
+def _map_frame(files: FrameFiles, inputs: InputOptions) -> Pair:
+    assert files.lr is not None and files.hr is not None
+    return map_pair(files.lr, files.hr, inputs)

@@ -3,6 +3,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from contextlib import suppress
 from typing import Any
@@ -17,9 +18,41 @@ from oiio_msspl.exr.preview import old_preview, write_preview
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
 from oiio_msspl.exr.writer import write_fused
 from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.image.parallel import in_background
+from oiio_msspl.jobs.existing import ExistingResults
+from oiio_msspl.jobs.frame import ShotFrame, State
 from oiio_msspl.jobs.report import FrameReport, provenance
+
+
+def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bool = False) -> None:
+    """Write the EXR and the preview of a frame that is settled.
+
+    Args:
+        frame: the frame; its report gets the time and the warnings of writing.
+        existing: says what is replaced.
+        only_frame: no other frame needs memory.
+
+    Raises:
+        InputError: another process has put a file there in the meantime.
+        MssplError: the file system refused. An old frame is as it was; of a new one nothing is left.
+    """
+    start, settings, picture = time.perf_counter(), existing.settings, frame.picture
+    overwrite = settings.overwrite or (frame.files.output.exists() and existing.replaces(frame.files))
+    # Half of what is left, because compression and the preview need memory, too. In a shot, the next frame needs all.
+    cache_bytes = max(0, settings.max_memory - FIXED_MEMORY - picture.nbytes) // 2 if only_frame else 0
+    write_frame(
+        frame.report,
+        picture,
+        settings.write,
+        settings.view_transform,
+        overwrite=overwrite,
+        overwrite_preview=existing.replaces_preview(frame.report.preview),
+        cache_bytes=cache_bytes,
+    )
+    frame.state = State.WRITTEN
+    frame.report.seconds["write"] = time.perf_counter() - start
 
 
 def write_frame(

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checks a shot before its first frame is read: whether results can be written, and which frames to skip."""
+"""Checks a job before its first pixel is read: whether its results can be written, and its layers are there."""
 
 from __future__ import annotations
 
@@ -7,22 +7,24 @@ import logging
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
+from oiio_msspl.aovs.features import ALBEDO, NORMAL
+from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_folder, check_separate, check_target, make_folder
-from oiio_msspl.exr.write_options import WriteOptions
+from oiio_msspl.exr.atomic import check_folder, check_separate, make_folder
+from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
+from oiio_msspl.exr.writer import check_layout
 from oiio_msspl.fusion.fuse import check_model
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.jobs.frame_checks import check_frame_memory, check_written_layers, require_outputs
-from oiio_msspl.jobs.frame_passes import check_passes
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
+from oiio_msspl.jobs.memory import check_frame_memory
 from oiio_msspl.jobs.model_choice import choose_model
 from oiio_msspl.jobs.pair_check import check_files
-from oiio_msspl.jobs.sequence import Frame, Shot
-from oiio_msspl.jobs.shot_report import FAILED, MISSING, SKIPPED, FrameResult, older_than, result_of
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import TemporalOptions, plan_temporal
+from oiio_msspl.jobs.passes import check_passes
+from oiio_msspl.jobs.plan import TemporalOptions, plan_temporal
+from oiio_msspl.jobs.sequence import FrameFiles, Shot
+from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.views import find_other_views
-from oiio_msspl.model.catalogue import family_of, for_spread_noise, load_model
+from oiio_msspl.model.catalogue import family_of, for_spread_noise
 
 log = logging.getLogger(__name__)
 
@@ -105,7 +107,22 @@ def check_no_input(
     check_separate(pairs.union(*others), [*(path for frame in shot.frames for path in frame.targets), *more_targets])
 
 
-def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]:
+def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
+    """Check by the headers that the layers that are asked for are there, and that one file can hold them all.
+
+    Raises:
+        InputError: a pattern of ``write`` matches nothing, or the layout can't hold the layers.
+    """
+    wanted = {
+        ERROR_LAYER: write.error_layer,
+        FRAMES_LAYER: write.frames_layer,
+        ALBEDO_LAYER: write.data_passes and ALBEDO in hr.features,
+        NORMAL_LAYER: write.data_passes and NORMAL in hr.features,
+    }
+    check_layout(hr.file, hr.beauty_channels, write, [name for name, is_added in wanted.items() if is_added])
+
+
+def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list[str]:
     """Check the first frame that has both renders, before a farm or cluster is asked to fuse all of them.
 
     Returns:
@@ -121,7 +138,7 @@ def check_first_pair(frames: Sequence[Frame], inputs: InputOptions) -> list[str]
 
 
 def check_wanted_outputs(
-    frames: Sequence[Frame], inputs: InputOptions, write: WriteOptions, model: str | None, max_memory: int
+    frames: Sequence[FrameFiles], inputs: InputOptions, write: WriteOptions, model: str | None, max_memory: int
 ) -> None:
     """Check on the first pair that can be read whether what is to be written can be, before a farm is asked for it.
 
@@ -144,9 +161,8 @@ def check_wanted_outputs(
             continue
         check_written_layers(hr, write)
         check_passes([hr, *others.hrls], write)
-        session = load_model(scale, model)
+        session = Settings(write=write, model=model).session(scale)
         check_model(session, scale, error=write.error_layer)
-        require_outputs(session, write)
         check_frame_memory(lr, hr, session, write, max_memory)
         return
     if problem is not None:
@@ -161,37 +177,7 @@ def check_temporal(
     If files of the mapping are not here, nothing is checked: they may exist on the workers only.
 
     Raises:
-        InputError: see :func:`oiio_msspl.jobs.temporal.plan_temporal`.
+        InputError: see :func:`oiio_msspl.jobs.plan.plan_temporal`.
     """
     if all(path.exists() for hr in shot.hr.files.values() for path in inputs.files(hr, None)):
         plan_temporal(shot, inputs, options, model, write)
-
-
-def known_result(frame: Frame, shot: Shot, stages: Stages) -> FrameResult | None:
-    """The result of a frame that need not or can't be fused; None for a frame to fuse.
-
-    Args:
-        frame: one of the shot's frames.
-        shot: the shot.
-        stages: their settings.
-    """
-    if stages.skips(frame):
-        newer = stages.newer_inputs(frame.lr, frame.hr, frame.output)
-        warnings = [older_than(newer[0])] if newer else []
-        return result_of(frame, SKIPPED, warnings=warnings)
-    sources = (("LRHS", frame.lr, shot.lr), ("HRLS", frame.hr, shot.hr))
-    lacking = [f"{name} ({sequence.pattern})" for name, path, sequence in sources if path is None]
-    if lacking:
-        return result_of(frame, MISSING, f"no {' and no '.join(lacking)} of this number", 2)
-    overwrite = stages.replaces(frame.lr, frame.hr, frame.output)
-    if frame.output.is_symlink() and not frame.output.exists() and not overwrite:
-        return result_of(frame, FAILED, "the output is a link to a file that does not exist; delete the link", 2)
-    if frame.output.exists() and not frame.output.is_dir() and not overwrite:
-        return result_of(frame, FAILED, "the output exists; pass --skip-existing or --overwrite", 2)
-    try:
-        check_target(frame.output, overwrite=overwrite)
-        if frame.preview is not None:
-            check_target(frame.preview, overwrite=stages.replaces_preview(frame.preview))
-    except InputError as error:
-        return result_of(frame, FAILED, str(error), error.exit_code)
-    return None

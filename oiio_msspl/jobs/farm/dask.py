@@ -19,9 +19,12 @@ from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.reader import use_threads
+from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.pipeline import run_pipeline
-from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.plan import ShotPlan
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.session import Session
 
@@ -67,13 +70,13 @@ def connect(scheduler: str) -> Client:
 
 
 def fuse_frames(
-    client: Client, stages: Stages, frames: list[Frame]
-) -> Iterator[tuple[Frame, dict[str, Any] | Exception | None]]:
+    client: Client, settings: Settings, plan: ShotPlan, frames: list[FrameFiles]
+) -> Iterator[tuple[FrameFiles, dict[str, Any] | Exception | None]]:
     """Fuse frames on the workers.
 
     Args:
         client: of the cluster, whose workers see the same files.
-        stages: settings, which every worker gets.
+        settings, plan: how frames are fused. Every worker gets them.
         frames: what to fuse. Frames end in any order.
 
     Yields:
@@ -90,23 +93,24 @@ def fuse_frames(
     if not frames:
         return
     workers = _most_workers_on_a_machine(client)
-    if stages.model is not None and Path(stages.model).is_file():
-        stages = replace(stages, model=str(Path(stages.model).absolute()))
-    find_model(2, stages.model)  # refuses an unknown model before any task is submitted
+    if settings.model is not None and Path(settings.model).is_file():
+        settings = replace(settings, model=str(Path(settings.model).absolute()))
+    find_model(2, settings.model)  # refuses an unknown model before any task is submitted
     address = client.scheduler.address
     run = uuid.uuid4().hex
     #: What is under way, and how often a frame of it may still be tried again.
-    futures: dict[Future, tuple[list[Frame], int]] = {}
-    stages = replace(stages, inputs=stages.inputs.absolute(), temporal=stages.temporal.absolute())
+    futures: dict[Future, tuple[list[FrameFiles], int]] = {}
+    settings, plan = replace(settings, inputs=settings.inputs.absolute()), plan.absolute()
+    existing = ExistingResults(settings, plan)
 
-    def submit(chunk: list[Frame], tries: int) -> Future:
+    def submit(chunk: list[FrameFiles], tries: int) -> Future:
         key = f"msspl-fuse-{chunk[0].number}-{tries}-{run}"
         task = [frame.absolute() for frame in chunk]
-        future = client.submit(_fuse_chunk, run, stages, task, workers, key=key, retries=RETRIES)
+        future = client.submit(_fuse_chunk, run, settings, plan, task, workers, key=key, retries=RETRIES)
         futures[future] = chunk, tries
         return future
 
-    size = CHUNK if stages.temporal.count else 1
+    size = CHUNK if plan.count else 1
     try:
         ended = as_completed([submit(frames[start : start + size], RETRIES) for start in range(0, len(frames), size)])
         for future in ended:
@@ -126,10 +130,7 @@ def fuse_frames(
                 failure = error
             if failure is not None:
                 # Frames of the chunk that were written before are complete.
-                done = [
-                    frame.output.exists() and not stages.replaces(frame.lr, frame.hr, frame.output) for frame in chunk
-                ]
-                yield from ((frame, None if fused else failure) for frame, fused in zip(chunk, done, strict=True))
+                yield from ((frame, None if existing.has(frame) else failure) for frame in chunk)
     finally:
         client.cancel(list(futures))
 
@@ -167,12 +168,14 @@ def _sessions(run: str) -> dict[tuple[int, str | None], Session]:
     return {}
 
 
-def _fuse_chunk(run: str, stages: Stages, frames: list[Frame], workers: int) -> list[dict[str, Any] | Exception | None]:
-    """Take frames through the three stages, in a worker.
+def _fuse_chunk(
+    run: str, settings: Settings, plan: ShotPlan, frames: list[FrameFiles], workers: int
+) -> list[dict[str, Any] | Exception | None]:
+    """Fuse frames in a worker.
 
     Args:
         run: identifies the run.
-        stages, frames: what to do, with absolute paths.
+        settings, plan, frames: what to do, with absolute paths.
         workers: those on this machine, which share its cores.
 
     Returns:
@@ -180,26 +183,17 @@ def _fuse_chunk(run: str, stages: Stages, frames: list[Frame], workers: int) -> 
     """
     from dask.system import CPU_COUNT
 
+    threads = settings.threads or (max(1, CPU_COUNT // workers) if workers > 1 else 0)
+    use_threads(threads)
+    # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
+    settings = replace(settings, threads=threads, skip_existing=True, sessions=_sessions(run))
+    existing = ExistingResults(settings, plan)
     outcomes: dict[int, dict[str, Any] | Exception | None] = {}
     # There was no EXR when the run began (or it may be replaced), so another try or another worker has written it.
-    missing = []
-    for frame in frames:
-        if stages.replaces(frame.lr, frame.hr, frame.output) or not frame.output.exists():
-            missing.append(frame)
-        else:
-            outcomes[frame.number] = None
-    threads = stages.threads or (max(1, CPU_COUNT // workers) if workers > 1 else 0)
-    # skip_existing lets a frame replace the preview that a dead worker left without its EXR.
-    use_threads(threads)
-    stages = replace(stages, threads=threads, skip_existing=True, sessions=_sessions(run))
+    missing = [frame for frame in frames if not existing.has(frame)]
     if missing:
-        run_pipeline(stages, missing, lambda frame, outcome: outcomes.update({frame.number: outcome}), lambda: None)
-    results: list[dict[str, Any] | Exception | None] = []
-    for frame in frames:
-        outcome = outcomes[frame.number]
-        if isinstance(outcome, InputError):
-            # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
-            replaces = stages.replaces(frame.lr, frame.hr, frame.output)
-            outcome = None if not replaces and frame.output.exists() else outcome
-        results.append(outcome)
-    return results
+        run_pipeline(ShotRun(settings, plan, missing), lambda frame, outcome: outcomes.update({frame.number: outcome}))
+    # Dask also gives up a worker that it can't reach, so two workers may have fused the same frame.
+    failed = {n for n, outcome in outcomes.items() if isinstance(outcome, InputError)}
+    written = {frame.number for frame in frames if frame.number in failed and existing.has(frame)}
+    return [None if frame.number in written else outcomes.get(frame.number) for frame in frames]

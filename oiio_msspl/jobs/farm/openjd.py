@@ -17,9 +17,9 @@ from typing import Any
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_encodable, check_folder, replacing
 from oiio_msspl.exr.preview import check_view
+from oiio_msspl.jobs.checks import check_no_file, check_no_input, model_of_shot
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.sequence import Shot, find_shot, format_frames, is_sequence
-from oiio_msspl.jobs.shot_checks import check_no_file, check_no_input, model_of_shot
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS

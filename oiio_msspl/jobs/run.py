@@ -1,0 +1,300 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The way of a shot: each frame is averaged, fused, settled and handed over as soon as its neighbours are there.
+
+A single frame is a shot of one. Files, Blender and the tasks of a farm are sources of frames for the same
+:meth:`ShotRun.take`.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB, is_light_of_pass
+from oiio_msspl.aovs.views import name_of
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.contents import stored_type
+from oiio_msspl.exr.render import Render
+from oiio_msspl.exr.replaced import ReplacedChannels
+from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.motion.shot import ShotMotion
+from oiio_msspl.fusion.motion.source import MotionFrame
+from oiio_msspl.fusion.neighbours.average import average_renders, average_results
+from oiio_msspl.fusion.neighbours.hops import find_hops
+from oiio_msspl.fusion.neighbours.path import Hop
+from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
+from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.image.arrays import kept
+from oiio_msspl.jobs.existing import ExistingResults
+from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
+from oiio_msspl.jobs.memory import check_frame_memory, is_large, light_features
+from oiio_msspl.jobs.passes import Progress, fuse_frame_passes, steps_of, uses_clean_aovs
+from oiio_msspl.jobs.plan import ShotPlan
+from oiio_msspl.jobs.read import features_read, read_frame
+from oiio_msspl.jobs.report import add_other_views, report_on, written_layers
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.timeline import Key
+from oiio_msspl.jobs.views import View, fuse_other_views, store_view
+
+
+class ShotRun:
+    """Fuses the frames of a shot. A frame is kept until no other frame needs it.
+
+    Args:
+        settings, plan: how frames are fused.
+        wanted: the frames to write.
+        only_frame: the shot is a single frame, which has all memory to itself.
+        tell: called with (steps done, steps in all) of the work on a single frame.
+        stops_at: the first error of a frame is raised, and not passed on with the frame, after a call with its number.
+    """
+
+    def __init__(
+        self,
+        settings: Settings,
+        plan: ShotPlan,
+        wanted: Sequence[FrameFiles],
+        *,
+        only_frame: bool = False,
+        tell: Callable[[int, int], None] | None = None,
+        stops_at: Callable[[int], None] | None = None,
+    ) -> None:
+        self.settings, self.plan = settings, plan
+        self._only_frame, self._tell, self._stops_at = only_frame, tell, stops_at
+        self._wanted = {files.number: files for files in wanted}
+        self._timeline = plan.timeline(wanted)
+        self._frames: dict[Key, ShotFrame] = {}
+        self._motion = {
+            view: ShotMotion(own.motion, with_borders=own.reach.results > 0)
+            for view, own in plan.views.items()
+            if own.motion is not None
+        }
+
+    @property
+    def existing(self) -> ExistingResults:
+        """What becomes of results that exist."""
+        return ExistingResults(self.settings, self.plan)
+
+    @property
+    def order(self) -> list[FrameFiles]:
+        """The frames to read, in this order: those to write, and all that these depend on."""
+        return [self._wanted.get(number) or self.plan.frames[number] for number in self._timeline.order]
+
+    def read(self, files: FrameFiles) -> list[ShotFrame]:
+        """Read a frame. While one is fused, the next one can be read by another thread."""
+        return read_frame(files, self.settings, self.plan, only_frame=self._only_frame)
+
+    def take(self, views: Sequence[ShotFrame]) -> Iterator[ShotFrame]:
+        """Take the views of a frame that is read, and yield each frame that can be written now, or has an error.
+
+        Raises:
+            InputError: the model can't be loaded, which no other frame would change.
+        """
+        self._frames.update({frame.key: frame for frame in views})
+        for key in self._timeline.fusable(views[0].number):
+            frame = self._frames[key]
+            self._average_renders(frame)
+            self._fuse(frame)
+            self._stop_at_error(frame)
+            self._timeline.fused(key)
+            self._release()
+        for number in self._timeline.settled():
+            frame = self._frames[number, None]
+            self._settle(frame)
+            self._stop_at_error(frame)
+            yield frame
+        self._release()
+
+    def _average_renders(self, frame: ShotFrame) -> None:
+        """Average the renders of a frame with those of its neighbours."""
+        missing = self.plan.missing(frame.number)
+        frame.warnings += [f"frame {number} is missing, so fewer neighbours are averaged" for number in missing]
+        if frame.error is not None:
+            return
+        frame.session = self.settings.session(align(frame.lr, frame.hr).scale)
+        start = time.perf_counter()
+        with frame.attempt():
+            if not self.plan.count and self.existing.skips(frame.files):
+                raise InputError("another run has fused it")  # is recorded as skipped
+            check_frame_memory(
+                frame.lr, frame.hr, frame.session, frame.write, self.settings.max_memory, frame.held_bytes
+            )
+            before, after = self._hops_of_renders(frame) if frame.plan.reach.renders else ([], [])
+            frame.averaged = frame.renders
+            if before or after:
+                _replace_by_means(frame, before, after)
+            frame.state = State.AVERAGED
+        frame.seconds["fuse"] = time.perf_counter() - start
+
+    def _fuse(self, frame: ShotFrame) -> None:
+        """Let the network fuse a frame, after the views that are fused by themselves."""
+        if frame.error is not None:
+            return
+        start = time.perf_counter()
+        with frame.attempt():
+            progress = self._progress(frame)
+            if frame.view is None and frame.number in self._wanted:
+                frame.replaced, frame.other_reports = fuse_other_views(
+                    frame.others,
+                    frame.session,
+                    self.settings.write,
+                    self.settings.max_memory,
+                    held=frame.held_bytes,
+                    progress=progress,
+                )
+            frame.fused = self.fuse(frame, progress)
+            frame.averaged, frame.progress = RenderPair(*frame.stored), progress
+            frame.state = State.FUSED
+            if frame.plan.reach.results:
+                frame.keep_result()
+        frame.seconds["fuse"] += time.perf_counter() - start
+
+    def fuse(self, frame: ShotFrame, progress: Callable[[int, int], None] | None = None) -> FusedFrame:
+        """Fuse the averaged renders of a frame."""
+        half = stored_type(frame.hr.beauty_channels, frame.write) == "half"
+        fused = fuse(
+            frame.averaged.lr,
+            frame.averaged.hr,
+            frame.session,
+            error=frame.write.error_layer,
+            clean_aovs=uses_clean_aovs(frame.hr, frame.write),
+            half=half and not self.plan.count,  # fused frames that are averaged are float
+            max_memory=self.settings.max_memory,
+            held=frame.held_bytes,
+            progress=progress,
+        )
+        fused.frames = frame.frame_counts
+        return fused
+
+    def _stop_at_error(self, frame: ShotFrame) -> None:
+        if self._stops_at is not None and frame.error is not None:
+            self._stops_at(frame.number)
+            raise frame.error
+
+    def _settle(self, first: ShotFrame) -> None:
+        """Average the fused views of a frame with those of its neighbours, and fuse what depends on the result."""
+        start = time.perf_counter()
+        with first.attempt():
+            views = [self._frames[first.number, view] for view in self.plan.views]
+            views = [frame for frame in views if not isinstance(frame.error, NoSuchView)]
+            for frame in views:
+                frame.require()
+            if self.plan.count and self.existing.skips(first.files):
+                raise InputError("another run has fused it")  # is recorded as skipped
+            self._average_results(first)
+            reports = list(first.other_reports)
+            first.picture.replaced = first.replaced
+            for frame in views[1:]:
+                self._average_results(frame)
+                # All views of a frame share the channels that are replaced.
+                frame.picture.replaced = first.picture.replaced or ReplacedChannels()
+                self._fuse_passes(frame)
+                first.picture.replaced = frame.picture.replaced
+                reports.append(store_view(View(frame.lr, frame.hr), frame.picture, frame.session))
+            self._fuse_passes(first)
+            first.state = State.SETTLED
+            first.report = report_on(
+                first.lr, first.hr, first.session, first.picture, first.files.output, first.files.preview
+            )
+            first.report.layers = written_layers(first.hr, first.write)
+            reports.sort(key=lambda report: first.hr.other_views.index(report.hr.view))
+            add_other_views(first.report, reports, [*first.others.passed_on, *self._unplanned_views(first)])
+            busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
+            first.report.seconds = {
+                "read": first.seconds["read"],
+                "fuse": busy,
+                "network": first.report.network_seconds,
+            }
+
+    def _average_results(self, frame: ShotFrame) -> None:
+        """Average a fused frame with its neighbours. Those that are missing or broken are named in its warnings."""
+        frame.picture = frame.fused
+        if not self.plan.count:
+            return
+        before, after = self._hops_of_results(frame)
+        warnings = list(dict.fromkeys([*frame.fused.warnings, *frame.warnings]))
+        picture = average_results(frame.fused, before, after) if before or after else frame.fused
+        frame.picture = replace(picture, warnings=warnings)
+
+    def _fuse_passes(self, frame: ShotFrame) -> None:
+        """Fuse the passes of a view, given its final beauty."""
+        fuse_frame_passes(
+            frame.lr,
+            frame.hr,
+            frame.picture,
+            frame.session,
+            frame.write,
+            self.settings.max_memory - frame.held_bytes,
+            frame.progress,
+            averaged=frame.means,
+        )
+
+    def _unplanned_views(self, first: ShotFrame) -> list[str]:
+        """Return a sentence for each view that is fused frame by frame because the plan does not know it."""
+        names = [view.hr.view for view in first.others.views if self.plan.count]
+        new = [name_of(name) for name in names if name not in self.plan.looked_at]
+        return [f"{name} is fused frame by frame: the frames by which its motion is found lack it" for name in new]
+
+    def _hops_of_renders(self, frame: ShotFrame) -> list[list[Hop[RenderPair]]]:
+        """Return the hops to the neighbours before and after a frame whose renders are averaged with its own."""
+
+        def frame_of(number: int) -> tuple[MotionFrame, RenderPair]:
+            neighbour = self._neighbour(number, frame)
+            return neighbour.motion_frame(), neighbour.renders
+
+        motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, "renders")
+        return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
+
+    def _hops_of_results(self, frame: ShotFrame) -> list[list[Hop[FusedFrame]]]:
+        """Return the hops to the neighbours before and after a frame whose fused pictures are averaged with its own."""
+
+        def frame_of(number: int) -> tuple[MotionFrame, FusedFrame]:
+            neighbour = self._neighbour(number, frame)
+            return neighbour.motion_frame(), neighbour.fused
+
+        motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, "results")
+        return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
+
+    def _neighbour(self, number: int, frame: ShotFrame) -> ShotFrame:
+        neighbour = self._frames[number, frame.view]
+        neighbour.require_as_neighbour()
+        return neighbour
+
+    def _progress(self, frame: ShotFrame) -> Progress | None:
+        """Return what joins the progress of all parts of the work on a single frame."""
+        if self._tell is None:
+            return None
+        pairs = [(frame.lr, frame.hr), *frame.others.views]
+        return Progress(self._tell, steps_of(pairs, frame.session, frame.write))
+
+    def _release(self) -> None:
+        """Forget what no frame needs any more."""
+        renders, pictures = self._timeline.needs_renders(), self._timeline.needs_pictures()
+        for key, frame in list(self._frames.items()):
+            if key not in renders and frame.state >= State.READ:
+                frame.forget_pixels()
+            if key not in renders | pictures:
+                del self._frames[key]
+            elif frame.state >= State.FUSED and not self._timeline.waits(frame.number):
+                frame.forget_all_but_picture()
+        for view, motion in self._motion.items():
+            motion.keep({number for number, own in self._frames if own == view})
+
+
+def _replace_by_means(frame: ShotFrame, before: Sequence[Hop[RenderPair]], after: Sequence[Hop[RenderPair]]) -> None:
+    """Put the means over neighbours in the place of a frame's renders, and keep what its passes are fused from."""
+    passes = light_features(frame.stored[1])
+    if any(lacking_passes(frame.renders, hop.frame) for hop in (*before, *after)):
+        passes = []
+    lr, hr, frame.frame_counts = average_renders(frame.renders, before, after, [*features_read(frame.session), *passes])
+    frame.averaged = RenderPair(lr, hr)
+    if passes:
+        on_disk = is_large(frame.hr)
+        frame.means = _kept(lr, on_disk=on_disk), _kept(hr, on_disk=on_disk)
+
+
+def _kept(render: Render, *, on_disk: bool) -> Render:
+    """Return what passes are fused from of a render that waits for its neighbours."""
+    needed = [name for name in render.layers if name in (RGB, ALBEDO, NORMAL) or is_light_of_pass(name)]
+    return replace(render, layers={name: kept(render.layers[name], on_disk=on_disk) for name in needed})

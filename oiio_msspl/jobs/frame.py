@@ -93,8 +93,8 @@ class ShotFrame:
     """The model for the scale of the pair."""
 
     # From FUSED on
-    fused: FusedFrame = field(init=False)
-    """As fused alone."""
+    fused: FusedFrame | None = None
+    """As the network fused it, for as long as a frame needs it."""
     replaced: ReplacedChannels | None = None
     """Of the first view: the channels of ``others``, fused."""
     other_reports: list[FrameReport] = field(default_factory=list)
@@ -104,8 +104,8 @@ class ShotFrame:
     """Joins the progress of the parts of the work, if somebody wants to know it."""
 
     # From SETTLED on
-    picture: FusedFrame = field(init=False)
-    """What is written."""
+    picture: FusedFrame | None = None
+    """What is written, until it is."""
     report: FrameReport = field(init=False)
     """Of the first view: on all views."""
 
@@ -138,27 +138,30 @@ class ShotFrame:
         if self.error is not None:
             raise self.error
 
-    def require_as_neighbour(self) -> None:
-        """Raise what went wrong with this frame, for a neighbour that is averaged with it.
+    def require_state(self, state: State) -> None:
+        """Raise why this frame has not come so far that a neighbour can be averaged with it.
 
         Raises:
             InputError: its files can't be used, so it is left out in every run.
             MssplError: it has failed otherwise, such as for a full disk. Without it, the neighbour would have other
                 pixels than in another run.
         """
-        if self.error is None or isinstance(self.error, InputError):
-            self.require()
+        if self.state >= state:
             return
+        assert self.error is not None
+        if isinstance(self.error, InputError):
+            raise self.error
         raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
 
     def motion_frame(self) -> MotionFrame:
         """Return what is needed to follow its surfaces."""
-        rgb = self.fused.rgb if self.state >= State.FUSED else None
+        rgb = None if self.fused is None else self.fused.rgb
         return MotionFrame(self.hr, rgb, self.vectors, self.renders.hr, self.number, self.lr)
 
     def keep_result(self) -> None:
         """Let the fused picture wait for its neighbours, in a temporary file if it is large."""
         fused = self.fused
+        assert fused is not None
         fused.rgb = kept(fused.rgb)
         fused.alpha = None if fused.alpha is None else kept(fused.alpha)
         fused.error = None if fused.error is None else kept(fused.error)
@@ -170,4 +173,5 @@ class ShotFrame:
     def forget_all_but_picture(self) -> None:
         """Give up what only this frame's own result needs."""
         self.means = None
-        self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)
+        if self.fused is not None:
+            self.fused = replace(self.fused, clean_aovs={}, error=None, frames=None)

@@ -43,22 +43,23 @@ def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_fr
     frames = [ShotFrame(files, view, own) for view, own in plan.views.items()]
     first = frames[0]
     with first.attempt():
-        _open(frames, settings)
-        present = [frame for frame in frames if frame.state == State.READ]
+        present = _open(frames, settings)
         if not only_frame:
             _budget(present, settings, missing=len(frames) - len(present))
-            for frame in present:
-                with frame.attempt():
+        for frame in present:
+            with frame.attempt():
+                if not only_frame:
                     _read_pixels(frame)
+                frame.state = State.READ
         first.seconds["read"] = time.perf_counter() - start
     for frame in frames[1:]:
-        if frame.state < State.READ:
+        if frame.state < State.READ and frame.error is None:
             frame.error = first.error or NoSuchView(f"it has no pair for {name_of(frame.view or '')}")
     return frames
 
 
-def _open(frames: Sequence[ShotFrame], settings: Settings) -> None:
-    """Open the pair, map it for each view, and check all that headers tell."""
+def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
+    """Open the pair, map it for each view, and check all that headers tell. Return the views that it has."""
     first, inputs, write = frames[0], settings.inputs, settings.write
     files = first.files
     assert files.lr is not None and files.hr is not None
@@ -70,11 +71,14 @@ def _open(frames: Sequence[ShotFrame], settings: Settings) -> None:
     check_passes([hr, *others.hrls], write)
     views = {view.hr.view: view for view in others.views}
     _set_pair(first, lr, hr, settings)
+    present = [first]
     for frame in frames[1:]:
         if frame.view in views:
             view = views.pop(frame.view)
             _set_pair(frame, view.lr, view.hr, settings)
+            present.append(frame)
     first.others = replace(others, views=tuple(views.values()))
+    return present
 
 
 def _set_pair(frame: ShotFrame, lr: MappedRender, hr: MappedRender, settings: Settings) -> None:
@@ -85,7 +89,6 @@ def _set_pair(frame: ShotFrame, lr: MappedRender, hr: MappedRender, settings: Se
     sets = sets_to_fuse(hr, frame.write) if frame.plan.reach.renders else []
     frame.stored = pass_features(lr, hr, sets) if sets else (lr, hr)
     frame.renders = RenderPair(*frame.stored)
-    frame.state = State.READ
 
 
 def _budget(frames: Sequence[ShotFrame], settings: Settings, *, missing: int) -> None:

@@ -32,7 +32,7 @@ from oiio_msspl.jobs.memory import check_frame_memory, is_large, light_features
 from oiio_msspl.jobs.passes import Progress, fuse_frame_passes, steps_of, uses_clean_aovs
 from oiio_msspl.jobs.plan import ShotPlan
 from oiio_msspl.jobs.read import features_read, read_frame
-from oiio_msspl.jobs.report import add_other_views, report_on, written_layers
+from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, written_layers
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
@@ -98,13 +98,13 @@ class ShotRun:
             self._fuse(frame)
             self._stop_at_error(frame)
             self._timeline.fused(key)
+            for number in self._timeline.settled():
+                first = self._frames[number, None]
+                self._settle(first)
+                self._stop_at_error(first)
+                yield first
+                del first  # or its pixels would be held while the next frame is fused
             self._release()
-        for number in self._timeline.settled():
-            frame = self._frames[number, None]
-            self._settle(frame)
-            self._stop_at_error(frame)
-            yield frame
-        self._release()
 
     def _average_renders(self, frame: ShotFrame) -> None:
         """Average the renders of a frame with those of its neighbours."""
@@ -182,52 +182,50 @@ class ShotRun:
                 frame.require()
             if self.plan.count and self.existing.skips(first.files):
                 raise InputError("another run has fused it")  # is recorded as skipped
-            self._average_results(first)
-            reports = list(first.other_reports)
-            first.picture.replaced = first.replaced
+            picture = self._average_results(first)
+            picture.replaced, reports = first.replaced, list(first.other_reports)
             for frame in views[1:]:
-                self._average_results(frame)
+                other = self._average_results(frame)
                 # All views of a frame share the channels that are replaced.
-                frame.picture.replaced = first.picture.replaced or ReplacedChannels()
-                self._fuse_passes(frame)
-                first.picture.replaced = frame.picture.replaced
-                reports.append(store_view(View(frame.lr, frame.hr), frame.picture, frame.session))
-            self._fuse_passes(first)
-            first.state = State.SETTLED
-            first.report = report_on(
-                first.lr, first.hr, first.session, first.picture, first.files.output, first.files.preview
-            )
-            first.report.layers = written_layers(first.hr, first.write)
-            reports.sort(key=lambda report: first.hr.other_views.index(report.hr.view))
-            add_other_views(first.report, reports, [*first.others.passed_on, *self._unplanned_views(first)])
+                other.replaced = picture.replaced or ReplacedChannels()
+                self._fuse_passes(frame, other)
+                picture.replaced = other.replaced
+                reports.append(store_view(View(frame.lr, frame.hr), other, frame.session))
+            self._fuse_passes(first, picture)
+            first.picture, first.report = picture, self._report(first, picture, reports)
             busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
-            first.report.seconds = {
-                "read": first.seconds["read"],
-                "fuse": busy,
-                "network": first.report.network_seconds,
-            }
+            network = first.report.network_seconds
+            first.report.seconds = {"read": first.seconds["read"], "fuse": busy, "network": network}
+            first.state = State.SETTLED
 
-    def _average_results(self, frame: ShotFrame) -> None:
+    def _report(self, first: ShotFrame, picture: FusedFrame, others: Sequence[FrameReport]) -> FrameReport:
+        """Report on a frame that is settled.
+
+        Args:
+            first, picture: its first view.
+            others: reports on the other views.
+        """
+        report = report_on(first.lr, first.hr, first.session, picture, first.files.output, first.files.preview)
+        report.layers = written_layers(first.hr, first.write)
+        views = sorted(others, key=lambda other: first.hr.other_views.index(other.hr.view))
+        add_other_views(report, views, [*first.others.passed_on, *self._unplanned_views(first)])
+        return report
+
+    def _average_results(self, frame: ShotFrame) -> FusedFrame:
         """Average a fused frame with its neighbours. Those that are missing or broken are named in its warnings."""
-        frame.picture = frame.fused
+        assert frame.fused is not None
         if not self.plan.count:
-            return
+            return frame.fused
         before, after = self._hops_of_results(frame)
         warnings = list(dict.fromkeys([*frame.fused.warnings, *frame.warnings]))
         picture = average_results(frame.fused, before, after) if before or after else frame.fused
-        frame.picture = replace(picture, warnings=warnings)
+        return replace(picture, warnings=warnings)
 
-    def _fuse_passes(self, frame: ShotFrame) -> None:
-        """Fuse the passes of a view, given its final beauty."""
+    def _fuse_passes(self, frame: ShotFrame, picture: FusedFrame) -> None:
+        """Fuse the passes of a view and add them to its final picture."""
+        room = self.settings.max_memory - frame.held_bytes
         fuse_frame_passes(
-            frame.lr,
-            frame.hr,
-            frame.picture,
-            frame.session,
-            frame.write,
-            self.settings.max_memory - frame.held_bytes,
-            frame.progress,
-            averaged=frame.means,
+            frame.lr, frame.hr, picture, frame.session, frame.write, room, frame.progress, averaged=frame.means
         )
 
     def _unplanned_views(self, first: ShotFrame) -> list[str]:
@@ -240,7 +238,8 @@ class ShotRun:
         """Return the hops to the neighbours before and after a frame whose renders are averaged with its own."""
 
         def frame_of(number: int) -> tuple[MotionFrame, RenderPair]:
-            neighbour = self._neighbour(number, frame)
+            neighbour = self._frames[number, frame.view]
+            neighbour.require_state(State.READ)
             return neighbour.motion_frame(), neighbour.renders
 
         motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, "renders")
@@ -250,16 +249,13 @@ class ShotRun:
         """Return the hops to the neighbours before and after a frame whose fused pictures are averaged with its own."""
 
         def frame_of(number: int) -> tuple[MotionFrame, FusedFrame]:
-            neighbour = self._neighbour(number, frame)
+            neighbour = self._frames[number, frame.view]
+            neighbour.require_state(State.FUSED)
+            assert neighbour.fused is not None
             return neighbour.motion_frame(), neighbour.fused
 
         motion, sides = self._motion[frame.view], self._timeline.sides(frame.key, "results")
         return [find_hops(motion, frame.number, side, frame_of, frame.warnings) for side in sides]
-
-    def _neighbour(self, number: int, frame: ShotFrame) -> ShotFrame:
-        neighbour = self._frames[number, frame.view]
-        neighbour.require_as_neighbour()
-        return neighbour
 
     def _progress(self, frame: ShotFrame) -> Progress | None:
         """Return what joins the progress of all parts of the work on a single frame."""
@@ -272,11 +268,14 @@ class ShotRun:
         """Forget what no frame needs any more."""
         renders, pictures = self._timeline.needs_renders(), self._timeline.needs_pictures()
         for key, frame in list(self._frames.items()):
-            if key not in renders and frame.state >= State.READ:
-                frame.forget_pixels()
             if key not in renders | pictures:
                 del self._frames[key]
-            elif frame.state >= State.FUSED and not self._timeline.waits(frame.number):
+                continue
+            if key not in renders and frame.state >= State.READ:
+                frame.forget_pixels()
+            if key not in pictures:
+                frame.fused = None
+            if not self._timeline.waits(frame.number):
                 frame.forget_all_but_picture()
         for view, motion in self._motion.items():
             motion.keep({number for number, own in self._frames if own == view})

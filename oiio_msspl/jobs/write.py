@@ -39,6 +39,7 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
         MssplError: the file system refused. An old frame is as it was; of a new one nothing is left.
     """
     start, settings, picture = time.perf_counter(), existing.settings, frame.picture
+    assert picture is not None
     overwrite = settings.overwrite or (frame.files.output.exists() and existing.replaces(frame.files))
     # Half of what is left, because compression and the preview need memory, too. In a shot, the next frame needs all.
     cache_bytes = max(0, settings.max_memory - FIXED_MEMORY - picture.nbytes) // 2 if only_frame else 0
@@ -51,7 +52,7 @@ def write_settled(frame: ShotFrame, existing: ExistingResults, *, only_frame: bo
         overwrite_preview=existing.replaces_preview(frame.report.preview),
         cache_bytes=cache_bytes,
     )
-    frame.state = State.WRITTEN
+    frame.state, frame.picture = State.WRITTEN, None
     frame.report.seconds["write"] = time.perf_counter() - start
 
 

@@ -95,7 +95,7 @@ def write_shot(folder: Path, count: int, width: int, height: int, scale: int, la
 def measure(folder: Path, quality: str, frames: str) -> dict[str, Any]:
     """Fuse the shot in this process."""
     from oiio_msspl import fuse_shot
-    from oiio_msspl.jobs.temporal import TemporalOptions
+    from oiio_msspl.jobs.plan import TemporalOptions
 
     report = fuse_shot(
         *(folder / name for name in ("lr", "hr", "out")),

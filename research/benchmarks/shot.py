@@ -41,8 +41,8 @@ def make_shot(folder: Path, count: int, width: int, height: int, scale: int) -> 
 
 def measure_stages(folder: Path, device: str, threads: int) -> dict[str, Any]:
     """Seconds of each stage alone, over all frames."""
+    from oiio_msspl.jobs.run import Stages
     from oiio_msspl.jobs.sequence import find_shot
-    from oiio_msspl.jobs.stages import Stages
 
     stages = Stages(device=device, threads=threads, overwrite=True)
     seconds = dict.fromkeys(("read", "infer", "write"), 0.0)

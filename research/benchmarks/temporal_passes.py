@@ -20,7 +20,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
 from oiio_msspl.image.arrays import Array
-from oiio_msspl.jobs.temporal import TemporalOptions
+from oiio_msspl.jobs.plan import TemporalOptions
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.runtime_temporal import OFF, STEP, clean_frame, write_shot

@@ -14,7 +14,7 @@ from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.aovs.renderers import renderers
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.image.colour import luminance
-from oiio_msspl.jobs.frame import fuse_files
+from oiio_msspl.jobs.files import fuse_files
 from oiio_msspl.jobs.inputs import InputOptions
 from tests.conftest import downsample, write_exr
 

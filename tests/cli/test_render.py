@@ -19,12 +19,12 @@ from msspl_cli.installed import shipped_folder
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import temporary_folder
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.jobs import frame_memory
-from oiio_msspl.jobs.rendered_shot import RenderedShot
-from oiio_msspl.jobs.sequence import Frame
+from oiio_msspl.jobs import memory, read
+from oiio_msspl.jobs.blender_source import RenderedShot
+from oiio_msspl.jobs.plan import TemporalOptions
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot import fuse_shot
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import TemporalOptions
 from tests.conftest import EXAMPLES
 from tests.jobs.test_temporal import make_moving_shot
 from tests.programs import leave_temporary
@@ -233,13 +233,11 @@ def test_a_shot_is_averaged_with_its_neighbours_while_it_is_rendered(farm, model
 def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, bilinear_models, moving, monkeypatch):
     """And their memory is counted."""
     loaded, counted = [], []
-    load, counts = Stages._load, frame_memory._vector_bytes
-    monkeypatch.setattr(Stages, "_load", lambda *given: loaded.append(load(*given)) or loaded[-1])
-    monkeypatch.setattr(
-        frame_memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels)
-    )
-    frames = [Frame(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
-    shot = RenderedShot(Stages(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
+    load, counts = read._read_pixels, memory._vector_bytes
+    monkeypatch.setattr(read, "_read_pixels", lambda frame: loaded.append(load(frame) or frame))
+    monkeypatch.setattr(memory, "_vector_bytes", lambda hr, channels: counted.append(channels) or counts(hr, channels))
+    frames = [FrameFiles(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
+    shot = RenderedShot(Settings(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
     for frame in shot.order:
         pair = [moving / f"{each}/{each}.{frame.number}.exr" for each in ("lr", "hr")]
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
@@ -295,7 +293,7 @@ def test_renders_are_kept_whatever_went_wrong_and_a_resumed_shot_replaces_them(f
     (folder / "sitecustomize.py").write_text(
         "import sys, os\n"
         "if os.environ.pop('FAULT', '') and sys.argv[0] == '-c':\n"
-        "    import oiio_msspl.jobs.stages as stages\n"
+        "    import oiio_msspl.jobs.run as stages\n"
         "    def fuse(*arguments, **more): raise MemoryError\n"
         "    stages.fuse = fuse\n"
     )

@@ -6,10 +6,10 @@ import pytest
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot, open_exr
 from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
 from oiio_msspl.image.arrays import box_downsample
-from oiio_msspl.jobs.openjd import make_job
+from oiio_msspl.jobs.checks import model_of_shot
+from oiio_msspl.jobs.farm.openjd import make_job
+from oiio_msspl.jobs.plan import TemporalOptions, _is_slow, plan_temporal
 from oiio_msspl.jobs.sequence import find_shot
-from oiio_msspl.jobs.shot_checks import model_of_shot
-from oiio_msspl.jobs.temporal import TemporalOptions, _is_slow, plan_temporal
 from oiio_msspl.model.catalogue import load_model, shipped_models
 from tests.conftest import noisy, picture, read_bits, rgb, write_exr
 from tests.fusion.checks.test_spread_noise import spread
@@ -63,7 +63,7 @@ def test_a_job_s_model_has_as_many_neighbours_as_one_run(tmp_path, monkeypatch):
     job = make_job(*pair, tmp_path / "out", model="best").template["steps"][0]["script"]["actions"]["onRun"]["args"]
     assert job[-2:] == ["--model", "joint"]
     found = MotionSource(VECTORS, "as vectors say")
-    monkeypatch.setattr("oiio_msspl.jobs.temporal.find_motion", lambda *arguments, **more: found)
+    monkeypatch.setattr("oiio_msspl.jobs.plan.find_motion", lambda *arguments, **more: found)
     plans = [plan_temporal(shot, InputOptions(), options, model) for model in ("best", "joint", "joint-large")]
     assert [plan.count for plan in plans] == [4, 4, 6]
 

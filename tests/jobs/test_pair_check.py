@@ -9,11 +9,11 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.preview import write_preview
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.colour import ACESCG, REC709, conversion
-from oiio_msspl.jobs.frame import fuse_files
+from oiio_msspl.jobs.checks import check_first_pair
+from oiio_msspl.jobs.files import fuse_files
 from oiio_msspl.jobs.inputs import InputOptions, map_pair
 from oiio_msspl.jobs.pair_check import check_files
 from oiio_msspl.jobs.sequence import find_shot
-from oiio_msspl.jobs.shot_checks import check_first_pair
 from tests.conftest import downsample, noisy, picture, rgb, write_exr
 from tests.shots import make_shot
 

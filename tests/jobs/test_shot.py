@@ -19,10 +19,11 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.jobs import frame_memory, frame_writing, shot, shot_report, stages
+from oiio_msspl.jobs import memory, pipeline, shot, shot_report, write
+from oiio_msspl.jobs import run as run_module
+from oiio_msspl.jobs.plan import TemporalOptions
+from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.shot_report import fused_result, read_earlier
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import TemporalOptions
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.shots import HEIGHT, WIDTH, contents, layers, low_layers, make_shot
@@ -57,7 +58,7 @@ def test_frames_without_room_in_memory_are_read_as_they_are_fused(tmp_path, bili
     folder = make_shot(tmp_path, 2)
     assert run(folder, bilinear_models[4]).exit_code == 0
     whole = contents(folder / "out")
-    monkeypatch.setattr(frame_memory, "_pixel_bytes", lambda render, features: 1 << 40)
+    monkeypatch.setattr(memory, "_pixel_bytes", lambda render, features: 1 << 40)
     monkeypatch.setattr("oiio_msspl.aovs.mapped_render.MappedRender.load", pytest.fail)
     assert run(folder, bilinear_models[4], overwrite=True).exit_code == 0
     assert contents(folder / "out") == whole
@@ -83,33 +84,33 @@ def test_layers_that_the_model_does_not_read_are_not_loaded(tmp_path, monkeypatc
 
 def test_the_three_stages_overlap_and_hold_one_frame_each(tmp_path, bilinear_models, monkeypatch):
     """Each frame waits in its stage until the neighbours are in theirs: a pipeline that did not overlap would hang."""
-    inside = {"read_views": 0, "fuse": 0, "write": 0}
+    inside = {"read": 0, "fuse": 0, "write_settled": 0}
     most = dict(inside)
     began = {(stage, n): threading.Event() for stage in inside for n in range(1, 7)}
 
-    def watched(stage, number_of, meanwhile):
-        real = getattr(Stages, stage)
+    def watched(owner, stage, meanwhile):
+        real = getattr(owner, stage)
 
-        def call(self, *arguments):
-            number = number_of(arguments[0])
+        def call(*arguments):
+            number = arguments[owner is ShotRun].number
             inside[stage] += 1
             most[stage] = max(most[stage], inside[stage])
             began[stage, number].set()
             for other, offset in meanwhile:
                 if (other, number + offset) in began:
                     assert began[other, number + offset].wait(20), f"{other} of {number + offset} does not overlap"
-            result = real(self, *arguments)
+            result = real(*arguments)
             inside[stage] -= 1
             return result
 
-        monkeypatch.setattr(Stages, stage, call)
+        monkeypatch.setattr(owner, stage, call)
 
-    watched("read_views", lambda frame: frame.number, [])
-    watched("fuse", lambda ready: ready.frame.number, [("read_views", 1), ("write", -1)])
-    watched("write", lambda report: int(report.output.stem.split(".")[1]), [("fuse", 1)])
+    watched(ShotRun, "read", [])
+    watched(ShotRun, "fuse", [("read", 1), ("write_settled", -1)])
+    watched(pipeline, "write_settled", [("fuse", 1)])
     folder = make_shot(tmp_path, 6, first=1)
     assert run(folder, bilinear_models[4]).exit_code == 0
-    assert most == {"read_views": 1, "fuse": 1, "write": 1}
+    assert most == {"read": 1, "fuse": 1, "write_settled": 1}
 
 
 def test_a_long_shot_loads_the_model_once_and_keeps_no_file_open(tmp_path, bilinear_models, monkeypatch):
@@ -314,14 +315,14 @@ def test_a_wrong_option_leaves_no_folder(tmp_path, bilinear_models, monkeypatch,
 
 def test_a_fault_of_the_program_in_one_frame_does_not_stop_the_others(tmp_path, bilinear_models, monkeypatch):
     folder = make_shot(tmp_path, 3)
-    real = stages.fuse
+    real = run_module.fuse
 
     def faulty(lr, *arguments, **more):
         if "1002" in lr.name:
             raise ZeroDivisionError("oh")
         return real(lr, *arguments, **more)
 
-    monkeypatch.setattr(stages, "fuse", faulty)
+    monkeypatch.setattr(run_module, "fuse", faulty)
     report = run(folder, bilinear_models[4])
     assert [result.status for result in report.results.values()] == ["fused", "failed", "fused"]
     assert report.results[1002].message.startswith("unexpected ZeroDivisionError: oh")
@@ -358,7 +359,7 @@ def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeyp
     """An old frame that can't be replaced, and one that another run puts there meanwhile."""
     folder = make_shot(tmp_path, 1)
     assert run(folder, bilinear_models[4], previews=True).exit_code == 0
-    before, real = contents(folder / "out"), frame_writing.write_fused
+    before, real = contents(folder / "out"), write.write_fused
 
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
@@ -368,13 +369,13 @@ def test_a_frame_that_stays_keeps_its_preview(tmp_path, bilinear_models, monkeyp
         return real(path, *arguments, **more)
 
     write_exr(folder / "lr/lr.1001.exr", {c: values / 2 for c, values in low_layers(1).items()})
-    monkeypatch.setattr(frame_writing, "write_fused", full_disk)
+    monkeypatch.setattr(write, "write_fused", full_disk)
     assert run(folder, bilinear_models[4], previews=True, overwrite=True).results[1001].message == "disk full"
     assert contents(folder / "out") == before
     (folder / "out/beauty.1001.exr").unlink()
     assert run(folder, bilinear_models[4], previews=True, skip_existing=True).results[1001].message == "disk full"
     assert contents(folder / "out") == {}
-    monkeypatch.setattr(frame_writing, "write_fused", too_late)
+    monkeypatch.setattr(write, "write_fused", too_late)
     assert "appeared while" in run(folder, bilinear_models[4], previews=True).results[1001].message
     assert (folder / "out/beauty.1001.png").exists()
 
@@ -691,7 +692,7 @@ def everything(folder):
 
 def test_frames_of_two_runs_at_the_same_time_are_skipped(tmp_path, bilinear_models, monkeypatch):
     """The other run has written a frame before this one fuses it, or while it was fused."""
-    folder, real = make_shot(tmp_path, 3), stages.fuse
+    folder, real = make_shot(tmp_path, 3), run_module.fuse
     assert run(folder, bilinear_models[4], previews=True).exit_code == 0
     other = folder / "other"
     (folder / "out").rename(other)
@@ -706,7 +707,7 @@ def test_frames_of_two_runs_at_the_same_time_are_skipped(tmp_path, bilinear_mode
         assert "1002" not in lr.name
         return real(lr, *arguments, **more)
 
-    monkeypatch.setattr(stages, "fuse", meanwhile)
+    monkeypatch.setattr(run_module, "fuse", meanwhile)
     report = run(folder, bilinear_models[4], previews=True, skip_existing=True)
     assert [result.status for result in report.results.values()] == ["skipped", "skipped", "fused"]
     assert contents(folder / "out") == expected

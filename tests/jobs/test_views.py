@@ -325,7 +325,7 @@ def test_memory_holds_one_view_at_a_time(tmp_path, bilinear_models, monkeypatch)
 
     original = views.fuse
     monkeypatch.setattr(views, "fuse", fuse)
-    monkeypatch.setattr("oiio_msspl.jobs.stages.fuse", fuse)
+    monkeypatch.setattr("oiio_msspl.jobs.run.fuse", fuse)
     fused(pair, tmp_path / "out.exr", bilinear_models)
     assert len(alive) == 2
 

@@ -5,7 +5,7 @@ import pytest
 from msspl_bridge.command import Settings
 
 from oiio_msspl.aovs.features import FEATURES
-from oiio_msspl.jobs.temporal import MOST, TemporalOptions
+from oiio_msspl.jobs.plan import MOST, TemporalOptions
 from oiio_msspl.model.catalogue import QUALITIES
 from oiio_msspl.model.devices import PROVIDERS
 from tests.nuke_gizmo.conftest import GIZMO

@@ -29,7 +29,7 @@ from oiio_msspl import map_render, open_exr
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
 from oiio_msspl.image.colour import srgb
-from oiio_msspl.jobs.temporal import AUTO, TemporalOptions
+from oiio_msspl.jobs.plan import AUTO, TemporalOptions
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.scenes import beauty

@@ -9,10 +9,6 @@ from fnmatch import fnmatchcase
 from functools import partial
 
 import numpy as np
-from oiio_msspl.jobs.frame_window import FrameWindow, FusedAlone, Neighbours
-from oiio_msspl.jobs.shot_checks import model_of_shot
-from oiio_msspl.jobs.stages import LoadedFrame, Stages
-from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, plan_temporal
 
 from oiio_msspl import map_render, open_exr
 from oiio_msspl.errors import InputError
@@ -21,7 +17,10 @@ from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.neighbours.average import average_renders
 from oiio_msspl.fusion.neighbours.renders import RenderPair
 from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.checks import model_of_shot
 from oiio_msspl.jobs.inputs import InputOptions
+from oiio_msspl.jobs.plan import Temporal, TemporalOptions, plan_temporal
+from oiio_msspl.jobs.run import FrameWindow, FusedAlone, LoadedFrame, Neighbours, Stages
 from oiio_msspl.jobs.sequence import Frame, find_shot
 from research.benchmarks.peers import oidn, oidn_prefiltered, oidn_split
 from research.benchmarks.temporal.sequence import Sequence

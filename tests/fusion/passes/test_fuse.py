@@ -17,7 +17,7 @@ from oiio_msspl.fusion.passes.fuse import _make_sum, fuse_passes, pass_steps
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.jobs import stages
+from oiio_msspl.jobs import settings
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
@@ -641,7 +641,7 @@ def test_layers_that_do_not_sum_are_passed_on(tmp_path, bilinear_models, beauty,
 )
 def test_a_wrong_name_is_one_sentence_before_the_work(tmp_path, bilinear_models, monkeypatch, passes, sums, message):
     pair = write_pair(tmp_path, lights())
-    monkeypatch.setattr(stages, "load_model", pytest.fail)
+    monkeypatch.setattr(settings, "load_model", pytest.fail)
     with pytest.raises(InputError, match=message):
         fused(pair, tmp_path / "out.exr", str(bilinear_models[4]), passes, sums)
     assert not (tmp_path / "out.exr").exists()

@@ -10,20 +10,23 @@ import time
 
 import numpy as np
 import pytest
-from oiio_msspl.jobs.frame_memory import FrameMemory
-from oiio_msspl.jobs.frame_window import FrameWindow
-from oiio_msspl.jobs.temporal import AUTO_COUNT, Temporal, TemporalOptions, plan_temporal, shares
 
 from oiio_msspl import InputError, InputOptions, fuse_shot, map_render, open_exr
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.layers import layers_of
-from oiio_msspl.exr.render import Window
+from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.motion.source import FLOW, VECTORS
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
 from oiio_msspl.image import parallel
-from oiio_msspl.jobs import frame_memory, frame_window, stages
-from oiio_msspl.jobs.sequence import Frame, find_shot
+from oiio_msspl.jobs import memory, read
+from oiio_msspl.jobs import run as run_module
+from oiio_msspl.jobs.memory import ViewMemory, memory_to_average
+from oiio_msspl.jobs.plan import AUTO_COUNT, ShotPlan, TemporalOptions, ViewPlan, plan_temporal, reach_of
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles, find_shot
+from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.timeline import ALONE, Reach
 from tests import shots
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, write_exr
 from tests.moving_plane import HEIGHT, positions, standing, texture, truck, vectors
@@ -257,32 +260,32 @@ def test_a_neighbour_that_cannot_be_decoded_is_absent(tmp_path, bilinear_models,
     folder = make_moving_shot(tmp_path, count=4)
     damaged = folder / "hr/hr.1003.exr"
     damaged.write_bytes(damaged.read_bytes()[:-2000])
-    monkeypatch.setattr(FrameMemory, "fits", in_memory)
+    monkeypatch.setattr(ViewMemory, "fits", in_memory)
     report = fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     assert [report.results[n].status for n in range(1001, 1005)] == ["fused", "fused", "failed", "fused"]
     assert any("frame 1003 is not averaged" in text for text in report.results[1002].warnings)
 
 
-@pytest.mark.parametrize("stage", ["_load", "fuse"])
+@pytest.mark.parametrize("stage", ["_read_pixels", "fuse"])
 def test_frames_beside_one_that_failed_for_another_reason_fail_too(tmp_path, bilinear_models, monkeypatch, stage):
     """Without it they would have other pixels than in a run that does not meet that failure."""
     folder = make_moving_shot(tmp_path, count=7)
     more = {"model": str(bilinear_models[4]), "temporal": TemporalOptions("2")}
     pair = folder / "lr", folder / "hr"
     fuse_shot(*pair, folder / "clean", **more)
-    real = getattr(stages.Stages, stage)
+    owner = ShotRun if stage == "fuse" else read
+    real = getattr(owner, stage)
 
-    def faulty(self, given, *arguments):
-        frame = given if stage == "_load" else given.frame
-        if frame.number == 1004:
+    def faulty(*arguments):
+        if arguments[owner is ShotRun].number == 1004:
             raise MemoryError
-        return real(self, given, *arguments)
+        return real(*arguments)
 
-    monkeypatch.setattr(stages.Stages, stage, faulty)
+    monkeypatch.setattr(owner, stage, faulty)
     report = fuse_shot(*pair, folder / "out", **more)
     failed = [n for n, result in report.results.items() if result.status == "failed"]
     # With one frame's renders and one fused frame on each side, a frame depends on two.
-    assert failed == ([1002, 1003, 1004, 1005, 1006] if stage == "_load" else [1003, 1004, 1005])
+    assert failed == ([1002, 1003, 1004, 1005, 1006] if stage == "_read_pixels" else [1003, 1004, 1005])
     assert report.results[1004].message.startswith("out of memory")
     assert "frame 1004, its neighbour, has failed: out of memory" in report.results[1003].message
     assert report.exit_code == 1
@@ -296,17 +299,16 @@ def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bili
     folder = make_moving_shot(tmp_path, count=4)
     fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]))
     in_memory = contents(folder / "out")
-    loaded = []
-    real = stages.Stages._load
-    monkeypatch.setattr(stages.Stages, "_load", lambda *arguments: loaded.append(real(*arguments)) or loaded[-1])
+    pixels = []
+    real = read._read_pixels
+    monkeypatch.setattr(read, "_read_pixels", lambda frame: pixels.append(real(frame) or frame.renders.hr))
     monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 10)
     if place == "disk":
-        monkeypatch.setattr(frame_memory, "_vector_bytes", lambda render, channels: 1 << 32)
+        monkeypatch.setattr(memory, "_vector_bytes", lambda render, channels: 1 << 32)
     else:
-        monkeypatch.setattr(frame_memory, "_pixel_bytes", lambda render, features: 1 << 40)
+        monkeypatch.setattr(memory, "_pixel_bytes", lambda render, features: 1 << 40)
     fuse_shot(folder / "lr", folder / "hr", folder / "out", model=str(bilinear_models[4]), overwrite=True)
     assert contents(folder / "out") == in_memory
-    pixels = [each.hr_pixels for each in loaded]
     assert len(pixels) == 4
     if place == "disk":
         assert all(isinstance(each.layers["rgb"], np.memmap) for each in pixels)
@@ -318,8 +320,8 @@ def test_renders_that_do_not_fit_into_memory_give_the_same_pixels(tmp_path, bili
     ("count", "averaged"), [(1, (0, 1)), (2, (1, 1)), (3, (1, 2)), (4, (2, 2)), (6, (4, 2)), (8, (6, 2))]
 )
 def test_renders_and_fused_frames_share_the_neighbours(count, averaged):
-    assert shares(count, VECTORS) == averaged
-    assert shares(count, FLOW) == (0, count)  # flow is computed on fused frames
+    assert reach_of(count, VECTORS) == averaged
+    assert reach_of(count, FLOW) == (0, count)  # flow is computed on fused frames
 
 
 def test_without_known_motion_frames_stay_alone(tmp_path, bilinear_models):
@@ -504,48 +506,49 @@ def test_passes_of_chunks_are_those_of_one_run_bit_for_bit(shot_with_passes, bil
 
 def test_frames_are_fused_once_and_kept_as_long_as_needed(shot, bilinear_models, monkeypatch):
     fused, most, most_renders = [], 0, 0
-    real, release = stages.Stages.fuse, FrameWindow.release
+    real, release = ShotRun.fuse, ShotRun._release
 
-    def count(self, loaded, session, neighbours):
-        fused.append(loaded.frame.number)
-        return real(self, loaded, session, neighbours)
+    def count(self, frame, *arguments):
+        fused.append(frame.number)
+        return real(self, frame, *arguments)
 
     def watch(self):
         nonlocal most, most_renders
         release(self)
-        most, most_renders = max(most, len(self._fused)), max(most_renders, len(self._loaded))
+        frames = self._frames.values()
+        most = max(most, sum(frame.fused is not None for frame in frames))
+        most_renders = max(most_renders, sum(isinstance(frame.renders.hr, Render) for frame in frames))
 
-    monkeypatch.setattr(stages.Stages, "fuse", count)
-    monkeypatch.setattr(FrameWindow, "release", watch)
+    monkeypatch.setattr(ShotRun, "fuse", count)
+    monkeypatch.setattr(ShotRun, "_release", watch)
     run(shot, bilinear_models[4], "once")
     assert fused == list(range(FIRST, FIRST + COUNT)) and (most, most_renders) == (4, 4)
 
 
 def test_averaging_uses_no_more_threads_than_allowed(shot, whole, bilinear_models, monkeypatch):
     seen = []
-    averaging = {stages: "average_renders", frame_window: "average_results"}
-    for module, name in averaging.items():
-        real = getattr(module, name)
+    for name in ("average_renders", "average_results"):
+        real = getattr(run_module, name)
 
         def watch(*arguments, real=real):
             seen.append(parallel._thread_limit.get())
             return real(*arguments)
 
-        monkeypatch.setattr(module, name, watch)
+        monkeypatch.setattr(run_module, name, watch)
     run(shot, bilinear_models[4], "one thread", threads=1)
     assert len(seen) == 2 * COUNT and set(seen) == {1}
     assert contents(shot / "one thread") == contents(shot / "whole")
 
 
 def test_the_order_of_a_part_begins_with_its_neighbours():
-    frames = {n: Frame(n, None, None, None) for n in (1, 2, 3, 5, 6, 7, 8, 9)}
-    temporal = Temporal(1, 1, None, frames)
+    frames = {n: FrameFiles(n, None, None, None) for n in (1, 2, 3, 5, 6, 7, 8, 9)}
+    plan = ShotPlan(frames, {None: ViewPlan(Reach(1, 1))})
 
     def order(number):
-        return [frame.number for frame in FrameWindow(temporal, [frames[number]], lambda *_: None).order()]
+        return [files.number for files in ShotRun(Settings(), plan, [frames[number]]).order]
 
     assert order(7) == [5, 6, 7, 8, 9] and order(3) == [1, 2, 3]
-    assert temporal.missing(3) == [4] and temporal.missing(6) == [4] and temporal.missing(1) == []
+    assert plan.missing(3) == [4] and plan.missing(6) == [4] and plan.missing(1) == []
 
 
 def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monkeypatch):
@@ -554,10 +557,9 @@ def test_large_frames_wait_in_temporary_files(shot, whole, bilinear_models, monk
     assert contents(shot / "on disk") == contents(shot / "whole")
     window = Window(0, 0, 4096, 2160)
     monkeypatch.undo()
-    temporal = Temporal(2, 2)
-    assert temporal.memory(window, 12, 2) < 1 << 30
-    assert temporal.memory(Window(0, 0, 1920, 1080), 12, 2) < 1 << 29
-    assert Temporal().memory(window, 12, 2) == 0
+    assert memory_to_average(Reach(2, 2), window, 12, 2) < 1 << 30
+    assert memory_to_average(Reach(2, 2), Window(0, 0, 1920, 1080), 12, 2) < 1 << 29
+    assert memory_to_average(ALONE, window, 12, 2) == 0
 
 
 def test_the_number_of_frames_that_counted_is_a_layer(shot, bilinear_models):
@@ -599,9 +601,9 @@ def test_a_frame_with_damaged_vectors_fails_however_much_memory_there_is(tmp_pat
         motion = {name: channels.pop(name) for name in list(channels) if name.startswith("motionFore")}
         write_exr(path, [("rgba", channels, (0, 0)), ("motionFore", motion, (0, 0))])
     damage_pixels(shot / f"hr/hr.{FIRST + 2}.exr", 1, HEIGHT)
-    for memory in (MAX_MEMORY, 1 << 29):
-        more = {"temporal": TemporalOptions("2"), "write": WriteOptions(layers=("none",)), "max_memory": memory}
-        report = fuse_shot(shot / "lr", shot / "hr", tmp_path / str(memory), model=str(bilinear_models[4]), **more)
+    for max_memory in (MAX_MEMORY, 1 << 29):
+        more = {"temporal": TemporalOptions("2"), "write": WriteOptions(layers=("none",)), "max_memory": max_memory}
+        report = fuse_shot(shot / "lr", shot / "hr", tmp_path / str(max_memory), model=str(bilinear_models[4]), **more)
         assert [report.results[FIRST + n].status for n in range(4)] == ["fused", "fused", "failed", "fused"]
 
 
@@ -619,9 +621,9 @@ def test_a_neighbour_with_one_damaged_pass_is_left_out_wherever_pixels_wait(tmp_
         write_exr(tmp_path / f"hr/hr.{n:04d}.exr", [(name, each, (0, 0)) for name, each in parts.items()])
     damage_pixels(tmp_path / "hr/hr.0003.exr", 1)
     fused = {}
-    for name, memory in (("pixels wait in memory", MAX_MEMORY), ("pixels are read twice", 1 << 29)):
+    for name, max_memory in (("pixels wait in memory", MAX_MEMORY), ("pixels are read twice", 1 << 29)):
         out = tmp_path / name
-        report = fuse_shot(tmp_path / "lr", tmp_path / "hr", out, model=str(bilinear_models[4]), max_memory=memory)
+        report = fuse_shot(tmp_path / "lr", tmp_path / "hr", out, model=str(bilinear_models[4]), max_memory=max_memory)
         assert [report.results[n].status for n in range(1, 6)] == ["fused", "fused", "failed", "fused", "fused"]
         assert any("frame 3 is not averaged" in text for text in report.results[2].warnings), report.temporal
         fused[name] = contents(out)

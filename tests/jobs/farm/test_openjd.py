@@ -14,7 +14,7 @@ from pathlib import Path
 import pytest
 
 from oiio_msspl.errors import MssplError
-from oiio_msspl.jobs import openjd as bundles
+from oiio_msspl.jobs.farm import openjd as bundles
 from tests.conftest import write_exr
 from tests.jobs.test_temporal import make_shot_with_passes
 from tests.programs import fuse, run

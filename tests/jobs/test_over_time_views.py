@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 
 from oiio_msspl import InputOptions, WriteOptions, fuse_shot
-from oiio_msspl.jobs import frame_memory, stages
-from oiio_msspl.jobs.frame_memory import FrameMemory
-from oiio_msspl.jobs.temporal import TemporalOptions
+from oiio_msspl.jobs import memory, read
+from oiio_msspl.jobs.memory import ViewMemory
+from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, ViewPlan
+from oiio_msspl.jobs.read import read_frame
+from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.timeline import Reach
 from tests.conftest import downsample, noisy, read_bits, rgb, same_bits, write_exr
 from tests.moving_plane import positions, texture, truck, vectors
 
@@ -140,7 +143,7 @@ def test_chunks_of_several_views_are_one_run_bit_for_bit(shot, whole, bilinear_m
 
 
 def test_large_renders_of_several_views_wait_in_files(shot, whole, bilinear_models, monkeypatch):
-    monkeypatch.setattr(frame_memory, "has_many_pixels", lambda height, width: True)
+    monkeypatch.setattr(memory, "has_many_pixels", lambda height, width: True)
     run(shot, bilinear_models[4], "on disk")
     once, again = (pixels_of(shot, name, 3) for name in ("whole", "on disk"))
     assert all(same_bits(once[name], again[name]) for name in once)
@@ -149,14 +152,15 @@ def test_large_renders_of_several_views_wait_in_files(shot, whole, bilinear_mode
 def test_frames_of_other_views_are_counted_as_memory(shot, whole):
     """Also by a frame that lacks the view."""
     frame = whole.shot.frames[0]
-    planned = stages.Temporal(2, 2, views={"bg": stages.Temporal(2, 2), "gone": stages.Temporal(2, 2)})
-    views = stages.Stages(temporal=planned).read_views(frame)
-    counted = {view: loaded.stages.held_by_other_views for view, loaded in views.items()}
+    plan = ShotPlan(views=dict.fromkeys([None, "bg", "gone"], ViewPlan(Reach(2, 2))))
+    views = {read.view: read for read in read_frame(frame, Settings(), plan) if read.error is None}
+    counted = {view: read.memory.other_views for view, read in views.items()}
     assert counted.keys() == {None, "bg"}
-    pixels = views["bg"].hr_pixels.layers["rgb"]
+    pixels = views["bg"].renders.hr.layers["rgb"]
     assert isinstance(pixels, np.memmap)  # renders wait in files, and results and vectors in memory
     assert min(counted.values()) >= 2 * (4 * 16 + 16 * 9) * pixels[..., 0].size
-    assert stages.Stages(temporal=stages.Temporal(2, 2)).read(frame).stages.held_by_other_views == 0
+    alone = ShotPlan(views={None: ViewPlan(Reach(2, 2))})
+    assert read_frame(frame, Settings(), alone)[0].memory.other_views == 0
 
 
 def test_a_view_without_motion_stays_alone(tmp_path, bilinear_models):
@@ -228,7 +232,7 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
     cut_part(path, view)
     results = []
     for name, fits in (("in memory", True), ("in files", False)):
-        monkeypatch.setattr(FrameMemory, "fits", fits)
+        monkeypatch.setattr(ViewMemory, "fits", fits)
         out = shot / name
         out.mkdir()
         options = TemporalOptions("auto")
@@ -243,16 +247,15 @@ def test_a_damaged_view_is_absent_wherever_renders_wait(tmp_path, bilinear_model
 
 def test_no_more_frames_are_held_than_are_counted(shot, bilinear_models, monkeypatch):
     held, most = [], []
-    real = stages.Stages._load
+    real = read._read_pixels
 
-    def load(self, *arguments):
-        loaded = real(self, *arguments)
-        if loaded.hr.view == "bg":
-            held.append(weakref.ref(loaded.hr_pixels.layers["rgb"]))
-            most.append((sum(pixels() is not None for pixels in held), 2 * self.temporal.renders + 2))
-        return loaded
+    def load(frame):
+        real(frame)
+        if frame.view == "bg":
+            held.append(weakref.ref(frame.renders.hr.layers["rgb"]))
+            most.append((sum(pixels() is not None for pixels in held), 2 * frame.plan.reach.renders + 2))
 
-    monkeypatch.setattr(stages.Stages, "_load", load)
+    monkeypatch.setattr(read, "_read_pixels", load)
     for count in ("auto", "1"):
         most.clear()
         run(shot, bilinear_models[4], f"held {count}", temporal=count)

@@ -14,11 +14,14 @@ from oiio_msspl import InputError, InputOptions, MssplError, WriteOptions, fuse_
 from oiio_msspl.exr.preview import is_our_preview, write_png
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY
-from oiio_msspl.jobs import frame_writing, stages
+from oiio_msspl.jobs import settings as job_settings
+from oiio_msspl.jobs import write as writing
+from oiio_msspl.jobs.checks import check_wanted_outputs
 from oiio_msspl.jobs.inputs import map_pair
-from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.shot_checks import check_wanted_outputs
-from oiio_msspl.jobs.stages import Stages
+from oiio_msspl.jobs.plan import ShotPlan
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
 from tests.conftest import downsample, picture, read_bits, rgb, write_exr
 from tests.programs import leave_temporary
 from tests.shots import HEIGHT, WIDTH, layers, low_layers
@@ -55,7 +58,7 @@ def test_the_result_is_written_over_the_hrls_s_data_window(pair, tmp_path, bilin
     ],
 )
 def test_what_is_wrong_is_said_before_the_work(pair, tmp_path, monkeypatch, output, more, message):
-    monkeypatch.setattr(stages, "load_model", pytest.fail)
+    monkeypatch.setattr(job_settings, "load_model", pytest.fail)
     with pytest.raises(InputError, match=message):
         fuse_files(*pair, tmp_path / output, **more)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["hr.exr", "lr.exr"]
@@ -69,11 +72,11 @@ def test_a_layout_that_can_not_hold_the_layers_is_refused_by_the_headers(tmp_pat
     mist = {"mist.Z": np.ones((8, 8), np.float32)}
     write_exr(hr, [("rgba", layers(1), (0, 0)), ("mist", mist, (5, 3))], display=display)
     write = WriteOptions(layout="multilayer")
-    of_shot = Frame(1, lr, hr, out)
+    of_shot = FrameFiles(1, lr, hr, out)
     monkeypatch.setattr(ExrFile, "read", pytest.fail)
     for check in (
         lambda: fuse_files(lr, hr, out, write=write),
-        lambda: Stages(write_options=write).read_views(of_shot),
+        lambda: ShotRun(Settings(write=write), ShotPlan(), [of_shot]).read(of_shot)[0].require(),
         lambda: check_wanted_outputs([of_shot], InputOptions(), write, None, MAX_MEMORY),
     ):
         with pytest.raises(InputError, match=r"part 'mist' of .* one part can hold only one, use --layout spec"):
@@ -84,7 +87,7 @@ def test_a_frame_without_its_preview_is_a_warning(pair, tmp_path, bilinear_model
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
 
-    monkeypatch.setattr(frame_writing, "write_preview", full_disk)
+    monkeypatch.setattr(writing, "write_preview", full_disk)
     out = tmp_path / "out.exr"
     report = fuse_files(*pair, out, model=str(bilinear_models[4]), preview_path=tmp_path / "out.png")
     assert out.is_file()
@@ -136,7 +139,7 @@ def luxcore_pair(folder):
 @pytest.mark.parametrize("kind", ["output", "preview"])
 def test_no_file_that_is_read_is_written_even_with_overwrite(tmp_path, monkeypatch, target, kind):
     """A file of --map, the mapping's file, the model, and the sibling files of a LuxCore beauty, by name or by link."""
-    monkeypatch.setattr(stages, "load_model", pytest.fail)
+    monkeypatch.setattr(job_settings, "load_model", pytest.fail)
     pair = luxcore_pair(tmp_path)
     write_exr(tmp_path / "other.exr", rgb(picture(HEIGHT, WIDTH)))
     for name in ("map.toml", "model.onnx"):
@@ -181,10 +184,10 @@ def test_a_new_frame_never_keeps_the_preview_of_the_old_one(pair, tmp_path, bili
     def full_disk(*arguments, **more):
         raise MssplError("disk full")
 
-    for preview, writes in ((None, frame_writing.write_preview), (png, full_disk)):
+    for preview, writes in ((None, writing.write_preview), (png, full_disk)):
         out.write_text("old")
         write_png(png, np.zeros((2, 2, 3)), overwrite=True)
-        monkeypatch.setattr(frame_writing, "write_preview", writes)
+        monkeypatch.setattr(writing, "write_preview", writes)
         fuse_files(*pair, out, model=model, preview_path=preview, overwrite=True)
         assert not png.exists()
     png.write_text("somebody's picture")

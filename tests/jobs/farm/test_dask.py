@@ -15,12 +15,15 @@ import pytest
 from oiio_msspl import InputError, MssplError, fuse_shot
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.preview import write_png
-from oiio_msspl.jobs import dask_cluster
-from oiio_msspl.jobs.dask_cluster import _sessions, connect, fuse_frames
+from oiio_msspl.jobs import pipeline
+from oiio_msspl.jobs.farm import dask as dask_cluster
+from oiio_msspl.jobs.farm.dask import _sessions, connect, fuse_frames
 from oiio_msspl.jobs.inputs import InputOptions
-from oiio_msspl.jobs.sequence import Frame
-from oiio_msspl.jobs.stages import Stages
-from oiio_msspl.jobs.temporal import Temporal, TemporalOptions
+from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, ViewPlan
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles
+from oiio_msspl.jobs.settings import Settings
+from oiio_msspl.jobs.timeline import Reach
 from tests.jobs.test_temporal import make_shot_with_passes
 from tests.programs import fuse
 from tests.shots import contents, make_shot
@@ -53,14 +56,14 @@ def client(two_workers):
 def hang_in_writing(marker):
     """In a worker: leave what there is in the middle of writing a frame, tell, and go no further."""
 
-    def write(self, report, fused):
-        write_png(report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
-        with replacing(report.output) as temporary:
+    def write(frame, existing):
+        write_png(frame.report.preview, np.zeros((2, 2, 3)))  # of a frame that is not there
+        with replacing(frame.report.output) as temporary:
             temporary.write_bytes(b"half")
             marker.touch()
             time.sleep(1000)
 
-    Stages.write = write
+    pipeline.write_settled = write
 
 
 def loaded_models():
@@ -169,10 +172,10 @@ def test_a_frame_that_kills_its_workers_is_given_up(tmp_path, bilinear_models, t
     make_shot(tmp_path, 1)
     two_workers.scheduler.allowed_failures, usual = 0, two_workers.scheduler.allowed_failures
 
-    def die(self, frame):
+    def die(self, files):
         os._exit(1)
 
-    client.run(partial(setattr, Stages, "read_views"), die)
+    client.run(partial(setattr, ShotRun, "read"), die)
     try:
         report = fuse_shot(tmp_path / "lr", tmp_path / "hr", tmp_path / "out", client=client)
     finally:
@@ -214,14 +217,14 @@ def test_a_file_without_a_scheduler_is_a_mistake(tmp_path, text):
 
 def test_a_shot_that_is_done_waits_for_no_worker():
     pytest.importorskip("distributed")
-    assert list(fuse_frames(None, None, [])) == []
+    assert list(fuse_frames(None, None, None, [])) == []
 
 
 #: Frames of the tasks that :func:`fail_once` has got.
 TASKS: list[list[int]] = []
 
 
-def fail_once(run, stages, frames, neighbours):
+def fail_once(run, settings, plan, frames, workers):
     """In place of a task, in this process: the server is away for frame 2, at first."""
     TASKS.append([frame.number for frame in frames])
     away = MssplError("the server is away") if len(TASKS) == 1 else {"warnings": []}
@@ -233,11 +236,12 @@ def test_only_the_frames_of_a_chunk_that_failed_are_tried_again(monkeypatch):
     """The others keep their reports, and are not fused again."""
     distributed = pytest.importorskip("distributed")
     monkeypatch.setattr(dask_cluster, "_fuse_chunk", fail_once)
-    frames = [Frame(number, Path("lr.exr"), Path("hr.exr"), Path(f"{number}.exr")) for number in (1, 2, 3, 4)]
+    frames = [FrameFiles(number, Path("lr.exr"), Path("hr.exr"), Path(f"{number}.exr")) for number in (1, 2, 3, 4)]
     with distributed.Client(
         processes=False, n_workers=1, threads_per_worker=1, dashboard_address="127.0.0.1:0", silence_logs=50
     ) as made:
-        outcomes = {f.number: outcome for f, outcome in fuse_frames(made, Stages(temporal=Temporal(1, 1)), frames)}
+        plan = ShotPlan(views={None: ViewPlan(Reach(1, 1))})
+        outcomes = {f.number: outcome for f, outcome in fuse_frames(made, Settings(), plan, frames)}
     assert TASKS == [[1, 2, 3, 4], [2]]
     assert outcomes[1] == {"warnings": ["a"]} and outcomes[2] == {"warnings": []} and outcomes[4] is None
     assert isinstance(outcomes[3], InputError)

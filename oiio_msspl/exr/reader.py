@@ -217,8 +217,7 @@ class ExrFile:
                 strip = self._decode_channels(part, y0, y1, indices)
                 cache.keep(key, strip)
             shared = area.intersect(Window(area.x0, y0, area.x1, y1))
-            rows, columns = shared.slices(Window(whole.x0, y0, whole.x1, y1))
-            result[(*shared.slices(window), planes)] = strip[rows, columns]
+            result[(*shared.slices(window), planes)] = strip[shared.slices(Window(whole.x0, y0, whole.x1, y1))]
 
     def _decode_channels(self, part: Part, y0: int, y1: int, indices: tuple[int, ...]) -> NDArray[Any]:
         """Decode a strip of some channels, each contiguous: half if all are stored as half, otherwise float."""

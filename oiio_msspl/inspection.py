@@ -12,12 +12,11 @@ import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import DIFFUSE, RADIANCE_FEATURES, RGB, SPECULAR, VARIANCE
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.motion.source import MotionSource, find_motion
 from oiio_msspl.fusion.passes.sums import check_sum
@@ -28,8 +27,6 @@ from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
-#: Rows whose pixels are read at a time.
-ROWS_PER_READ = 256
 #: Features that only the paper's network reads. They are left out for the other models, unless the user maps them.
 PAPER_FEATURES = frozenset({DIFFUSE, SPECULAR, VARIANCE})
 
@@ -250,12 +247,10 @@ def _facts(file: ExrFile) -> list[str]:
 
 def _pixel_facts(render: MappedRender) -> list[str]:
     """Read all features once: count values that are not finite or negative, and name features that are all zero."""
-    window = render.data_window
     brightest: dict[str, float] = {}
     not_finite: dict[str, int] = {}
     negative: dict[str, int] = {}
-    for y in range(window.y0, window.y1, ROWS_PER_READ):
-        rows = Window(window.x0, y, window.x1, min(y + ROWS_PER_READ, window.y1))
+    for rows in render.data_window.bands(ROWS_PER_LOAD):
         for name, values in render.read(rows).items():
             finite = np.isfinite(values)
             not_finite[name] = not_finite.get(name, 0) + int(values.size - np.count_nonzero(finite))

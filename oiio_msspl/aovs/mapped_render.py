@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Any
@@ -22,8 +22,6 @@ from oiio_msspl.image.colour import REC709, ColourSpace
 
 #: Rows that are read at a time: decoded channels take memory beside the features that are made of them.
 ROWS_PER_LOAD = 256
-#: Name of the alpha among the features that are read.
-ALPHA = "alpha"
 
 
 @dataclass
@@ -38,7 +36,7 @@ class MappedRender:
     other_views: list[str]
     """The views and view layers that were not chosen."""
     features: dict[str, FeatureFormula]
-    """The features that were found; ``rgb`` is among them."""
+    """Formulas of the features that the file has, always ``rgb``."""
     alpha: Channel | None
     spp: float | None
     """Samples per pixel; None if neither the header nor the user says."""
@@ -93,9 +91,9 @@ class MappedRender:
             formula = self.features.get(feature)
             status = "default" if formula is None else "computed" if formula.is_computed else "found"
             text, note = (formula.text, formula.note) if formula else ("", "")
-            rows.append(_row(feature, status if feature in read else "unused", text, note))
-        rows.append(_row("alpha", "found", self.alpha.name) if self.alpha else _row("alpha", "absent"))
-        return rows
+            rows.append((feature, status if feature in read else "unused", text, note))
+        rows.append(("alpha", "found", self.alpha.name, "") if self.alpha else ("alpha", "absent", "", ""))
+        return [dict(zip(("feature", "status", "source", "note"), row, strict=True)) for row in rows]
 
     def drop_features(self, unread: Collection[str]) -> None:
         """Forget features that the model does not read, and the notes about them."""
@@ -126,13 +124,13 @@ class MappedRender:
     @property
     def _formulas(self) -> dict[str, FeatureFormula]:
         """The features and, if there is one, the alpha."""
-        return self.features | ({ALPHA: FeatureFormula(((self.alpha,),))} if self.alpha else {})
+        return self.features | ({"alpha": FeatureFormula(((self.alpha,),))} if self.alpha else {})
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
         """Return features over a rectangle, float32 (height, width, channels), in the units of the features.
 
-        Each channel is contiguous in memory. Features that are read from one file may share the memory of all of them.
-        Values are as the renderer wrote them: NaN and infinities may be among them.
+        Channels are contiguous in memory; features of one file may be views of one array. Values are as the renderer
+        wrote them: NaN and infinities may be among them.
 
         Args:
             window: a rectangle inside the data window.
@@ -148,7 +146,7 @@ class MappedRender:
     ) -> tuple[dict[str, Array], Array]:
         """Read features and, as they are stored, more channels, (height, width, channels)."""
         available = self._formulas
-        names = (*FEATURES, ALPHA) if features is None else features
+        names = (*FEATURES, "alpha") if features is None else features
         formulas = {name: available[name] for name in names if name in available}
         channels = [c for formula in formulas.values() for c in formula.channels]
         if VARIANCE in formulas:
@@ -200,7 +198,7 @@ class MappedRender:
         whole = self.data_window
         layers: dict[str, Array] = {}
         stored = np.empty((len(channels), whole.height, whole.width), np.float32).transpose(1, 2, 0)
-        for window in self._bands():
+        for window in whole.bands(ROWS_PER_LOAD):
             strips, stored[window.slices(whole)] = self._read_with(window, features, channels)
             for name, rows in strips.items():
                 if name not in layers:
@@ -215,17 +213,8 @@ class MappedRender:
         Raises:
             InputError: pixels can't be decoded, because a file is truncated or corrupt.
         """
-        for window in self._bands():
+        for window in self.data_window.bands(ROWS_PER_LOAD):
             self._read_with(window, features, channels)
-
-    def _bands(self) -> Iterator[Window]:
-        whole = self.data_window
-        for y0 in range(whole.y0, whole.y1, ROWS_PER_LOAD):
-            yield Window(whole.x0, y0, whole.x1, min(y0 + ROWS_PER_LOAD, whole.y1))
-
-
-def _row(feature: str, status: str, source: str = "", note: str = "") -> dict[str, str]:
-    return {"feature": feature, "status": status, "source": source, "note": note}
 
 
 def origin(row: Mapping[str, str]) -> str:

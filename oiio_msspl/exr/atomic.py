@@ -85,11 +85,7 @@ def _identity(path: Path) -> object:
 
 
 def check_encodable(path: Path) -> None:
-    """Check that a path is UTF-8: OpenImageIO can't open others.
-
-    Raises:
-        InputError: it is not.
-    """
+    """Raise InputError if a path is not UTF-8: OpenImageIO can't open it."""
     try:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -46,6 +46,11 @@ class Window:
     def shift(self, dx: int, dy: int) -> Window:
         """Return the rectangle moved by ``dx`` pixels to the right and ``dy`` pixels down."""
         return Window(self.x0 + dx, self.y0 + dy, self.x1 + dx, self.y1 + dy)
+
+    def bands(self, rows: int) -> Iterator[Window]:
+        """Cut the rectangle into bands of at most ``rows`` rows, from top to bottom."""
+        for y0 in range(self.y0, self.y1, rows):
+            yield Window(self.x0, y0, self.x1, min(y0 + rows, self.y1))
 
     def slices(self, inside: Window) -> tuple[slice, slice]:
         """Return the row and column slices of this rectangle in an array that covers ``inside``."""

@@ -57,7 +57,7 @@ class MappedRender:
 
     @property
     def display_window(self) -> Window:
-        """The frame: what the camera shows."""
+        """The frame that the camera shows."""
         return self.file.display_window
 
     @property

@@ -173,7 +173,7 @@ def _decide_normal_encoding(render: MappedRender) -> None:
     bands = [render.file.read(formula.terms[0], rows) for rows in _bands(render.data_window)]
     normal = np.concatenate([band.reshape(-1, 3) for band in bands])
     normal = normal[np.isfinite(normal).all(axis=1) & (np.abs(normal).max(axis=1) > 0)]
-    unsigned = len(normal) > 0 and normal.min() >= 0 and _unit_share(normal * 2 - 1) > _unit_share(normal)
+    unsigned = len(normal) > 0 and normal.min() >= 0 and _unit_fraction(normal * 2 - 1) > _unit_fraction(normal)
     render.features[NORMAL] = replace(formula, encoding="unsigned" if unsigned else "signed")
 
 
@@ -186,6 +186,6 @@ def _bands(window: Window) -> list[Window]:
     return [Window(window.x0, top, window.x1, top + _ROWS_PER_BAND) for top in tops]
 
 
-def _unit_share(vectors: Array) -> float:
+def _unit_fraction(vectors: Array) -> float:
     """Return the fraction of the vectors (n, 3) whose length is 1 +- 0.1."""
     return float(np.mean(np.abs(np.linalg.norm(vectors, axis=1) - 1) < 0.1)) if len(vectors) else 0.0

@@ -54,7 +54,7 @@ class FusedPixels:
 
 @dataclass(frozen=True)
 class FileContents:
-    """All that a writer needs to know."""
+    """The input of a writer: the fused pixels, and the channels of the HRLS that are passed on."""
 
     source: ExrFile
     """The HRLS."""

@@ -79,7 +79,7 @@ class Part:
         return sum(self.plane_bytes(channel) for channel in self.channels)
 
     def plane_bytes(self, channel: Channel) -> int:
-        """Bytes of the pixels of one channel in its stored type."""
+        """Return the bytes of the pixels of a channel in its stored type."""
         return self.data_window.width * self.data_window.height * (2 if channel.type == "half" else 4)
 
     @property

@@ -130,7 +130,7 @@ class ReadableRender(Protocol):
 
     @property
     def display_window(self) -> Window:
-        """The frame: what the camera shows."""
+        """The frame that the camera shows."""
 
     @property
     def data_window(self) -> Window:

@@ -33,7 +33,7 @@ OPTIONS |= dict.fromkeys((ALBEDO_LAYER, NORMAL_LAYER), "--data-passes")
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How the result is stored.
+    """The user's choices about the output file.
 
     Raises:
         InputError: layout, compression or pixel type is unknown, or ``none`` is combined with other patterns.

@@ -221,8 +221,8 @@ def origin(row: Mapping[str, str]) -> str:
     """Say where a feature comes from, by a row of :meth:`MappedRender.table`."""
     status, source = row["status"], row["source"] + (f" ({row['note']})" if row["note"] else "")
     if status == "default":  # features are optional, but without an albedo textures are lost
-        hint = ": expect blur, render an albedo (or name it with --map albedo=LAYER)"
-        return f"none{hint if row['feature'] == ALBEDO else ' (optional)'}"
+        hint = "none: expect blur, render an albedo (or name it with --map albedo=LAYER)"
+        return hint if row["feature"] == ALBEDO else "none (optional)"
     if status == "unused":
         return f"found: {source}; this model does not read it" if source else "none; this model does not read it"
     return "none" if status == "absent" else f"{status}: {source}"

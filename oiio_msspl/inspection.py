@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
-from oiio_msspl.aovs.features import DIFFUSE, RADIANCE_FEATURES, RGB, SPECULAR, VARIANCE
+from oiio_msspl.aovs.features import PAPER_FEATURES, RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
@@ -26,9 +26,6 @@ from oiio_msspl.jobs.inputs import InputOptions, map_hrls, map_other_hrls
 from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
-
-#: Features that only the paper's network reads. They are left out for the other models, unless the user maps them.
-PAPER_FEATURES = frozenset({DIFFUSE, SPECULAR, VARIANCE})
 
 
 @dataclass
@@ -137,7 +134,7 @@ def inspect_file(
     """
     contract = Contract.of_file(find_model(SCALES[0], model))
     result = Inspection(path, contract=contract)
-    unread = PAPER_FEATURES.difference(contract.hrls, inputs.mapping)
+    unread = PAPER_FEATURES.difference(contract.hrls, inputs.mapping)  # a feature that the user maps is listed
     try:
         if is_sequence(path) and not path.is_dir():
             raise InputError(f"{path}: is a pattern; name one of its files, and the next frame is found beside it")

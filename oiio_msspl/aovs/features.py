@@ -25,6 +25,8 @@ VARIANCE = "variance"
 HRLS_FEATURES: dict[str, int] = {RGB: 3, ALBEDO: 3, NORMAL: 3, DIFFUSE: 3, SPECULAR: 3, VARIANCE: 1}
 #: All features, in order.
 FEATURES = tuple(HRLS_FEATURES)
+#: Features that only the paper's network reads.
+PAPER_FEATURES = frozenset({DIFFUSE, SPECULAR, VARIANCE})
 #: Features that are radiance: they scale with the brightness of the scene.
 RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
 #: Features that a render may lack. The network then reads the value in ``DEFAULTS``.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Comparing EXR files with a reference: scores, and a picture of the error."""
+"""Compare EXR files with a reference: scores, and a picture of the error."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ ERROR_MAP_SOFTWARE = f"{SOFTWARE} compare"
 
 
 def scores(image: Array, reference: Array) -> dict[str, float]:
-    """All measures of :mod:`oiio_msspl.image.metrics`.
+    """Measure an image by all metrics of :mod:`oiio_msspl.image.metrics`.
 
     Args:
         image, reference: scene linear, (height, width, 3).
@@ -51,15 +51,15 @@ class Comparison:
     """EXR files whose beauties are compared, over the part of the frame that all of them show."""
 
     renders: list[MappedRender]
-    """The images, and behind them the reference if there is one."""
+    """The images, and then the reference if there is one."""
     has_reference: bool
     largest: int
     """Position of the render at whose size all are compared: the reference, or else the largest image."""
     windows: list[Window]
-    """What is compared of each render, see :func:`common_windows`."""
+    """The compared rectangle of every render, see :func:`common_windows`."""
     broken: dict[str, int] = field(default_factory=dict)
-    """Numbers of values that were NaN or infinite, by the name of the render, as far as it was read. NaN counts as
-    black, infinity as the largest half float of its sign."""
+    """Numbers of NaN and infinite values by the name of the render, for renders that were read. NaN counts as black,
+    infinity as the largest half float of its sign."""
 
     @cached_property
     def truth(self) -> Array:
@@ -67,12 +67,11 @@ class Comparison:
         return self._read(-1)
 
     def image(self, position: int) -> Array:
-        """The beauty of an image, upsampled to the size of the reference if it is smaller."""
-        image, (height, width) = self._read(position), self.truth.shape[:2]
-        return image if image.shape == self.truth.shape else upsample_bicubic(image, width, height)
+        """Return the beauty of an image, upsampled to the size of the reference if it is smaller."""
+        return upsampled_like(self._read(position), self.truth)
 
     def _read(self, position: int) -> Array:
-        """The beauty of a render without NaN and infinities, in the linear RGB space of the largest one."""
+        """Read a beauty without NaN and infinities, in the linear RGB space of the largest render."""
         render = self.renders[position]
         rgb, broken = repair(render.read(self.windows[position], [RGB])[RGB], signed=True)
         if broken is not None:
@@ -85,82 +84,72 @@ def open_comparison(images: Sequence[Path], reference: Path | None = None, layer
 
     Args:
         images: EXR files. One may be smaller than the largest by x2, x4 or x8.
-        reference: EXR file of what the images should be.
-        layer: of all files, in place of their beauty.
+        reference: EXR file of the converged frame.
+        layer: layer of all files to compare in place of their beauty.
 
     Returns:
-        The files with the view, or view layer, that the first image has in front. A file that lacks it takes part with
-        its own first one, see :func:`note_on_views`.
+        The files with the first view, or view layer, of the first image. A file that lacks it takes part with its own
+        first one, see :func:`note_on_views`.
 
     Raises:
-        InputError: a file can't be read or lacks what is compared, or see :func:`common_windows`.
+        InputError: a file can't be read, lacks the beauty or the layer, or see :func:`common_windows`.
     """
-    paths = [*images, *([reference] if reference else [])]
-    renders = _renders_of_one_view(paths, {RGB: layer} if layer else {})
-    sizes = [each.data_window.width * each.data_window.height for each in renders]
+    mapping = {RGB: layer} if layer else {}
+    renders: list[MappedRender] = []
+    for path in [*images, *([reference] if reference else [])]:
+        file = open_exr(path)
+        render = map_render(file, mapping, features=())
+        view = renders[0].view if renders else ""
+        if view != render.view and any(view in (label, *label.split("/")) for label in render.other_views):
+            render = map_render(file, mapping, view=view, features=())
+        renders.append(render)
+    sizes = [render.data_window.width * render.data_window.height for render in renders]
     largest = len(renders) - 1 if reference else sizes.index(max(sizes))
     return Comparison(renders, reference is not None, largest, common_windows(renders, renders[largest]))
 
 
-def _renders_of_one_view(paths: Sequence[Path], mapping: dict[str, str]) -> list[MappedRender]:
-    """Files with the view, or view layer, that the first one has in front; those that lack it with their own first."""
-    renders: list[MappedRender] = []
-    for path in paths:
-        file = open_exr(path)
-        render = map_render(file, mapping, features=())
-        wanted = renders[0].view if renders else ""
-        if wanted != render.view and any(wanted in (label, *label.split("/")) for label in render.other_views):
-            render = map_render(file, mapping, view=wanted, features=())
-        renders.append(render)
-    return renders
-
-
 def score_images(comparison: Comparison) -> list[dict[str, float]]:
-    """The :func:`scores` of each image. One that is smaller than the reference is upsampled bicubically first.
+    """Return the :func:`scores` of all images. Those smaller than the reference are upsampled bicubically first.
 
     Raises:
-        InputError: pixels can't be read, or what is compared is too small.
+        InputError: pixels can't be read, or the compared part is too small.
     """
     render, window = comparison.renders[-1], comparison.windows[-1]
     if min(window.height, window.width) < SSIM_WINDOW:
-        what = "is" if window == render.data_window else "the part that all files show is"
-        raise InputError(f"{render.name}: {what} {window.size}; SSIM needs at least {SSIM_WINDOW} pixels each way")
+        part = "is" if window == render.data_window else "the part that all files show is"
+        raise InputError(f"{render.name}: {part} {window.size}; SSIM needs at least {SSIM_WINDOW} pixels each way")
     return [scores(comparison.image(i), comparison.truth) for i in range(len(comparison.renders) - 1)]
 
 
-def in_space_of(rgb: Array, render: MappedRender, other: MappedRender) -> Array:
-    """Colours (h, w, 3) of a render in the linear RGB space of another one. They stay as they are unless both headers
-    declare a space."""
-    source, target = space_of(render.metadata), space_of(other.metadata)
-    return rgb if source is None or target is None else converted(rgb, source, target)
+def in_space_of(rgb: Array, render: MappedRender, target: MappedRender) -> Array:
+    """Convert colours (h, w, 3) of a render to the linear RGB space of another one if their headers declare both."""
+    source_space, target_space = space_of(render.metadata), space_of(target.metadata)
+    return rgb if source_space is None or target_space is None else converted(rgb, source_space, target_space)
 
 
 def note_on_spaces(comparison: Comparison) -> str:
-    """A sentence for the user if pictures are converted to another linear RGB space; empty if none is."""
+    """Say which pictures are converted to another linear RGB space; empty if none is."""
     largest = comparison.renders[comparison.largest]
     target = space_of(largest.metadata)
-    spaces = {each.name: space_of(each.metadata) for each in comparison.renders}
     if target is None:
         return ""
-    others = [f"{name} ({space.name})" for name, space in spaces.items() if space and not same_space(space, target)]
-    if not others:
-        return ""
-    return f"Converted to {target.name}, the colour space of {largest.name}: {', '.join(others)}"
+    spaces = {render.name: space_of(render.metadata) for render in comparison.renders}
+    names = [f"{name} ({space.name})" for name, space in spaces.items() if space and not same_space(space, target)]
+    return f"Converted to {target.name}, the colour space of {largest.name}: {', '.join(names)}" if names else ""
 
 
 def note_on_views(comparison: Comparison) -> str:
-    """A sentence for the user if a file lacks the view, or view layer, of the first image; empty if all have it, and
-    if no file has several."""
+    """Say that a file lacks the view, or view layer, of the first image; empty if all have it or none has several."""
     renders = comparison.renders
-    wanted = renders[0].view
-    same = all(wanted in (each.view, *each.view.split("/")) for each in renders)
-    if same or not any(each.other_views for each in renders):
+    view = renders[0].view
+    same = all(view in (render.view, *render.view.split("/")) for render in renders)
+    if same or not any(render.other_views for render in renders):
         return ""
-    return f"Different views are compared: {', '.join(f'{name_of(each.view)} of {each.name}' for each in renders)}"
+    return f"Different views are compared: {', '.join(f'{name_of(r.view)} of {r.name}' for r in renders)}"
 
 
 def notes_on_broken(comparison: Comparison) -> list[str]:
-    """A sentence for the user for each render that was read and has values that are NaN or infinite."""
+    """Say of every render that was read how many values are NaN or infinite, unless none is."""
     return [
         f"{name}: {count} values are NaN or infinite; NaN counts as black here, infinity as {HALF_MAX:.0f}"
         for name, count in comparison.broken.items()
@@ -168,11 +157,7 @@ def notes_on_broken(comparison: Comparison) -> list[str]:
 
 
 def note_on_windows(comparison: Comparison) -> str:
-    """A sentence for the user if not all files show the whole frame, so that only a part can be compared.
-
-    Returns:
-        An empty text if all that the files show is compared.
-    """
+    """Say which part is compared if not all files show the whole frame; empty if all pixels are compared."""
     if comparison.windows == [render.data_window for render in comparison.renders]:
         return ""
     part = comparison.windows[comparison.largest]
@@ -181,65 +166,58 @@ def note_on_windows(comparison: Comparison) -> str:
 
 @dataclass(frozen=True)
 class _Place:
-    """Where a render lies in the pixels of the one at whose size all are compared.
+    """Position of a render in the pixels of the largest one.
 
-    Its pixel x covers those from ``x0 + scale * x`` on, ``scale`` of them; y likewise.
+    Its pixel x covers the ``scale`` pixels from ``x0 + scale * x`` on; y likewise.
     """
 
     scale: int
     x0: int
     y0: int
     shown: Window
-    """What it shows."""
+    """The pixels of the largest render that this one shows."""
+
+    def pixel(self, x: int, y: int) -> tuple[int, int]:
+        """Return the render's pixel at a pixel of the largest one."""
+        return (x - self.x0) // self.scale, (y - self.y0) // self.scale
 
 
 def common_windows(renders: Sequence[MappedRender], largest: MappedRender) -> list[Window]:
-    """The rectangle of each render, in its own pixels, over which all of them are compared.
+    """Return the rectangles, in the pixels of every render, over which all of them are compared.
 
-    Renders are laid over each other by their places in their display windows, if these are equal, or one of them is
-    cropped and the sizes of their display windows differ by a scale of ``SCALES``. Each other one shows what the data
-    window of ``largest`` shows, at its size or smaller by such a scale.
+    Renders are laid over each other by their display windows if these are equal, or if one is cropped and the sizes of
+    their display windows differ by a scale of ``SCALES``. Otherwise a render shows the data window of ``largest``, at
+    its size or smaller by such a scale.
 
     Args:
-        renders: what is compared.
-        largest: the one of these at whose size all are compared.
+        renders: the renders to compare.
+        largest: the render at whose size all are compared.
 
     Raises:
         InputError: a size does not fit, or renders have no part in common.
     """
     whole = common = largest.data_window
-    places = [_place(each, largest) for each in renders]
+    places = [_place(render, largest) for render in renders]
     for place in places:
         common = common.intersect(place.shown)
     if common == whole and all(place.scale == 1 or place.shown == whole for place in places):
         # An odd side may have been rounded, so smaller renders may show a little more or less.
         return [
-            whole.shift(-place.x0, -place.y0) if place.scale == 1 and place.shown != whole else each.data_window
-            for each, place in zip(renders, places, strict=True)
+            whole.shift(-place.x0, -place.y0) if place.scale == 1 and place.shown != whole else render.data_window
+            for render, place in zip(renders, places, strict=True)
         ]
     # Smaller renders are cut between whole pixels.
-    columns = [x for x in range(common.x0, common.x1 + 1) if all((x - each.x0) % each.scale == 0 for each in places)]
-    rows = [y for y in range(common.y0, common.y1 + 1) if all((y - each.y0) % each.scale == 0 for each in places)]
+    columns = [x for x in range(common.x0, common.x1 + 1) if all((x - p.x0) % p.scale == 0 for p in places)]
+    rows = [y for y in range(common.y0, common.y1 + 1) if all((y - p.y0) % p.scale == 0 for p in places)]
     if len(columns) < 2 or len(rows) < 2:
-        names = ", ".join(f"{each.name} ({each.data_window})" for each in renders)
+        names = ", ".join(f"{render.name} ({render.data_window})" for render in renders)
         raise InputError(f"these pictures have no part of the frame in common: {names}; compare those of one part")
-    return [
-        Window(
-            (columns[0] - each.x0) // each.scale,
-            (rows[0] - each.y0) // each.scale,
-            (columns[-1] - each.x0) // each.scale,
-            (rows[-1] - each.y0) // each.scale,
-        )
-        for each in places
-    ]
+    corners = ((columns[0], rows[0]), (columns[-1], rows[-1]))
+    return [Window(*(side for x, y in corners for side in place.pixel(x, y))) for place in places]
 
 
 def _place(render: MappedRender, largest: MappedRender) -> _Place:
-    """Where a render lies in the pixels of another one.
-
-    Raises:
-        InputError: its size does not fit.
-    """
+    """Place a render in the pixels of the largest one, or refuse its size."""
     data, display, whole, frame = render.data_window, render.display_window, largest.data_window, largest.display_window
     if display == frame:
         return _Place(1, 0, 0, data)
@@ -253,10 +231,9 @@ def _place(render: MappedRender, largest: MappedRender) -> _Place:
     raise InputError(f"{render.name} is {data.size}, but {largest.name} is {whole.size}; compare pictures of one size")
 
 
-def _scale(window: Window, other: Window) -> int | None:
-    """How much smaller a window is than another one; None if its size is neither the same nor smaller by a scale of
-    ``SCALES``."""
-    sides = ((window.height, other.height), (window.width, other.width))
+def _scale(window: Window, larger: Window) -> int | None:
+    """Return how many times smaller a window is: 1 or one of ``SCALES``; None if it is no such scale."""
+    sides = ((window.height, larger.height), (window.width, larger.width))
     # An odd side may have been rounded up or down.
     return next((scale for scale in (1, *SCALES) if all(a in (b // scale, -(-b // scale)) for a, b in sides)), None)
 
@@ -265,8 +242,8 @@ def check_error_map(path: Path, compared: Sequence[Path], *, overwrite: bool) ->
     """Check that an error map of the files ``compared`` can be written at ``path``.
 
     Raises:
-        InputError: it is not named .png, it is one of the files compared, it exists and may not be overwritten, or its
-            folder is missing or read-only.
+        InputError: ``path`` does not end with .png, is one of the files compared, exists and may not be overwritten, or
+            lies in a folder that is missing or read-only.
     """
     if path.suffix.lower() != ".png":
         raise InputError(f"{path}: the error map is a PNG; name it .png")
@@ -291,12 +268,12 @@ def write_error_map(path: Path, comparison: Comparison, *, overwrite: bool) -> N
 
 
 def error_map(image: Array, truth: Array) -> Array:
-    """The :func:`error_levels` of an image in the :func:`error_colours`: display values, (height, width, 3)."""
+    """Return the :func:`error_levels` of an image in :func:`error_colours`: display values, (height, width, 3)."""
     return error_colours(error_levels(image, truth))
 
 
 def error_levels(image: Array, truth: Array) -> Array:
-    """log10 of each pixel's RelMSE (0.5, 0.01).
+    """Return log10 of every pixel's RelMSE (0.5, 0.01), scaled to [0, 1].
 
     Args:
         image, truth: scene linear, (height, width, 3).
@@ -309,15 +286,21 @@ def error_levels(image: Array, truth: Array) -> Array:
 
 
 def error_colours(levels: Array) -> Array:
-    """OpenImageIO's "inferno" colours, (height, width, 3) in [0, 1], of the levels (height, width)."""
+    """Colour levels (height, width) with OpenImageIO's "inferno": (height, width, 3) in [0, 1]."""
     mapped = oiio.ImageBufAlgo.color_map(oiio.ImageBuf(np.ascontiguousarray(levels[..., None])), 0, "inferno")
     if mapped.has_error:
         raise MssplError(f"the error map's colours: {mapped.geterror()}")
     return np.asarray(mapped.get_pixels(oiio.FLOAT), dtype=np.float32)[..., :3]
 
 
+def upsampled_like(image: Array, truth: Array) -> Array:
+    """Return an image at the size of its reference, upsampled bicubically if it is smaller."""
+    height, width = truth.shape[:2]
+    return image if image.shape == truth.shape else upsample_bicubic(image, width, height)
+
+
 def upsample_bicubic(image: Array, width: int, height: int) -> Array:
-    """Bicubic resampling (OpenImageIO's "cubic"): (h, w, 3) to (height, width, 3); negative values become 0."""
+    """Resample (h, w, 3) to (height, width, 3) with OpenImageIO's "cubic"; negative values become 0."""
     buffer = oiio.ImageBuf(np.ascontiguousarray(image))
     result = oiio.ImageBufAlgo.resize(buffer, filtername="cubic", roi=oiio.ROI(0, width, 0, height))
     return np.maximum(np.asarray(result.get_pixels(oiio.FLOAT), dtype=np.float32), 0)

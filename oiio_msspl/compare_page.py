@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A page for the browser that shows pictures with all their layers: ``msspl compare --html``.
+"""Write a page for the browser that shows pictures with all their layers: ``msspl compare --html``.
 
 The page is one file: ``compare_page.html`` with the pixels in it. It asks the network for nothing.
 
@@ -9,8 +9,8 @@ The page is one file: ``compare_page.html`` with the pixels in it. It asks the n
 
 So a step is about as large as one of an 8-bit sRGB picture near white, and smaller elsewhere, at any exposure. Three
 planes of codes are stored: green, red minus green, blue minus green. The noise of a render is mostly brightness, so the
-differences are nearly free of it and take little space. Where that is smaller, each code is stored as the difference to
-its left neighbour. Then come the low bytes of all codes, then the high bytes, in zlib's format and base64.
+differences are nearly free of it and take little space. If that is smaller, a code is stored as the difference to its
+left neighbour. Then come the low bytes of all codes, then the high bytes, in zlib's format and base64.
 
 PNGs would not be safer: browsers that protect against tracking change the pixels that a page reads from a picture.
 """
@@ -33,7 +33,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.compare import Comparison, error_colours, error_levels, in_space_of, upsample_bicubic
+from oiio_msspl.compare import Comparison, error_colours, error_levels, in_space_of, upsampled_like
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate, check_target, replacing
 from oiio_msspl.exr.layers import Layer, layers_of, matches_layer, same_spelling
@@ -44,17 +44,17 @@ from oiio_msspl.image.colour import REC709, converted, space_of
 from oiio_msspl.image.metrics import psnr, relmse
 
 TEMPLATE = "compare_page.html"
-#: The comment of the template in whose place the data stand.
+#: The comment of the template that the data replace.
 DATA = "<!-- data -->"
 
 #: Codes for a factor of two.
 CODES_PER_STOP = 64
-#: Stops from 1 down to the light below which steps no longer shrink. At an exposure of +4 stops, the step in black is a
+#: Stops from 1 down to the light below which steps stop shrinking. At an exposure of +4 stops, the step in black is a
 #: seventh of a step of an 8-bit picture.
 STOPS_BELOW_ONE = 12
 #: Colours of an error map.
 ERROR_LEVELS = 64
-#: Part of the values of a data layer, such as depth, that is darker than black, and that is brighter than white.
+#: Fraction of the values of a data layer, such as depth, that is clipped at black, and at white.
 _CLIPPED = 0.005
 
 BEAUTY = "beauty"
@@ -64,12 +64,12 @@ Codes = NDArray[np.int16]
 
 @dataclass(frozen=True)
 class PageSummary:
-    """What :func:`write_page` wrote."""
+    """Size and layers of a page."""
 
     size: int
     """Bytes of the file."""
     layers: tuple[str, ...]
-    """Names of the layers that it shows."""
+    """Names of the layers on the page."""
 
 
 @dataclass(frozen=True)
@@ -79,34 +79,29 @@ class _Layer:
     name: str
     formula: FeatureFormula
     is_colour: bool
-    """Otherwise data, such as depth or normals: shown from their lowest to their highest value."""
+    """False for data, such as depth or normals: shown from their lowest to their highest value."""
     additive: str = ""
-    """Name of the additive set that it belongs to."""
+    """Name of the additive set that holds the layer."""
     stored: str = ""
-    """Its name in the file."""
+    """Name in the file."""
 
     def matches(self, pattern: str) -> bool:
-        """Whether a pattern such as ``light*`` means it, or its set."""
+        """Return whether a pattern such as ``light*`` means the layer or its set."""
         return any(matches_layer(pattern, name) for name in (self.name, self.stored, self.additive) if name)
 
 
 @dataclass(frozen=True)
 class _Picture:
-    """One of the files that are shown."""
+    """A file on the page."""
 
     render: MappedRender
     layers: dict[str, _Layer]
-    """All that the file holds, by their names without what programs spell differently."""
+    """All layers of the file, by :func:`oiio_msspl.exr.layers.same_spelling` of their names."""
     window: Window
-    """The part that is shown, inside the data window."""
-
-    @property
-    def size(self) -> tuple[int, int]:
-        """Height and width of what is shown."""
-        return self.window.height, self.window.width
+    """The part of the data window that is shown."""
 
     def read(self, key: str) -> Array:
-        """A layer, (height, width, 3 or 1). Light has no NaN, infinities and negative values."""
+        """Read a layer, (height, width, 3 or 1); colours have no NaN, infinities and negative values."""
         layer = self.layers[key]
         features = {RGB: self.render.features[RGB], key: layer.formula}
         values = replace(self.render, features=features, alpha=None).read(self.window, [key])[key]
@@ -117,8 +112,8 @@ def check_page(path: Path, compared: Sequence[Path], *, overwrite: bool) -> None
     """Check that a page of the files ``compared`` can be written at ``path``.
 
     Raises:
-        InputError: it is not named .html, it is one of the files compared, it exists and may not be overwritten, or its
-            folder is missing or read-only.
+        InputError: ``path`` does not end with .html, is one of the files compared, exists and may not be overwritten,
+            or lies in a folder that is missing or read-only.
     """
     if path.suffix.lower() not in (".html", ".htm"):
         raise InputError(f"{path}: the page is HTML; name it .html")
@@ -147,8 +142,8 @@ def write_page(
 
     Args:
         path: the page to write.
-        comparison: the images, and perhaps a reference. Without it there are no scores and error maps. The page shows
-            an image that is smaller with its own large pixels. Scores and error maps upsample it bicubically.
+        comparison: the images, and perhaps a reference. Without it, scores and error maps are left out. A smaller image
+            is shown with large pixels, and upsampled bicubically for scores and error maps.
         layers: patterns of the layers to show beside the beauty. Without any, those that sum to the beauty are shown.
         overwrite: replace an existing file.
         progress: called with the number of layers done and of all.
@@ -180,32 +175,30 @@ def write_page(
 def _picture(render: MappedRender, window: Window) -> _Picture:
     """Find the layers of a file."""
     beauty = render.features[RGB]
-    found = {BEAUTY: _Layer(BEAUTY, beauty, True, stored=beauty.text)}
-    in_sets = set()
+    layers = {BEAUTY: _Layer(BEAUTY, beauty, True, stored=beauty.text)}
+    shown = set(beauty.terms)
     for additive in render.additive_sets:
-        for each in additive.layers:
-            name = f"{each.name} x colour" if each.factor else each.name
-            layer = _Layer(name, each.formula, True, additive.name, stored=each.name)
-            found.setdefault(same_spelling(name), layer)
-            in_sets.add(each.channels)
+        for light in additive.layers:
+            name = f"{light.name} x colour" if light.factor else light.name
+            layers.setdefault(same_spelling(name), _Layer(name, light.formula, True, additive.name, light.name))
+            shown.add(light.channels)
     views = render.view.split("/")
     for stored in layers_of(render.file):
-        # Cryptomattes hold numbers that stand for objects: their pictures tell nothing.
+        # Cryptomattes hold numbers of objects: their pictures tell nothing.
         if "crypto" in stored.name.lower() or (stored.view and stored.view not in views):
             continue
         name = next((stored.name.removeprefix(f"{v}.") for v in views if stored.name.startswith(f"{v}.")), stored.name)
         for channels, component in _groups(stored):
-            unusable = any(channel.type == "uint" for channel in channels)
-            if not unusable and channels not in in_sets and channels not in beauty.terms:
+            if channels not in shown and all(channel.type != "uint" for channel in channels):
                 label = ".".join(filter(None, (name, component))) or "RGB"
                 is_colour = len(channels) == 3 and channels[0] is stored.channels.get("R")
                 layer = _Layer(label, FeatureFormula((channels,), text=label), is_colour, stored=stored.name)
-                found.setdefault(same_spelling(label), layer)
-    return _Picture(render, found, window)
+                layers.setdefault(same_spelling(label), layer)
+    return _Picture(render, layers, window)
 
 
 def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
-    """The channels of a layer that make a picture, and what they are called in it: three, or one of the rest."""
+    """Yield the channels of a layer that make a picture, three or one, with their component's name."""
     triple = layer.triple() or ()
     if triple:
         yield triple, ""
@@ -215,31 +208,27 @@ def _groups(layer: Layer) -> Iterator[tuple[tuple[Channel, ...], str]]:
 
 
 def _chosen(pictures: Sequence[_Picture], patterns: Sequence[str]) -> list[str]:
-    """Keys of the layers to show: the beauty, then what the patterns mean, or all layers of additive sets."""
-    known: dict[str, list[_Layer]] = {}
+    """Return the keys of the layers to show: the beauty, and those of the patterns, or else of additive sets."""
+    candidates: dict[str, list[_Layer]] = {}
     for picture in pictures:
         for key, layer in picture.layers.items():
-            known.setdefault(key, []).append(layer)
+            candidates.setdefault(key, []).append(layer)
     if not patterns:
-        return [key for key, layers in known.items() if key == BEAUTY or any(layer.additive for layer in layers)]
-    wanted = {BEAUTY}
+        return [key for key, layers in candidates.items() if key == BEAUTY or any(layer.additive for layer in layers)]
+    chosen = {BEAUTY}
     for pattern in patterns:
-        meant = {key for key, layers in known.items() if any(layer.matches(pattern) for layer in layers)}
-        if not meant:
-            names = ", ".join(layers[0].name for layers in known.values())
+        matches = {key for key, layers in candidates.items() if any(layer.matches(pattern) for layer in layers)}
+        if not matches:
+            names = ", ".join(layers[0].name for layers in candidates.values())
             raise InputError(f"--layers {pattern!r}: no image has such a layer; they have: {names}")
-        wanted |= meant
-    return [key for key in known if key in wanted]
+        chosen |= matches
+    return [key for key in candidates if key in chosen]
 
 
 def _write_layer(
     out: TextIO, index: int, key: str, pictures: Sequence[_Picture], reference: _Picture | None
 ) -> dict[str, Any]:
-    """Write the codes of a layer of all pictures that have it, and of its error maps.
-
-    Returns:
-        Its entry of the manifest.
-    """
+    """Write the codes of a layer's pictures and error maps, and return the layer's entry in the manifest."""
     holders = [(place, picture) for place, picture in enumerate(pictures) if key in picture.layers]
     first = holders[0][1].layers[key]
     truth = None
@@ -257,9 +246,7 @@ def _write_layer(
             shown = _to_rec709(values, picture, pictures)
         images[place] = _write_codes(out, f"image-{index}-{place}", to_codes(shown))
         if truth is not None and reference is not None and picture is not reference and picture.layers[key].is_colour:
-            height, width = truth.shape[:2]
-            image = in_space_of(values, picture.render, reference.render)
-            image = image if image.shape == truth.shape else upsample_bicubic(image, width, height)
+            image = upsampled_like(in_space_of(values, picture.render, reference.render), truth)
             decibels = psnr(image, truth)
             images[place] |= {"psnr": decibels if math.isfinite(decibels) else None, "relmse": relmse(image, truth)}
             levels = np.round(error_levels(image, truth) * (ERROR_LEVELS - 1)).astype(np.int16)
@@ -268,7 +255,8 @@ def _write_layer(
 
 
 def _range_of(values: Array) -> tuple[float, float]:
-    """The values of a data layer that are shown as black and as white. The sky is not deep but infinitely far."""
+    """Return the values of a data layer that are shown as black and as white."""
+    # A depth may be infinite, or the largest half, in the sky.
     finite = values[np.isfinite(values) & (np.abs(values) < HALF_MAX)]
     if not finite.size:
         return 0.0, 1.0
@@ -277,49 +265,43 @@ def _range_of(values: Array) -> tuple[float, float]:
 
 
 def _to_rec709(values: Array, picture: _Picture, pictures: Sequence[_Picture]) -> Array:
-    """Colours in Rec. 709 primaries, those of sRGB. A file that declares no space has that of another picture."""
-    spaces = [space_of(each.render.metadata) for each in (picture, *pictures)]
+    """Convert colours to Rec. 709 primaries. A file that declares no space has that of the first one that does."""
+    spaces = [space_of(file.render.metadata) for file in (picture, *pictures)]
     space = next(filter(None, spaces), REC709)
     return values if values.shape[-1] == 1 else converted(values, space, REC709)
 
 
 def to_codes(values: Array) -> Codes:
-    """The codes of light, see the head of this module. Negative values and NaN become 0, infinities the largest half.
+    """Encode light, see the head of this module. Negative values and NaN become 0, infinities the largest half.
 
     The error of ``from_codes(to_codes(x))`` is at most 0.55 % of ``x + 2**-12``.
     """
-    light = repair(values)[0]
-    return np.round(CODES_PER_STOP * (np.log2(light + np.float32(2**-STOPS_BELOW_ONE)) + STOPS_BELOW_ONE)).astype(
-        np.int16
-    )
+    stops = np.log2(repair(values)[0] + np.float32(2**-STOPS_BELOW_ONE)) + STOPS_BELOW_ONE
+    return np.round(CODES_PER_STOP * stops).astype(np.int16)
 
 
 def from_codes(codes: Codes) -> Array:
-    """The light that codes stand for."""
+    """Decode codes to light."""
     stops = codes.astype(np.float64) / CODES_PER_STOP - STOPS_BELOW_ONE
     return (np.exp2(stops) - 2.0**-STOPS_BELOW_ONE).astype(np.float32)
 
 
 def pack(codes: Codes) -> tuple[bytes, bool]:
-    """Codes (height, width, 1 or 3) as compressed bytes, and whether they are differences to the left neighbour."""
+    """Compress codes (height, width, 1 or 3), and return whether they are differences to the left neighbour."""
     planes = np.ascontiguousarray(np.moveaxis(codes, -1, 0))
     if len(planes) == 3:
         planes = np.stack([planes[1], planes[0] - planes[1], planes[2] - planes[1]])
-
-    def differences(planes: Codes) -> Codes:
-        return np.diff(planes, axis=-1, prepend=np.int16(0))
-
+    differences = np.diff(planes, axis=-1, prepend=np.int16(0))
     # Every 16th row tells which is smaller.
-    some = planes[:, ::16]
-    smooth = len(_compressed(differences(some), 1)) < len(_compressed(some, 1))
-    return _compressed(differences(planes) if smooth else planes, 6), smooth
+    smooth = len(_compressed(differences[:, ::16], 1)) < len(_compressed(planes[:, ::16], 1))
+    return _compressed(differences if smooth else planes, 6), smooth
 
 
 def _compressed(planes: Codes, effort: int) -> bytes:
-    """The low bytes, then the high bytes. The sign moves to the lowest bit, so small codes have a high byte of 0."""
+    """Compress the low bytes, then the high bytes; the sign is the lowest bit, so high bytes are mostly 0."""
     unsigned = ((planes << 1) ^ (planes >> 15)).view(np.uint16)
     low, high = (unsigned & 255).astype(np.uint8), (unsigned >> 8).astype(np.uint8)
-    # In noise, short repetitions are chance; this strategy ignores them, which saves 4 %.
+    # In noise, short repetitions are chance. This strategy ignores them, which saves 4 %.
     compressor = zlib.compressobj(effort, strategy=zlib.Z_FILTERED)
     return compressor.compress(low.tobytes()) + compressor.compress(high.tobytes()) + compressor.flush()
 
@@ -335,23 +317,22 @@ def _write_codes(out: TextIO, name: str, codes: Codes) -> dict[str, Any]:
 def _manifest(
     pictures: Sequence[_Picture], largest: _Picture, has_reference: bool, layers: Sequence[dict[str, Any]]
 ) -> dict[str, Any]:
-    """What the page has to know beside the pixels."""
+    """Describe the pictures and layers for the page's script."""
     colours = error_colours(np.linspace(0, 1, ERROR_LEVELS, dtype=np.float32)[None])[0]
     return {
-        "height": largest.size[0],
-        "width": largest.size[1],
+        "height": largest.window.height,
+        "width": largest.window.width,
         "pixelAspect": largest.render.pixel_aspect,
         "codesPerStop": CODES_PER_STOP,
         "stopsBelowOne": STOPS_BELOW_ONE,
         "errorColours": np.round(colours * 255).astype(int).tolist(),
-        "pictures": list(_labels([picture.render.file.path for picture in pictures])),
+        "pictures": _labels([picture.render.file.path for picture in pictures]),
         "reference": len(pictures) - 1 if has_reference else None,
         "layers": list(layers),
     }
 
 
-def _labels(paths: Sequence[Path]) -> Iterator[str]:
-    """The files' names, or paths where two files have one name."""
+def _labels(paths: Sequence[Path]) -> list[str]:
+    """Return the names of files, or their paths if two files have one name."""
     names = [path.name for path in paths]
-    for path in paths:
-        yield path.name if names.count(path.name) == 1 else str(path)
+    return [path.name if names.count(path.name) == 1 else str(path) for path in paths]

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Inspecting a render: what the file holds, and what the network would read of it."""
+"""Inspect a render: what the file holds, and which of its layers a model would read."""
 
 from __future__ import annotations
 
@@ -11,13 +11,12 @@ from typing import Any
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
-from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
-from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.aovs.features import PAPER_FEATURES, RADIANCE_FEATURES, RGB
+from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.motion.source import MotionSource, find_motion
 from oiio_msspl.fusion.passes.sums import check_sum
@@ -28,9 +27,6 @@ from oiio_msspl.jobs.sequence import is_sequence, next_file
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES, Contract
 
-#: Rows whose pixels are read at a time.
-ROWS_PER_READ = 256
-
 
 @dataclass
 class Inspection:
@@ -40,23 +36,23 @@ class Inspection:
     file: ExrFile | None = None
     """None if the headers can't be read."""
     render: MappedRender | None = None
-    """The first view, or the one that is asked for; None if the layers can't be mapped."""
+    """The first view, or the requested one; None if the layers can't be mapped."""
     other_views: list[MappedRender] = field(default_factory=list)
-    """The other views and view layers, unless one is asked for."""
+    """The remaining views and view layers, unless one is requested."""
     contract: Contract | None = None
-    """Of the model that would read the file."""
+    """Contract of the model that would read the file."""
     facts: list[str] = field(default_factory=list)
-    """What was found, one line each."""
+    """Facts about the file, one line each."""
     motion: MotionSource | None = None
-    """How the movement to the next frame is known; None if there is no next frame beside this one."""
+    """Source of the movement to the next frame; None if the next frame does not lie beside this one."""
     noise: str | None = None
-    """``independent`` or ``spread`` over neighbouring pixels; None unless :func:`inspect_noise` has looked."""
+    """``independent`` or ``spread`` over neighbouring pixels, by :func:`inspect_noise`; None if it is unknown."""
     fused_sets: list[AdditiveSet] = field(default_factory=list)
-    """The sets of all views that sum to their beauty."""
+    """Additive sets of all views that sum to their beauty."""
     unused: list[str] = field(default_factory=list)
     """Names of the layers and channels that are neither read nor fused."""
     problems: list[str] = field(default_factory=list)
-    """Why the file can't be used, one sentence each; empty if it can."""
+    """Reasons why the file can't be used, one sentence each; empty if it can."""
 
     @property
     def model(self) -> str:
@@ -64,17 +60,17 @@ class Inspection:
         return self.contract.name.removesuffix(f"-x{self.contract.scale}") if self.contract else ""
 
     def aovs(self, view: MappedRender | None = None) -> list[dict[str, str]]:
-        """What the model would read, as :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` describes it.
+        """List the layers that the model would read: rows of ``MappedRender.table``, and of unread mapped features.
 
         Args:
             view: one of ``other_views``; None for ``render``.
         """
         render = view or self.render
         assert render is not None and self.contract is not None
-        return render.table(self.contract.hrls)
+        return [row for row in render.table(self.contract.hrls) if row["status"] != "unused" or row["source"]]
 
     def as_dict(self) -> dict[str, Any]:
-        """The inspection as it is written to JSON."""
+        """Return the inspection as JSON values."""
         result: dict[str, Any] = {
             "file": str(self.path),
             "usable": not self.problems,
@@ -103,13 +99,13 @@ class Inspection:
                 "renderer": self.render.renderer,
                 "view": self.render.view or None,
                 "other_views": self.render.other_views,
-                "views": [{"view": each.view or None, "aovs": self.aovs(each)} for each in self.other_views],
+                "views": [{"view": view.view or None, "aovs": self.aovs(view)} for view in self.other_views],
                 "spp": self.render.spp,
                 "model": self.model,
                 "aovs": self.aovs(),
                 "notes": self.render.notes,
                 "unused": self.unused,
-                "motion_layers": {each.name: str(each.format) for each in self.render.motion.fields},
+                "motion_layers": {vectors.name: str(vectors.format) for vectors in self.render.motion.fields},
                 "noise": self.noise,
                 "motion": {"kind": self.motion.kind, "text": self.motion.text} if self.motion else None,
             }
@@ -121,33 +117,37 @@ def inspect_file(
 ) -> Inspection:
     """Open a file, map its layers and read all pixels of its features once.
 
-    If the next frame lies beside it, the two verify the motion vectors.
+    If the next frame lies beside the file, the two verify the motion vectors.
 
     Args:
         path: an EXR.
-        inputs: how its layers are to be understood; ``hr_spp`` says the samples per pixel.
+        inputs: the mapping of its layers; ``hr_spp`` says the samples per pixel.
         model: the model that would read it, see :func:`oiio_msspl.model.catalogue.find_model`. The models of a family
-            read the same features at every scale.
+            read equal features at every scale.
         motion_format: the user's description of motion vectors, see :func:`oiio_msspl.aovs.motion.user_fields`.
 
     Returns:
-        What was found. A file that can't be used is described in ``problems``; nothing is raised for it.
+        The inspection; ``problems`` says why a file can't be used.
 
     Raises:
-        InputError: there is no such model.
+        InputError: the model is unknown.
     """
-    result = Inspection(path, contract=Contract.of_file(find_model(SCALES[0], model)))
+    contract = Contract.of_file(find_model(SCALES[0], model))
+    result = Inspection(path, contract=contract)
+    unread = PAPER_FEATURES.difference(contract.hrls, inputs.mapping)  # a feature that the user maps is listed
     try:
         if is_sequence(path) and not path.is_dir():
             raise InputError(f"{path}: is a pattern; name one of its files, and the next frame is found beside it")
         file = result.file = open_exr(path)
         result.facts = _facts(file)
         render = result.render = map_hrls(file, inputs)
+        render.drop_features(unread)
         result.facts.append(_renderer_fact(render))
         result.facts += [*_pixel_facts(render), *_look_at_sets(result, render)]
         for label in render.other_views if inputs.view is None else ():
             try:
                 view = map_other_hrls(render, label, inputs)
+                view.drop_features(unread)
                 facts = [*_pixel_facts(view), *_look_at_sets(result, view)]
                 result.other_views.append(view)
             except InputError as error:
@@ -162,15 +162,15 @@ def inspect_file(
     return result
 
 
-def inspect_noise(found: Sequence[Inspection]) -> None:
-    """Tell of the two renders of a frame whether the pixel filter has spread their noise. The larger one gets the fact.
+def inspect_noise(inspections: Sequence[Inspection]) -> None:
+    """Add to the larger of a frame's two renders the fact whether the pixel filter has spread their noise.
 
-    Files that are no such pair are left as they are.
+    Nothing is added if the files are not such a pair.
     """
-    renders = [(each.render, each) for each in found if each.render is not None]
+    renders = [(inspection.render, inspection) for inspection in inspections if inspection.render is not None]
     if len(renders) != 2:
         return
-    (lr, low), (hr, high) = sorted(renders, key=lambda each: each[0].display_window.width)
+    (lr, low), (hr, high) = sorted(renders, key=lambda pair: pair[0].display_window.width)
     try:
         spread = is_noise_spread(lr, hr, align(lr, hr))
     except InputError:
@@ -183,41 +183,37 @@ def inspect_noise(found: Sequence[Inspection]) -> None:
 
 
 def _look_at_sets(result: Inspection, render: MappedRender) -> list[str]:
-    """A line for each additive set of a view. Those that sum to the beauty are added to the result."""
+    """Describe the additive sets of a view, and add those that sum to the beauty to the result."""
     facts = []
-    for each in render.additive_sets:
-        check = check_sum(render, each)
-        facts.append(f"{each.name} ({each.layer_names}): {check.text}")
+    for additive in render.additive_sets:
+        check = check_sum(render, additive)
+        facts.append(f"{additive.name} ({additive.layer_names}): {check.text}")
         if not check.problem:
-            result.fused_sets.append(each)
+            result.fused_sets.append(additive)
     return facts
 
 
-def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptions, wanted: str | None) -> None:
-    """Find the layers of motion vectors, and verify them with the next frame if there is one.
-
-    Raises:
-        InputError: this frame can't be read, or ``wanted`` does not fit.
-    """
+def _inspect_motion(result: Inspection, render: MappedRender, inputs: InputOptions, motion_format: str | None) -> None:
+    """Find the layers of motion vectors, and verify them with the next frame if it exists."""
     path = next_file(result.path)
-    if path is not None:
-        if wanted:
-            user_fields(render.motion, wanted, render.name)
-        following = None
-        try:
-            following = map_hrls(open_exr(path), inputs)
-            result.motion = find_motion(render, following, wanted)
-        except InputError as error:
-            files = (path, *following.file.siblings) if following else ()
-            if following and not str(error).startswith(tuple(f"{each}: " for each in files)):
-                raise  # it is about this frame, or about ``wanted``
-            # The next frame may still be rendered.
-            result.facts.append(f"motion: not verified, because the next frame can't be read: {error}")
-            return
+    if path is None:
+        if render.motion.fields:
+            layers = " and ".join(f"{vectors.name} ({vectors.format})" for vectors in render.motion.fields)
+            result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")
+        return
+    if motion_format:
+        user_fields(render.motion, motion_format, render.name)
+    following = None
+    try:
+        following = map_hrls(open_exr(path), inputs)
+        result.motion = find_motion(render, following, motion_format)
+    except InputError as error:
+        if following and not str(error).startswith(tuple(f"{file}: " for file in (path, *following.file.siblings))):
+            raise  # the error is about this frame, or about the format
+        # The next frame may still be rendered.
+        result.facts.append(f"motion: not verified, because the next frame can't be read: {error}")
+    else:
         result.facts.append(f"motion, checked with {path.name}: {result.motion.text}")
-    elif render.motion.fields:
-        layers = " and ".join(f"{each.name} ({each.format})" for each in render.motion.fields)
-        result.facts.append(f"motion: {layers} expected; the next frame beside this one would verify it")
 
 
 def _renderer_fact(render: MappedRender) -> str:
@@ -228,7 +224,7 @@ def _renderer_fact(render: MappedRender) -> str:
 
 
 def _facts(file: ExrFile) -> list[str]:
-    """Windows, and the types and storage of the parts; parts that are alike share a line."""
+    """Describe the windows, and the types and storage of the parts; parts that are alike share a line."""
     aspect = "" if file.pixel_aspect == 1 else f", pixel aspect {file.pixel_aspect:g}"
     facts = [f"display window {file.display_window}{aspect}"]
     alike: dict[str, list[str]] = {}
@@ -247,16 +243,11 @@ def _facts(file: ExrFile) -> list[str]:
 
 
 def _pixel_facts(render: MappedRender) -> list[str]:
-    """Read every feature once: count what is not finite and what is negative, and name what is all zero.
-
-    A beauty that is black everywhere is told in the notes of the render, too.
-    """
-    window = render.data_window
+    """Read all features once: count values that are not finite or negative, and name features that are all zero."""
     brightest: dict[str, float] = {}
     not_finite: dict[str, int] = {}
     negative: dict[str, int] = {}
-    for y in range(window.y0, window.y1, ROWS_PER_READ):
-        rows = Window(window.x0, y, window.x1, min(y + ROWS_PER_READ, window.y1))
+    for rows in render.data_window.bands(ROWS_PER_LOAD):
         for name, values in render.read(rows).items():
             finite = np.isfinite(values)
             not_finite[name] = not_finite.get(name, 0) + int(values.size - np.count_nonzero(finite))
@@ -264,14 +255,10 @@ def _pixel_facts(render: MappedRender) -> list[str]:
                 negative[name] = negative.get(name, 0) + int(np.count_nonzero(finite & (values < 0)))
             brightest[name] = max(brightest.get(name, 0.0), float(np.abs(values[finite]).max(initial=0.0)))
     if brightest[RGB] == 0:
-        others = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
-        hint = f", though others are not: {others}; check which layer it is (--map rgb=LAYER)" if others else ""
+        bright = ", ".join(name for name, value in brightest.items() if value > 0 and name != "alpha")
+        hint = f", though others are not: {bright}; check which layer it is (--map rgb=LAYER)" if bright else ""
         render.notes.append(f"the beauty is black everywhere{hint}")
-    counts = [
-        f"{name}: {count} values are NaN or infinite; fusing repairs them"
-        for name, count in not_finite.items()
-        if count
-    ]
+    counts = [f"{name}: {n} values are NaN or infinite; fusing repairs them" for name, n in not_finite.items() if n]
     for name, count in negative.items():
         reason = " (colours out of gamut)" if name in RADIANCE_FEATURES else ""
         if count:

@@ -28,14 +28,14 @@ from tests.conftest import downsample, picture, rgb, write_exr
 
 def test_scores_follow_the_conventions_that_they_are_named_after():
     image, truth = picture(32, 32), 1.5 * picture(32, 32)
-    found = scores(image, truth)
-    assert found["relmse"] == relmse(image, truth, (0.5, 0.01))
-    assert found["relmse_gharbi"] == relmse(image, truth, RELMSE_GHARBI) != found["relmse"]
+    measures = scores(image, truth)
+    assert measures["relmse"] == relmse(image, truth, (0.5, 0.01))
+    assert measures["relmse_gharbi"] == relmse(image, truth, RELMSE_GHARBI) != measures["relmse"]
 
 
 def part_of(path, truth, x0, y0, width, height):
     """A file of the frame ``truth`` that holds only a part of its pixels."""
-    display = tuple(np.array(each, np.int32) for each in ((0, 0), (truth.shape[1] - 1, truth.shape[0] - 1)))
+    display = tuple(np.array(corner, np.int32) for corner in ((0, 0), (truth.shape[1] - 1, truth.shape[0] - 1)))
     pixels = truth[y0 : y0 + height, x0 : x0 + width]
     return write_exr(path, [("rgba", rgb(pixels), (x0, y0))], display=display)
 
@@ -47,10 +47,10 @@ def test_pictures_are_compared_where_they_lie(tmp_path):
     moved = part_of(tmp_path / "moved.exr", truth, 0, 0, 64, 44)  # of the reference's size
     low = write_exr(tmp_path / "low.exr", rgb(downsample(truth[4:], 4)))
     comparison = open_comparison([image, moved, low], reference)
-    found = score_images(comparison)
-    assert [each["relmse"] for each in found[:2]] == [0, 0]
+    measures = score_images(comparison)
+    assert [m["relmse"] for m in measures[:2]] == [0, 0]
     shown = upsample_bicubic(downsample(truth[4:], 4)[:10, 2:], 56, 40)
-    assert found[2]["relmse"] == pytest.approx(relmse(shown, truth[4:44, 8:]), rel=1e-4)
+    assert measures[2]["relmse"] == pytest.approx(relmse(shown, truth[4:44, 8:]), rel=1e-4)
     assert note_on_windows(comparison).endswith(" is compared: 56x40+8+4")
     assert note_on_windows(open_comparison([low], reference)) == ""
 
@@ -64,11 +64,11 @@ def test_a_smaller_picture_of_the_whole_frame_lies_under_a_crop(tmp_path, crop):
     whole = write_exr(tmp_path / "low.exr", rgb(low))
     part = part_of(tmp_path / "part.exr", low, 3, 2, 13, 10)
     comparison = open_comparison([whole, part], reference)
-    x0, y0 = (-(-each // 4) for each in crop[:2])
+    x0, y0 = (-(-side // 4) for side in crop[:2])
     x1, y1 = ((crop[i] + crop[i + 2]) // 4 for i in (0, 1))
     shown = upsample_bicubic(low[y0:y1, x0:x1], 4 * (x1 - x0), 4 * (y1 - y0))
     expected = relmse(shown, truth[4 * y0 : 4 * y1, 4 * x0 : 4 * x1])
-    assert [each["relmse"] for each in score_images(comparison)] == pytest.approx([expected, expected], rel=1e-4)
+    assert [m["relmse"] for m in score_images(comparison)] == pytest.approx([expected, expected], rel=1e-4)
     assert note_on_windows(comparison).endswith(f": {4 * (x1 - x0)}x{4 * (y1 - y0)}+{4 * x0}+{4 * y0}")
 
 
@@ -79,8 +79,8 @@ def test_pictures_are_compared_in_the_space_of_the_reference(tmp_path):
     image = write_exr(tmp_path / "aces.exr", rgb(in_aces), chromaticities=ACESCG.chromaticities)
     plain = write_exr(tmp_path / "plain.exr", rgb(in_aces))
     comparison = open_comparison([image, plain], reference)
-    same, other = (each["psnr"] for each in score_images(comparison))
-    assert same > 80 and other < 40
+    in_space, unconverted = (measures["psnr"] for measures in score_images(comparison))
+    assert in_space > 80 and unconverted < 40
     assert note_on_spaces(comparison) == f"Converted to lin_rec709, the colour space of {reference}: {image} (acescg)"
     assert note_on_spaces(open_comparison([plain], reference)) == ""
 
@@ -145,7 +145,7 @@ def test_all_files_are_compared_in_the_view_of_the_first_image(tmp_path):
     high, reference = (views(tmp_path / f"{name}.exr", image, "AB") for name in ("hr", "ref"))
     comparison = open_comparison([fused, high], reference)
     assert [render.view for render in comparison.renders] == ["B", "B", "B"]
-    assert [each["relmse"] for each in score_images(comparison)] == [0, 0]
+    assert [measures["relmse"] for measures in score_images(comparison)] == [0, 0]
     assert note_on_views(comparison) == ""
     plain = open_comparison([views(tmp_path / "a.exr", image, "A")], write_exr(tmp_path / "plain.exr", rgb(image)))
     assert note_on_views(plain) == ""  # there is nothing to choose
@@ -173,8 +173,8 @@ def test_the_left_eyes_are_compared_with_the_left_eye(tmp_path):
         with OpenEXR.File(parts) as file:
             file.write(str(tmp_path / f"{name}.exr"))
         paths.append(tmp_path / f"{name}.exr")
-    (found,) = score_images(open_comparison(paths[:1], paths[1]))
-    assert found["relmse"] == 0
+    (measures,) = score_images(open_comparison(paths[:1], paths[1]))
+    assert measures["relmse"] == 0
 
 
 def test_an_enlarged_picture_has_no_negative_light():

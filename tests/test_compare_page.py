@@ -133,9 +133,9 @@ def test_the_page_needs_nothing_from_outside(page):
 
 def test_by_default_the_page_shows_layers_that_sum_to_the_beauty(folder):
     image = open_comparison([folder / "hr.exr"])
-    found = write_page(folder / "sets.html", image, overwrite=True)
-    assert found.layers == ("beauty", "light_1", "light_2")
-    assert found.size == (folder / "sets.html").stat().st_size
+    summary = write_page(folder / "sets.html", image, overwrite=True)
+    assert summary.layers == ("beauty", "light_1", "light_2")
+    assert summary.size == (folder / "sets.html").stat().st_size
     assert write_page(folder / "sets.html", image, layers=["beauty"], overwrite=True).layers == ("beauty",)
     everything = write_page(folder / "sets.html", image, layers=["*"], overwrite=True)
     assert everything.layers == ("beauty", "light_1", "light_2", "Z")  # no numbers of objects
@@ -143,8 +143,8 @@ def test_by_default_the_page_shows_layers_that_sum_to_the_beauty(folder):
 
 def test_a_deep_part_hides_no_layer(tmp_path):
     path = behind_a_deep_part(tmp_path / "a.exr", rgb(picture(16, 16)) | {"Z": picture(16, 16)[..., 0]})
-    found = write_page(tmp_path / "page.html", open_comparison([path]), layers=["*"])
-    assert found.layers == ("beauty", "Z")
+    summary = write_page(tmp_path / "page.html", open_comparison([path]), layers=["*"])
+    assert summary.layers == ("beauty", "Z")
 
 
 def test_colours_are_those_of_srgb(tmp_path):
@@ -152,10 +152,10 @@ def test_colours_are_those_of_srgb(tmp_path):
     write_page(tmp_path / "page.html", open_comparison([tmp_path / "aces.exr"]))
     entry = manifest(tmp_path / "page.html")["layers"][0]["images"]["0"]
     text = re.search(rf'id="{entry["id"]}">(.*?)<', (tmp_path / "page.html").read_text(encoding="utf-8"))[1]
-    found = from_codes(unpack(base64.b64decode(text), entry["differences"], 16, 16, 3).astype(np.int16))
+    light = from_codes(unpack(base64.b64decode(text), entry["differences"], 16, 16, 3).astype(np.int16))
     expected = np.maximum(picture(16, 16) @ conversion(ACESCG, REC709).T, 0)
     assert np.abs(expected - picture(16, 16)).max() > 0.1
-    np.testing.assert_allclose(found, expected, rtol=0.006, atol=1e-5)
+    np.testing.assert_allclose(light, expected, rtol=0.006, atol=1e-5)
 
 
 def test_what_can_not_be_shown_is_refused(folder, tmp_path):
@@ -172,9 +172,9 @@ def look(page, **wanted):
     html = dump_dom(f"{page.as_uri()}#{urlencode(wanted)}")
     readout = re.search(r'id="readout"[^>]*>(.*?)<', html)[1]
     screen = re.search(r'data-screen="([\d ]+)"', html)[1]
-    values = {side: list(map(float, each.split())) for side, each in re.findall(r"(left|right) ([\d. e+-]+)", readout)}
-    found = re.findall(r'id="((?:caption|missing)-\w+)"[^>]*>(.*?)<', html, re.DOTALL)
-    texts = {name: unescape(text) for name, text in found}
+    values = {side: list(map(float, text.split())) for side, text in re.findall(r"(left|right) ([\d. e+-]+)", readout)}
+    elements = re.findall(r'id="((?:caption|missing)-\w+)"[^>]*>(.*?)<', html, re.DOTALL)
+    texts = {name: unescape(text) for name, text in elements}
     return np.array([int(v) for v in screen.split()][:3]), values, texts
 
 
@@ -226,8 +226,8 @@ def act(page, script, tmp_path, **wanted):
     code = f"{helpers} setTimeout(() => {{ {script} setTimeout(() => {{ {look} }}, 1000); }}, 1000);"
     html = page.read_text(encoding="utf-8").replace("</body>", f"<script>{code}</script></body>")
     copy.write_text(html, encoding="utf-8")
-    found = dump_dom(f"{copy.as_uri()}#{urlencode(wanted)}")
-    codes = re.search(r'data-around="([\d ]+)"', found)[1].split()
+    page = dump_dom(f"{copy.as_uri()}#{urlencode(wanted)}")
+    codes = re.search(r'data-around="([\d ]+)"', page)[1].split()
     return np.array(codes, int).reshape(21, 21, 4)[..., :3]
 
 

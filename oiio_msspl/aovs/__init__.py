@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""AOVs: which layers of a render are the features that the network reads, and reading them in documented units."""
+"""Find the layers (AOVs) of a render that are the features of a network, and read them in documented units."""

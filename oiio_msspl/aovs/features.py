@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The features that the network reads: names, channels, order and units.
+"""Name the features that networks read, with their channels, order and units.
 
-In the paper the HRLS branch reads RGB, albedo, normal, diffuse, specular and variance (section 4). The LRHS branch
-reads RGB only; more did not help (section 5.3).
+The HRLS branch of the paper's network reads all of them (section 4), the LRHS branch RGB only (section 5.3). The other
+models read RGB, albedo and normal.
 
 Units:
 
@@ -21,28 +21,24 @@ DIFFUSE = "diffuse"
 SPECULAR = "specular"
 VARIANCE = "variance"
 
-#: Feature -> number of channels, in the order in which the network's HRLS branch stacks them.
+#: Feature -> number of channels, in the order in which the paper's HRLS branch stacks them.
 HRLS_FEATURES: dict[str, int] = {RGB: 3, ALBEDO: 3, NORMAL: 3, DIFFUSE: 3, SPECULAR: 3, VARIANCE: 1}
 #: All features, in order.
 FEATURES = tuple(HRLS_FEATURES)
+#: Features that only the paper's network reads.
+PAPER_FEATURES = frozenset({DIFFUSE, SPECULAR, VARIANCE})
 #: Features that are radiance: they scale with the brightness of the scene.
 RADIANCE_FEATURES = (RGB, DIFFUSE, SPECULAR)
-#: Beside these, a render may have the light of single passes, as features whose names begin so. Networks do not read
-#: them.
+#: Features that a render may lack. The network then reads the value in ``DEFAULTS``.
+OPTIONAL_FEATURES = (ALBEDO, NORMAL, DIFFUSE, SPECULAR, VARIANCE)
+#: Value of a missing feature, encoded as the network reads it. The paper sets a missing variance to a constant (its
+#: Gharbi experiment) without giving the value. Ours is the standard deviation of a pixel whose noise is as large as mid
+#: grey, about 0.5 when encoded: the network should expect noise.
+DEFAULTS: dict[str, float] = {ALBEDO: 0.5, NORMAL: 0.0, DIFFUSE: 0.0, SPECULAR: 0.0, VARIANCE: 0.5}
+#: Prefix of the names of features that hold the light of a single pass. Networks do not read them.
 LIGHT_OF = "light of "
 
 
 def is_light_of_pass(feature: str) -> bool:
-    """Whether a feature is the light of a pass."""
+    """Return whether a feature is the light of a pass."""
     return feature.startswith(LIGHT_OF)
-
-
-#: Features that a render may lack. The network then reads the value in ``DEFAULTS``.
-OPTIONAL_FEATURES = (ALBEDO, NORMAL, DIFFUSE, SPECULAR, VARIANCE)
-
-#: Value of a missing feature, encoded as the network reads it.
-#:
-#: The paper sets the variance of renders that have none to a constant (its Gharbi experiment), but does not give the
-#: value. Ours is the standard deviation of a pixel whose noise is as large as mid grey, about 0.5 when encoded: the
-#: network should expect noise.
-DEFAULTS: dict[str, float] = {ALBEDO: 0.5, NORMAL: 0.0, DIFFUSE: 0.0, SPECULAR: 0.0, VARIANCE: 0.5}

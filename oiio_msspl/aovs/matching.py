@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Mapping a file: which of its layers are the features of :mod:`oiio_msspl.aovs.features`.
+"""Map a file: find the layers that are the features of :mod:`oiio_msspl.aovs.features`.
 
-The names are data in ``renderers.toml``. Whatever was chosen is kept as text for the user.
+The names of layers are data in ``renderers.toml``. The choice is kept as text for the user.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from oiio_msspl.aovs.formula import NEEDS_SPP, FeatureFormula
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.mapping import check_mapping
 from oiio_msspl.aovs.motion import find_motion_layers
-from oiio_msspl.aovs.renderers import detect_renderer, samples_per_pixel, view_layer_of
+from oiio_msspl.aovs.renderers import detect_renderer, entry_of, samples_per_pixel, view_layer_of
 from oiio_msspl.aovs.views import Beauty, choose_beauty, find_beauties
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.layers import Layer, layers_of
@@ -28,7 +28,7 @@ from oiio_msspl.exr.reader import ExrFile
 from oiio_msspl.exr.render import Window
 from oiio_msspl.image.arrays import Array
 
-#: Bands of rows that tell whether normals are signed, and rows in each.
+#: Bands of rows that tell whether normals are signed, and rows of a band.
 _BANDS_OF_NORMALS, _ROWS_PER_BAND = 8, 8
 
 
@@ -45,17 +45,21 @@ def map_render(
 
     Args:
         file: from :func:`oiio_msspl.exr.reader.open_exr`.
-        mapping: the user's own candidates by feature. They replace those of the table, and their layers must exist.
+        mapping: the user's candidates by feature. They replace those of the table, and their layers must exist.
         view: view (``left``) or view layer (``ViewLayer``) to take; the file's first if None.
         spp: samples per pixel, if the header does not say or is wrong.
-        features: which features to look for, beside the beauty.
-        sums: the user's own additive sets, see :func:`oiio_msspl.aovs.additive_sets.find_additive_sets`.
+        features: features to look for beside the beauty.
+        sums: the user's additive sets, see :func:`oiio_msspl.aovs.additive_sets.find_additive_sets`.
 
     Raises:
         InputError: the mapping or a sum has a mistake; the file has only deep data, no beauty or no such view; a layer
             holds integers; or a layer of the mapping is missing or has the wrong channels.
     """
-    layers = _flat_layers(file)
+    if all(part.deep for part in file.parts):
+        raise InputError(
+            f"{file.path}: holds deep data only; flatten it first (a deep pixel has no single colour to fuse)"
+        )
+    layers = layers_of(file)
     mapping = check_mapping(dict(mapping or {}), "mapping")
     renderer = detect_renderer(file, layers)
     if RGB not in mapping:
@@ -65,30 +69,30 @@ def map_render(
         raise _no_beauty(file, layers, mapping.get(RGB))
     beauty = choose_beauty(file, beauties, view)
     notes: list[str] = []
-    found = {RGB: _beauty_formula(beauty)}
+    formulas = {RGB: _beauty_formula(beauty)}
     finder = LayerFinder(file, layers, renderer, beauty.view, beauty.view_layer)
     for feature in features:
         if feature in mapping:
-            formula: FeatureFormula | None = _user_formula(finder, feature, mapping[feature], file)
-        else:
-            formula = _first_formula(finder, feature, renderer.get(feature, []), notes)
-        if formula is not None:
-            found[feature] = formula
-    _check_no_integers(found)
+            formulas[feature] = _user_formula(finder, feature, mapping[feature], file)
+            continue
+        candidates = (finder.formula(feature, candidate, notes) for candidate in renderer.get(feature, ()))
+        if (formula := next(filter(None, candidates), None)) is not None:
+            formulas[feature] = formula
+    _check_no_integers(formulas)
     alpha = beauty.layer.channels.get("A")
     if alpha is not None and alpha.type == "uint":
         notes.append(f"alpha: {alpha.name} holds integers; the render counts as one without alpha")
         alpha = None
-    labels = dict.fromkeys(each.label for each in beauties)
+    labels = dict.fromkeys(candidate.label for candidate in beauties)
     render = MappedRender(
         file=file,
         renderer=renderer["name"],
         view=beauty.label,
         other_views=[label for label in labels if label != beauty.label],
-        features=found,
+        features=formulas,
         alpha=alpha,
         spp=spp if spp is not None else samples_per_pixel(renderer, file, beauty.view_layer),
-        data_window=file.parts[found[RGB].terms[0][0].part].data_window,
+        data_window=file.parts[formulas[RGB].terms[0][0].part].data_window,
         additive_sets=find_additive_sets(renderer, layers, beauty, sums, str(file.path)),
         motion=find_motion_layers(renderer, layers, beauty),
         notes=notes,
@@ -98,17 +102,8 @@ def map_render(
     return render
 
 
-def _flat_layers(file: ExrFile) -> list[Layer]:
-    """The layers that are not deep."""
-    if all(part.deep for part in file.parts):
-        raise InputError(
-            f"{file.path}: holds deep data only; flatten it first (a deep pixel has no single colour to fuse)"
-        )
-    return layers_of(file)
-
-
 def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
-    """Refuse a file that by its name holds an AOV, for renderers that write one file for each."""
+    """Refuse a file that by its name holds a single AOV."""
     if "not_beauty" in renderer and re.search(renderer["not_beauty"], file.path.stem):
         raise InputError(
             f"{file.path}: holds {renderer['name']}'s {file.path.stem} alone, no beauty; give the RGB file beside it "
@@ -117,9 +112,9 @@ def _check_holds_beauty(renderer: dict[str, Any], file: ExrFile) -> None:
 
 
 def _no_beauty(file: ExrFile, layers: list[Layer], mapped: Any) -> InputError:
-    """The error for a file without the beauty of the table, or without the one that the user has ``mapped``."""
+    """Return the error for a file without the table's beauty, or without the one that the user has ``mapped``."""
     if mapped is not None:
-        alias = mapped if isinstance(mapped, str) else mapped.get("layer", "")
+        alias = entry_of(mapped).get("layer", "")
         for layer in layers:
             if alias and view_layer_of(layer.name, alias) is not None:
                 return InputError(f"{file.path}: {wrong_channels(RGB, layer)}")
@@ -140,23 +135,11 @@ def _beauty_formula(beauty: Beauty) -> FeatureFormula:
 
 
 def _user_formula(finder: LayerFinder, feature: str, candidate: Any, file: ExrFile) -> FeatureFormula:
-    """The formula of the user's candidate, which must exist."""
     problems: list[str] = []
     formula = finder.formula(feature, candidate, problems)
     if formula is None:
         raise InputError(f"{file.path}: {problems[0] if problems else missing(feature, candidate, file)}")
     return formula
-
-
-def _first_formula(
-    finder: LayerFinder, feature: str, candidates: Sequence[Any], notes: list[str]
-) -> FeatureFormula | None:
-    """The formula of the first candidate that exists; layers that exist but can't be used are added to ``notes``."""
-    for candidate in candidates:
-        formula = finder.formula(feature, candidate, notes)
-        if formula is not None:
-            return formula
-    return None
 
 
 def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:
@@ -172,7 +155,7 @@ def _check_no_integers(formulas: dict[str, FeatureFormula]) -> None:
 
 
 def _drop_unusable_variance(render: MappedRender) -> None:
-    """Treat a variance as missing if it needs samples per pixel that nobody says."""
+    """Drop a variance that needs samples per pixel if they are unknown."""
     formula = render.features.get(VARIANCE)
     if formula is not None and formula.kind in NEEDS_SPP and not render.spp:
         del render.features[VARIANCE]
@@ -183,19 +166,19 @@ def _drop_unusable_variance(render: MappedRender) -> None:
 
 
 def _decide_normal_encoding(render: MappedRender) -> None:
-    """Where the table can't say whether normals are signed or n * 0.5 + 0.5, decide by the pixels."""
+    """Decide by the pixels whether normals are signed or n * 0.5 + 0.5 if the table can't say."""
     formula = render.features.get(NORMAL)
     if formula is None or formula.encoding != "auto":
         return
     bands = [render.file.read(formula.terms[0], rows) for rows in _bands(render.data_window)]
     normal = np.concatenate([band.reshape(-1, 3) for band in bands])
     normal = normal[np.isfinite(normal).all(axis=1) & (np.abs(normal).max(axis=1) > 0)]
-    unsigned = len(normal) > 0 and normal.min() >= 0 and _unit_share(normal * 2 - 1) > _unit_share(normal)
+    unsigned = len(normal) > 0 and normal.min() >= 0 and _unit_fraction(normal * 2 - 1) > _unit_fraction(normal)
     render.features[NORMAL] = replace(formula, encoding="unsigned" if unsigned else "signed")
 
 
 def _bands(window: Window) -> list[Window]:
-    """Bands of rows, evenly spread over a window; the whole window if it is small."""
+    """Return bands of rows, evenly spread over a window; the whole window if it is small."""
     if window.height <= _BANDS_OF_NORMALS * _ROWS_PER_BAND:
         return [window]
     last = window.y1 - _ROWS_PER_BAND
@@ -203,6 +186,6 @@ def _bands(window: Window) -> list[Window]:
     return [Window(window.x0, top, window.x1, top + _ROWS_PER_BAND) for top in tops]
 
 
-def _unit_share(vectors: Array) -> float:
-    """Share of the vectors (n, 3) whose length is 1, give or take a tenth."""
+def _unit_fraction(vectors: Array) -> float:
+    """Return the fraction of the vectors (n, 3) whose length is 1 +- 0.1."""
     return float(np.mean(np.abs(np.linalg.norm(vectors, axis=1) - 1) < 0.1)) if len(vectors) else 0.0

@@ -1,11 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The table of renderers (``renderers.toml``): which renderer wrote a file, and how it names its layers."""
+"""Read the table of renderers (``renderers.toml``): which renderer wrote a file, and how it names its layers."""
 
 from __future__ import annotations
 
 import math
 import re
 import tomllib
+from collections.abc import Iterator, Mapping
 from fnmatch import fnmatchcase
 from functools import lru_cache
 from importlib import resources
@@ -18,30 +19,33 @@ from oiio_msspl.exr.reader import ExrFile
 
 @lru_cache(maxsize=1)
 def renderers() -> list[dict[str, Any]]:
-    """The entries of ``renderers.toml``, most specific renderer first; the last one matches every file."""
+    """Return the entries of ``renderers.toml``, most specific renderer first; the last one matches every file."""
     text = resources.files("oiio_msspl.aovs").joinpath("renderers.toml").read_text(encoding="utf-8")
     return list(tomllib.loads(text)["renderer"])
 
 
 def detect_renderer(file: ExrFile, layers: list[Layer]) -> dict[str, Any]:
-    """The entry of the renderer that wrote a file, by its layers, header attributes and file name."""
-    return next(
-        renderer for renderer in renderers() if any(_holds(condition, file, layers) for condition in renderer["detect"])
-    )
+    """Find the entry of the renderer that wrote a file, by layers, header attributes and file name."""
+    return next(entry for entry in renderers() if any(_holds(rule, file, layers) for rule in entry["detect"]))
+
+
+def entry_of(candidate: str | Mapping[str, Any]) -> Mapping[str, Any]:
+    """Return a candidate as a table: a plain name means ``{ layer = name }``."""
+    return {"layer": candidate} if isinstance(candidate, str) else candidate
 
 
 def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) -> float | None:
-    """Samples per pixel as the header says; None if it says nothing, or no number above 0.
+    """Read the samples per pixel from the header; None if it does not say, or says no number above 0.
 
     Args:
         renderer: entry of the table.
         file: the render.
-        view_layer: the one that was chosen: Blender writes one attribute for each.
+        view_layer: the chosen one, because Blender writes an attribute for each view layer.
     """
     for rule in renderer.get("spp", ()):
-        found = [match for key in file.metadata if (match := re.search(rule["attribute"], key))]
-        if found:
-            match = next((match for match in found if view_layer in match.groups()), found[0])
+        matches = [match for key in file.metadata if (match := re.search(rule["attribute"], key))]
+        if matches:
+            match = next((match for match in matches if view_layer in match.groups()), matches[0])
             try:
                 spp = float(file.metadata[match.string]) ** rule.get("power", 1)
             except (TypeError, ValueError, OverflowError):
@@ -51,80 +55,78 @@ def samples_per_pixel(renderer: dict[str, Any], file: ExrFile, view_layer: str) 
 
 
 def layer_of_source(renderer: dict[str, Any], file: ExrFile, aov: str) -> str | None:
-    """The layer that holds an AOV under another name, as the header says; None if it names none or several.
+    """Return the layer that by the header holds an AOV under another name; None if none or several do.
 
-    Several layers hold the same AOV where lights are split into groups: none of them is the whole.
+    Several layers hold one AOV if lights are split into groups: none of the layers is the whole AOV.
     """
-    rule = re.compile(renderer["source"]) if "source" in renderer else None
-    found = {
-        match[1]
-        for key, value in file.metadata.items()
-        if rule and (match := rule.search(key)) and same_spelling(str(value)) == same_spelling(aov)
-    }
-    return found.pop() if len(found) == 1 else None
+    if "source" not in renderer:
+        return None
+    named = (key for key, value in file.metadata.items() if same_spelling(str(value)) == same_spelling(aov))
+    layers = {match[1] for key in named if (match := re.search(renderer["source"], key))}
+    return layers.pop() if len(layers) == 1 else None
 
 
 def view_layer_of(layer: str, alias: str) -> str | None:
-    """The view layer in front of ``alias`` in a layer's name.
+    """Return the view layer in front of ``alias`` in the name of an EXR layer.
 
     Names are compared without case, spaces, ``_`` and ``-``; ``*`` in the alias matches any text.
 
     Returns:
-        ``ViewLayer`` for ``ViewLayer.Combined`` and the alias ``combined``; empty if the layer has just the alias as
-        its name; None if it is another layer.
+        ``ViewLayer`` for the layer ``ViewLayer.Combined`` and the alias ``combined``; empty if the alias is the whole
+        name; None if the alias means another layer.
     """
     name, wanted = same_spelling(layer), same_spelling(alias)
     if name == wanted or ("*" in wanted and fnmatchcase(name, wanted)):
         return ""
     if wanted and name.endswith("." + wanted):
-        # Cut the stored name as many dots from its end as the alias takes.
+        # Cut as many dots from the end of the stored name as the alias takes.
         return layer.rsplit(".", wanted.count(".") + 1)[0]
     return None
 
 
-def _holds(condition: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:
-    """Whether all that an entry of ``detect`` asks for is true of a file."""
-    for alias in condition.get("layers", ()):
-        if all(view_layer_of(layer.name, alias) is None for layer in layers):
-            return False
-    for key, value in condition.get("attributes", {}).items():
-        if not any(re.search(key, k) and re.search(value, str(v)) for k, v in file.metadata.items()):
-            return False
-    return _holds_by_name(condition, file.path)
+def _holds(rule: dict[str, Any], file: ExrFile, layers: list[Layer]) -> bool:
+    """Return whether all conditions of an entry of ``detect`` are true of a file."""
+    return (
+        all(any(view_layer_of(layer.name, alias) is not None for layer in layers) for alias in rule.get("layers", ()))
+        and all(
+            any(re.search(name, key) and re.search(value, str(stored)) for key, stored in file.metadata.items())
+            for name, value in rule.get("attributes", {}).items()
+        )
+        and _holds_by_name(rule, file.path)
+    )
 
 
-def _holds_by_name(condition: dict[str, Any], path: Path) -> bool:
-    """Whether all is true that an entry of ``detect`` asks for of a file's name and of what lies beside it."""
-    if "sibling" in condition and not siblings_of(path, condition["sibling"])[0].is_file():
+def _holds_by_name(rule: dict[str, Any], path: Path) -> bool:
+    """Return whether the conditions of an entry of ``detect`` on file names are true."""
+    if "sibling" in rule and not siblings_of(path, rule["sibling"])[0].is_file():
         return False
-    return bool(re.search(condition.get("file", ""), path.stem))
+    return bool(re.search(rule.get("file", ""), path.stem))
 
 
-def siblings_of(path: Path, name: str) -> list[Path]:
-    """Where a renderer that writes a file for each AOV may have put one, beside the beauty ``path``: the file that
-    belongs to this beauty by its name first."""
-    return [path.with_name(f"{stem}.exr") for stem in (f"{path.stem}.{name}", name)]
+def siblings_of(path: Path, aov: str) -> list[Path]:
+    """Return the possible files of an AOV beside the beauty ``path``; the one named after the beauty comes first."""
+    return [path.with_name(f"{stem}.exr") for stem in (f"{path.stem}.{aov}", aov)]
 
 
-def sibling_of(path: Path, name: str) -> Path | None:
-    """The file of an AOV beside the beauty ``path``, see :func:`siblings_of`; None if there is none."""
-    return next((each for each in siblings_of(path, name) if each != path and each.is_file()), None)
+def sibling_of(path: Path, aov: str) -> Path | None:
+    """Return the file of an AOV beside the beauty ``path``; None if it does not exist."""
+    return next((file for file in siblings_of(path, aov) if file != path and file.is_file()), None)
 
 
 def aov_files(path: Path) -> set[Path]:
-    """The files of AOVs beside the beauty ``path``, as far as names tell: the beauty is not opened."""
-    found = (
-        sibling_of(path, name)
-        for renderer in renderers()
-        if (names := _file_names(renderer)) and any(_holds_by_name(each, path) for each in renderer["detect"])
-        for name in names
-    )
-    return {each for each in found if each is not None}
+    """Find the files of AOVs beside the beauty ``path`` by names, without opening the beauty."""
+    names: set[str] = set()
+    for renderer in renderers():
+        aovs = set(file_names(renderer))
+        if aovs and any(_holds_by_name(rule, path) for rule in renderer["detect"]):
+            names |= aovs
+    return {file for name in names if (file := sibling_of(path, name))}
 
 
-def _file_names(entry: object) -> set[str]:
-    """The AOVs that an entry of the table, or a part of one, reads from files of their own: ``file:AOV``."""
-    if isinstance(entry, str):
-        return {entry.removeprefix("file:")} if entry.startswith("file:") else set()
-    parts = entry.values() if isinstance(entry, dict) else entry if isinstance(entry, list) else ()
-    return set().union(*map(_file_names, parts))
+def file_names(entry: object) -> Iterator[str]:
+    """Yield NAME for every ``file:NAME`` in a candidate, a mapping, or an entry of the table."""
+    if isinstance(entry, str) and entry.startswith("file:"):
+        yield entry.removeprefix("file:")
+    elif isinstance(entry, Mapping | list):
+        for element in entry.values() if isinstance(entry, Mapping) else entry:
+            yield from file_names(element)

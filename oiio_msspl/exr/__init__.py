@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""EXR files: reading their headers and pixels, grouping channels into layers, writing the result and its preview."""
+"""Read EXR files by rectangles, group channels into layers, and write the result and its preview."""

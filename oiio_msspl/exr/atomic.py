@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing files atomically: a file appears whole or not at all.
+"""Write files atomically: a file appears whole or not at all.
 
-It is written under a temporary name beside the target, ``.STEM.NAME-MACHINE-PROCESS-RANDOM.tmp.SUFFIX``. NAME is a hash
-of the target's name, MACHINE one of the machine on which the process PROCESS runs. So a later run can tell whose
-temporary file it finds, and whether that process still lives.
+The file is written under a temporary name beside the target, ``.STEM.NAME-MACHINE-PROCESS-RANDOM.tmp.SUFFIX``. NAME is
+a hash of the target's name, MACHINE a hash of the machine on which the process PROCESS runs. So a later run can tell
+whose temporary file it meets, and whether that process still lives.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from oiio_msspl.errors import InputError, MssplError
 
 #: Bytes of the target's stem in the name of its temporary file. Names may have 143 bytes on encrypted file systems.
 _STEM_BYTES = 60
-#: Seconds after which what a process that can't be looked up has left counts as left over. A file that is being written
-#: is touched every few seconds, a folder with each frame that is rendered.
+#: Seconds after which the files of a process that can't be looked up count as abandoned. A file that is being written
+#: is touched every few seconds, a folder with every frame that is rendered.
 _ABANDONED = 24 * 3600
 
 
@@ -38,8 +38,8 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
         ``path`` as a ``Path``.
 
     Raises:
-        InputError: it exists and may not be overwritten, it is write-protected or a folder, or its folder is missing or
-            read-only.
+        InputError: the file exists and may not be overwritten, is write-protected or a folder, or its folder is
+            missing or read-only.
     """
     path = Path(path)
     check_encodable(path)
@@ -57,7 +57,7 @@ def check_target(path: str | Path, *, overwrite: bool) -> Path:
 
 
 def check_separate(reads: Iterable[Path], writes: Iterable[Path]) -> None:
-    """Check that no file that a run writes is one that it reads, or one that it also writes under another name.
+    """Check that a run reads no file that it writes, and writes no file under two names.
 
     Links and hard links are followed. ``--overwrite`` makes no difference: the caller wants both files.
 
@@ -76,7 +76,7 @@ def check_separate(reads: Iterable[Path], writes: Iterable[Path]) -> None:
 
 
 def _identity(path: Path) -> object:
-    """What is equal for two names of one file: device and number of the file, or the full path if it does not exist."""
+    """Return a value that is equal for all names of a file: device and inode, or the full path of a missing file."""
     try:
         status = path.stat()
     except OSError:
@@ -85,7 +85,7 @@ def _identity(path: Path) -> object:
 
 
 def check_encodable(path: Path) -> None:
-    """Raise InputError if a path is not UTF-8: OpenImageIO could not open it."""
+    """Raise InputError if a path is not UTF-8: OpenImageIO can't open it."""
     try:
         str(path).encode("utf-8")
     except UnicodeEncodeError as error:
@@ -118,7 +118,7 @@ def make_folder(folder: Path) -> None:
 
 
 def not_written(folder: Path, reason: str) -> MssplError:
-    """The error for a result that could not be written into a folder."""
+    """Return the error for a result that could not be written into a folder."""
     return MssplError(f"{folder}: the result can't be written ({reason}); the target is as it was; is the disk full?")
 
 
@@ -186,9 +186,7 @@ def remove_leftovers(targets: Iterable[Path]) -> None:
 
 
 def temporary_folder(folder: Path) -> tempfile.TemporaryDirectory[str]:
-    """Make a hidden folder in ``folder``, which is deleted when its ``with`` block ends.
-
-    Its name is ``.msspl-MACHINE-PROCESS-RANDOM``, as in the names of temporary files.
+    """Make a hidden folder ``.msspl-MACHINE-PROCESS-RANDOM``, which is deleted when its ``with`` block ends.
 
     Raises:
         OSError: it can't be made.
@@ -197,7 +195,7 @@ def temporary_folder(folder: Path) -> tempfile.TemporaryDirectory[str]:
 
 
 def remove_left_folders(folder: Path) -> None:
-    """Delete what killed processes left of :func:`temporary_folder` in ``folder``, by the rule for temporary files."""
+    """Delete the folders of :func:`temporary_folder` that killed processes left, by the rule for temporary files."""
     with suppress(OSError):
         for name in os.listdir(folder):
             match = re.fullmatch(r"\.msspl-([0-9a-f]{8})-(\d+)-[^.]+", name)
@@ -206,17 +204,15 @@ def remove_left_folders(folder: Path) -> None:
 
 
 def _prefix(target: Path) -> str:
-    """The beginning of the names of a target's temporary files."""
+    """Return the beginning of the names of a target's temporary files."""
     stem = os.fsencode(target.stem)[:_STEM_BYTES].decode("utf-8", "ignore")
     return f".{stem}.{_hash(target.name)}-"
 
 
 @lru_cache(maxsize=1)
 def _machine() -> str:
-    """A hash that says where the number of a process has a meaning: this machine, or this container, since its start.
-
-    Containers may share the name of a machine and not its processes.
-    """
+    """Return a hash of this machine or container since its start: process numbers have a meaning only there."""
+    # Containers may share the name of a machine, but not its processes.
     names = [socket.gethostname()]
     with suppress(OSError):
         names += [Path("/proc/sys/kernel/random/boot_id").read_text(), os.readlink("/proc/self/ns/pid")]
@@ -228,7 +224,6 @@ def _hash(text: str) -> str:
 
 
 def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:
-    """Whether nobody uses a temporary file or folder any more."""
     # On Windows, os.kill would end the process.
     if machine == _machine() and sys.platform != "win32":
         try:
@@ -245,13 +240,12 @@ def _is_abandoned(temporary: Path, machine: str, process: int) -> bool:
 
 
 def _name_if_free(temporary: Path, target: Path) -> None:
-    """Rename a file if there is no target yet: two jobs must not overwrite each other. It is one step, but on a file
-    system without hard links, where two jobs that end in the same moment may."""
+    """Rename a file unless its target exists, so that two jobs don't overwrite each other."""
     try:
         os.link(temporary, target)
     except FileExistsError:
         raise
-    except OSError:
+    except OSError:  # without hard links, two jobs that end in the same moment may overwrite each other
         if target.exists():
             raise FileExistsError from None
         os.replace(temporary, target)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the output file holds: the fused pixels, and the channels of the HRLS that are passed on beside them."""
+"""Describe the output file: the fused pixels, and the channels of the HRLS that are passed on."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from oiio_msspl.image.arrays import HALF_MAX, Array
 
 @dataclass(frozen=True)
 class FusedPixels:
-    """The fused beauty, and layers about it.
+    """The fused beauty, and further layers such as ``error``.
 
     Rows are converted to the stored type as they are written: a second copy of an 8K frame takes half a gigabyte.
     """
@@ -36,14 +36,14 @@ class FusedPixels:
     """Pixel type in the file: ``half`` or ``float``."""
 
     def rows(self, start: int, stop: int) -> NDArray[Any]:
-        """Rows of the beauty as stored, (stop - start, width, 3 or 4)."""
+        """Return rows of the beauty as stored, (stop - start, width, 3 or 4)."""
         values = self.rgb[start:stop]
         if self.alpha is not None:
             values = np.concatenate([values, self.alpha[start:stop]], axis=-1)
         return self._stored(values)
 
     def extra_rows(self, name: str, start: int, stop: int) -> NDArray[Any]:
-        """Rows of a further layer as stored, (stop - start, width, channels)."""
+        """Return rows of a further layer as stored, (stop - start, width, channels)."""
         return self._stored(self.extra[name][start:stop])
 
     def _stored(self, values: NDArray[Any]) -> NDArray[Any]:
@@ -54,14 +54,14 @@ class FusedPixels:
 
 @dataclass(frozen=True)
 class FileContents:
-    """Everything that a writer needs to know."""
+    """The input of a writer: the fused pixels, and the channels of the HRLS that are passed on."""
 
     source: ExrFile
     """The HRLS."""
     beauty: tuple[Channel, ...]
-    """Its channels R, G, B and perhaps A, which the fused pixels replace."""
+    """Channels R, G, B and perhaps A of the HRLS, which the fused pixels replace."""
     dropped: frozenset[Channel]
-    """Its channels that are left out."""
+    """Channels of the HRLS that are left out."""
     pixels: FusedPixels
     attributes: dict[str, str]
     """Header attributes that are added to the part of the beauty."""
@@ -76,7 +76,7 @@ class FileContents:
 
     @cached_property
     def layers(self) -> dict[Channel, Layer]:
-        """The layer of each channel of the HRLS. A channel may be in none, and those of deep parts are."""
+        """Layers by channel of the HRLS. Channels of deep parts are missing, and others may be."""
         return layer_by_channel(self.source)
 
     @property
@@ -92,26 +92,21 @@ class FileContents:
 
 
 def lossless(part: Part) -> str:
-    """A part's compression, or a lossless one in place of a lossy one."""
+    """Return a part's compression, or ``DEFAULT_COMPRESSION`` if that is lossy."""
     return part.compression if part.compression in LOSSLESS else DEFAULT_COMPRESSION
 
 
-def widest_type(channels: Sequence[Channel]) -> str:
-    """``float`` if one of the channels is float, otherwise ``half``."""
-    return "float" if any(c.type == "float" for c in channels) else "half"
-
-
 def stored_type(beauty: Sequence[Channel], options: WriteOptions) -> str:
-    """Pixel type in which the fused beauty is written: ``half`` or ``float``."""
-    return options.pixel_type or widest_type(beauty)
+    """Return the pixel type in which the fused beauty is written: ``half`` or ``float``."""
+    return options.pixel_type or ("float" if any(channel.type == "float" for channel in beauty) else "half")
 
 
 def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequence[str]) -> frozenset[Channel]:
-    """The channels of the HRLS that are neither replaced nor passed on.
+    """Return the channels of the HRLS that are neither replaced nor passed on.
 
     Args:
         file: the HRLS.
-        beauty: its channels that the fused beauty replaces.
+        beauty: channels of the HRLS that the fused beauty replaces.
         patterns: ``WriteOptions.layers``. A pattern matches the name of a layer or of a channel, see
             :func:`oiio_msspl.exr.layers.matches_layer`.
 
@@ -122,25 +117,23 @@ def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequenc
         return frozenset()
     # A deep part must not take the place of a flat one that has a layer of the same name.
     layer_of = layer_by_channel(file, deep=True) | layer_by_channel(file)
-    every = {c for part in file.parts for c in part.channels}
+    channels = {c for part in file.parts for c in part.channels}
     kept: set[Channel] = {*beauty}
     for pattern in patterns:
-        # The beauty may be named, too, though it is written anyway.
-        found = {c for c in every if _is_meant(pattern, c, layer_of.get(c), file.parts[c.part])}
-        if not found and pattern != "none":
-            names = {layer_of[c].name or c.name if c in layer_of else c.name for c in every.difference(beauty)}
-            known = ", ".join(sorted(names)) or "no other layer"
-            raise InputError(f"--layers {pattern!r}: {file.path} has no such layer; it has: {known}")
-        kept |= found
-    return frozenset(every - kept)
+        # A pattern may name the beauty, though it is written anyway.
+        matches = {c for c in channels if _is_meant(pattern, c, layer_of.get(c), file.parts[c.part])}
+        if not matches and pattern != "none":
+            names = {layer_of[c].name or c.name if c in layer_of else c.name for c in channels.difference(beauty)}
+            listed = ", ".join(sorted(names)) or "no other layer"
+            raise InputError(f"--layers {pattern!r}: {file.path} has no such layer; it has: {listed}")
+        kept |= matches
+    return frozenset(channels - kept)
 
 
 def _is_meant(pattern: str, channel: Channel, layer: Layer | None, part: Part) -> bool:
-    """Whether a pattern means a channel. ``depth`` also means a plain Z, as in Nuke. A layer without a name, such as a
-    view's beauty, goes by the names of its part and its view."""
     prefix, _, component = channel.name.rpartition(".")
     name = layer.name if layer else prefix
-    if not name:
+    if not name:  # such as a view's beauty. In Nuke, a plain Z is called depth.
         names = [channel.name, part.name, layer.view if layer else "", "depth" if channel.name == "Z" else ""]
-        return any(matches_layer(pattern, each) for each in names if each)
+        return any(matches_layer(pattern, name) for name in names if name)
     return matches_layer(pattern, name if name == part.name else f"{part.name}.{name}", component)

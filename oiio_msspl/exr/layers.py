@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Grouping the channels of a file into layers, by the names of channels, parts and views."""
+"""Group the channels of a file into layers, by the names of channels, parts and views."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ class Layer:
     """By component: ``R``, ``G``, ``B``, ``A``, ``X``, ``Y``, ``Z``, or else the last part of the stored name."""
 
     def triple(self) -> tuple[Channel, ...] | None:
-        """The channels R, G, B or X, Y, Z; None if one is missing."""
+        """Return the channels R, G, B or X, Y, Z; None if one is missing."""
         for names in _TRIPLES:
             if all(n in self.channels for n in names):
                 return tuple(self.channels[n] for n in names)
         return None
 
     def scalar(self) -> tuple[Channel, ...] | None:
-        """The only channel, as a tuple of one; None if there are several."""
+        """Return the only channel as a tuple of one; None if the layer has several."""
         return tuple(self.channels.values()) if len(self.channels) == 1 else None
 
 
@@ -43,7 +43,7 @@ def layers_of(file: ExrFile, *, deep: bool = False) -> list[Layer]:
     """Group a file's channels into layers, in file order: those of flat parts, or with ``deep`` of all parts.
 
     Renderers name layers in three ways. OpenEXR's rule puts the layer in front of the channel's name
-    (``diffuse.R``). Karma and Nuke put it in the part's name only. Blender 5 does both. So the prefix of the channel
+    (``diffuse.R``). Karma and Nuke name only the part after it. Blender 5 writes the two. So the prefix of the channel
     names the layer, or else the part's name does. In a file of one part, the part's name says nothing about layers.
 
     If two channels have the same view, layer and component (``foo.R`` and ``foo.red``), the layer holds the first.
@@ -59,17 +59,17 @@ def layers_of(file: ExrFile, *, deep: bool = False) -> list[Layer]:
 
 
 def layer_by_channel(file: ExrFile, *, deep: bool = False) -> dict[Channel, Layer]:
-    """The layer of each channel that is in one of :func:`layers_of`."""
+    """Map every channel that is in one of :func:`layers_of` to its layer."""
     return {channel: layer for layer in layers_of(file, deep=deep) for channel in layer.channels.values()}
 
 
 def same_spelling(name: str) -> str:
-    """A name without what programs spell differently: case, spaces, ``_`` and ``-``."""
+    """Return a name without what programs spell differently: case, spaces, ``_`` and ``-``."""
     return re.sub(r"[ _-]", "", name).lower()
 
 
 def matches_layer(pattern: str, name: str, component: str = "") -> bool:
-    """Whether a pattern such as ``crypto*`` means a layer, or a channel of it.
+    """Return whether a pattern such as ``crypto*`` means a layer, or a channel of it.
 
     Case, spaces, ``_`` and ``-`` make no difference. The pattern may leave out the view layer or part in front of the
     name: ``crypto*`` means ``ViewLayer.CryptoObject00``.
@@ -85,29 +85,25 @@ def matches_layer(pattern: str, name: str, component: str = "") -> bool:
 
 
 def views_of(file: ExrFile) -> list[str]:
-    """Views of OpenEXR's ``multiView`` attribute, the default view first."""
+    """Return the views of OpenEXR's ``multiView`` attribute, the default view first."""
     views = file.metadata.get("multiView") or ()
     return [views] if isinstance(views, str) else [str(view) for view in views]
 
 
 def _split_name(name: str, part: Part, views: list[str], *, several: bool) -> tuple[str, str, str]:
-    """View, layer and component of a channel, in a file of one part or of several.
-
-    In a ``multiView`` file the view stands between the layer and the component (``diffuse.left.R``), and perhaps in a
-    part of one view, too. Other channels belong to the view of the part, or else to the default view.
-    """
+    """Return view, layer and component of a channel, in a file of one part or of several."""
     prefix, _, component = name.rpartition(".")
     view = part.view or (views[0] if views else "")
+    # In a multiView file, and perhaps in a part of one view, the view may stand in the name: diffuse.left.R.
     if (last := prefix.rpartition(".")[2]) and last in (*views, part.view):
         prefix, _, view = prefix.rpartition(".")
     return view, prefix or (_part_layer(part) if several else ""), _COMPONENTS.get(component.lower(), component)
 
 
 def _part_layer(part: Part) -> str:
-    """The layer that a part's name means: without the view at its end or in front, and empty for names such as
-    ``rgba``."""
+    """Return the layer that a part's name means, without its view; empty for names such as ``rgba``."""
     view = re.escape(part.view)
     name = re.sub(rf"(^|[._ -]){view}$|^{view}[._ -]", "", part.name) if view else part.name
-    # Without a separator, only a plain name may be left: a view "l" is no part of "normal"
+    # Without a separator, only a plain name may be left: a view "l" is not part of "normal".
     joined = part.name.removesuffix(part.view)
-    return "" if any(_PLAIN_PART.fullmatch(each) for each in (name, joined)) else name
+    return "" if _PLAIN_PART.fullmatch(name) or _PLAIN_PART.fullmatch(joined) else name

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Descriptions of the parts of a multi-part file, as OpenImageIO's ``ImageSpec``.
+"""Describe the parts of a multi-part file as OpenImageIO's ``ImageSpec``.
 
-Each starts as a copy of the HRLS's part, so that windows and metadata are kept.
+A description starts as a copy of the HRLS's part, so that windows and metadata are kept.
 """
 
 from __future__ import annotations
@@ -17,26 +17,25 @@ from oiio_msspl.exr.contents import FileContents, lossless
 from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.write_options import COMPONENTS
 
-#: Attributes that say how the source was stored. The writer sets them anew, or they have no meaning in the copy.
+#: Attributes that say how the source was stored. The writer sets them again, or they have no meaning in the copy.
 _STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
 #: ST 2065-4 forbids compression and AOVs in a file that carries this flag.
 _ACES_FLAG = "acesImageContainerFlag"
-#: Effort of ZIP, 1 to 9. OpenEXR's own is 4, which takes a third longer and makes files of renders 1 to 2 % smaller.
+#: Effort of ZIP, 1 to 9. OpenEXR's default is 4, which takes a third longer and makes renders 1 to 2 % smaller.
 ZIP_LEVEL = 1
-#: Attributes that OpenEXR wants to be the same in all parts of a file. Only the first part may have one alone.
+#: Attributes that OpenEXR requires to be equal in all parts of a file. Only the first part may have one alone.
 _SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode")
-#: Attributes to which OpenImageIO would give values of its own in every part that lacks them.
+#: Attributes that OpenImageIO would fill in with defaults in every part that lacks them.
 _FILLED_IN = ("screenWindowWidth", "screenWindowCenter", "DateTime")
-#: Attributes that every part keeps: those that would be filled in, the shared ones, and those that describe a part.
+#: Attributes that every part keeps.
 _KEPT_IN_EVERY_PART = (*_FILLED_IN, *_SHARED, "view", "name", "oiio:subimagename", "compression")
-
 
 #: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
 LARGEST_MIXED_PART = 256 << 20
 
 
 class _NameOrigin(IntEnum):
-    """Where the name of a part is from. If two parts would get the same, the first of these keeps it."""
+    """The source of a part's name. Of two equal names, the one from the source listed first stays as it is."""
 
     PART = 0
     LAYER = 1
@@ -45,7 +44,7 @@ class _NameOrigin(IntEnum):
 
 @dataclass(frozen=True)
 class _Piece:
-    """What becomes a part: a whole part of the HRLS, or its channels of one layer and pixel type."""
+    """A future part: a whole part of the HRLS, or its channels of one layer and pixel type."""
 
     source: Part
     view: str
@@ -53,29 +52,28 @@ class _Piece:
     whole: bool
     name: str
     origin: _NameOrigin
-    """Where ``name`` is from."""
     repeats_metadata: bool
-    """Whether another part that is written holds the metadata of ``source``."""
+    """Another part that is written holds the metadata of ``source``."""
 
 
 @dataclass(frozen=True)
 class PassedOnPart:
-    """A part to be written, with pixels of the HRLS."""
+    """A part to be written with pixels of the HRLS."""
 
     spec: Any
     source: Part
     runs: tuple[tuple[Channel, ...], ...] | None
     """Runs of neighbouring channels of one pixel type, in the order in which they are written. None copies the whole
-    part, in its mixed pixel types."""
+    part with its mixed pixel types."""
 
 
 def beauty_spec(contents: FileContents) -> Any:
-    """The part of the fused beauty."""
+    """Describe the part of the fused beauty."""
     home = contents.home
     if contents.options.layout == "nuke":
         name, channels = _nuke_name("rgba", contents.view), ["R", "G", "B", "A"][: len(contents.beauty)]
     else:
-        # In a file of one part, its name says nothing; in the result, it would name a layer of plain channels.
+        # The name of an only part says nothing; in the result, it would name a layer of plain channels.
         named = home.name and (len(contents.source.parts) > 1 or "." in contents.beauty[0].name)
         name, channels = home.name if named else "rgba", [channel.name for channel in contents.beauty]
     spec = _spec(home, name, channels, contents.pixels.kind, contents.view)
@@ -86,7 +84,7 @@ def beauty_spec(contents: FileContents) -> Any:
 
 
 def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
-    """The part of a further layer; its name is not among ``taken`` and is added to them."""
+    """Describe the part of a further layer, and add its name to those that are ``taken``."""
     prefix = "" if contents.options.layout == "nuke" else f"{name}."
     channels = [f"{prefix}{component}" for component in COMPONENTS[name]]
     spec = _spec(contents.home, _unique(name, taken), channels, contents.pixels.kind, contents.view)
@@ -96,23 +94,22 @@ def extra_spec(contents: FileContents, name: str, taken: set[str]) -> Any:
 
 
 def passed_on_parts(contents: FileContents, taken: set[str]) -> Iterator[PassedOnPart]:
-    """The parts with all channels of the HRLS but the fused and the dropped ones.
+    """Yield parts with all channels of the HRLS that are neither fused nor dropped.
 
-    A part stays whole if it can. The others are split into one part for each layer and pixel type.
+    A part stays whole if it can. Others are split into one part for each layer and pixel type.
 
     Args:
-        contents: what is written.
+        contents: the file to write.
         taken: names of the parts so far; those of the new parts are added.
     """
     pieces = list(_pieces(contents))
     for piece in pieces:
-        others = (each for each in pieces if each.name != piece.name or each.origin < piece.origin)
-        name = _unique(piece.name, taken, {each.name for each in others if each.origin <= piece.origin})
+        stronger = (p for p in pieces if p.origin < piece.origin or p.name != piece.name)
+        name = _unique(piece.name, taken, {p.name for p in stronger if p.origin <= piece.origin})
         yield _whole_part(piece.source, name) if piece.whole else _layer_part(contents, piece, name)
 
 
 def _pieces(contents: FileContents) -> Iterator[_Piece]:
-    """What becomes a part, in file order."""
     layer_of = contents.layers
     for part in contents.source.parts:
         if part.deep:
@@ -125,7 +122,7 @@ def _pieces(contents: FileContents) -> Iterator[_Piece]:
         for channel in part.channels:
             if channel not in contents.beauty and channel not in contents.dropped:
                 layer = layer_of.get(channel)
-                # A channel in no layer means the same as another one (foo.r beside foo.R): it gets its own part.
+                # A channel without a layer repeats another one (foo.r beside foo.R): it gets a part of its own.
                 key = (layer.view, layer.name, channel.type) if layer else ("", channel.name, channel.type)
                 groups.setdefault(key, []).append(channel)
         # Metadata is written once: in the beauty's part, or in the first part that this one is split into.
@@ -137,20 +134,19 @@ def _pieces(contents: FileContents) -> Iterator[_Piece]:
 
 
 def _stays_whole(part: Part, contents: FileContents) -> bool:
-    """Whether all channels of a part can be copied into one part of the same name."""
-    if contents.options.layout == "nuke":
+    """Return whether all channels of a part can be copied into one part of the same name."""
+    if contents.options.layout == "nuke" or any(c in contents.beauty or c in contents.dropped for c in part.channels):
         return False
-    if any(c in contents.beauty or c in contents.dropped for c in part.channels):
-        return False
-    if contents.replaced is not None and not _has_one_type(part) and any(c in contents.replaced for c in part.channels):
-        return False
-    # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. A part of a single pixel type
-    # is rewritten as scan lines; OpenImageIO can't do so with mixed types. It copies those whole, in memory.
-    return _has_one_type(part) or (part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART)
+    if _has_one_type(part):
+        return True
+    # OpenEXR can't mix tiles with scan lines in one file, and the beauty has scan lines. OpenImageIO can't rewrite
+    # mixed pixel types as scan lines: it copies such a part in memory, as it is.
+    is_replaced = contents.replaced is not None and any(c in contents.replaced for c in part.channels)
+    return not is_replaced and part.tile == (0, 0) and part.nbytes <= LARGEST_MIXED_PART
 
 
 def is_held_whole(part: Part, contents: FileContents) -> bool:
-    """Whether a part is held in memory while it is copied, because it stays whole and has several pixel types."""
+    """Return whether a part is held in memory while it is copied: it stays whole and has several pixel types."""
     return not part.deep and not _has_one_type(part) and _stays_whole(part, contents)
 
 
@@ -171,7 +167,7 @@ def _whole_part(part: Part, name: str) -> PassedOnPart:
 def _layer_name(
     contents: FileContents, part: Part, view: str, layer: str, channels: Sequence[Channel]
 ) -> tuple[str, _NameOrigin]:
-    """The name of the part for the channels of one layer and pixel type."""
+    """Name the part for the channels of one layer and pixel type."""
     components = _components(channels)
     is_beauty = not layer and view and {"R", "G", "B"} <= {*components}  # of another view
     plain = layer or ("rgba" if is_beauty else "depth" if components == ["Z"] else "other")
@@ -187,7 +183,6 @@ def _layer_name(
 
 
 def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPart:
-    """A part for the channels of one layer and pixel type."""
     channels = piece.channels
     nuke = contents.options.layout == "nuke"
     names = _components(channels) if nuke else [c.name for c in channels]
@@ -198,18 +193,20 @@ def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPar
 
 
 def _components(channels: Sequence[Channel]) -> list[str]:
-    """The channels' names without their layers."""
+    """Return the channels' names without their layers."""
     return [channel.name.rpartition(".")[2] for channel in channels]
 
 
 def share_attributes(specs: Sequence[Any], source: ExrFile) -> None:
-    """Give all parts that are written what OpenEXR wants to be the same in all of them, as far as a part of ``source``
-    has it. The beauty is written first, and ``source`` may have it in another part only."""
+    """Copy the attributes that OpenEXR requires to match (pixel aspect, time code, ...) to every output part.
+
+    The first part of ``source`` that has such an attribute counts, because the beauty's part may lack it.
+    """
     for name in _SHARED:
-        found = [a for part in source.parts for a in part.spec.extra_attribs if a.name == name]
-        for spec in specs if found else ():
+        attributes = [a for part in source.parts for a in part.spec.extra_attribs if a.name == name]
+        for spec in specs if attributes else ():
             if spec.getattribute(name) is None:
-                spec.attribute(name, found[0].type, found[0].value)
+                spec.attribute(name, attributes[0].type, attributes[0].value)
 
 
 def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
@@ -224,24 +221,21 @@ def runs(channels: Sequence[Channel]) -> Iterator[tuple[Channel, ...]]:
 
 
 def _nuke_name(layer: str, view: str) -> str:
-    """Part name of a layer as Nuke writes it: no dot but the one before the view."""
+    """Name a part as Nuke does: the only dot is the one before the view."""
     return layer.replace(".", "_") + (f".{view}" if view else "")
 
 
-def _unique(name: str, taken: set[str], kept: Collection[str] = ()) -> str:
-    """Parts of one file need different names: add a number to ``name`` if it is taken, or ``kept`` for another part."""
+def _unique(name: str, taken: set[str], reserved: Collection[str] = ()) -> str:
+    """Add a number to a part's name if it is taken or reserved: parts of one file need different names."""
     candidate, number = name, 2
-    while candidate in taken or candidate in kept:
+    while candidate in taken or candidate in reserved:
         candidate, number = f"{name}{number}", number + 1
     taken.add(candidate)
     return candidate
 
 
 def _spec(part: Part, name: str, channels: list[str], kind: str, view: str) -> Any:
-    """A part of scan lines with other channels than ``part``, keeping its windows and metadata.
-
-    All its channels are of one view. ``multiView`` names the views of a part that has several.
-    """
+    """Describe a part of scan lines with channels of one view, with the windows and metadata of ``part``."""
     spec = oiio.ImageSpec(part.spec)
     spec.tile_width = spec.tile_height = spec.tile_depth = 0
     spec.nchannels = len(channels)
@@ -249,14 +243,14 @@ def _spec(part: Part, name: str, channels: list[str], kind: str, view: str) -> A
     spec.channelformats = ()
     spec.format = oiio.TypeDesc(kind)
     _name_and_compress(spec, name, lossless(part))
-    spec.erase_attribute("multiView")
+    spec.erase_attribute("multiView")  # it names the views of a part that has several
     if view:
         spec.attribute("view", view)
     return spec
 
 
 def _drop_repeated_attributes(spec: Any) -> None:
-    """Drop the metadata that one part holds for the whole file: a Cryptomatte manifest can take megabytes."""
+    """Drop metadata that another part holds for the whole file: a Cryptomatte manifest can take megabytes."""
     for name in [attribute.name for attribute in spec.extra_attribs]:
         # OpenImageIO can't erase an attribute whose name is not UTF-8. Such a name holds surrogates.
         if name not in _KEPT_IN_EVERY_PART and name.isprintable():

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing 8-bit PNG pictures: the preview of the result, and other pictures of display values."""
+"""Write 8-bit PNG pictures: the preview of the result, and pictures of display values."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.render import Window
-from oiio_msspl.exr.strips import ROWS_PER_STRIP
+from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import REC709, ColourSpace, conversion, srgb
 from oiio_msspl.image.parallel import one_ahead
@@ -24,28 +24,18 @@ Pixels = NDArray[np.uint8]
 
 #: Pinned: OpenColorIO's "-latest" configurations change their default view between releases.
 OCIO_CONFIG = "ocio://cg-config-v2.2.0_aces-v1.3_ocio-v2.4"
-OCIO_DISPLAY = "sRGB - Display"
-OCIO_INPUT = "lin_rec709"
-
-#: The "Software" entry of previews. It tells them from other pictures of the same name.
+OCIO_DISPLAY, OCIO_INPUT = "sRGB - Display", "lin_rec709"
+#: The "Software" entry of previews. It tells them from unrelated pictures of the same name.
 SOFTWARE = "oiio_msspl"
-
 #: The last bytes of every PNG: its chunk IEND.
 PNG_END = b"\0\0\0\0IEND\xaeB`\x82"
 
-#: PNG filter "Sub": each byte minus that of the pixel to the left. To try all filters for each row would take longer
-#: than to compress the row.
-SUB_FILTER = 16
-#: Only runs of equal bytes are looked for. The filtered rows of a rendered picture repeat little else, so to search for
-#: more takes time, and the file becomes larger.
-RUNS_ONLY = "rle"
-
 
 def is_our_preview(path: Path) -> bool:
-    """Whether the file is a preview that this module wrote."""
+    """Return whether the file is a preview that this module wrote."""
     file = oiio.ImageInput.open(str(path))
     if file is None:
-        oiio.geterror()  # OpenImageIO prints an error that nobody asked for when the process ends
+        oiio.geterror()  # an error that nobody reads would be printed when the process ends
         return False
     ours = file.format_name() == "png" and file.spec().get_string_attribute("Software") == SOFTWARE
     file.close()
@@ -53,7 +43,7 @@ def is_our_preview(path: Path) -> bool:
 
 
 def old_preview(exr: Path) -> Path | None:
-    """The preview that this module wrote beside an EXR that exists, or None."""
+    """Return the preview that this module wrote beside an existing EXR, or None."""
     png = exr.with_suffix(".png")
     return png if exr.exists() and png.is_file() and not png.is_symlink() and is_our_preview(png) else None
 
@@ -62,7 +52,7 @@ def check_view(view: str) -> None:
     """Check the name of an OpenColorIO view.
 
     Raises:
-        InputError: the configuration has no such view; the message lists those that it has.
+        InputError: the configuration has no such view.
     """
     views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
     if view not in views:
@@ -79,7 +69,7 @@ def write_preview(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Write a PNG of the frame, atomically. Pixels of the frame outside the data window are black.
+    """Write an sRGB PNG of the frame, atomically. Pixels outside the data window are black.
 
     Args:
         path: the PNG to write.
@@ -92,12 +82,11 @@ def write_preview(
         overwrite: replace an existing file.
 
     Raises:
-        InputError: there is no such view, or ``path`` exists.
+        InputError: the view is unknown, or ``path`` exists.
         MssplError: the file can't be written.
     """
     if view is not None:
         check_view(view)
-
     to_rec709 = None if space == REC709 else conversion(space, REC709).T.astype(np.float32)
 
     def rows(start: int, stop: int) -> Pixels:
@@ -127,22 +116,17 @@ def write_png(path: Path, display: Array, *, software: str = SOFTWARE, overwrite
         InputError: ``path`` exists.
         MssplError: the file can't be written.
     """
-
-    def rows(start: int, stop: int) -> Pixels:
-        return _to_8_bits(display[start:stop])
-
-    _write_png(path, display.shape[1], display.shape[0], rows, software, overwrite)
+    height, width = display.shape[:2]
+    _write_png(path, width, height, lambda start, stop: _to_8_bits(display[start:stop]), software, overwrite)
 
 
 def _to_8_bits(display: Array) -> Pixels:
-    """Display values as they are stored, clipped to [0, 1]."""
     return (np.clip(display, 0, 1) * 255 + 0.5).astype(np.uint8)
 
 
 def _srgb_pixels(linear: Array) -> Pixels:
-    """Linear values through the sRGB curve, by a table of all half floats: six times as fast as to compute it. One
-    value in a hundred is rounded to the other side."""
-    with np.errstate(over="ignore"):  # what half can't hold becomes infinite, and white
+    """Apply the sRGB curve by a table of all half floats, six times as fast; 1 % of the values are rounded apart."""
+    with np.errstate(over="ignore"):  # values too bright for half become infinite, and white
         half = linear.astype(np.float16, copy=False)
     return _srgb_table().take(half.view(np.uint16))
 
@@ -165,17 +149,19 @@ def _write_png(
         spec.attribute("oiio:ColorSpace", "sRGB")
         spec.attribute("Software", software)
         spec.attribute("png:compressionLevel", 1)
-        spec.attribute("png:filter", SUB_FILTER)
-        spec.attribute("compression", RUNS_ONLY)
+        # Filter "Sub": every byte minus that of the pixel to the left. Trying all filters would take longer than zlib.
+        spec.attribute("png:filter", 16)
+        # Search for runs of equal bytes only: filtered rows of a render repeat little else.
+        spec.attribute("compression", "rle")
         ok = writer.open(str(temporary), spec)
-        ranges = [(start, min(start + ROWS_PER_STRIP, height)) for start in range(0, height, ROWS_PER_STRIP)]
+        ranges = strip_rows(0, height, 0, ROWS_PER_STRIP, height)
         # The next rows are converted while OpenImageIO compresses these.
         for start, stop, pixels in one_ahead((a, b, np.ascontiguousarray(rows(a, b))) for a, b in ranges):
             ok = ok and writer.write_scanlines(start, stop, 0, pixels)
         ok = writer.close() and ok
         if not ok:
             raise MssplError(f"{path}: can't be written ({writer.geterror() or oiio.geterror()})")
-        # OpenImageIO does not tell if the last bytes can't be written, as on a full disk.
+        # OpenImageIO does not tell if a full disk cut off the last bytes.
         with open(temporary, "rb") as file:
             file.seek(-min(len(PNG_END), temporary.stat().st_size), os.SEEK_END)
             if file.read() != PNG_END:
@@ -183,7 +169,7 @@ def _write_png(
 
 
 def _through_ocio(linear: Array, view: str) -> Array:
-    """Scene-linear values, (height, width, 3), to display values through an OpenColorIO view."""
+    """Convert scene-linear values (height, width, 3) to display values through an OpenColorIO view."""
     image = oiio.ImageBuf(np.ascontiguousarray(linear))
     result = oiio.ImageBufAlgo.ociodisplay(
         image, OCIO_DISPLAY, view, fromspace=OCIO_INPUT, unpremult=False, colorconfig=OCIO_CONFIG

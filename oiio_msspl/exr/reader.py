@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reading EXR files through OpenImageIO: headers when a file is opened, pixels by rectangle when they are needed.
+"""Read EXR files through OpenImageIO: headers when a file is opened, pixels by rectangle when they are needed.
 
-No file is read whole: an 8K frame with sixty float channels is larger than the memory of most machines. What a layer
-means is decided in :mod:`oiio_msspl.aovs`.
+No file is read whole: an 8K frame with sixty float channels is larger than the memory of most machines.
+:mod:`oiio_msspl.aovs` decides what a layer means.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from oiio_msspl.exr.strips import LARGEST_STRIP, ROWS_PER_STRIP, StripCache, Str
 from oiio_msspl.image.arrays import Array, unload
 
 # OpenImageIO's own limits protect programs that read whole files: 1024 channels, and an image as large as the memory.
-# Files with thousands of light groups are larger. This module reads by rectangle, so it needs no limit to the image.
+# Files with thousands of light groups are larger. This module reads by rectangle, so the image needs no limit.
 oiio.attribute("limits:channels", 1 << 16)
 oiio.attribute("limits:imagesize_MB", 0)
 
-#: Characters of an error of OpenImageIO that are quoted.
+#: Characters of OpenImageIO's error messages that are quoted. A damaged header may be quoted in one.
 LONGEST_REASON = 200
 
 
@@ -79,12 +79,12 @@ class Part:
         return sum(self.plane_bytes(channel) for channel in self.channels)
 
     def plane_bytes(self, channel: Channel) -> int:
-        """Bytes of the pixels of one channel in its stored type."""
+        """Return the bytes of the pixels of a channel in its stored type."""
         return self.data_window.width * self.data_window.height * (2 if channel.type == "half" else 4)
 
     @property
     def strip_height(self) -> int:
-        """Rows that are decoded together: whole tiles, or whole chunks of scan lines. Many channels make it fewer."""
+        """Rows that are decoded together: whole tiles, or whole chunks of scan lines; fewer with many channels."""
         unit = self.tile[1] or self.spec.get_int_attribute("oiio:RowsPerChunk", 1)
         row_bytes = self.nbytes // max(1, self.data_window.height)
         return unit * max(1, min(ROWS_PER_STRIP, LARGEST_STRIP // max(1, row_bytes)) // unit)
@@ -116,14 +116,14 @@ class ExrFile:
         return handle
 
     def close(self) -> None:
-        """Close the file, and those beside it. The next :meth:`read` opens it again."""
+        """Close the file and its siblings. The next :meth:`read` opens them again."""
         if (handle := self.__dict__.pop("_input", None)) is not None:
             handle.close()
         for sibling in self.siblings.values():
             sibling.close()
 
     def read(self, channels: Sequence[Channel], window: Window) -> Array:
-        """Channels over a rectangle, as float32 (height, width, len(channels)); each channel is contiguous in memory.
+        """Return channels over a rectangle, float32 (height, width, len(channels)), each contiguous in memory.
 
         Pixels outside a part's data window are 0, as OpenEXR defines them. All channels of a part are decoded
         together, whatever layers they belong to.
@@ -137,25 +137,24 @@ class ExrFile:
         """
         self._cache.drop_outside(window.y0, window.y1)
         result = np.zeros((len(channels), window.height, window.width), dtype=np.float32).transpose(1, 2, 0)
-        groups: dict[tuple[Path, int], list[int]] = {}
+        groups: dict[tuple[Path, int], dict[int, int]] = {}
         for position, channel in enumerate(channels):
-            groups.setdefault((channel.path, channel.part), []).append(position)
-        for (path, part), positions in groups.items():
+            groups.setdefault((channel.path, channel.part), {})[position] = channel.index
+        for (path, part), columns in groups.items():
             owner = self if path == self.path else self.siblings[path]
-            indices = tuple(channels[i].index for i in positions)
-            owner._read_part(owner.parts[part], indices, window, result, positions, self._cache)
+            owner._read_part(owner.parts[part], columns, window, result, self._cache)
         return result
 
     @contextmanager
     def cache_strips(self, max_bytes: int) -> Iterator[None]:
-        """Inside the ``with`` block, keep decoded rows from one :meth:`read` to the next.
+        """Keep decoded rows from one :meth:`read` to the next inside the ``with`` block.
 
         Read windows from left to right and from top to bottom: every row is then decoded once for each row of windows.
-        The cache holds the rows of the last window over the full width, 2 bytes for each pixel of a channel if all
-        channels of its part that are read are half, otherwise 4.
+        The cache holds the rows of the last window over the full width: 2 bytes for each pixel of a channel if all
+        channels that are read from the part are half, otherwise 4.
 
         Args:
-            max_bytes: what the cache holds at most, but for small parts of strips. Rows that do not fit are decoded
+            max_bytes: size of the cache; small parts of strips are kept beyond it. Rows that do not fit are decoded
                 again for each window.
         """
         self._cache.max_bytes = max_bytes
@@ -168,13 +167,14 @@ class ExrFile:
     def native_strips(
         self, part: Part, first: int, last: int, later: Sequence[tuple[int, int]] = ()
     ) -> Iterator[tuple[int, int, NDArray[Any]]]:
-        """All rows of neighbouring channels in their stored pixel type, for copying them bit for bit.
+        """Yield all rows of neighbouring channels in their stored pixel type, to be copied bit for bit.
 
         Args:
+            part: the part that holds the channels.
             first, last: indices of the first channel and of the one after the last. All have one pixel type.
-            later: more such ranges, which are read by later calls inside of the same :meth:`cache_strips`. Those of the
-                same pixel type are decoded together with this one, and kept until they are read: in a temporary file
-                what does not fit into the cache.
+            later: more such ranges, which later calls read inside of one :meth:`cache_strips`. Those of this pixel type
+                are decoded together with this range and kept until they are read; those that do not fit into the
+                cache, in a temporary file.
 
         Yields:
             First row, last row (exclusive), and the strip (rows, width, channels).
@@ -185,8 +185,7 @@ class ExrFile:
         """
         window, kind = part.data_window, part.channels[first].type
         later = [(a, b) for a, b in later if part.channels[a].type == kind]
-        start = min(first, *(a for a, _ in later)) if later else first
-        stop = max(last, *(b for _, b in later)) if later else last
+        start, stop = min(a for a, _ in [(first, last), *later]), max(b for _, b in [(first, last), *later])
         for y0, y1 in strip_rows(window.y0, window.y1, window.y0, part.strip_height, window.y1):
             strip = self._cache.pop(StripKey(self.path, part.index, tuple(range(first, last)), y0, y1))
             if strip is None:
@@ -199,25 +198,18 @@ class ExrFile:
             yield y0, y1, strip
             unload(strip)
 
-    def _read_part(
-        self,
-        part: Part,
-        indices: tuple[int, ...],
-        window: Window,
-        result: Array,
-        positions: list[int],
-        cache: StripCache,
-    ) -> None:
-        """Put some channels of one part at ``positions`` of the last axis of ``result``, which covers ``window``."""
-        area = window.intersect(part.data_window)
+    def _read_part(self, part: Part, columns: dict[int, int], window: Window, result: Array, cache: StripCache) -> None:
+        """Read channels of a part, whose indices are ``columns`` by position in ``result``, which covers ``window``."""
+        whole = part.data_window
+        area = window.intersect(whole)
         if area.width == 0 or area.height == 0:
             return
+        positions, indices = list(columns), tuple(columns.values())
         adjacent = positions == list(range(positions[0], positions[-1] + 1))
         # A slice is copied several times as fast as a list of indices.
         planes = slice(positions[0], positions[-1] + 1) if adjacent else positions
-        whole = part.data_window
         for y0, y1 in strip_rows(area.y0, area.y1, whole.y0, part.strip_height, whole.y1):
-            if not (cache.max_bytes or part.tile[1]):  # no other read needs the other rows
+            if not (cache.max_bytes or part.tile[1]):  # only this read needs these rows
                 y0, y1 = max(y0, area.y0), min(y1, area.y1)
             key = StripKey(self.path, part.index, indices, y0, y1)
             strip = cache.get(key)
@@ -225,11 +217,10 @@ class ExrFile:
                 strip = self._decode_channels(part, y0, y1, indices)
                 cache.keep(key, strip)
             shared = area.intersect(Window(area.x0, y0, area.x1, y1))
-            rows, columns = shared.slices(Window(whole.x0, y0, whole.x1, y1))
-            result[(*shared.slices(window), planes)] = strip[rows, columns]
+            result[(*shared.slices(window), planes)] = strip[shared.slices(Window(whole.x0, y0, whole.x1, y1))]
 
     def _decode_channels(self, part: Part, y0: int, y1: int, indices: tuple[int, ...]) -> NDArray[Any]:
-        """A strip of some channels, each contiguous in memory: half if all are stored as half, otherwise float."""
+        """Decode a strip of some channels, each contiguous: half if all are stored as half, otherwise float."""
         first, last = min(indices), max(indices) + 1
         decoded = part.channels[first:last]
         strip = self._decode(part, y0, y1, first, last, "half" if all(c.type == "half" for c in decoded) else "float")
@@ -242,7 +233,7 @@ class ExrFile:
         return planes.transpose(1, 2, 0)
 
     def _decode(self, part: Part, y0: int, y1: int, first: int, last: int, kind: str) -> NDArray[Any]:
-        """Rows of neighbouring channels over the full width, in pixel type ``kind``: (rows, width, channels)."""
+        """Decode rows of neighbouring channels over the full width, in pixel type ``kind``: (rows, width, channels)."""
         if part.tile[1]:
             x0, x1 = part.data_window.x0, part.data_window.x1
             strip = self._input.read_tiles(part.index, 0, x0, x1, y0, y1, 0, 1, first, last, kind)
@@ -254,13 +245,13 @@ class ExrFile:
 
 
 def use_threads(count: int) -> None:
-    """Let OpenImageIO and OpenEXR decode and compress with so many threads, in the whole process; 0 changes nothing."""
+    """Set the number of threads with which this process decodes and compresses; 0 changes nothing."""
     for library in ("threads", "exr_threads") if count else ():
         oiio.attribute(library, count)
 
 
 def unreadable(path: Path, part: Part, reason: str, where: str = "") -> InputError:
-    """The error for pixels that can't be decoded; ``where`` follows the part's name."""
+    """Return the error for pixels that can't be decoded; ``where`` follows the part's name."""
     return InputError(
         f"{path}: part {part.index} ({part.name or 'unnamed'}){where} can't be read ({reason}); "
         "the file is damaged or still being written"
@@ -271,8 +262,7 @@ def open_exr(path: str | Path) -> ExrFile:
     """Read the headers of an EXR file.
 
     Raises:
-        InputError: there is no such file, it is not an EXR, its headers are corrupt, or one of its parts has
-            subsampled channels.
+        InputError: the file does not exist, is not an EXR, has corrupt headers, or has subsampled channels.
     """
     path = Path(path)
     check_encodable(path)
@@ -283,7 +273,7 @@ def open_exr(path: str | Path) -> ExrFile:
         parts.append(_part(path, len(parts), handle.spec()))
         for name, value in parts[-1].metadata.items():
             metadata.setdefault(name, value)
-    if handle.has_error:  # not behind the last part, but at one that OpenImageIO can't read
+    if handle.has_error:  # the loop ended at a part that OpenImageIO can't read
         raise _refused(path, reason_of(handle))
     if not parts:
         raise InputError(f"{path}: holds no image")
@@ -299,7 +289,6 @@ def open_exr(path: str | Path) -> ExrFile:
 
 
 def _open(path: Path) -> Any:
-    """OpenImageIO's ``ImageInput`` of an EXR file."""
     if path.is_dir():
         raise InputError(f"{path}: is a folder; name a file in it")
     if not path.is_file():
@@ -315,13 +304,11 @@ def _open(path: Path) -> Any:
 
 
 def _refused(path: Path, reason: str) -> InputError:
-    """The error for a file that OpenImageIO can't read, or not all parts of it."""
     hint = "convert it to RGB" if "ubsampled" in reason else "render it again"
     return InputError(f"{path}: can't be opened as an EXR ({reason}); {hint}")
 
 
 def _part(path: Path, index: int, spec: Any) -> Part:
-    """Describe the part of which ``spec`` is the ``ImageSpec``."""
     types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
     return Part(
         index=index,
@@ -340,14 +327,12 @@ def _part(path: Path, index: int, spec: Any) -> Part:
 
 
 def _text(value: Any) -> Any:
-    """A header's text, or a sequence of texts. Bytes that are not UTF-8 are read as Latin-1; old exporters write that.
-
-    OpenImageIO gives such bytes as lone surrogates, which it refuses to write. So they are written as UTF-8.
-    """
+    """Return a header's text, or its sequence of texts, with bytes that are not UTF-8 read as Latin-1."""
     if isinstance(value, tuple | list):
-        return tuple(_text(each) for each in value)
+        return tuple(_text(element) for element in value)
     if not isinstance(value, str) or value.isascii():
         return value
+    # Old exporters write Latin-1. OpenImageIO gives such bytes as lone surrogates, which it refuses to write.
     raw = value.encode("utf-8", "surrogateescape")
     try:
         return raw.decode("utf-8")
@@ -356,12 +341,9 @@ def _text(value: Any) -> Any:
 
 
 def reason_of(source: Any) -> str:
-    """The error of OpenImageIO, or of one of its files, on one line: the first one, of which others may be the result.
-
-    It is cut because a damaged header may be quoted in it.
-    """
+    """Return the first error of OpenImageIO, or of one of its files, on one line; others may follow from it."""
     try:
-        # What follows is advice for programmers: to raise a limit of the library.
+        # The rest is advice for programmers: to raise a limit of the library.
         reason = str(source.geterror()).partition("Possible corrupt input?")[0].strip()
         first = " ".join(reason.partition("\n")[0].split())
         return f"{first[:LONGEST_REASON]}..." if len(first) > LONGEST_REASON else first or "no reason given"

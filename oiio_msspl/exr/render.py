@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a render is: a rectangle of pixels, layers in memory, and the protocol of everything that reads as layers."""
+"""Define windows (rectangles of pixels), renders in memory, and the protocol of all that is read as features."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any, Protocol
@@ -12,7 +12,7 @@ import numpy as np
 
 from oiio_msspl.image.arrays import Array, unload
 
-#: The layers that a render in memory may have, with their channels. :mod:`oiio_msspl.aovs.features` states their units.
+#: Features of a render in memory and their numbers of channels. :mod:`oiio_msspl.aovs.features` states their units.
 CHANNELS = {"rgb": 3, "albedo": 3, "normal": 3, "diffuse": 3, "specular": 3, "variance": 1, "alpha": 1}
 
 
@@ -38,21 +38,24 @@ class Window:
         """``1920x1080``, for messages."""
         return f"{self.width}x{self.height}"
 
-    def intersect(self, other: Window) -> Window:
-        """The common rectangle; its width or height is 0 where there is none."""
-        x0, y0 = max(self.x0, other.x0), max(self.y0, other.y0)
-        return Window(x0, y0, max(x0, min(self.x1, other.x1)), max(y0, min(self.y1, other.y1)))
+    def intersect(self, window: Window) -> Window:
+        """Return the common rectangle; its width or height is 0 if the two do not overlap."""
+        x0, y0 = max(self.x0, window.x0), max(self.y0, window.y0)
+        return Window(x0, y0, max(x0, min(self.x1, window.x1)), max(y0, min(self.y1, window.y1)))
 
     def shift(self, dx: int, dy: int) -> Window:
-        """The rectangle moved by ``dx`` pixels to the right and ``dy`` pixels down."""
+        """Return the rectangle moved by ``dx`` pixels to the right and ``dy`` pixels down."""
         return Window(self.x0 + dx, self.y0 + dy, self.x1 + dx, self.y1 + dy)
 
+    def bands(self, rows: int) -> Iterator[Window]:
+        """Cut the rectangle into bands of at most ``rows`` rows, from top to bottom."""
+        for y0 in range(self.y0, self.y1, rows):
+            yield Window(self.x0, y0, self.x1, min(y0 + rows, self.y1))
+
     def slices(self, inside: Window) -> tuple[slice, slice]:
-        """Row and column slices of this rectangle in an array that covers ``inside``."""
-        return (
-            slice(self.y0 - inside.y0, self.y1 - inside.y0),
-            slice(self.x0 - inside.x0, self.x1 - inside.x0),
-        )
+        """Return the row and column slices of this rectangle in an array that covers ``inside``."""
+        x, y = inside.x0, inside.y0
+        return slice(self.y0 - y, self.y1 - y), slice(self.x0 - x, self.x1 - x)
 
     def __str__(self) -> str:
         return f"{self.size}{self.x0:+d}{self.y0:+d}"
@@ -62,9 +65,8 @@ class Window:
 class Render:
     """A render in memory, or a rectangle of one.
 
-    ``layers`` maps the name of a feature to float32 (height, width, channels) over ``data_window``. ``rgb`` is always
-    there; ``albedo``, ``normal``, ``diffuse``, ``specular``, ``variance`` and ``alpha`` are there if the render has
-    them. :mod:`oiio_msspl.aovs.features` states their units.
+    ``layers`` maps the name of a feature, one of ``CHANNELS``, to float32 (height, width, channels) over
+    ``data_window``. ``rgb`` is always present.
     """
 
     layers: dict[str, Array]
@@ -73,24 +75,24 @@ class Render:
     pixel_aspect: float = 1.0
     metadata: dict[str, Any] = field(default_factory=dict)
     name: str = "render"
-    """What messages call it, such as the path of its file."""
+    """For messages, such as the path of the file."""
 
     @classmethod
     def from_arrays(cls, name: str = "render", **layers: Array) -> Render:
-        """A render without overscan, from arrays.
+        """Make a render without overscan from arrays.
 
         Args:
-            name: what messages call it.
+            name: for messages.
             layers: float (height, width, channels), of those in ``CHANNELS``; ``rgb`` is required.
 
         Raises:
-            ValueError: ``rgb`` is missing, there is another name, sizes differ or are 0, a layer has another number of
-                channels, or values are no floats.
+            ValueError: ``rgb`` is missing, a name is unknown, sizes differ or are 0, a layer has the wrong number of
+                channels, or values are not floats.
         """
         if "rgb" not in layers:
             raise ValueError(f"{name}: no 'rgb' among the layers {sorted(layers)}")
         arrays = {key: np.asarray(value) for key, value in layers.items()}
-        # Of another number of dimensions, it is refused as any other layer of a wrong shape.
+        # An rgb without three dimensions is refused below, as any layer of a wrong shape is.
         height, width = arrays["rgb"].shape[:2] if arrays["rgb"].ndim == 3 else (0, 0)
         for key, value in arrays.items():
             if key not in CHANNELS:
@@ -104,23 +106,18 @@ class Render:
         return cls({k: np.asarray(v, dtype=np.float32) for k, v in arrays.items()}, window, window, name=name)
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Layers over a rectangle inside the data window, as views of the whole arrays.
-
-        Args:
-            window: the rectangle.
-            features: which layers; all if None. Those that the render lacks are left out.
-        """
+        """Return features over a rectangle as views of the whole arrays, as :meth:`ReadableRender.read` does."""
         rows, columns = window.slices(self.data_window)
         names = self.layers if features is None else [f for f in features if f in self.layers]
         return {name: self.layers[name][rows, columns] for name in names}
 
     def unload(self) -> None:
-        """Give the memory of layers that wait in temporary files back to the system."""
+        """Give the memory of pixels that wait in temporary files back to the system."""
         for image in self.layers.values():
             unload(image)
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
-        """Nothing to do: the layers are in memory already. See :meth:`ReadableRender.cache_strips`."""
+        """Do nothing, because the pixels are in memory already."""
         return nullcontext()
 
 
@@ -129,11 +126,11 @@ class ReadableRender(Protocol):
 
     @property
     def name(self) -> str:
-        """What messages call it."""
+        """Name for messages, such as the path of the file."""
 
     @property
     def display_window(self) -> Window:
-        """The frame: what the camera shows."""
+        """The frame that the camera shows."""
 
     @property
     def data_window(self) -> Window:
@@ -144,17 +141,17 @@ class ReadableRender(Protocol):
         """Width of a pixel divided by its height."""
 
     def read(self, window: Window, features: Iterable[str] | None = None) -> dict[str, Array]:
-        """Layers over a rectangle inside the data window: float32 (height, width, channels) by feature.
+        """Return features over a rectangle inside the data window, float32 (height, width, channels) each.
 
         Values are as stored: NaN and infinities may be among them.
 
         Args:
             window: the rectangle.
-            features: which layers; all if None. Those that the render lacks are left out.
+            features: names of features; all if None. Those that the render lacks are left out.
         """
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
-        """Inside the ``with`` block, keep at most ``max_bytes`` of decoded rows from one :meth:`read` to the next.
+        """Keep at most ``max_bytes`` of decoded rows from one :meth:`read` to the next inside the ``with`` block.
 
         A file stores rows as wide as the frame, so neighbouring tiles share them.
         """

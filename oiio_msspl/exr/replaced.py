@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels that take the place of channels of the HRLS in the fused file."""
+"""Store pixels that replace channels of the HRLS in the fused file."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ DTYPES: dict[str, Any] = {"half": np.float16, "float": np.float32, "uint": np.ui
 class ReplacedChannels:
     """New pixels for some channels, in their stored types.
 
-    They are kept in a temporary file, because forty channels of an 8K frame take gigabytes. The system deletes it with
-    the process, even a killed one. The variable ``TMPDIR`` says where it is.
+    They are kept in a temporary file, because forty channels of an 8K frame take gigabytes. The system deletes the file
+    with the process, even a killed one. The variable ``TMPDIR`` says where it lies.
     """
 
     def __init__(self) -> None:
         self._places: dict[Channel, tuple[int, int]] = {}
-        """Offset in the file and width of each channel."""
+        """Offset in the file and width of every channel."""
         self._size = 0
         self._file = tempfile.TemporaryFile(prefix="msspl-")  # noqa: SIM115 - it lives as long as this object
 
     def add(self, channels: Sequence[Channel], width: int, height: int) -> None:
-        """Make room for ``channels``, of ``width`` x ``height`` pixels each; a channel that has room keeps it.
+        """Make room for channels of ``width`` x ``height`` pixels; a channel that has room keeps it.
 
         Raises:
             MssplError: the disk has no room.
@@ -46,7 +46,7 @@ class ReplacedChannels:
         return channel in self._places
 
     def put(self, channel: Channel, start: int, rows: Array) -> int:
-        """Store rows (n, width) of a channel from row ``start`` on; what is too bright for its type is clipped.
+        """Store rows (n, width) of a channel from row ``start`` on; values too bright for its type are clipped.
 
         Returns:
             The number of values that were too bright.
@@ -58,14 +58,14 @@ class ReplacedChannels:
         return int(np.count_nonzero(rows > largest)) if rows.size and rows.max() > largest else 0
 
     def get(self, channel: Channel, start: int, stop: int) -> NDArray[Any]:
-        """Rows of a channel, (stop - start, width)."""
+        """Return rows of a channel, (stop - start, width)."""
         dtype = np.dtype(DTYPES[channel.type])
         width = self._seek(channel, start)
         data = self._file.read((stop - start) * width * dtype.itemsize)
         return np.frombuffer(data, dtype).reshape(stop - start, width)
 
     def apply(self, channels: Sequence[Channel], start: int, pixels: NDArray[Any]) -> NDArray[Any]:
-        """Put the new pixels over rows (n, width, channels) from row ``start`` on, in a copy."""
+        """Return a copy of rows (n, width, channels) from row ``start`` on, with the new pixels in it."""
         if not any(channel in self for channel in channels):
             return pixels
         pixels = pixels.copy()
@@ -75,7 +75,7 @@ class ReplacedChannels:
         return pixels
 
     def _seek(self, channel: Channel, row: int) -> int:
-        """Go to a row of a channel. Returns the channel's width."""
+        """Go to a row of a channel, and return the channel's width."""
         offset, width = self._places[channel]
         self._file.seek(offset + row * width * np.dtype(DTYPES[channel.type]).itemsize)
         return width

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing the result as a single part with all channels.
+"""Write the result as a single part with all channels.
 
-OpenImageIO would convert the channels of a part to one pixel type. OpenEXR's own module keeps each channel's type, but
-needs the whole file in memory.
+OpenImageIO would convert the channels of a part to one pixel type. OpenEXR's Python module keeps their types, but needs
+the whole file in memory.
 """
 
 from __future__ import annotations
@@ -22,19 +22,10 @@ from oiio_msspl.exr.reader import Channel, Part
 from oiio_msspl.exr.replaced import DTYPES
 from oiio_msspl.exr.write_options import COMPONENTS
 
-#: Header entries that say how the source was stored. The ACES flag is forbidden in a file with AOVs (ST 2065-4).
+#: Header entries that describe how the source was stored. ST 2065-4 forbids the ACES flag in a file with AOVs.
 _STRUCTURE = ("channels", "chunkCount", "lineOrder", "acesImageContainerFlag", "tiles", "name")
 #: Header entries that count for all parts of a file, whichever part holds them.
 _SHARED = ("chromaticities", "timeCode")
-
-
-def check_single_part(contents: FileContents) -> None:
-    """Check by the headers that one part can hold all channels. The fused pixels are not looked at.
-
-    Raises:
-        InputError: parts have different data windows or equal channel names.
-    """
-    _names(contents)
 
 
 def write_single_part(path: Path, contents: FileContents) -> None:
@@ -57,7 +48,7 @@ def write_single_part(path: Path, contents: FileContents) -> None:
 
 
 def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
-    """The fused beauty and the layers about it: (height, width) by channel name."""
+    """Return the fused beauty and the further layers, (height, width) by channel name."""
     height = contents.pixels.rgb.shape[0]
     beauty = contents.pixels.rows(0, height)
     channels = {c.name: np.ascontiguousarray(beauty[..., i]) for i, c in enumerate(contents.beauty)}
@@ -71,7 +62,7 @@ def _fused_channels(contents: FileContents) -> dict[str, NDArray[Any]]:
 
 def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[Any]]) -> None:
     """Add the channels of the HRLS that are neither fused nor dropped."""
-    file, names = contents.source, _names(contents)
+    file, names = contents.source, channel_names(contents)
     for part, passed_on in _passed_on(contents):
         for kind in sorted({channel.type for channel in passed_on}):
             for run in runs([channel for channel in passed_on if channel.type == kind]):
@@ -85,14 +76,14 @@ def _add_passed_on_channels(contents: FileContents, channels: dict[str, NDArray[
 
 
 def _passed_on(contents: FileContents) -> Iterator[tuple[Part, list[Channel]]]:
-    """The parts of the HRLS with their channels that are neither fused nor dropped."""
+    """Yield the parts of the HRLS with their channels that are neither fused nor dropped."""
     for part in contents.source.parts:
         if not part.deep and not contents.dropped.issuperset(part.channels):
             yield part, [c for c in part.channels if c not in contents.beauty and c not in contents.dropped]
 
 
-def _names(contents: FileContents) -> dict[Channel, str]:
-    """What the channels that are passed on are called in the file that is written.
+def channel_names(contents: FileContents) -> dict[Channel, str]:
+    """Name the channels that are passed on, by the headers alone.
 
     Raises:
         InputError: parts have different data windows, or two channels would have one name.
@@ -115,10 +106,9 @@ def _names(contents: FileContents) -> dict[Channel, str]:
 
 
 def _name(contents: FileContents, channel: Channel) -> str:
-    """The channel's own name, or the part's name in front of it if only that names the layer. Another view than that of
-    the beauty is named behind the layer, as OpenEXR wants it."""
+    """Return the channel's stored name, behind the part's name if only that names the layer."""
     layer = contents.layers.get(channel)
-    if layer is not None and layer.view not in ("", contents.view):
+    if layer is not None and layer.view not in ("", contents.view):  # OpenEXR wants the view behind the layer
         return ".".join(name for name in (layer.name, layer.view, channel.name.rpartition(".")[2]) if name)
     if "." in channel.name or channel.part == contents.home.index:
         return channel.name
@@ -127,22 +117,18 @@ def _name(contents: FileContents, channel: Channel) -> str:
 
 
 def _header(contents: FileContents) -> dict[str, Any]:
-    """The header of the HRLS's beauty, with the compression and the attributes of the contents.
-
-    Metadata of the other parts is added, such as Cryptomatte's manifests. Where two parts differ, the beauty's counts,
-    then that of the first part.
-    """
+    """Return the header of the HRLS's beauty, with metadata of the parts that are passed on."""
     import OpenEXR
 
     path = contents.source.path
     try:
         with OpenEXR.File(str(path), header_only=True) as source:
             header = dict(source.parts[contents.home.index].header)
-            for part, _ in _passed_on(contents):
-                others = source.parts[part.index].header
-                header = {key: value for key, value in others.items() if key != "view"} | header
-            for each in source.parts:  # a part may hold it for all, and be left out itself
-                header = {key: each.header[key] for key in _SHARED if key in each.header} | header
+            for part, _ in _passed_on(contents):  # such as Cryptomatte's manifests
+                passed_on = source.parts[part.index].header
+                header = {key: value for key, value in passed_on.items() if key != "view"} | header
+            for part in source.parts:  # also those that are left out
+                header = {key: part.header[key] for key in _SHARED if key in part.header} | header
     except UnicodeDecodeError as error:
         raise InputError(
             f"--layout multilayer: the header of {path} has names or texts that are not UTF-8; use --layout spec"
@@ -150,14 +136,12 @@ def _header(contents: FileContents) -> dict[str, Any]:
     for key in _STRUCTURE:
         header.pop(key, None)
     layers = contents.layers
-    views = [
-        contents.view,
-        *(layers[c].view for _, passed_on in _passed_on(contents) for c in passed_on if c in layers),
-    ]
-    written = list(dict.fromkeys(view for view in views if view))
-    if len(written) > 1 or "multiView" in header:
+    channels = (channel for _, passed_on in _passed_on(contents) for channel in passed_on)
+    views = dict.fromkeys([contents.view, *(layers[channel].view for channel in channels if channel in layers)])
+    views.pop("", None)
+    if len(views) > 1 or "multiView" in header:
         header.pop("view", None)
-        header["multiView"] = written
+        header["multiView"] = list(views)
     name = "NO" if contents.compression == "none" else contents.compression.upper()
     header["compression"] = getattr(OpenEXR, f"{name}_COMPRESSION")
     header["type"] = OpenEXR.scanlineimage

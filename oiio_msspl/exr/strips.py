@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Strips: decoded rows, as wide as the part that stores them.
+"""Cache strips: decoded rows, as wide as the part that stores them.
 
 An EXR of scan lines can only be decoded in full rows. Tiles are narrower than the frame, so the tiles of one row of
 tiles share strips. A cache keeps them from one tile to the next.
@@ -27,7 +27,7 @@ SMALLEST_FILE = 1 << 20
 
 
 class StripKey(NamedTuple):
-    """What a strip holds."""
+    """The channels and rows that a strip holds."""
 
     path: Path
     part: int
@@ -41,27 +41,26 @@ class StripKey(NamedTuple):
 
 @dataclass
 class StripCache:
-    """Strips that were decoded, up to a number of bytes.
+    """Decoded strips, up to a number of bytes.
 
     Tiles are read row by row of tiles, and all tiles of such a row need the same strips. So a strip is kept until a
-    read needs other rows. A strip that does not fit any more is not kept: each tile then decodes only these again.
+    read needs other rows. A strip that does not fit is not kept: every tile decodes it again.
     """
 
     max_bytes: int = 0
     """Bytes that the strips may take together. With 0, nothing is kept."""
-    _strips: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
-
     bytes: int = field(default=0, init=False)
     """Bytes that the strips take in memory at the moment."""
+    _strips: dict[StripKey, NDArray[Any]] = field(default_factory=dict, repr=False)
     _in_memory: set[StripKey] = field(default_factory=set, repr=False)
-    """Of the strips that are not in a temporary file."""
+    """Keys of the strips that are not in a temporary file."""
 
     def get(self, key: StripKey) -> NDArray[Any] | None:
-        """The strip, if it is kept."""
+        """Return the strip, or None if it is not kept."""
         return self._strips.get(key)
 
     def pop(self, key: StripKey) -> NDArray[Any] | None:
-        """The strip, if it is kept, and forget it."""
+        """Return the strip and forget it, or return None if it is not kept."""
         strip = self._strips.pop(key, None)
         if strip is not None and key in self._in_memory:
             self._in_memory.remove(key)
@@ -79,24 +78,23 @@ class StripCache:
         return self.bytes + strip.nbytes <= self.max_bytes
 
     def keep_all(self, parts: Mapping[StripKey, NDArray[Any]]) -> None:
-        """Keep copies of parts of a strip, in one temporary file those for which there is no room. If these are small,
-        they are kept in memory all the same.
+        """Keep copies of parts of a strip; those without room in one temporary file, or in memory if they are small.
 
         Raises:
             MssplError: the disk has no room.
         """
-        left = {}
+        spilled = {}
         for key, part in parts.items():
             if self._has_room(part):
                 self.keep(key, part.copy())
             else:
-                left[key] = part
-        if sum(part.nbytes for part in left.values()) < SMALLEST_FILE:
-            self._strips |= {key: part.copy() for key, part in left.items()}
+                spilled[key] = part
+        if sum(part.nbytes for part in spilled.values()) < SMALLEST_FILE:
+            self._strips |= {key: part.copy() for key, part in spilled.items()}
             return
-        ends = np.cumsum([part.size for part in left.values()])
-        block = blank((int(ends[-1]),), next(iter(left.values())).dtype, on_disk=True)
-        for (key, part), flat in zip(left.items(), np.split(block, ends[:-1]), strict=True):
+        ends = np.cumsum([part.size for part in spilled.values()])
+        block = blank((int(ends[-1]),), next(iter(spilled.values())).dtype, on_disk=True)
+        for (key, part), flat in zip(spilled.items(), np.split(block, ends[:-1]), strict=True):
             self._strips[key] = flat.reshape(part.shape)
             self._strips[key][:] = part
         unload(block)
@@ -114,7 +112,7 @@ class StripCache:
 
 
 def strip_rows(start: int, stop: int, origin: int, height: int, end: int) -> Iterator[tuple[int, int]]:
-    """Rows (first, last exclusive) of the strips that cover the rows from ``start`` to ``stop`` (exclusive).
+    """Yield the rows (first, last exclusive) of the strips that cover rows ``start`` to ``stop`` (exclusive).
 
     Strips begin on multiples of ``height`` rows below ``origin``, the part's first row, so that they hold whole chunks.
     The last one ends at ``end``, the part's last row (exclusive).

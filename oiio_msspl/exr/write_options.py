@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The user's choices about the output file: layout, compression, pixel type and layers."""
+"""Declare and check the user's choices about the output file: layout, compression, pixel type and layers."""
 
 from __future__ import annotations
 
@@ -24,30 +24,26 @@ DEFAULT_COMPRESSION = "zip"
 ERROR_LAYER, FRAMES_LAYER = "error", "frames"
 #: Names of the layers that hold albedo and normal without noise.
 ALBEDO_LAYER, NORMAL_LAYER = "denoised_albedo", "denoised_normal"
-#: The channels of each of these layers.
+#: The channels of these layers.
 COMPONENTS = {ERROR_LAYER: "Y", FRAMES_LAYER: "Y", ALBEDO_LAYER: "RGB", NORMAL_LAYER: "XYZ"}
-#: The option that adds each.
-OPTIONS = {
-    ERROR_LAYER: "--error-layer",
-    FRAMES_LAYER: "--frames-layer",
-    ALBEDO_LAYER: "--data-passes",
-    NORMAL_LAYER: "--data-passes",
-}
+#: The options that add them.
+OPTIONS = {ERROR_LAYER: "--error-layer", FRAMES_LAYER: "--frames-layer"}
+OPTIONS |= dict.fromkeys((ALBEDO_LAYER, NORMAL_LAYER), "--data-passes")
 
 
 @dataclass(frozen=True)
 class WriteOptions:
-    """How the result is stored.
+    """The user's choices about the output file.
 
     Raises:
-        InputError: there is no such layout, compression or pixel type, or patterns exclude each other.
+        InputError: layout, compression or pixel type is unknown, or ``none`` is combined with other patterns.
     """
 
     layout: str = "spec"
     """One of ``LAYOUTS``."""
     compression: str | None = None
     """One of ``COMPRESSIONS``, for the fused beauty. None keeps the compression of the HRLS's beauty, or takes ``zip``
-    where that is lossy. Other layers always keep theirs, or become ``zip``: they must not lose bits a second time."""
+    if that is lossy. Other layers keep theirs, or become ``zip`` if it is lossy: they must not lose bits again."""
     pixel_type: str | None = None
     """``half`` or ``float``, for the fused beauty; None keeps the type of the HRLS's beauty."""
     layers: tuple[str, ...] = ()
@@ -58,7 +54,7 @@ class WriteOptions:
     error_layer: bool = False
     """Add a layer ``error``: the error that the model predicts for the fused beauty."""
     frames_layer: bool = False
-    """Add a layer ``frames``: of how many frames a pixel of a shot is the average."""
+    """Add a layer ``frames``: the number of frames that were averaged in a pixel of a shot."""
     data_passes: bool = False
     """Add the layers ``denoised_albedo`` and ``denoised_normal``."""
 
@@ -73,7 +69,7 @@ class WriteOptions:
             if isinstance(patterns, str):
                 raise InputError(f"{option} {patterns!r}: give a tuple of patterns, such as ({patterns!r},)")
             if "none" in patterns and len(patterns) > 1:
-                others = ", ".join(each for each in patterns if each != "none")
+                others = ", ".join(pattern for pattern in patterns if pattern != "none")
                 raise InputError(f"{option} none excludes {others or 'a second none'}; give one of them")
         if self.layout == "multilayer" and self.compression not in (None, *LOSSLESS) and self.layers != ("none",):
             raise InputError(

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writing the result: the fused beauty first, then every other layer of the HRLS, bit for bit.
+"""Write the result: the fused beauty first, then the layers of the HRLS that are passed on, bit for bit.
 
-A layer that is passed on is never converted to another pixel type: OpenImageIO copies whole parts, and other channels
-are copied strip by strip in their own type.
+These layers keep their pixel types: OpenImageIO copies whole parts, and the channels of split parts are copied strip by
+strip in their stored type.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ from oiio_msspl.exr.part_specs import (
 from oiio_msspl.exr.reader import Channel, ExrFile, open_exr, reason_of, unreadable
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.exr.single_part import check_single_part, write_single_part
-from oiio_msspl.exr.strips import ROWS_PER_STRIP
+from oiio_msspl.exr.single_part import channel_names, write_single_part
+from oiio_msspl.exr.strips import ROWS_PER_STRIP, strip_rows
 from oiio_msspl.exr.write_options import OPTIONS, WriteOptions
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.parallel import one_ahead
@@ -58,14 +58,14 @@ def write_fused(
 
     Args:
         path: the EXR to write.
-        source: the HRLS, whose other layers are passed on.
-        beauty: its channels R, G, B and, if it has one, A, which the fused frame replaces.
+        source: the HRLS, whose layers are passed on.
+        beauty: channels R, G, B and perhaps A of the HRLS, which the fused frame replaces.
         rgb: scene linear, (height, width, 3), over the beauty's data window.
         alpha: (height, width, 1) if ``beauty`` has an A, otherwise None.
         attributes: header attributes that are added to the beauty's part.
         options: layout, compression, pixel type and layers.
         extra: further layers, such as ``error``, see :attr:`FusedPixels.extra`.
-        replaced: new pixels for some of the other channels, each over the data window of its part.
+        replaced: new pixels for channels that are passed on, over the data window of their part.
         overwrite: replace an existing file.
         cache_bytes: memory for decoded rows of a part that is split into layers. What does not fit waits in temporary
             files.
@@ -76,7 +76,7 @@ def write_fused(
 
     Raises:
         InputError: the layout can't hold these parts, a layer can't be read, or ``path`` exists.
-        MssplError: the file can't be written. What stood at ``path`` is untouched.
+        MssplError: the file can't be written; a file at ``path`` is untouched.
     """
     pixels = FusedPixels(rgb, alpha, extra, stored_type(beauty, options))
     dropped = dropped_channels(source, beauty, options.layers)
@@ -87,11 +87,8 @@ def write_fused(
         else:
             _write_parts(temporary, contents, cache_bytes)
         _check_whole(temporary, path)
-    return [
-        f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on"
-        for part in source.parts
-        if part.deep
-    ]
+    deep = (part for part in source.parts if part.deep)
+    return [f"part {part.index} ({part.name or 'unnamed'}) is deep and was not passed on" for part in deep]
 
 
 def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str]) -> None:
@@ -102,7 +99,7 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
         extra: names of further layers.
 
     Raises:
-        InputError: it can't, a layer of the HRLS has the name of a further one, or a pattern of ``options`` matches
+        InputError: it can't; a further layer has the name of a layer of the HRLS; a pattern of ``options`` matches
             nothing.
     """
     contents = _without_pixels(source, beauty, options, extra)
@@ -114,11 +111,11 @@ def check_layout(source: ExrFile, beauty: Sequence[Channel], options: WriteOptio
                 "or leave the option out"
             )
     if options.layout == "multilayer":
-        check_single_part(contents)
+        channel_names(contents)
 
 
 def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions) -> int:
-    """Memory of the pixels that :func:`write_fused` holds at once, beside the fused frame; from the headers alone."""
+    """Return the bytes of pixels that :func:`write_fused` holds beside the fused frame, by the headers alone."""
     contents = _without_pixels(source, beauty, options)
     if options.layout == "multilayer":
         flat = [part for part in source.parts if not part.deep]
@@ -129,11 +126,7 @@ def bytes_held(source: ExrFile, beauty: Sequence[Channel], options: WriteOptions
 def _without_pixels(
     source: ExrFile, beauty: Sequence[Channel], options: WriteOptions, extra: Iterable[str] = ()
 ) -> FileContents:
-    """What :func:`write_fused` would write, as far as the headers tell.
-
-    Raises:
-        InputError: a pattern of ``options`` matches nothing.
-    """
+    """Describe by the headers alone what :func:`write_fused` would write."""
     nothing = np.empty((0, 0, 3), np.float32)
     pixels = FusedPixels(nothing, None, dict.fromkeys(extra, nothing), stored_type(beauty, options))
     dropped = dropped_channels(source, beauty, options.layers)
@@ -141,7 +134,7 @@ def _without_pixels(
 
 
 def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
-    """Write a file of several parts: the beauty, the layers about it, and what is passed on."""
+    """Write a file of several parts: the beauty, the further layers, and those that are passed on."""
     beauty = beauty_spec(contents)
     taken = {str(beauty.getattribute("oiio:subimagename"))}
     passed_on = list(passed_on_parts(contents, taken))
@@ -164,13 +157,11 @@ def _write_parts(path: Path, contents: FileContents, cache_bytes: int) -> None:
     # Closing flushes: a full disk may show only here, and only as an error message.
     ok = writer.close() and ok
     if not ok or writer.has_error:
-        reason = reason_of(writer) if writer.has_error else "no reason given"
-        raise not_written(path.parent, reason)
+        raise not_written(path.parent, reason_of(writer) if writer.has_error else "no reason given")
 
 
 def _check_whole(temporary: Path, path: Path) -> None:
-    """Read the first and the last row of each part. If the last bytes of a file can't be written, as on a full disk,
-    OpenImageIO does not tell."""
+    """Read the first and last row of every part: OpenImageIO does not tell if a full disk cut off the file's end."""
     try:
         with closing(open_exr(temporary)) as file:
             for part in file.parts:
@@ -183,7 +174,7 @@ def _check_whole(temporary: Path, path: Path) -> None:
 
 def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]) -> bool:
     """Write the part that is open, a strip at a time; ``rows(start, stop)`` gives its pixels."""
-    ranges = ((start, min(start + ROWS_PER_STRIP, spec.height)) for start in range(0, spec.height, ROWS_PER_STRIP))
+    ranges = strip_rows(0, spec.height, 0, ROWS_PER_STRIP, spec.height)
     # The next rows are converted while OpenImageIO compresses these.
     for start, stop, pixels in one_ahead((a, b, rows(a, b)) for a, b in ranges):
         if not writer.write_scanlines(spec.y + start, spec.y + stop, 0, pixels):
@@ -192,7 +183,7 @@ def _write_rows(writer: Any, spec: Any, rows: Callable[[int, int], NDArray[Any]]
 
 
 def _copy(contents: FileContents, part: PassedOnPart, later: Sequence[PassedOnPart], writer: Any) -> bool:
-    """Copy pixels of the HRLS into the part that is open, in their own pixel types; ``later`` parts follow."""
+    """Copy pixels of the HRLS into the open part in their stored types; ``later`` parts follow."""
     file, replaced = contents.source, contents.replaced
     if part.runs is None:
         source = oiio.ImageInput.open(str(file.path))
@@ -202,9 +193,9 @@ def _copy(contents: FileContents, part: PassedOnPart, later: Sequence[PassedOnPa
         return bool(copied)
     ranges = [
         (run[0].index, run[-1].index + 1)
-        for other in (part, *later)
-        if other.source.index == part.source.index and other.runs
-        for run in other.runs
+        for written in (part, *later)
+        if written.source.index == part.source.index and written.runs
+        for run in written.runs
     ]
     runs = [file.native_strips(part.source, *ranges[i], ranges[i + 1 :]) for i in range(len(part.runs))]
     # The next strips are decoded while OpenImageIO compresses these.

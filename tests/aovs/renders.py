@@ -25,6 +25,6 @@ def mapped(tmp_path, channels, mapping=None, stem="hr", **options):
     return map_render(open_exr(write_exr(tmp_path / f"{stem}.exr", channels, **attributes)), mapping, **options)
 
 
-def found(render):
+def sources(render):
     """{feature: layers} of the features that were found."""
     return {row["feature"]: row["source"] for row in render.table() if row["status"] in ("found", "computed")}

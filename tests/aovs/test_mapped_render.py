@@ -7,7 +7,7 @@ from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Window
-from tests.aovs.renders import H, W, found, layer, mapped, plane
+from tests.aovs.renders import H, W, layer, mapped, plane, sources
 from tests.conftest import EXAMPLES, SHARED, needs_shared, picture, rgb, write_exr
 from tests.exr.sources import behind_a_deep_part
 
@@ -75,7 +75,7 @@ def test_layers_of_another_view_are_told_apart(tmp_path):
     """In a stereo file, the albedo of the left eye is read and that of the right eye is passed through."""
     channels = layer("", 1) | layer("albedo", 2) | layer("right", 3) | layer("albedo.right", 4)
     render = mapped(tmp_path, channels, attributes={"multiView": ["left", "right"]})
-    assert (render.view, found(render)["albedo"]) == ("left", "albedo")
+    assert (render.view, sources(render)["albedo"]) == ("left", "albedo")
     assert render.unused_layers([], []) == ["albedo (right)", "right.R (right)", "right.G (right)", "right.B (right)"]
 
 

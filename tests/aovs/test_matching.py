@@ -7,7 +7,7 @@ from oiio_msspl.aovs.mapping import parse_map_options, read_map_file
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
-from tests.aovs.renders import H, W, found, layer, mapped, plane
+from tests.aovs.renders import H, W, layer, mapped, plane, sources
 from tests.conftest import SHARED, needs_shared, rgb, write_exr
 from tests.exr.sources import behind_a_deep_part
 
@@ -49,7 +49,7 @@ def test_karmas_layers_come_from_part_names_alone(tmp_path):
     ]
     render = mapped(tmp_path, parts)
     assert render.renderer == "Karma"
-    assert found(render) == {
+    assert sources(render) == {
         "rgb": "C",
         "albedo": "albedo",
         "normal": "N",
@@ -68,13 +68,13 @@ def test_blender_5_writes_the_layer_in_part_and_channel(tmp_path):
 
 
 def test_arnolds_header_says_which_aov_a_layer_holds(tmp_path):
-    """An AOV of N may have any name; where several layers hold an AOV, none of them is the whole."""
+    """An AOV of N may have any name; of several layers that hold an AOV, none is the whole."""
     channels = layer("", 1) | layer("normals", 0, "XYZ") | layer("key_diffuse", 2) | layer("fill_diffuse", 3)
-    sources = {"normals": "N", "key_diffuse": "diffuse", "fill_diffuse": "diffuse"}
-    attributes = {f"arnold/aovs/{name}/source": source for name, source in sources.items()}
-    assert found(mapped(tmp_path, channels, attributes=attributes)) == {"rgb": "R G B", "normal": "normals"}
-    both = channels | layer("N", 0, "XYZ")
-    assert found(mapped(tmp_path, both, attributes=attributes))["normal"] == "N"
+    aov_of = {"normals": "N", "key_diffuse": "diffuse", "fill_diffuse": "diffuse"}
+    attributes = {f"arnold/aovs/{name}/source": source for name, source in aov_of.items()}
+    assert sources(mapped(tmp_path, channels, attributes=attributes)) == {"rgb": "R G B", "normal": "normals"}
+    more = channels | layer("N", 0, "XYZ")
+    assert sources(mapped(tmp_path, more, attributes=attributes))["normal"] == "N"
 
 
 def test_luxcores_files_are_layers_of_one_frame(tmp_path):
@@ -96,7 +96,7 @@ def test_files_of_a_frame_may_have_its_name(tmp_path):
         write_exr(tmp_path / f"{stem}.exr", layer("", value))
     render = mapped(tmp_path, layer("", 1), stem="one")
     assert (render.renderer, render.read(render.data_window)["albedo"][0, 0, 0]) == ("LuxCore", 2)
-    assert found(mapped(tmp_path, layer("", 1), stem="two")) == {"rgb": "R G B"}
+    assert sources(mapped(tmp_path, layer("", 1), stem="two")) == {"rgb": "R G B"}
     with pytest.raises(InputError, match=r"LuxCore's one\.ALBEDO alone"):
         map_render(open_exr(tmp_path / "one.ALBEDO.exr"))
 
@@ -164,7 +164,7 @@ def test_a_header_without_a_number_of_samples_says_nothing(tmp_path, samples):
 def test_a_variance_per_sample_without_spp_is_defaulted_and_said(tmp_path):
     channels = layer("", 1) | layer("Albedo", 2) | layer("Ns", 0, "XYZ") | layer("Variance", 3)
     render = mapped(tmp_path, channels)
-    assert "variance" not in found(render)
+    assert "variance" not in sources(render)
     assert "needs the samples per pixel" in render.notes[0]
 
 
@@ -195,8 +195,8 @@ def test_the_users_mapping_wins(tmp_path):
 
 
 def test_a_mapping_may_add_layers_or_name_another_file(tmp_path):
-    other = write_exr(tmp_path / "other.exr", layer("", 7))
-    mapping = parse_map_options(["diffuse=direct+indirect", f"albedo={other}"])
+    path = write_exr(tmp_path / "other.exr", layer("", 7))
+    mapping = parse_map_options(["diffuse=direct+indirect", f"albedo={path}"])
     render = mapped(tmp_path, layer("", 1) | layer("direct", 2) | layer("indirect", 3), mapping)
     values = render.read(render.data_window)
     assert values["diffuse"][0, 0, 0] == 5
@@ -205,18 +205,18 @@ def test_a_mapping_may_add_layers_or_name_another_file(tmp_path):
 
 def beside(tmp_path, channels, mapping, stem="other", **options):
     """A plain render whose features are mapped to another EXR with these channels."""
-    other = write_exr(tmp_path / f"{stem}.exr", channels)
-    return mapped(tmp_path, layer("", 1), parse_map_options([each.format(other) for each in mapping]), **options)
+    path = write_exr(tmp_path / f"{stem}.exr", channels)
+    return mapped(tmp_path, layer("", 1), parse_map_options([text.format(path) for text in mapping]), **options)
 
 
 def test_a_feature_of_another_exr_is_found_by_the_table_of_renderers(tmp_path):
     """--map albedo=other.exr reads its albedo, not its beauty."""
-    other = layer("v.Combined", 5) | layer("v.Denoising Albedo", 7) | layer("v.DiffDir", 2) | layer("v.DiffInd", 3)
-    other |= layer("v.DiffCol", 4)
-    render = beside(tmp_path, other, ["albedo={}", "diffuse={}"])
+    channels = layer("v.Combined", 5) | layer("v.Denoising Albedo", 7) | layer("v.DiffDir", 2) | layer("v.DiffInd", 3)
+    channels |= layer("v.DiffCol", 4)
+    render = beside(tmp_path, channels, ["albedo={}", "diffuse={}"])
     values = render.read(render.data_window)
     assert (values["albedo"][0, 0, 0], values["diffuse"][0, 0, 0]) == (7, 20)
-    assert found(render)["albedo"] == "other.exr: v.Denoising Albedo"
+    assert sources(render)["albedo"] == "other.exr: v.Denoising Albedo"
 
 
 def test_another_exr_must_show_the_same_frame(tmp_path):
@@ -236,13 +236,13 @@ def test_a_deep_part_of_another_exr_is_not_read(tmp_path, name):
 
 def test_a_layer_of_another_exr_can_be_named(tmp_path):
     """Case and view layer need not be typed, as in --map without a file."""
-    other = layer("v.Combined", 5) | layer("v.Denoising Albedo", 7) | layer("v.Paint", 8)
+    channels = layer("v.Combined", 5) | layer("v.Denoising Albedo", 7) | layer("v.Paint", 8)
     for name in ("paint", "v.Paint", "V.PAINT"):
-        render = beside(tmp_path, other, [f"albedo={{}}:{name}"])
+        render = beside(tmp_path, channels, [f"albedo={{}}:{name}"])
         assert render.read(render.data_window)["albedo"][0, 0, 0] == 8
-        assert found(render)["albedo"] == "other.exr: v.Paint"
+        assert sources(render)["albedo"] == "other.exr: v.Paint"
     with pytest.raises(InputError, match=r"other.exr: has no layer 'Pint'; name one, as --map 'albedo=other.exr:v"):
-        beside(tmp_path, other, ["albedo={}:Pint"])
+        beside(tmp_path, channels, ["albedo={}:Pint"])
 
 
 @pytest.mark.parametrize(
@@ -266,8 +266,8 @@ def test_another_exr_with_no_albedo_or_several_is_refused(tmp_path, channels, me
 def test_of_two_view_layers_of_another_exr_that_of_the_render_is_read(tmp_path):
     names = [f"{view}.{name}" for view in "ab" for name in ("Combined", "Denoising Albedo")]
     channels = {c: p for i, name in enumerate(names) for c, p in layer(name, i).items()}
-    other = write_exr(tmp_path / "other.exr", channels)
-    render = mapped(tmp_path, channels, parse_map_options([f"albedo={other}"]), view="b")
+    path = write_exr(tmp_path / "other.exr", channels)
+    render = mapped(tmp_path, channels, parse_map_options([f"albedo={path}"]), view="b")
     assert render.read(render.data_window)["albedo"][0, 0, 0] == 3
 
 
@@ -282,7 +282,7 @@ def test_listed_channels_can_be_multiplied_by_a_layer(tmp_path):
     channels = layer("", 1) | {name: plane(4) for name in "uvw"} | layer("colour", 5)
     render = mapped(tmp_path, channels, {"diffuse": {"channels": ["u", "v", "w"], "times": "colour"}})
     assert render.read(render.data_window)["diffuse"][0, 0, 0] == 20
-    assert found(render)["diffuse"] == "u v w * colour"
+    assert sources(render)["diffuse"] == "u v w * colour"
 
 
 def test_listed_channels_are_those_of_the_view(tmp_path):
@@ -336,7 +336,7 @@ def test_a_mapped_layer_must_exist_and_have_the_right_channels(tmp_path):
 
 def test_an_aov_of_the_wrong_channel_count_is_not_used_silently(tmp_path):
     render = mapped(tmp_path, layer("", 1) | {"albedo.R": plane(1), "albedo.G": plane(1)})
-    assert "albedo" not in found(render)
+    assert "albedo" not in sources(render)
     assert "albedo: layer 'albedo' has channels R, G" in render.notes[0]
 
 
@@ -403,7 +403,7 @@ def test_real_files_are_mapped(name):
     renderer, features = REAL[name]
     render = map_render(open_exr(SHARED / "exr" / f"{name}.exr"))
     assert render.renderer == renderer
-    assert found(render).keys() == features
+    assert sources(render).keys() == features
 
 
 @needs_shared("exr")

@@ -123,4 +123,4 @@ def test_a_render_with_the_names_of_a_real_one_is_mapped_and_fused(tmp_path, ren
 
 
 def test_every_renderer_of_the_table_has_a_stand_in():
-    assert {each["name"] for each in renderers()} == {render["renderer"] for render in RENDERS}
+    assert {entry["name"] for entry in renderers()} == {render["renderer"] for render in RENDERS}

@@ -34,18 +34,30 @@ def test_inspect_tells_of_a_pair_whether_its_noise_is_spread(tmp_path, sigma, no
     assert (high["noise"], low["noise"]) == (noise, None)
 
 
-def test_inspect_says_what_the_model_does_not_read(files):
+def test_inspect_lists_only_what_the_model_reads(files):
     """joint reads colour, albedo and normal; paper reads diffuse, specular and variance, too."""
-    channels = rgb(picture(8, 8)) | rgb(picture(8, 8), "diffuse.") | {"variance.Y": picture(8, 8)[..., 0]}
+    channels = rgb(picture(8, 8)) | rgb(picture(8, 8), "diffuse.") | {"variance.Y": -picture(8, 8)[..., 0]}
     write_exr(files / "more.exr", channels)
     said = {model: run("msspl", "inspect", files / "more.exr", "--model", model).stdout for model in ("joint", "paper")}
-    assert "  what joint would read:\n" in said["joint"]
-    assert "diffuse   found: diffuse; this model does not read it\n" in said["joint"]
-    assert "variance  found: variance; this model does not read it\n" in said["joint"]
+    table = said["joint"].partition("  what joint would read:\n")[2]
+    assert [line.split()[0] for line in table.splitlines()[:4]] == ["rgb", "albedo", "normal", "alpha"]
+    assert "  neither read nor fused: diffuse, variance\n" in table
+    assert "variance" not in said["joint"].replace(table, "")
     assert "diffuse   found: diffuse\n" in said["paper"]
     assert "specular  none (optional)\n" in said["paper"]
+    assert "variance: 64 values are negative; fusing sets them to 0\n" in said["paper"]
     for text in said.values():
-        assert "albedo    none: expect blur, render an albedo (or name it with --map albedo=LAYER)\n" in text
+        assert "none: expect blur, render an albedo (or name it with --map albedo=LAYER)\n" in text
+    mapped = run("msspl", "inspect", files / "more.exr", "--model", "joint", "--map", "specular=diffuse").stdout
+    assert "specular  found: diffuse; this model does not read it\n" in mapped
+
+
+def test_inspect_keeps_notes_on_a_variance_for_the_model_that_reads_it(files):
+    """A variance of single samples needs the samples per pixel, which this header lacks."""
+    (files / "map.toml").write_text('variance = { layer = "v", kind = "per_sample" }')
+    write_exr(files / "v.exr", rgb(picture(8, 8)) | rgb(picture(8, 8), "v."))
+    command = ["msspl", "inspect", files / "v.exr", "--map-file", files / "map.toml", "--model", "paper"]
+    assert "note: variance: 'v' is per sample, which needs the samples per pixel" in run(*command).stdout
 
 
 def test_inspect_counts_negatives_apart(files):

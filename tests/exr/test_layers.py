@@ -46,7 +46,7 @@ def test_a_short_name_of_a_view_is_no_end_of_a_layers_name(tmp_path):
     names = {"rgba": "RGB", "normal": "XYZ", "depth.l": "Z"}
     parts = [(name, dict.fromkeys(channels, plane), (0, 0), {"view": "l"}) for name, channels in names.items()]
     file = open_exr(write_exr(tmp_path / "a.exr", parts))
-    assert [(each.view, each.name) for each in layers_of(file)] == [("l", ""), ("l", "normal"), ("l", "depth")]
+    assert [(layer.view, layer.name) for layer in layers_of(file)] == [("l", ""), ("l", "normal"), ("l", "depth")]
 
 
 def test_a_layer_may_lie_in_several_parts(tmp_path):

@@ -139,9 +139,9 @@ def test_real_headers_are_read(path):
     file = open_exr(path)
     with OpenEXR.File(str(path), header_only=True) as expected:
         assert len(file.parts) == len(expected.parts)
-        for part, other in zip(file.parts, expected.parts, strict=True):
-            assert {c.name for c in part.channels} == {c.name for c in other.header["channels"]}
-            low, high = other.header["dataWindow"]
+        for part, stored in zip(file.parts, expected.parts, strict=True):
+            assert {c.name for c in part.channels} == {c.name for c in stored.header["channels"]}
+            low, high = stored.header["dataWindow"]
             assert part.data_window == Window(low[0], low[1], high[0] + 1, high[1] + 1)
 
 

@@ -72,8 +72,8 @@ def test_a_file_of_one_part_with_any_name_is_read_again(tmp_path):
 def test_layers_none_leaves_the_beauty_alone_and_a_misspelt_layer_is_named(tmp_path):
     _, _, after = written(tmp_path, everything(), WriteOptions(layers=("none",)))
     assert [list(channels) for _, channels in after] == [["A", "B", "G", "R"]]
-    known = "Z, albedo, crypto00, id, mask"
-    with pytest.raises(InputError, match=rf"--layers 'cripto': .* has no such layer; it has: {known}$"):
+    names = "Z, albedo, crypto00, id, mask"
+    with pytest.raises(InputError, match=rf"--layers 'cripto': .* has no such layer; it has: {names}$"):
         written(tmp_path, everything(), WriteOptions(layers=("cripto",)))
 
 
@@ -149,7 +149,7 @@ def test_every_layout_keeps_all_views(tmp_path, layout, stored):
     for view in views:
         before, after = (map_render(open_exr(tmp_path / name), view=view) for name in ("hr.exr", "out.exr"))
         assert (after.view, after.other_views) == (view, before.other_views)
-        expected, pixels = (each.read(each.data_window) for each in (before, after))
+        expected, pixels = (render.read(render.data_window) for render in (before, after))
         if view == "left":
             expected["rgb"] = fused
         assert expected.keys() == pixels.keys() == {"rgb", "normal"}
@@ -483,5 +483,5 @@ def test_an_alpha_of_integers_is_passed_on(tmp_path, layout):
     """It is no alpha, so the fused alpha does not take its place."""
     ids = np.arange(H * W, dtype=np.uint32).reshape(H, W)
     _, _, after = written(tmp_path, rgb(picture(H, W)) | {"A": ids}, WriteOptions(layout))
-    (found,) = [planes["A"] for _, planes in after if "A" in planes]
-    assert same_bits(found, ids)
+    (plane,) = [planes["A"] for _, planes in after if "A" in planes]
+    assert same_bits(plane, ids)

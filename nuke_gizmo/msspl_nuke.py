@@ -129,10 +129,7 @@ def _prepare(node: nuke.Node, first: int, last: int, as_range: bool) -> _Job:
     if as_range:
         ranges = [ReadRange(read.name(), _file_at(read, first), _file_at(read, last)) for read in reads]
         numbers = file_numbers(ranges, out, first, last)
-    settings = Settings(
-        **{knob: _text(node, knob) for knob in _KNOBS},
-        overwrite=bool(node["overwrite"].value()),
-    )
+    settings = Settings(**{knob: _text(node, knob) for knob in _KNOBS}, overwrite=bool(node["overwrite"].value()))
     program = find_program(_path(node, "program"), os.environ)
     return _Job(
         node=node,

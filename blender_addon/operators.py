@@ -133,7 +133,8 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
         with tempfile.TemporaryDirectory(prefix="msspl-") as name:
             work, output = Path(name), Path(bpy.path.abspath(path))
             fuse = functools.partial(programs.fuse, program, work, overwrite, options.threads)
-            report = yield from frame.render_and_fuse(scene, options, output, work, fuse, overwrite, window)
+            job = frame.render_and_fuse(scene, options, output, work, fuse, overwrite=overwrite, window=window)
+            report = yield from job
         self._finish(overrides.find_scene(*identity), path, report.warnings, f"{path}: {report}")
 
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl compare``."""
+"""Defines ``msspl compare``."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def compare(
 
 
 def _layer(mapping: list[str]) -> str | None:
-    """The layer that ``--map`` names; None for the beauty."""
+    """Return the layer that ``--map`` names; None for the beauty."""
     from oiio_msspl.aovs.features import RGB
     from oiio_msspl.aovs.mapping import parse_map_options
 
@@ -145,7 +145,7 @@ def _print(images: list[Path], results: list[dict[str, float]]) -> None:
 
 
 def _write_page(html: Path, comparison: Comparison, layers: list[str], overwrite: bool) -> str:
-    """Write the page. Returns a sentence about it."""
+    """Write the page, and return a sentence about it."""
     from oiio_msspl.compare_page import write_page
 
     with console.ProgressBar() as bar:

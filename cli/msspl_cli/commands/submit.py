@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl submit``."""
+"""Defines ``msspl submit``."""
 
 from __future__ import annotations
 
@@ -66,13 +66,14 @@ def submit(
     from oiio_msspl.jobs.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
     from oiio_msspl.jobs.sequence import format_frames
     from oiio_msspl.jobs.shot_checks import check_first_pair, check_temporal, check_wanted_outputs
+    from oiio_msspl.jobs.temporal import TemporalOptions
 
     # Options with a wrong value are refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
     written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
     write = options.make_write_options(**{name: given[name] for name in written})
-    temporal = options.make_temporal_options(given["temporal"], given["motion_format"])
+    temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
     job = make_job(
@@ -138,15 +139,15 @@ def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
         elif getattr(parameter, "count", False):
             passed_on += [parameter.opts[0]] * value
         else:
-            for each in value if isinstance(value, list | tuple) else [value]:
-                passed_on += [parameter.opts[0], _full_path(each) if name == "mapping" else str(each)]
+            for text in value if isinstance(value, list | tuple) else [value]:
+                passed_on += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
     # Some versions of typer convert paths only when they call the command.
     paths = {name: Path(context.params[name]) for name in _PATHS if context.params[name] is not None}
     return context.params | paths, passed_on
 
 
 def _full_path(mapping: str) -> str:
-    """A ``--map`` with an absolute path if it names an EXR, because tasks run in other folders."""
+    """Make the path of a ``--map`` absolute if it names an EXR, because tasks run in other folders."""
     from oiio_msspl.aovs.mapping import is_exr
 
     feature, equals, layer = mapping.partition("=")

@@ -27,7 +27,7 @@ from oiio_msspl.jobs.stages import Stages
 from oiio_msspl.jobs.temporal import TemporalOptions
 from tests.conftest import EXAMPLES
 from tests.jobs.test_temporal import make_moving_shot
-from tests.programs import leave_temporary
+from tests.programs import leave_temporary, start
 from tests.shots import pixels
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
@@ -98,21 +98,21 @@ def farm(tmp_path):
     """Runs msspl-render with a stand-in for Blender that does ``code`` while it renders."""
     (tmp_path / "scene.blend").write_text("")
 
-    def start(*arguments, code="pass", stderr=subprocess.PIPE):
+    def start_render(*arguments, code="pass", stderr=subprocess.PIPE):
         blender = tmp_path / "blender"
         blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}")
         blender.chmod(0o755)
         main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
         command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "--blender", str(blender), *arguments]
-        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=stderr, text=True)
+        return start(command, cwd=tmp_path, stderr=stderr)
 
     def run(*arguments, code="pass"):
-        with start(*arguments, code=code) as process:
+        with start_render(*arguments, code=code) as process:
             out, err = process.communicate()
         left = sorted(p.name for p in tmp_path.iterdir() if p.name not in ("blender", "scene.blend", "log"))
         return process.returncode, out, err, left
 
-    return start, run, tmp_path
+    return start_render, run, tmp_path
 
 
 @posix
@@ -407,9 +407,9 @@ def test_a_shot_that_fails_midway_says_where_and_is_resumed(farm):
 @posix
 def test_the_progress_bar_is_wiped_before_an_error(farm, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
-    start, _, _ = farm
+    start_render, _, _ = farm
     reader, terminal = os.openpty()
-    with start(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
+    with start_render(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
         process.wait()
         said = os.read(reader, 10000).decode()
     assert "LRHS 16x9, 16 spp" in said
@@ -453,12 +453,12 @@ def test_nothing_is_overwritten_unasked(farm):
 @posix
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_cancelling_ends_blender_and_what_it_started(farm, how):
-    start, _, folder = farm
+    start_render, _, folder = farm
     code = (
         "import subprocess; child = subprocess.Popen(['sleep', '60']); "
         "Path('pids').write_text(f'{os.getpid()} {child.pid}'); child.wait()"
     )
-    process = start(code=code)
+    process = start_render(code=code)
     while not (folder / "pids").exists() or not (folder / "pids").read_text():
         time.sleep(0.02)
         assert process.poll() is None
@@ -477,8 +477,8 @@ def test_cancelling_ends_blender_and_what_it_started(farm, how):
 @posix
 def test_what_a_killed_run_left_is_deleted_by_the_next_one(farm):
     """And nothing of a run that is alive, nor what only looks like it."""
-    start, run, folder = farm
-    process = start(
+    start_render, run, folder = farm
+    process = start_render(
         code="Path('pid').write_text(str(os.getpid())); Path(job['work'], 'lr.exr').touch(); time.sleep(60)"
     )
     while not (folder / "pid").exists() or not (folder / "pid").read_text():

@@ -29,13 +29,7 @@ def say(text: str, *, error: bool = False) -> None:
 
 
 def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 2) -> None:
-    """Print rows with aligned columns on standard output.
-
-    Args:
-        rows: cells, equally many in each row.
-        header: the first row holds the titles of the columns.
-        indent: spaces in front of each row.
-    """
+    """Print rows of equally many cells, as aligned columns. With ``header``, the first row holds the titles."""
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text

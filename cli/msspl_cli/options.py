@@ -26,8 +26,10 @@ LARGEST_MEMORY = 1 << 62
 INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
 
 
-def option(group: str, text: str, *names: str, metavar: str | None = None, hidden: bool = False, **more: Any) -> Any:
-    """Describe an option of a group. Without names, it is called as its parameter."""
+def option(
+    group: str | None, text: str, *names: str, metavar: str | None = None, hidden: bool = False, **more: Any
+) -> Any:
+    """Describe an option, and its group in the help text. Without names, it is called as its parameter."""
     return typer.Option(*names, help=text, metavar=metavar, hidden=hidden, rich_help_panel=group, **more)
 
 

@@ -51,6 +51,7 @@ EXAMPLES = """[bold]Examples[/bold]
   129, 130, 143: stopped by SIGHUP, by Ctrl-C, by SIGTERM
 """
 
+_OUTPUT = "EXR to write. For a shot: a pattern or a folder."
 _LAYERS = (
     "Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is left out, too. "
     "May be repeated. \\[default: all]"
@@ -83,14 +84,7 @@ def fuse(
         int, option(MODEL, "CPU threads. 0: one on each core.", metavar="N", min=0, max=MOST_THREADS, hidden=True)
     ] = 0,
     # Output
-    output: Annotated[
-        Path,
-        option(
-            *(OUTPUT, "EXR to write. For a shot: a pattern or a folder.", "--output", "-o"),
-            metavar="OUT",
-            show_default=False,
-        ),
-    ],
+    output: Annotated[Path, option(OUTPUT, _OUTPUT, "--output", "-o", metavar="OUT", show_default=False)],
     layout: options.Layout = "spec",
     layers: Annotated[list[str], option(OUTPUT, _LAYERS, metavar="PATTERN")] = [],  # noqa: B006
     passes: options.Passes = ["auto"],  # noqa: B006
@@ -98,8 +92,7 @@ def fuse(
     data_passes: options.DataPasses = False,
     compression: Annotated[str | None, option(OUTPUT, _COMPRESSION, metavar="NAME", hidden=True)] = None,
     half: Annotated[
-        bool | None,
-        option(OUTPUT, "Pixel type of the fused layer. \\[default: as HR]", "--half/--float", hidden=True),
+        bool | None, option(OUTPUT, "Pixel type of the fused layer. \\[default: as HR]", "--half/--float", hidden=True)
     ] = None,
     preview: Annotated[bool, option(OUTPUT, "Write an sRGB PNG beside OUT.", hidden=True)] = True,
     view: Annotated[str | None, option(OUTPUT, "OpenColorIO view of the preview.", metavar="VIEW", hidden=True)] = None,
@@ -115,8 +108,7 @@ def fuse(
         bool, option(SHOT, "Skip frames that exist and are newer than their inputs.", "--update", hidden=True)
     ] = False,
     report_file: Annotated[
-        Path | None,
-        option(SHOT, "JSON report, kept up to date frame by frame.", "--report", metavar="FILE", hidden=True),
+        Path | None, option(SHOT, "JSON report, updated frame by frame.", "--report", metavar="FILE", hidden=True)
     ] = None,
     progress: Annotated[
         str | None, option(SHOT, "Print progress for programs: openjd or json.", metavar="FORM", hidden=True)

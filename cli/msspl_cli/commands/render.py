@@ -14,14 +14,7 @@ from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
 from msspl_cli.options import INPUT, OUTPUT, SHOT, option
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import (
-    check_folder,
-    check_separate,
-    check_target,
-    make_folder,
-    remove_left_folders,
-    remove_leftovers,
-)
+from oiio_msspl.exr import atomic
 from oiio_msspl.image.parallel import MOST_THREADS
 
 EXAMPLES = """[bold]Examples[/bold]
@@ -51,7 +44,10 @@ _LR_SPP = (
 )
 _FILTER = "Pixel filter: box, which is sharpest, or scene for the scene's own."
 _COMPONENTS = "Render all component passes, from diffuse to volume, besides the passes that the scene has on."
-_FRAMES = "7, 1001-1100x2 or 1001,1005-1010. Without it: the frame at which the scene was saved."
+_THREADS = "CPU threads. 0: as the scene says, or one on each core."
+_FRAMES = (
+    "Render only these frames: 7, 1001-1100x2 or 1001,1005-1010. Without it: the frame at which the scene was saved."
+)
 
 
 def render(
@@ -69,16 +65,7 @@ def render(
     hr_spp: Annotated[int, option(RENDER, "Samples per pixel of the full-resolution render.", min=1, metavar="N")] = 1,
     pixel_filter: Annotated[str, option(RENDER, _FILTER, "--filter", metavar="NAME", hidden=True)] = "box",
     components: Annotated[bool, option(RENDER, _COMPONENTS, "--components")] = False,
-    threads: Annotated[
-        int,
-        option(
-            *(RENDER, "CPU threads. 0: as the scene says, or one on each core."),
-            min=0,
-            max=MOST_THREADS,
-            metavar="N",
-            hidden=True,
-        ),
-    ] = 0,
+    threads: Annotated[int, option(RENDER, _THREADS, min=0, max=MOST_THREADS, metavar="N", hidden=True)] = 0,
     # Model
     quality: options.Quality = None,
     model: options.Model = "auto",
@@ -166,9 +153,9 @@ def render(
         "overwrite": overwrite,
         "compare": compare,
     }
-    make_folder(output.parent)
-    remove_leftovers(path for _, path in shot)
-    remove_left_folders(output.parent)
+    atomic.make_folder(output.parent)
+    atomic.remove_leftovers(path for _, path in shot)
+    atomic.remove_left_folders(output.parent)
     printer = _Printer(quiet, bool(verbose))
 
     def show(event: dict[str, Any]) -> None:
@@ -222,14 +209,14 @@ def _check_files(
 ) -> None:
     """Refuse results, and extra files beside them, that can't be written."""
     if _is_pattern(output) and not output.parent.exists():
-        check_folder(output.parent)  # the shot makes the folder
+        atomic.check_folder(output.parent)  # the shot makes the folder
     else:
         for path in targets:
-            check_target(path, overwrite=overwrite)
+            atomic.check_target(path, overwrite=overwrite)
         for path in extras:
             # A resumed shot replaces the files that an earlier run left beside a frame that it could not complete.
-            check_target(path, overwrite=overwrite or skip_existing)
-    check_separate([scene], [*targets, *extras])
+            atomic.check_target(path, overwrite=overwrite or skip_existing)
+    atomic.check_separate([scene], [*targets, *extras])
 
 
 class _Printer:

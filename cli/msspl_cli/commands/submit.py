@@ -68,7 +68,7 @@ def submit(
     from oiio_msspl.jobs.shot_checks import check_first_pair, check_temporal, check_wanted_outputs
     from oiio_msspl.jobs.temporal import TemporalOptions
 
-    # Options with a wrong value are refused here, and not by every task.
+    # A wrong value is refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
     written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
@@ -76,20 +76,9 @@ def submit(
     temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
-    job = make_job(
-        given["lr"],
-        given["hr"],
-        given["output"],
-        frames=given["frames"],
-        inputs=inputs,
-        model=model,
-        map_file=given["map_file"],
-        device=given["device"],
-        view=given["view"],
-        options=passed_on,
-        chunk=chunk,
-        timeout=timeout,
-    )
+    settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
+    settings |= {"inputs": inputs, "model": model, "options": passed_on, "chunk": chunk, "timeout": timeout}
+    job = make_job(given["lr"], given["hr"], given["output"], **settings)
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     with limit_threads(given["threads"]):
         check_temporal(job.shot, inputs, temporal, model, write)

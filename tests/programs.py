@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The programs as users run them."""
+"""Runs the programs as users run them."""
 
 import os
 import signal
@@ -33,7 +33,7 @@ def start(command, **options):
 
 
 def leave_temporary(target):
-    """The temporary file of a process that was killed while it wrote ``target``."""
+    """Return the temporary file of a process that was killed while it wrote ``target``."""
     code = (
         "import sys, os; from pathlib import Path; from oiio_msspl.exr import atomic\n"
         "atomic._machine = lambda: sys.argv[2]\n"

@@ -95,7 +95,7 @@ for number, output in job["frames"]:
 
 @pytest.fixture
 def farm(tmp_path):
-    """Runs msspl-render with a stand-in for Blender that does ``code`` while it renders."""
+    """Return functions that run msspl-render with a stand-in for Blender, which does ``code`` while it renders."""
     (tmp_path / "scene.blend").write_text("")
 
     def start_render(*arguments, code="pass", stderr=subprocess.PIPE):
@@ -138,7 +138,7 @@ ASKS = f"""
     work = Path(job["work"])
     log = open(Path(job["scene"]).with_name("log"), "a")
     print(number, len(list(work.glob("*.exr"))), file=log, flush=True)
-    pair = [work / f"{{each}}.{{number}}.exr" for each in ("lr", "hr")]
+    pair = [work / f"{{render}}.{{number}}.exr" for render in ("lr", "hr")]
     for path, name in zip(pair, ("LR", "HR")):
         shown = os.environ.get(name, {str(EXAMPLES)!r} + f"/{{name.lower()}}.exr")
         if Path(shown.format(number)).exists(): shutil.copy(shown.format(number), path)
@@ -155,7 +155,7 @@ ASKS = f"""
 
 @pytest.fixture
 def model(bilinear_models, tmp_path, monkeypatch):
-    """A copy of a model, which ASKS spoils."""
+    """Copy a model, which ASKS spoils."""
     path = tmp_path.parent / f"{tmp_path.name}.onnx"
     shutil.copy(bilinear_models[4], path)
     monkeypatch.setenv("MODEL", str(path))
@@ -188,7 +188,7 @@ def test_a_frame_that_cannot_be_fused_ends_the_shot_with_its_sentence(farm, mode
 
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory, bilinear_models):
-    """A shot with motion vectors, fused by fuse_shot frame by frame and with neighbours: alone/ and whole/."""
+    """Make a shot with motion vectors, fused by fuse_shot frame by frame and with neighbours: alone/ and whole/."""
     folder = make_moving_shot(tmp_path_factory.mktemp("moving"), count=7)
     for name, temporal in (("alone", "off"), ("whole", "auto")):
         options = {"model": str(bilinear_models[4]), "temporal": TemporalOptions(temporal)}
@@ -241,9 +241,9 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
     frames = [Frame(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
     shot = RenderedShot(Stages(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
     for frame in shot.order:
-        pair = [moving / f"{each}/{each}.{frame.number}.exr" for each in ("lr", "hr")]
+        pair = [moving / f"{render}/{render}.{frame.number}.exr" for render in ("lr", "hr")]
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
-    assert [list(each.vectors) for each in loaded] == [[1]] * 3
+    assert [list(frame.vectors) for frame in loaded] == [[1]] * 3
     assert counted and all(counted)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1001.exr", "1002.exr", "1003.exr"]
 

@@ -33,18 +33,14 @@ def find_fuse(preference: str = "") -> str:
     Raises:
         Failure: no program is found there.
     """
-    for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", os.environ.get("MSSPL_FUSE"))):
-        if name:
-            program = shutil.which(os.path.expanduser(name))
-            if program is None:
-                raise Failure(f"{name}: no such program; correct the path in {where}")
+    variable = os.environ.get("MSSPL_FUSE")
+    for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
+        program = shutil.which(os.path.expanduser(name)) if name else None
+        if program is not None:
             return program
-    program = shutil.which("msspl-fuse")
-    if program is None:
-        raise Failure(
-            "msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE"
-        )
-    return program
+        if name and where:
+            raise Failure(f"{name}: no such program; correct the path in {where}")
+    raise Failure("msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE")
 
 
 def find_render(preference: str = "") -> str:

@@ -41,12 +41,11 @@ def find_blender(named: str | None) -> str:
         InputError: there is no such program.
     """
     for where, name in (("--blender", named), ("MSSPL_BLENDER", os.environ.get("MSSPL_BLENDER")), ("", "blender")):
-        if name:
-            program = shutil.which(os.path.expanduser(name))
-            if program is not None:
-                return program
-            if where:
-                raise InputError(f"{where} {name}: no such program")
+        program = shutil.which(os.path.expanduser(name)) if name else None
+        if program is not None:
+            return program
+        if name and where:
+            raise InputError(f"{where} {name}: no such program")
     raise InputError("blender is not on the path; name it with --blender or MSSPL_BLENDER")
 
 

@@ -54,8 +54,7 @@ class RenderedFrames:
         frames = [Frame(number or 0, None, None, path.absolute()) for number, path in shot]
         results = {path.absolute() for path in wanted}
         to_write = [frame for frame in frames if frame.output in results]
-        self._shot = RenderedShot(stages, frames, to_write, temporal, keep=keep)
-        self._keep = keep
+        self._shot, self._keep = RenderedShot(stages, frames, to_write, temporal, keep=keep), keep
         self._waiting: list[dict[str, Any]] = []  # reports of frames that wait for their neighbours
         self._warnings: list[str] = []  # about all frames
         self.order = [

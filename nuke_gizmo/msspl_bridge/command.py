@@ -95,20 +95,17 @@ def find_program(chosen: str, environment: Mapping[str, str]) -> str:
     Raises:
         FuseError: no program is found there.
     """
-    search = environment.get("PATH")
-    for source, value in (("the program knob", chosen), ("MSSPL_FUSE", environment.get("MSSPL_FUSE", ""))):
-        if value:
-            program = shutil.which(os.path.expanduser(value), path=search)
-            if program is None:
-                raise FuseError(f"{source} names {value}, but there is no such program; give the path of msspl-fuse")
+    variable = environment.get("MSSPL_FUSE", "")
+    for source, name in (("the program knob", chosen), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
+        program = shutil.which(os.path.expanduser(name), path=environment.get("PATH")) if name else None
+        if program is not None:
             return program
-    program = shutil.which("msspl-fuse", path=search)
-    if program is None:
-        raise FuseError(
-            "msspl-fuse was not found; install oiio_msspl, and put the path of msspl-fuse into the program knob or "
-            "into the environment variable MSSPL_FUSE"
-        )
-    return program
+        if name and source:
+            raise FuseError(f"{source} names {name}, but there is no such program; give the path of msspl-fuse")
+    raise FuseError(
+        "msspl-fuse was not found; install oiio_msspl, and put the path of msspl-fuse into the program knob or "
+        "into the environment variable MSSPL_FUSE"
+    )
 
 
 def clean_environment(environment: Mapping[str, str], host_folder: str) -> dict[str, str]:

@@ -54,46 +54,46 @@ _MAP = (
 Map = Annotated[list[str], option(INPUT, _MAP, "--map", metavar="FEATURE=LAYER")]
 _MAP_FILE = "Read mappings (see --map) from a file."
 MapFile = Annotated[Path | None, option(INPUT, _MAP_FILE, "--map-file", metavar="TOML", hidden=True)]
-_VIEW_LAYER = "Fuse only this view (left) or view layer. \\[default: all]"
+_VIEW_LAYER = "Read only this view (left) or view layer. \\[default: all]"
 ViewLayer = Annotated[str | None, option(INPUT, _VIEW_LAYER, "--view-layer", metavar="NAME")]
 _COLOURSPACE = (
-    "Linear RGB space of both renders: lin_rec709, acescg, aces2065-1, lin_rec2020 or lin_p3d65. "
-    "\\[default: as their headers say, or lin_rec709]"
+    "Read both renders in this linear RGB space instead of that of their headers: lin_rec709, acescg, aces2065-1, "
+    "lin_rec2020 or lin_p3d65. \\[default: as their headers say, or lin_rec709]"
 )
 Colourspace = Annotated[str | None, option(INPUT, _COLOURSPACE, "--colorspace", metavar="NAME", hidden=True)]
-_SUM = "Layers of HR that sum to the beauty, if their names are not known. May be repeated."
+_SUM = "Fuse layers of HR that sum to the beauty under unusual names. May be repeated."
 Sum = Annotated[list[str], option(INPUT, _SUM, "--sum", metavar="NAME=A+B+C*D", hidden=True)]
 _MOTION_FORMAT = (
-    "How motion vectors are stored, if the pixels can't tell: layer=NAME, and any of channels=XY, to=next|previous, "
-    "x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5, premultiplied. A second layer follows "
-    "after +."
+    "Read motion vectors in this format, if the pixels can't tell it: layer=NAME, and any of channels=XY, "
+    "to=next|previous, x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5, premultiplied. A "
+    "second layer follows after +."
 )
 MotionFormat = Annotated[str | None, option(INPUT, _MOTION_FORMAT, "--motion-format", metavar="FORMAT", hidden=True)]
 
-_QUALITY = "Choose the model by quality: fast, balanced or best. \\[default: balanced]"
+_QUALITY = "Choose fast for previews, best for final frames that can wait, or balanced. \\[default: balanced]"
 Quality = Annotated[str | None, option(MODEL, _QUALITY, metavar="NAME")]
-_MODEL = "Instead of a quality: a family (paper), a shipped model (see msspl models) or an ONNX file."
+_MODEL = "Choose a family (paper), a shipped model (see msspl models) or an ONNX file instead of a quality."
 Model = Annotated[str, option(MODEL, _MODEL, metavar="NAME", hidden=True)]
 _DEVICE = "Run the model on cpu, cuda, tensorrt, openvino, coreml or directml."
 Device = Annotated[str, option(MODEL, _DEVICE, metavar="NAME")]
 _MAX_MEMORY = "Stay below this memory. The result does not depend on it."
 MaxMemory = Annotated[str, option(MODEL, _MAX_MEMORY, metavar="SIZE")]
 
-_LAYOUT = "Store parts as spec, nuke or multilayer."
+_LAYOUT = "Arrange parts for any program (spec), for Nuke (nuke) or as a single part (multilayer)."
 Layout = Annotated[str, option(OUTPUT, _LAYOUT, metavar="NAME")]
-_PASSES = "Passes to fuse with the beauty: auto (all that sum to it), none, or names of sets or layers (light*)."
+_PASSES = "Fuse these passes with the beauty: auto (all that sum to it), none, or names of sets or layers (light*)."
 Passes = Annotated[list[str], option(OUTPUT, _PASSES, metavar="PATTERN")]
 ErrorLayer = Annotated[
     bool, option(OUTPUT, "Add a layer 'error': the error that the model expects in each pixel.", "--error-layer")
 ]
-_DATA_PASSES = "Add the layers 'denoised_albedo' and 'denoised_normal'. For --quality best."
+_DATA_PASSES = "Add the layers 'denoised_albedo' and 'denoised_normal'. It needs --quality best."
 DataPasses = Annotated[bool, option(OUTPUT, _DATA_PASSES, "--data-passes", hidden=True)]
 Overwrite = Annotated[bool, option(OUTPUT, "Replace existing files.", "--overwrite")]
 Json = Annotated[bool, option(OUTPUT, "Print a report as JSON on standard output.", "--json")]
 
-_FRAMES = "Fuse only these frames: 1001-1100x2 or 1001,1005-1010. \\[default: all]"
+_FRAMES = "Take only these frames: 1001-1100x2 or 1001,1005-1010. \\[default: all]"
 Frames = Annotated[str | None, option(SHOT, _FRAMES, metavar="RANGE")]
-_TEMPORAL = "Average each frame with N frames before and after it, along their motion; or off. auto: 4"
+_TEMPORAL = "Remove flicker: average each frame with N frames before and after, along motion; or off. auto: 4"
 _WHERE_KNOWN = " where motion is known, 6 with --quality best."
 Temporal = Annotated[str, option(SHOT, _TEMPORAL + _WHERE_KNOWN, "--temporal", metavar="N")]
 _BLURRED = ", or off where motion blur is on."

@@ -32,20 +32,16 @@ EXAMPLES = """[bold]Examples[/bold]
 LARGE_PAGE = 60_000_000
 
 
+_REFERENCE = "Measure against this converged render. Only --html works without it."
 _ERROR_MAP = "Write a picture of the first image's error (log RelMSE; dark is small)."
 _HTML = "Write a page to look at all pictures in a browser, with their layers."
-_LAYERS = (
-    "Layers that the page shows beside the beauty (light*). May be repeated. \\[default: those that sum to the beauty]"
-)
+_LAYERS = "Show these layers on the page (light*). May be repeated. \\[default: those that sum to the beauty]"
 _MAP = "Compare this layer of all files instead of their beauty."
 
 
 def compare(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to measure.", show_default=False)],
-    reference: Annotated[
-        Path | None,
-        option(None, "The converged render. Only --html works without it.", "--reference", "-r", metavar="EXR"),
-    ] = None,
+    reference: Annotated[Path | None, option(None, _REFERENCE, "--reference", "-r", metavar="EXR")] = None,
     error_map: Annotated[Path | None, option(None, _ERROR_MAP, metavar="PNG")] = None,
     html: Annotated[Path | None, option(None, _HTML, metavar="HTML")] = None,
     layers: Annotated[list[str], option(None, _LAYERS, metavar="PATTERN")] = [],  # noqa: B006

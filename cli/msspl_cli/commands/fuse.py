@@ -51,12 +51,12 @@ EXAMPLES = """[bold]Examples[/bold]
   129, 130, 143: stopped by SIGHUP, by Ctrl-C, by SIGTERM
 """
 
-_OUTPUT = "EXR to write. For a shot: a pattern or a folder."
+_OUTPUT = "Write this EXR. For a shot: a pattern or a folder."
 _LAYERS = (
     "Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is left out, too. "
     "May be repeated. \\[default: all]"
 )
-_COMPRESSION = "Compression of the fused layer: zip, zips, piz, dwaa, ... \\[default: as HR]"
+_COMPRESSION = "Compress the fused layer by zip, zips, piz, dwaa, ... \\[default: as HR]"
 
 
 def fuse(
@@ -68,10 +68,10 @@ def fuse(
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
     lr_spp: Annotated[
-        float | None, option(INPUT, "Samples per pixel of LR, if its header does not say.", metavar="N", hidden=True)
+        float | None, option(INPUT, "Set LR's samples per pixel, if its header does not.", metavar="N", hidden=True)
     ] = None,
     hr_spp: Annotated[
-        float | None, option(INPUT, "Samples per pixel of HR, if its header does not say.", metavar="N", hidden=True)
+        float | None, option(INPUT, "Set HR's samples per pixel, if its header does not.", metavar="N", hidden=True)
     ] = None,
     colorspace: options.Colourspace = None,
     sums: options.Sum = [],  # noqa: B006
@@ -81,7 +81,7 @@ def fuse(
     device: options.Device = "cpu",
     max_memory: options.MaxMemory = "3G",
     threads: Annotated[
-        int, option(MODEL, "CPU threads. 0: one on each core.", metavar="N", min=0, max=MOST_THREADS, hidden=True)
+        int, option(MODEL, "Use N CPU threads. 0: one on each core.", metavar="N", min=0, max=MOST_THREADS, hidden=True)
     ] = 0,
     # Output
     output: Annotated[Path, option(OUTPUT, _OUTPUT, "--output", "-o", metavar="OUT", show_default=False)],
@@ -92,10 +92,10 @@ def fuse(
     data_passes: options.DataPasses = False,
     compression: Annotated[str | None, option(OUTPUT, _COMPRESSION, metavar="NAME", hidden=True)] = None,
     half: Annotated[
-        bool | None, option(OUTPUT, "Pixel type of the fused layer. \\[default: as HR]", "--half/--float", hidden=True)
+        bool | None, option(OUTPUT, "Set the fused layer's type. \\[default: as HR]", "--half/--float", hidden=True)
     ] = None,
     preview: Annotated[bool, option(OUTPUT, "Write an sRGB PNG beside OUT.", hidden=True)] = True,
-    view: Annotated[str | None, option(OUTPUT, "OpenColorIO view of the preview.", metavar="VIEW", hidden=True)] = None,
+    view: Annotated[str | None, option(OUTPUT, "Preview in an OpenColorIO view.", metavar="VIEW", hidden=True)] = None,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
@@ -108,7 +108,7 @@ def fuse(
         bool, option(SHOT, "Skip frames that exist and are newer than their inputs.", "--update", hidden=True)
     ] = False,
     report_file: Annotated[
-        Path | None, option(SHOT, "JSON report, updated frame by frame.", "--report", metavar="FILE", hidden=True)
+        Path | None, option(SHOT, "Write a JSON report after each frame.", "--report", metavar="FILE", hidden=True)
     ] = None,
     progress: Annotated[
         str | None, option(SHOT, "Print progress for programs: openjd or json.", metavar="FORM", hidden=True)

@@ -27,9 +27,9 @@ MARKER = "# added by msspl nuke-install"
 
 
 def nuke_install(
-    folder: Annotated[Path, typer.Option("--dir", metavar="DIR", help="The user's or the site's Nuke folder.")] = Path(
-        "~/.nuke"
-    ),
+    folder: Annotated[
+        Path, typer.Option("--dir", metavar="DIR", help="Use this Nuke folder, of a user or a site.")
+    ] = Path("~/.nuke"),
     uninstall: Annotated[bool, typer.Option("--uninstall", help="Remove the line.")] = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,

@@ -35,16 +35,16 @@ RENDER = "Render"
 #: Number and file of a frame. The number is None for the frame at which the scene was saved.
 Target = tuple[int | None, Path]
 
-_SCENE_NAME = "Scene to render, if the file has several. Without it: the one that was active when it was saved."
-_BLENDER = "Blender 4.5 or later, or a Python that has bpy. Without it: MSSPL_BLENDER, or blender on the path."
-_SCALE = "2, 4 or 8: the low-resolution render has 1/N of the width and height."
+_SCENE_NAME = "Render this scene, if the file has several. Without it: the one that was active when it was saved."
+_BLENDER = "Run this Blender (4.5 or later) or Python with bpy. Without it: MSSPL_BLENDER, or blender on the path."
+_SCALE = "Divide width and height of the low-resolution render by 2, 4 or 8."
 _LR_SPP = (
-    "Samples per pixel of the low-resolution render. \\[default: a third as many samples in total as the "
+    "Render N samples per pixel at low resolution. \\[default: a third as many samples in total as the "
     "full-resolution render has, but at least 4, 16 or 64 at x2, x4 or x8]"
 )
-_FILTER = "Pixel filter: box, which is sharpest, or scene for the scene's own."
+_FILTER = "Filter pixels with box, which is sharpest, or scene for the scene's own filter."
 _COMPONENTS = "Render all component passes, from diffuse to volume, besides the passes that the scene has on."
-_THREADS = "CPU threads. 0: as the scene says, or one on each core."
+_THREADS = "Use N CPU threads. 0: as the scene says, or one on each core."
 _FRAMES = (
     "Render only these frames: 7, 1001-1100x2 or 1001,1005-1010. Without it: the frame at which the scene was saved."
 )
@@ -55,14 +55,14 @@ def render(
     *,
     # Input
     view_layer: Annotated[
-        str, option(INPUT, "View layer to render, if several are on.", metavar="NAME", show_default=False)
+        str, option(INPUT, "Render this view layer, if several are on.", metavar="NAME", show_default=False)
     ] = "",
     scene_name: Annotated[str, option(INPUT, _SCENE_NAME, metavar="NAME", show_default=False, hidden=True)] = "",
     blender: Annotated[str | None, option(INPUT, _BLENDER, metavar="PROGRAM")] = None,
     # Render
     scale: Annotated[int, option(RENDER, _SCALE, "--scale", "-s", metavar="N")] = 4,
     lr_spp: Annotated[int | None, option(RENDER, _LR_SPP, min=1, metavar="N", show_default=False)] = None,
-    hr_spp: Annotated[int, option(RENDER, "Samples per pixel of the full-resolution render.", min=1, metavar="N")] = 1,
+    hr_spp: Annotated[int, option(RENDER, "Render N samples per pixel at full resolution.", min=1, metavar="N")] = 1,
     pixel_filter: Annotated[str, option(RENDER, _FILTER, "--filter", metavar="NAME", hidden=True)] = "box",
     components: Annotated[bool, option(RENDER, _COMPONENTS, "--components")] = False,
     threads: Annotated[int, option(RENDER, _THREADS, min=0, max=MOST_THREADS, metavar="N", hidden=True)] = 0,
@@ -73,7 +73,7 @@ def render(
     max_memory: options.MaxMemory = "3G",
     # Output
     output: Annotated[
-        Path, option(OUTPUT, "EXR to write, or a pattern.", "--output", "-o", metavar="OUT", show_default=False)
+        Path, option(OUTPUT, "Write this EXR, or a pattern.", "--output", "-o", metavar="OUT", show_default=False)
     ],
     layout: options.Layout = "multilayer",
     passes: options.Passes = ["auto"],  # noqa: B006

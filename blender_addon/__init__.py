@@ -4,11 +4,11 @@
 from . import operators, panel
 
 
-def register():
+def register() -> None:
     panel.register()
     operators.register()
 
 
-def unregister():
+def unregister() -> None:
     operators.unregister()
     panel.unregister()

@@ -1,46 +1,42 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering and fusing a list of frames without a window, as :mod:`.headless` gets them from msspl-render."""
+"""Renders and fuses a list of frames without a window, as :mod:`.headless` gets them from msspl-render."""
 
 import os
 import time
+from collections.abc import Callable, Generator
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import bpy
+from bpy.types import Scene
 
 from . import render_settings
 from .checks import check_animation, check_scene
 from .errors import Failure
-from .frame import render_and_fuse, run_to_end
+from .frame import Progress, Report, render_and_fuse, run_to_end
 from .options import Options, find_view_layer, hrls_size
 from .overrides import override
 from .render import escape_path, render
 
+#: Prints a message for msspl-render, given as keyword arguments.
+Send = Callable[..., None]
 
-def run_job(job, send, receive):
+
+def run_job(job: dict[str, Any], send: Send, receive: Callable[[], None]) -> None:
     """Render every frame of a job, and let msspl-render fuse it.
 
     Args:
         job: the dictionary that :mod:`.headless` describes.
-        send: called with the progress, with what is to be fused, and with the report of each frame, as keyword
-            arguments.
-        receive: called to wait until it is fused.
+        send: gets the progress, the files to fuse, and the report of each frame.
+        receive: waits until the files are fused.
 
     Raises:
         Failure: a frame failed. The frames before it are complete.
     """
     if bpy.app.version < (4, 5, 0):
         raise Failure(f"Blender {bpy.app.version_string} is too old; use 4.5 or later")
-    if not bpy.data.filepath:
-        try:
-            bpy.ops.wm.open_mainfile(filepath=job["scene"])
-        except RuntimeError as error:
-            raise Failure(f"{job['scene']}: can't be opened ({str(error).strip()})") from error
-    if job["scene_name"]:
-        if job["scene_name"] not in bpy.data.scenes:
-            known = ", ".join(each.name for each in bpy.data.scenes)
-            raise Failure(f"{job['scene']}: has no scene '{job['scene_name']}'; it has {known}")
-        bpy.context.window.scene = bpy.data.scenes[job["scene_name"]]
+    _open_scene(job["scene"], job["scene_name"])
     if bpy.app.autoexec_fail:
         send(
             warning=f"Blender did not run the scripts and drivers of {job['scene']} ({bpy.app.autoexec_fail_message}); "
@@ -62,8 +58,21 @@ def run_job(job, send, receive):
             _run_frame(scene, options, job, None, send, receive)
 
 
-def _passes(scene, options):
-    """The passes that both renders will have, as msspl-render gets them, see :mod:`.headless`."""
+def _open_scene(file: str, name: str) -> None:
+    """Open a .blend, unless Blender has opened one, and activate a scene; with an empty name the scene stays."""
+    if not bpy.data.filepath:
+        try:
+            bpy.ops.wm.open_mainfile(filepath=file)
+        except RuntimeError as error:
+            raise Failure(f"{file}: can't be opened ({str(error).strip()})") from error
+    if name:
+        if name not in bpy.data.scenes:
+            raise Failure(f"{file}: has no scene '{name}'; it has {', '.join(scene.name for scene in bpy.data.scenes)}")
+        bpy.context.window.scene = bpy.data.scenes[name]
+
+
+def _passes(scene: Scene, options: Options) -> dict[str, Any]:
+    """Return the passes that both renders will have, for the message that :mod:`.headless` describes."""
     try:
         from cycles.engine import list_render_passes
 
@@ -77,23 +86,25 @@ def _passes(scene, options):
         return {"layers": None, "pixel_bytes": 0}
 
 
-def _run_frame(scene, options, job, output, send, receive):
+def _run_frame(
+    scene: Scene, options: Options, job: dict[str, Any], output: Path | None, send: Send, receive: Callable[[], None]
+) -> dict[str, Any]:
     """Render a frame and have it fused. A frame without an output is rendered for its neighbours."""
     number = scene.frame_current
     work = Path(job["work"], str(number))
     work.mkdir()
 
-    def on_step(step, fraction):
+    def on_step(step: str, fraction: float) -> None:
         send(frame=number, step=step, fraction=fraction)
 
-    def fuse(lrhs, hrls, output):
+    def fuse(lrhs: str, hrls: str, output: str) -> Generator[Progress, None, dict[str, Any]]:
         yield "fuse", 2 / 3
         send(fuse={"lrhs": lrhs, "hrls": hrls})  # msspl-render keeps its model loaded
         receive()
-        return {"warnings": []}  # msspl-render has them, and may not have written this frame yet
+        return {"warnings": []}  # msspl-render has its own, and may not have written this frame yet
 
     on_step("start", 0.0)
-    steps = render_and_fuse(scene, options, output or work / "none.exr", work, fuse, overwrite=job["overwrite"])
+    steps = render_and_fuse(scene, options, output or work / "none.exr", work, fuse, job["overwrite"])
     report = run_to_end(steps, on_step)
     result = {"frame": number, "seconds": report.seconds, "plain_spp": report.plain_spp, **asdict(report)}
     if job["compare"] and output:
@@ -104,13 +115,16 @@ def _run_frame(scene, options, job, output, send, receive):
     return result
 
 
-def _render_plain(scene, options, report, on_step, work):
+def _render_plain(
+    scene: Scene, options: Options, report: Report, on_step: Callable[[str, float], None], work: Path
+) -> dict[str, Any]:
     """Render the frame the ordinary way with OIDN, in the time that the LRHS, the HRLS and the fusion took together.
 
-    Render times cannot be predicted well. Each attempt sets the spp of the next one from its own time, and the closest
-    of at most three attempts is kept.
+    Render times cannot be predicted well. So each of at most three attempts sets the spp of the next one from its own
+    time, and the closest attempt is kept.
     """
-    attempts, samples = {}, report.plain_spp
+    attempts: dict[int, dict[str, Any]] = {}
+    samples = report.plain_spp
     while len(attempts) < 3 and (spp := max(1, round(samples))) not in attempts:
         on_step(f"ordinary render with OIDN, {spp} spp", 1.0)
         start = time.perf_counter()
@@ -124,4 +138,4 @@ def _render_plain(scene, options, report, on_step, work):
         if 0.9 < ratio < 1.1:
             break
         samples = spp * ratio
-    return min(attempts.values(), key=lambda each: abs(each["seconds"] - report.seconds))
+    return min(attempts.values(), key=lambda attempt: abs(attempt["seconds"] - report.seconds))

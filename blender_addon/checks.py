@@ -1,14 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Refusing what cannot be rendered or fused, with a sentence that says what to change."""
+"""Refuses a scene that cannot be rendered or fused, with a sentence that says what to change."""
 
 import os
+from pathlib import Path
+from typing import Any
+
+from bpy.types import Scene
 
 from .errors import Failure
-from .options import find_view_layer, hrls_size, lrhs_size, view_layer_path
+from .options import Options, find_view_layer, hrls_size, lrhs_size, view_layer_path
 from .overrides import read
 
 
-def check_scene(scene, options):
+def check_scene(scene: Scene, options: Options) -> None:
     """Check the scene before anything is rendered.
 
     Raises:
@@ -34,7 +38,7 @@ def check_scene(scene, options):
     find_view_layer(scene, options)
 
 
-def check_animation(scene, values):
+def check_animation(scene: Scene, values: dict[str, Any]) -> None:
     """Check that no keyframe or driver changes an overridden setting when the frame is rendered.
 
     Args:
@@ -46,17 +50,17 @@ def check_animation(scene, values):
     if scene.animation_data is None:
         return
     wanted = {path: read(scene, path) for path in values}  # as Blender stores them, in single precision
-    rendered = next(each for each in scene.view_layers if each.use)
+    rendered = next(layer for layer in scene.view_layers if layer.use)
     scene.frame_set(scene.frame_current, subframe=scene.frame_subframe)
     # Some animated values change only in the evaluated copy, and that copy has only the rendered view layer.
     copy = scene.evaluated_get(rendered.depsgraph)
     for path, value in wanted.items():
         other_layer = path.startswith("view_layers[") and not path.startswith(view_layer_path(rendered))
-        if any(read(each, path) != value for each in ([scene] if other_layer else [scene, copy])):
+        if any(read(version, path) != value for version in ([scene] if other_layer else [scene, copy])):
             raise Failure(f"scene '{scene.name}': {path} is animated; remove its keyframes or driver")
 
 
-def check_output(path, overwrite):
+def check_output(path: Path, overwrite: bool) -> None:
     """Check the output before anything is rendered.
 
     Raises:

@@ -1,15 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Showing fused frames in the scene's compositor, as an Image node."""
+"""Shows fused frames in the scene's compositor, as an Image node."""
+
+from collections.abc import Sequence
 
 import bpy
+from bpy.types import Node, NodeTree, Scene
 
 from .render_settings import BLENDER_5, linear_override
 
 NODE = "MSSPL Fused"
 
 
-def show(scene, path, connect, frames=None):
-    """Load a fused EXR into the node ``MSSPL Fused``. A new node is made if there is none; an old one keeps its links.
+def show(scene: Scene, path: str, connect: bool, frames: Sequence[int] | None = None) -> Node:
+    """Load a fused EXR into the node ``MSSPL Fused``, which is made if there is none. An old node keeps its links.
 
     Args:
         path: may begin with ``//``, which stands for the folder of the .blend.
@@ -47,8 +50,8 @@ def show(scene, path, connect, frames=None):
     return node
 
 
-def _tree(scene):
-    """(the compositor's node tree, whether it was created now)."""
+def _tree(scene: Scene) -> tuple[NodeTree, bool]:
+    """Return the compositor's node tree, and whether it was created now."""
     if BLENDER_5:
         fresh = scene.compositing_node_group is None
         if fresh:
@@ -59,8 +62,8 @@ def _tree(scene):
     return scene.node_tree, fresh
 
 
-def _output(tree):
-    """The node whose first input is the composited image. Since Blender 5.0, it is the output of a node group."""
+def _output(tree: NodeTree) -> Node:
+    """Return the node that gets the composited image. Since Blender 5.0, it is the output of a node group."""
     kind = "NodeGroupOutput" if BLENDER_5 else "CompositorNodeComposite"
     if BLENDER_5 and not any(
         item.item_type == "SOCKET" and item.in_out == "OUTPUT" for item in tree.interface.items_tree

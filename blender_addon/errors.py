@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""How a job ends when it does not succeed."""
+"""The exceptions that end a job."""
 
 
 class Failure(Exception):
-    """One sentence for the user. ``code`` is 2 for the caller's mistake and 1 for any other failure."""
+    """A sentence for the user. ``code`` is 2 for the caller's mistake and 1 for any other failure."""
 
-    def __init__(self, message, code=2):
+    def __init__(self, message: str, code: int = 2) -> None:
         super().__init__(message)
         self.code = code
 

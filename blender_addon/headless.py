@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The script that msspl-render runs in Blender, or in a Python that has bpy::
+"""Runs a job of msspl-render in Blender, or in a Python that has bpy::
 
     blender -b scene.blend --python headless.py -- job.json
     python -P headless.py job.json
@@ -19,11 +19,11 @@ Progress, reports and errors are printed. Each is one line: ``MSSPL`` and a JSON
 ``MSSPL {"fuse": {"lrhs": file, "hrls": file}}``, msspl-render fuses these files, and deletes them when no frame needs
 them any more. It then writes a line to standard input. A frame that it can't fuse ends the input.
 
-The line ``MSSPL {"size": [width, height], "layers": names or null, "pixel_bytes": number}`` comes before the first
-frame is rendered: the size of the HRLS, the passes with colours that it will have, and the bytes of all passes for each
-pixel (0 if they are not known). If they can't be fused, msspl-render ends this process.
+Before the first frame is rendered comes ``MSSPL {"size": [width, height], "layers": names or null, "pixel_bytes":
+number}``: the size of the HRLS, its passes with colours, and the bytes of all its passes for each pixel (0 if they are
+not known). If such a frame can't be fused, msspl-render ends this process.
 
-The line ``MSSPL {"no_vectors": reason}`` says that frames can't be fused with their neighbours, ``MSSPL {"warning":
+``MSSPL {"no_vectors": reason}`` says that frames can't be averaged with their neighbours, ``MSSPL {"warning":
 sentence}`` that all frames may be wrong.
 """
 
@@ -34,6 +34,7 @@ import shutil
 import sys
 import traceback
 from pathlib import Path
+from typing import NoReturn
 
 import bpy
 
@@ -44,18 +45,18 @@ run_job = importlib.import_module(f"{_FOLDER.name}.batch").run_job
 Failure = importlib.import_module(f"{_FOLDER.name}.errors").Failure
 
 
-def send(**message):
+def send(**message: object) -> None:
     """Print a message for msspl-render."""
     print("MSSPL", json.dumps(message), flush=True)
 
 
-def receive():
+def receive() -> None:
     """Wait until msspl-render has fused the frame."""
     if not sys.stdin.readline():
         raise Failure("the frame was not fused", 1)
 
 
-def leave(code):
+def leave(code: int) -> NoReturn:
     """End the process with an exit code."""
     sys.stdout.flush()
     if bpy.app.binary_path:

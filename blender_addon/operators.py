@@ -1,13 +1,15 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The buttons "Render and Fuse" and "Render and Fuse Animation". They run step by step in a window and block in a
-script."""
+"""Runs the two buttons, for a frame and for an animation: step by step in a window, blocking in a script."""
 
 import functools
 import re
 import tempfile
 import time
+from collections.abc import Callable, Generator, Sequence
+from pathlib import Path
 
 import bpy
+from bpy.types import Context, Event, Scene
 
 from . import compositor, frame, overrides, programs
 from .checks import check_scene
@@ -20,15 +22,18 @@ _CONSUME_EVENT = {"RUNNING_MODAL"}
 
 
 class _Job:
-    """An operator that does a job, which its ``_job`` yields step by step."""
+    """An operator whose ``_job`` yields its progress."""
 
     bl_options = {"UNDO"}
+    _cancelled: str
+    _job: Callable[..., Generator[frame.Progress, None, None]]
+    report: Callable[[set[str], str], None]
 
     @classmethod
-    def poll(cls, context):
+    def poll(cls, context: Context) -> bool:
         return not status.text
 
-    def execute(self, context):
+    def execute(self, context: Context) -> set[str]:
         status.text = "starting"  # From now on, poll() refuses a second job.
         self._steps = self._job(context)
         try:
@@ -38,7 +43,7 @@ class _Job:
             self._end()
         return result
 
-    def invoke(self, context, event):
+    def invoke(self, context: Context, event: Event) -> set[str]:
         status.text = "starting"
         self._steps, self._timer = self._job(context, window=True), None
         try:
@@ -49,7 +54,7 @@ class _Job:
             raise
         return {"RUNNING_MODAL"}
 
-    def modal(self, context, event):
+    def modal(self, context: Context, event: Event) -> set[str]:
         if event.type == "ESC":
             if bpy.app.is_job_running("RENDER"):  # Blender cancels its render itself.
                 return _CONTINUE
@@ -71,7 +76,7 @@ class _Job:
                 area.tag_redraw()
         return result
 
-    def cancel(self, context):
+    def cancel(self, context: Context) -> None:
         """Cancel the job and clean up. Blender also calls this when another file is opened."""
         try:
             if self._timer is not None:
@@ -80,13 +85,13 @@ class _Job:
         finally:
             self._end()
 
-    def _end(self):
+    def _end(self) -> None:
         try:
             self._steps.close()
         finally:
             status.text = ""
 
-    def _step(self):
+    def _step(self) -> set[str]:
         """Run the job up to its next step and return the operator's result."""
         try:
             self._doing = next(self._steps)
@@ -100,8 +105,10 @@ class _Job:
             return {"CANCELLED"}
         return _CONTINUE
 
-    def _finish(self, scene, path, warnings, text, frames=None):
-        """Show what is written in the compositor, and report it."""
+    def _finish(
+        self, scene: Scene, path: str, warnings: list[str], text: str, frames: Sequence[int] | None = None
+    ) -> None:
+        """Show the result in the compositor, and report it."""
         compositor.show(scene, path, scene.msspl.connect, frames)
         for warning in dict.fromkeys(warnings):
             self.report({"WARNING"}, warning)
@@ -115,7 +122,7 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
     bl_label = "Render and Fuse"
     _cancelled = "Cancelled; nothing was written"
 
-    def _job(self, context, window=False):
+    def _job(self, context: Context, window: bool = False) -> Generator[frame.Progress, None, None]:
         scene, settings = context.scene, context.scene.msspl
         identity, overwrite = (scene.name, scene.session_uid), scene.render.use_overwrite
         program = programs.find_fuse(_preference(context))
@@ -123,12 +130,11 @@ class MSSPL_OT_fuse(_Job, bpy.types.Operator):
         path = _numbered(settings.output, scene.frame_current)
         if path.startswith("//") and not bpy.data.filepath:
             raise Failure(f"{path}: save the .blend first, or give a full path")
-        with tempfile.TemporaryDirectory(prefix="msspl-") as work:
-            output = bpy.path.abspath(path)
-            run = functools.partial(programs.fuse, program, work=work, overwrite=overwrite, threads=options.threads)
-            report = yield from frame.render_and_fuse(
-                scene, options, output, work, run, overwrite=overwrite, window=window
-            )
+        with tempfile.TemporaryDirectory(prefix="msspl-") as name:
+            work, output = Path(name), Path(bpy.path.abspath(path))
+            fuse = functools.partial(programs.fuse, program, work, overwrite, options.threads)
+            job = frame.render_and_fuse(scene, options, output, work, fuse, overwrite=overwrite, window=window)
+            report = yield from job
         self._finish(overrides.find_scene(*identity), path, report.warnings, f"{path}: {report}")
 
 
@@ -140,7 +146,7 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
     bl_label = "Render and Fuse Animation"
     _cancelled = "Cancelled; the frames that were written stay"
 
-    def _job(self, context, window=False):
+    def _job(self, context: Context, window: bool = False) -> Generator[frame.Progress, None, None]:
         scene, settings = context.scene, context.scene.msspl
         identity, file = (scene.name, scene.session_uid), bpy.data.filepath
         program = programs.find_render(_preference(context))
@@ -149,48 +155,33 @@ class MSSPL_OT_fuse_animation(_Job, bpy.types.Operator):
         # Without a window, Blender does not know whether a file has changed.
         if not file or (bpy.data.is_dirty and not bpy.app.background):
             raise Failure(f"{file or 'the scene'}: save the .blend first; another Blender renders the saved file")
-        frames = range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
-        pattern = settings.output
+        pattern, frames = settings.output, range(scene.frame_start, scene.frame_end + 1, scene.frame_step)
         if not _LAST_NUMBER.search(pattern):
             raise Failure(f"{pattern}: name the frames with #### as the last number, such as //fused_####.exr")
-        outputs = [bpy.path.abspath(_numbered(pattern, number)) for number in frames]
+        outputs = {number: bpy.path.abspath(_numbered(pattern, number)) for number in frames}
         with tempfile.TemporaryDirectory(prefix="msspl-") as work:
             reports = yield from programs.render_shot(
-                program,
-                file,
-                scene=identity[0],
-                frames=frames,
-                outputs=outputs,
-                pattern=bpy.path.abspath(pattern),
-                options=options,
-                work=work,
-                overwrite=scene.render.use_overwrite,
-                average=settings.average,
+                program, Path(work), scene, options, bpy.path.abspath(pattern), outputs
             )
-        scene = overrides.find_scene(*identity)
-        self._finish(
-            scene,
-            _numbered(pattern, frames[0]),
-            [warning for report in reports for warning in report["warnings"]],
-            f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused"
-            + (f" {reports[0]['temporal']}" if reports else ""),
-            frames,
-        )
+        warnings = [warning for report in reports for warning in report["warnings"]]
+        text = f"{pattern}: {len(reports)} of {len(frames)} frames rendered and fused"
+        text += f" {reports[0]['temporal']}" if reports else ""
+        self._finish(overrides.find_scene(*identity), _numbered(pattern, frames[0]), warnings, text, frames)
 
 
 #: The frame number in the name of a file. The name of a folder may contain #.
 _NUMBER = re.compile(r"#+(?=[^/\\]*$)")
-#: The same as Blender's compositor takes it: the last number of the name.
+#: The last number of the name, which Blender's compositor takes for the frame number.
 _LAST_NUMBER = re.compile(r"(?<![\d#])#+[^/\\\d#]*$")
 
 
-def _numbered(pattern, number):
-    """The file of a frame."""
+def _numbered(pattern: str, number: int) -> str:
+    """Return the file of a frame."""
     return _NUMBER.sub(lambda signs: f"{number:0{len(signs[0])}d}", pattern)
 
 
-def _preference(context):
-    """Path of msspl-fuse in the add-on's preferences; empty if there is none."""
+def _preference(context: Context) -> str:
+    """Return the path of msspl-fuse in the add-on's preferences; empty if there is none."""
     addon = context.preferences.addons.get(__package__)
     return bpy.path.abspath(addon.preferences.program) if addon else ""
 
@@ -198,17 +189,17 @@ def _preference(context):
 _CLASSES = (MSSPL_OT_fuse, MSSPL_OT_fuse_animation)
 
 
-def register():
-    for each in _CLASSES:
-        bpy.utils.register_class(each)
+def register() -> None:
+    for added in _CLASSES:
+        bpy.utils.register_class(added)
     bpy.app.handlers.save_pre.append(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
         after.append(overrides.override_after_save)
 
 
-def unregister():
+def unregister() -> None:
     bpy.app.handlers.save_pre.remove(overrides.restore_for_save)
     for after in (bpy.app.handlers.save_post, bpy.app.handlers.save_post_fail):
         after.remove(overrides.override_after_save)
-    for each in reversed(_CLASSES):
-        bpy.utils.unregister_class(each)
+    for added in reversed(_CLASSES):
+        bpy.utils.unregister_class(added)

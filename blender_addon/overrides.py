@@ -1,21 +1,23 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Overriding settings of a scene for a while. The user's values come back afterwards, and saved files contain them."""
+"""Overrides settings of a scene for a while. The user's values come back afterwards, and saved files contain them."""
 
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from typing import Any
 
 import bpy
+from bpy.types import Scene
 
 from .errors import Failure
 
 #: The overrides that are active now: (name and session_uid of the scene, values, the user's values).
-_active = []
+_active: list[tuple[tuple[str, int], dict[str, Any], dict[str, Any]]] = []
 
 
 @contextmanager
-def override(scene, values):
+def override(scene: Scene, values: dict[str, Any]) -> Iterator[None]:
     """Set ``{data path: value}`` on a scene. The user's values come back however the block ends."""
-    identity = scene.name, scene.session_uid
-    users = {path: read(scene, path) for path in values}
+    identity, users = (scene.name, scene.session_uid), {path: read(scene, path) for path in values}
     active = identity, values, users
     _active.append(active)
     try:
@@ -29,43 +31,43 @@ def override(scene, values):
 
 
 @bpy.app.handlers.persistent
-def restore_for_save(*_):
-    """Before Blender saves a file: set the user's values, so that the file contains them."""
+def restore_for_save(*arguments: object) -> None:
+    """Set the user's values before Blender saves a file, so that the file contains them."""
     for identity, _, users in reversed(_active):
         with suppress(Failure):
             _write(find_scene(*identity), users)
 
 
 @bpy.app.handlers.persistent
-def override_after_save(*_):
-    """After Blender has saved a file: set the overriding values again."""
+def override_after_save(*arguments: object) -> None:
+    """Set the overriding values again after Blender has saved a file."""
     for identity, values, _ in _active:
         with suppress(Failure):
             _write(find_scene(*identity), values)
 
 
-def find_scene(name, uid):
-    """The scene with a ``session_uid``. Undo replaces scene objects, so a reference to one does not stay valid.
+def find_scene(name: str, uid: int) -> Scene:
+    """Return the scene with a ``session_uid``. Undo replaces scene objects, so a reference to one becomes invalid.
 
     Raises:
         Failure: the scene was removed.
     """
-    found = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
-    if found is None:
+    scene = next((scene for scene in bpy.data.scenes if scene.session_uid == uid), None)
+    if scene is None:
         raise Failure(f"scene '{name}' was removed while it was rendered; undo the removal and render again")
-    return found
+    return scene
 
 
-def read(scene, path):
-    """The value at a data path."""
+def read(scene: Scene, path: str) -> Any:
+    """Return the value at a data path."""
     return getattr(*_owner(scene, path))
 
 
-def _write(scene, values):
+def _write(scene: Scene, values: dict[str, Any]) -> None:
     for path, value in values.items():
         setattr(*_owner(scene, path), value)
 
 
-def _owner(scene, path):
+def _owner(scene: Scene, path: str) -> tuple[Any, str]:
     head, _, name = path.rpartition(".")
     return scene.path_resolve(head), name

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The panel Render Properties > MSSPL Fuse, its settings, and the add-on's preferences."""
+"""Draws the panel Render Properties > MSSPL Fuse, and holds its settings and the add-on's preferences."""
 
 from dataclasses import dataclass
 
 import bpy
 from bpy.props import BoolProperty, EnumProperty, IntProperty, PointerProperty, StringProperty
+from bpy.types import Context
 
 from .options import Options, hrls_size, lrhs_size
 
@@ -13,7 +14,7 @@ from .options import Options, hrls_size, lrhs_size
 class Status:
     """The current step of the running job. The text is empty if no job runs.
 
-    This is no Blender property, because that would be saved in the .blend.
+    A Blender property would be saved in the .blend.
     """
 
     text: str = ""
@@ -43,23 +44,19 @@ class MSSPLSettings(bpy.types.PropertyGroup):
     filter: EnumProperty(
         name="Pixel Filter",
         items=[
-            (
-                "BOX",
-                "Box",
-                "A low-resolution pixel is the mean of its full-resolution pixels, as the network expects",
-            ),
+            ("BOX", "Box", "A low-resolution pixel is the mean of its full-resolution pixels, as the network expects"),
             ("SCENE", "Scene", "The pixel filter of the scene"),
         ],
     )
     components: BoolProperty(
         name="All Component Passes",
-        description="Render diffuse, glossy, transmission, emission, environment and volume passes, from which the "
-        "beauty can be built again. Passes and light groups that the view layer has on are always rendered and fused",
+        description="Render diffuse, glossy, transmission, emission, environment and volume passes, which sum to the "
+        "beauty. Passes and light groups that the view layer has on are always rendered and fused",
     )
     average: BoolProperty(
         name="Average Neighbouring Frames",
-        description="In an animation: average each frame with four frames before and four after it, along the motion "
-        "of the surfaces. This needs motion blur to be off, and renders the pass Vector",
+        description="In an animation, average each frame with four frames before and four after it, along the motion "
+        "of the surfaces. It removes noise and flicker, needs motion blur to be off, and renders the pass Vector",
         default=True,
     )
     output: StringProperty(
@@ -74,7 +71,8 @@ class MSSPLSettings(bpy.types.PropertyGroup):
         description="Connect the fused frame to the compositor's output even if another node is connected there",
     )
 
-    def options(self, view_layer):
+    def options(self, view_layer: str) -> Options:
+        """Return the options of a frame of a view layer."""
         return Options(int(self.scale), self.hr_spp, self.lr_spp, self.filter, view_layer, self.components)
 
 
@@ -88,7 +86,7 @@ class MSSPLPreferences(bpy.types.AddonPreferences):
         subtype="FILE_PATH",
     )
 
-    def draw(self, context):
+    def draw(self, context: Context) -> None:
         self.layout.prop(self, "program")
 
 
@@ -101,10 +99,10 @@ class MSSPL_PT_fuse(bpy.types.Panel):
     COMPAT_ENGINES = {"CYCLES"}
 
     @classmethod
-    def poll(cls, context):
+    def poll(cls, context: Context) -> bool:
         return context.engine in cls.COMPAT_ENGINES
 
-    def draw(self, context):
+    def draw(self, context: Context) -> None:
         layout, scene = self.layout, context.scene
         settings = scene.msspl
         layout.use_property_split = True
@@ -125,13 +123,13 @@ class MSSPL_PT_fuse(bpy.types.Panel):
 CLASSES = (MSSPLSettings, MSSPLPreferences, MSSPL_PT_fuse)
 
 
-def register():
-    for each in CLASSES:
-        bpy.utils.register_class(each)
+def register() -> None:
+    for added in CLASSES:
+        bpy.utils.register_class(added)
     bpy.types.Scene.msspl = PointerProperty(type=MSSPLSettings)
 
 
-def unregister():
+def unregister() -> None:
     del bpy.types.Scene.msspl
-    for each in reversed(CLASSES):
-        bpy.utils.unregister_class(each)
+    for added in reversed(CLASSES):
+        bpy.utils.unregister_class(added)

@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Running msspl-fuse and msspl-render while Blender goes on.
+"""Runs msspl-fuse and msspl-render while Blender goes on.
 
-:func:`fuse` and :func:`render_shot` are generators that yield ``(current step, fraction done)``. Closing one ends its
-program.
+:func:`fuse` and :func:`render_shot` are generators that yield their progress. Closing one ends its program.
 """
 
 import json
@@ -11,11 +10,16 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
+from typing import Any
 
 import bpy
+from bpy.types import Scene
 
 from .errors import Failure
+from .frame import Progress
+from .options import Options
 
 #: msspl-fuse prints this after each step if it runs with -v.
 _STEP = re.compile(r"step (\d+) of (\d+)")
@@ -23,40 +27,38 @@ _STEP = re.compile(r"step (\d+) of (\d+)")
 _GRACE = 20
 
 
-def find_fuse(preference=""):
-    """Path of msspl-fuse: from the add-on's preferences, otherwise from ``MSSPL_FUSE``, otherwise from ``PATH``.
+def find_fuse(preference: str = "") -> str:
+    """Find msspl-fuse: in the add-on's preferences, otherwise in ``MSSPL_FUSE``, otherwise on ``PATH``.
 
     Raises:
         Failure: no program is found there.
     """
-    for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", os.environ.get("MSSPL_FUSE"))):
-        if name:
-            found = shutil.which(os.path.expanduser(name))
-            if found is None:
-                raise Failure(f"{name}: no such program; correct the path in {where}")
-            return found
-    found = shutil.which("msspl-fuse")
-    if found is None:
-        raise Failure(
-            "msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE"
-        )
-    return found
+    variable = os.environ.get("MSSPL_FUSE")
+    for where, name in (("the add-on's preferences", preference), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
+        program = shutil.which(os.path.expanduser(name)) if name else None
+        if program is not None:
+            return program
+        if name and where:
+            raise Failure(f"{name}: no such program; correct the path in {where}")
+    raise Failure("msspl-fuse is not on PATH; give its path in the add-on's preferences or in the variable MSSPL_FUSE")
 
 
-def find_render(preference=""):
-    """Path of msspl-render, which is installed beside msspl-fuse.
+def find_render(preference: str = "") -> str:
+    """Find msspl-render, which is installed beside msspl-fuse.
 
     Raises:
         Failure: one of the two is not found.
     """
-    beside = Path(find_fuse(preference))
-    found = shutil.which(str(beside.with_name(f"msspl-render{beside.suffix}")))
-    if found is None:
-        raise Failure(f"msspl-render does not lie beside {beside}; name the msspl-fuse that was installed with it")
-    return found
+    fuse = Path(find_fuse(preference))
+    program = shutil.which(str(fuse.with_name(f"msspl-render{fuse.suffix}")))
+    if program is None:
+        raise Failure(f"msspl-render does not lie beside {fuse}; name the msspl-fuse that was installed with it")
+    return program
 
 
-def fuse(program, lrhs, hrls, output, work, overwrite, threads):
+def fuse(
+    program: str, work: Path, overwrite: bool, threads: int, lrhs: str, hrls: str, output: str
+) -> Generator[Progress, None, dict[str, Any]]:
     """Fuse two files.
 
     Args:
@@ -72,29 +74,25 @@ def fuse(program, lrhs, hrls, output, work, overwrite, threads):
     # Blender's Image node shows all passes of a single-part file only.
     command = [program, lrhs, hrls, "-o", output, "--layout", "multilayer", "--no-preview", "--json", "-v"]
     command += ["--overwrite"] if overwrite else []
-    command += ["--threads", threads] if threads else []
+    command += ["--threads", str(threads)] if threads else []
 
-    def progress(log):
+    def progress(log: Path) -> Progress:
         steps = _STEP.findall(_read(log))
         return "fuse", (2 + (int(steps[-1][0]) / int(steps[-1][1]) if steps else 0)) / 3
 
     return (yield from _run("msspl-fuse", command, work, progress))
 
 
-def render_shot(program, file, *, scene, frames, outputs, pattern, options, work, overwrite, average):
-    """Render and fuse frames of a .blend in another Blender.
+def render_shot(
+    program: str, work: Path, scene: Scene, options: Options, pattern: str, outputs: dict[int, str]
+) -> Generator[Progress, None, list[dict[str, Any]]]:
+    """Render and fuse the frames of a scene that is saved, in another Blender.
 
     Args:
         program: of :func:`find_render`.
-        file: the .blend.
-        scene: the name of the scene in it.
-        frames: a range of their numbers.
-        outputs: the EXR of each.
-        pattern: the name of all of them, with # for the number.
-        options: :class:`.options.Options`.
         work: a folder for temporary files.
-        overwrite: replace files that exist. Otherwise their frames are left out.
-        average: average each frame with its neighbours.
+        pattern: the name of all EXRs, with # for the number.
+        outputs: the EXR of each frame, by its number. If the scene does not overwrite, frames that exist are left out.
 
     Returns:
         The reports of msspl-render, one for each frame that it has written.
@@ -102,43 +100,40 @@ def render_shot(program, file, *, scene, frames, outputs, pattern, options, work
     Raises:
         Failure: msspl-render failed. The message is its own.
     """
-    first, last, step = frames[0], frames[-1], frames.step
-    command = [program, file, "-o", pattern, "--frames", f"{first}-{last}x{step}", "--json"]
+    overwrite, frames = scene.render.use_overwrite, f"{min(outputs)}-{max(outputs)}x{scene.frame_step}"
+    command = [program, bpy.data.filepath, "-o", pattern, "--frames", frames, "--json"]
     command += ["--blender", bpy.app.binary_path or sys.executable]
-    command += ["--scene-name", scene, "--view-layer", options.view_layer]
-    command += ["--scale", options.scale, "--hr-spp", options.hr_spp, "--filter", options.filter.lower()]
-    command += ["--lr-spp", options.lr_spp] if options.lr_spp else []
+    command += ["--scene-name", scene.name, "--view-layer", options.view_layer]
+    command += ["--scale", str(options.scale), "--hr-spp", str(options.hr_spp), "--filter", options.filter.lower()]
+    command += ["--lr-spp", str(options.lr_spp)] if options.lr_spp else []
     command += ["--components"] if options.components else []
-    command += ["--threads", options.threads] if options.threads else []
-    command += ["--temporal", "auto" if average else "off", "--overwrite" if overwrite else "--skip-existing"]
-    before = [_written(path) for path in outputs] if overwrite else [None] * len(outputs)
-    done = 0
+    command += ["--threads", str(options.threads)] if options.threads else []
+    command += ["--temporal", "auto" if scene.msspl.average else "off"]
+    command += ["--overwrite" if overwrite else "--skip-existing"]
+    files = list(outputs.values())
+    before, done = [_written(path) if overwrite else None for path in files], 0
 
-    def progress(_):
+    def progress(_: Path) -> Progress:
         nonlocal done  # frames are written in order
-        while done < len(outputs) and _written(outputs[done]) not in (None, before[done]):
+        while done < len(files) and _written(files[done]) not in (None, before[done]):
             done += 1
-        return f"{done} of {len(outputs)} frames", done / len(outputs)
+        return f"{done} of {len(files)} frames", done / len(files)
 
     return (yield from _run("msspl-render", command, work, progress))
 
 
-def _run(name, command, work, progress):
-    """Run a program that prints JSON, and return that.
-
-    Args:
-        name: what messages call the program.
-        work: a folder for what it prints.
-        progress: takes the file of its messages, and returns what to yield.
-    """
+def _run(
+    name: str, command: Sequence[str], work: Path, progress: Callable[[Path], Progress]
+) -> Generator[Progress, None, Any]:
+    """Run a program and return the JSON that it prints. ``progress`` gets the file of its messages."""
     # The program runs in another Python, which must not get the variables of Blender's.
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("PYTHON")}
+    environment = {key: value for key, value in os.environ.items() if not key.startswith("PYTHON")}
     environment["PYTHONUTF8"] = "1"  # Paths and messages are in UTF-8 on every platform.
-    report, log = Path(work, "report.json"), Path(work, "messages.log")
+    report, log = work / "report.json", work / "messages.log"
     with report.open("wb") as out, log.open("wb") as err:
         try:
             process = subprocess.Popen(
-                [str(part) for part in command],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=out,
                 stderr=err,
@@ -159,19 +154,19 @@ def _run(name, command, work, progress):
     return json.loads(_read(report))
 
 
-def _written(path):
-    """When a file was written; None if there is none."""
+def _written(path: str) -> int | None:
+    """Return when a file was written, or None if there is no file."""
     try:
         return os.stat(path).st_mtime_ns
     except OSError:
         return None
 
 
-def _read(path):
+def _read(path: Path) -> str:
     return path.read_text(encoding="utf-8", errors="replace")
 
 
-def _end(process):
+def _end(process: subprocess.Popen[bytes]) -> None:
     if process.poll() is None:
         process.terminate()
         try:

@@ -1,16 +1,18 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""Rendering a scene to the file that it names."""
+"""Renders a scene to the file that its settings name."""
 
 import os
 import re
+from collections.abc import Iterator
 
 import bpy
+from bpy.types import Scene
 
 from .errors import Cancelled, Failure
 
 
-def render(scene, file, *, window=False):
-    """Render the scene with its present settings. This is a generator that yields while Blender renders.
+def render(scene: Scene, file: str, *, window: bool = False) -> Iterator[None]:
+    """Render the scene with its present settings, and yield while Blender renders.
 
     Args:
         file: the path in ``render.filepath``.
@@ -33,6 +35,6 @@ def render(scene, file, *, window=False):
         raise Cancelled
 
 
-def escape_path(path):
-    """A path for ``render.filepath``, where Blender replaces ``{name}`` by the value of a variable."""
+def escape_path(path: str) -> str:
+    """Double the braces of a path for ``render.filepath``, where Blender takes ``{name}`` for a variable."""
     return path.replace("{", "{{").replace("}", "}}")

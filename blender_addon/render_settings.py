@@ -5,10 +5,12 @@ Dictionaries of data paths can be merged, read back and restored by code that kn
 """
 
 import re
+from typing import Any
 
 import bpy
+from bpy.types import Scene
 
-from .options import find_view_layer, hrls_size, lrhs_size, view_layer_path
+from .options import Options, find_view_layer, hrls_size, lrhs_size, view_layer_path
 
 BLENDER_5 = bpy.app.version >= (5, 0, 0)
 
@@ -41,8 +43,8 @@ _LINEAR = re.compile(r"(?<![a-z])lin(ear)?(?![a-z])|acescg|aces2065", re.IGNOREC
 _LRHS_SEED = 1009
 
 
-def lrhs(scene, options):
-    """Settings of the LRHS."""
+def lrhs(scene: Scene, options: Options) -> dict[str, Any]:
+    """Return the settings of the LRHS."""
     (width, height), (full_width, full_height) = lrhs_size(scene, options.scale), hrls_size(scene)
     aspect_x, aspect_y = scene.render.pixel_aspect_x, scene.render.pixel_aspect_y
     # The size is rounded up, so the pixel aspect is adjusted until the LRHS shows exactly the frame.
@@ -60,8 +62,8 @@ def lrhs(scene, options):
     }
 
 
-def hrls(scene, options):
-    """Settings of the HRLS."""
+def hrls(scene: Scene, options: Options) -> dict[str, Any]:
+    """Return the settings of the HRLS."""
     width, height = hrls_size(scene)
     return _common(scene, options) | {
         "render.resolution_x": width,
@@ -70,8 +72,8 @@ def hrls(scene, options):
     }
 
 
-def plain(scene, options, spp):
-    """Settings of an ordinary render that Cycles denoises with OIDN at its highest quality."""
+def plain(scene: Scene, options: Options, spp: int) -> dict[str, Any]:
+    """Return the settings of an ordinary render that Cycles denoises with OIDN at its highest quality."""
     return hrls(scene, options) | {
         "render.use_persistent_data": False,  # Its time includes loading the scene, as the time of the LRHS does.
         "cycles.samples": spp,
@@ -84,11 +86,11 @@ def plain(scene, options, spp):
     }
 
 
-def _common(scene, options):
-    """Settings of both renders: the passes, unbiased and unfiltered noise, and a lossless multilayer EXR."""
+def _common(scene: Scene, options: Options) -> dict[str, Any]:
+    """Return what both renders share: the passes, unbiased and unfiltered noise, and a lossless multilayer EXR."""
     image = scene.render.image_settings
     chosen = find_view_layer(scene, options)
-    values = {f"{view_layer_path(each)}.use": each == chosen for each in scene.view_layers}
+    values = {f"{view_layer_path(layer)}.use": layer == chosen for layer in scene.view_layers}
     passes = [*_PASSES, *(["use_pass_vector"] if options.vectors else [])]
     if options.components:
         # Behind a transparent film, Combined has no environment, but the pass Environment would have it.
@@ -100,7 +102,7 @@ def _common(scene, options):
         "cycles.time_limit": 0.0,
         "cycles.use_layer_samples": "IGNORE",
         "cycles.use_sample_subset": False,
-        # Noise must be independent from pixel to pixel, and clamping would darken the two renders differently.
+        # Pixels must have independent noise, and clamping would darken the two renders differently.
         "cycles.sampling_pattern": "TABULATED_SOBOL",
         "cycles.auto_scrambling_distance": False,
         "cycles.scrambling_distance": 1.0,
@@ -132,16 +134,16 @@ def _common(scene, options):
     return values
 
 
-def linear_override(scene):
-    """The colour space that the scene's output is overridden with, if it is linear; otherwise an empty text."""
+def linear_override(scene: Scene) -> str:
+    """Return the colour space that overrides the scene's for its output, if it is linear; otherwise an empty text."""
     image = scene.render.image_settings
     name = image.linear_colorspace_settings.name
     overridden = image.color_management == "OVERRIDE" and image.has_linear_colorspace
     return name if overridden and _LINEAR.search(name) else ""
 
 
-def _colour_space(scene):
-    """The colour space of the file. Without an override it is that in which the scene is rendered."""
+def _colour_space(scene: Scene) -> dict[str, Any]:
+    """Return the colour space of the file: an override, or else the space in which the scene is rendered."""
     values = {"render.image_settings.color_management": "OVERRIDE" if linear_override(scene) else "FOLLOW_SCENE"}
     name = scene.render.image_settings.linear_colorspace_settings.name
     if name:  # Blender can change it when the file format is set. It is empty if the configuration lacks it.

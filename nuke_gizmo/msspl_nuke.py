@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The gizmo's buttons and the menu. Only this module and init.py import nuke.
+"""Runs the gizmo's buttons and the menu. Only this module and init.py import nuke.
 
 A button runs in Nuke's main thread and starts a thread that watches msspl-fuse. Nodes may be touched in the main thread
 only, so the watching thread calls ``nuke.executeInMainThread``.
@@ -49,7 +49,7 @@ def fuse_range(node: nuke.Node) -> None:
 
 
 def rebuild(node: nuke.Node) -> None:
-    """Below the Read of the fused file, make a group for each fused set that builds the beauty from its layers."""
+    """Make a group for each fused set, below the Read of the fused file, that builds the beauty from the layers."""
     try:
         with node.parent():
             read = _made_read(node.name())
@@ -88,7 +88,7 @@ def copy_to_group() -> None:
 
 @dataclass(frozen=True)
 class _Job:
-    """All that the watching thread needs, read from the nodes in the main thread."""
+    """The values that the watching thread needs, read from the nodes in the main thread."""
 
     node: nuke.Node
     name: str
@@ -129,10 +129,7 @@ def _prepare(node: nuke.Node, first: int, last: int, as_range: bool) -> _Job:
     if as_range:
         ranges = [ReadRange(read.name(), _file_at(read, first), _file_at(read, last)) for read in reads]
         numbers = file_numbers(ranges, out, first, last)
-    settings = Settings(
-        **{knob: _text(node, knob) for knob in _KNOBS},
-        overwrite=bool(node["overwrite"].value()),
-    )
+    settings = Settings(**{knob: _text(node, knob) for knob in _KNOBS}, overwrite=bool(node["overwrite"].value()))
     program = find_program(_path(node, "program"), os.environ)
     return _Job(
         node=node,
@@ -147,22 +144,22 @@ def _prepare(node: nuke.Node, first: int, last: int, as_range: bool) -> _Job:
 
 
 def _find_read(node: nuke.Node, index: int, label: str) -> nuke.Node:
-    """The Read that feeds an input, directly or through nodes that change nothing."""
-    found = node.input(index)
-    while found is not None and found.Class() in _PASS_THROUGH:
-        found = found.input(0)
-    if found is None:
+    """Return the Read that feeds an input, directly or through nodes that change nothing."""
+    source = node.input(index)
+    while source is not None and source.Class() in _PASS_THROUGH:
+        source = source.input(0)
+    if source is None:
         raise FuseError(f"nothing is connected to {label}; connect the Read of that render")
-    if found.Class() != "Read":
+    if source.Class() != "Read":
         raise FuseError(
-            f"{label} is connected to {found.name()} ({found.Class()}), but MSSPLFuse reads files; connect the Read "
+            f"{label} is connected to {source.name()} ({source.Class()}), but MSSPLFuse reads files; connect the Read "
             "itself, or write the image to an EXR and read that"
         )
-    return found
+    return source
 
 
 def _file_at(read: nuke.Node, frame: int) -> FrameFile:
-    """The file that a Read reads at a frame. Nuke is asked, so every frame mode and expression is followed."""
+    """Ask Nuke for the file that a Read reads at a frame. Nuke follows every frame mode and expression."""
     pattern, path = nuke.filename(read), read.metadata("input/filename", frame)
     if not pattern or not path:
         raise FuseError(f"{read.name()} has no file at frame {frame}; go to a frame that is rendered")
@@ -174,7 +171,7 @@ def _text(node: nuke.Node, knob: str) -> str:
 
 
 def _path(node: nuke.Node, knob: str) -> str:
-    """The value of a file knob. Nuke evaluates its expressions and leaves ``%04d`` for the frame."""
+    """Return the value of a file knob. Nuke evaluates its expressions and leaves ``%04d`` for the frame."""
     return str(cast(nuke.File_Knob, node[knob]).getEvaluatedValue() or "").strip()
 
 
@@ -208,7 +205,7 @@ def _watch(job: _Job) -> None:
 
 
 def _has_frames(job: _Job) -> bool:
-    """Whether a range that failed or was cancelled has at least one finished frame."""
+    """Return whether a range that failed or was cancelled has at least one finished frame."""
     numbers = range(job.numbers[0], job.numbers[1] + 1) if job.numbers else ()
     return any(os.path.exists(replace(job.out, number=n).path) for n in numbers)
 
@@ -243,7 +240,7 @@ def _show(job: _Job, warnings: list[str]) -> None:
 
 
 def _made_read(node_name: str) -> nuke.Node | None:
-    """The Read that an earlier job made for a node of the current group."""
+    """Return the Read that an earlier job made for a node of the current group."""
     reads = (n for n in nuke.allNodes("Read") if n.knob(_MADE_BY) and n[_MADE_BY].value() == node_name)
     return next(reads, None)
 
@@ -265,7 +262,7 @@ _REBUILD, _DIFFERENCE = "rebuild", "difference"
 
 
 def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
-    """A group that adds up the layers of a set, and shows the sum or its difference from the beauty.
+    """Make a group that adds up the layers of a set, and shows the sum or its difference from the beauty.
 
     Every layer has a Shuffle of its own, behind which the artist may put a Grade.
     """
@@ -301,7 +298,7 @@ def _rebuild_group(read: nuke.Node, fused: FusedSet) -> nuke.Group:
 
 
 def _shuffle(source: nuke.Node, layer: str, x: int, y: int) -> nuke.Node:
-    """A layer as rgb."""
+    """Make a Shuffle that shows a layer as rgb."""
     return _node("Shuffle", [source], x, y, **{"in": layer, "label": layer})
 
 
@@ -310,10 +307,10 @@ def _merge(operation: str, b: nuke.Node, a: nuke.Node, x: int, y: int) -> nuke.N
 
 
 def _node(kind: str, inputs: list[nuke.Node], x: int, y: int, **knobs: str) -> nuke.Node:
-    """A node in the current group."""
+    """Make a node in the current group."""
     node = getattr(nuke.nodes, kind)()
-    for index, each in enumerate(inputs):
-        node.setInput(index, each)
+    for index, source in enumerate(inputs):
+        node.setInput(index, source)
     for name, value in knobs.items():
         node[name].setValue(value)
     node.setXYpos(x, y)

@@ -27,7 +27,7 @@ from typing import NamedTuple
 
 #: Seconds after which a run counts as hung.
 TIME_LIMIT = 30
-#: What ``--max-memory`` is set to, in MiB. It is more than the pairs need.
+#: The value of ``--max-memory``, in MiB. It is more than the pairs need.
 MAX_MEMORY = 1024
 
 
@@ -43,7 +43,7 @@ class Attribute(NamedTuple):
 
 
 def attributes(data: bytes) -> Iterator[Attribute]:
-    """The attributes of all headers of an EXR."""
+    """Yield the attributes of all headers of an EXR."""
     position, several = 8, bool(struct.unpack_from("<I", data, 4)[0] & 0x1000)
     while data[position]:
         while data[position]:
@@ -63,7 +63,7 @@ CORNERS = (-(2**31), 2**31 - 1, -1, 0, 1, 7, 10**4, 10**6, 2**20, 2**24)
 
 
 def flip(data: bytearray, rng: random.Random) -> None:
-    """A few bytes anywhere."""
+    """Change a few bytes anywhere."""
     for _ in range(rng.choice((1, 3, 20))):
         data[rng.randrange(len(data))] ^= rng.randrange(1, 256)
 
@@ -79,7 +79,7 @@ def truncate(data: bytearray, rng: random.Random) -> None:
 
 
 def forge_window(data: bytearray, rng: random.Random) -> None:
-    windows = [each for each in attributes(data) if each.name in ("dataWindow", "displayWindow")]
+    windows = [attribute for attribute in attributes(data) if attribute.name in ("dataWindow", "displayWindow")]
     for window in rng.sample(windows, rng.randint(1, len(windows))):
         for corner in rng.sample(range(4), rng.randint(1, 4)):
             struct.pack_into("<i", data, window.size + 4 + 4 * corner, rng.choice(CORNERS))
@@ -87,9 +87,13 @@ def forge_window(data: bytearray, rng: random.Random) -> None:
 
 def forge_name(data: bytearray, rng: random.Random) -> None:
     """Overwrite a part of a channel list, of a part's name, or of the name of any attribute."""
-    found = list(attributes(data))
-    named = [each for each in found if each.name in ("channels", "name", "view", "multiView")] or found
-    start, end = rng.choice([(each.size + 4, each.end) for each in named] + [(e.start, e.size) for e in found])
+    everything = list(attributes(data))
+    named = [entry for entry in everything if entry.name in ("channels", "name", "view", "multiView")] or everything
+    values, names = (
+        [(entry.size + 4, entry.end) for entry in named],
+        [(entry.start, entry.size) for entry in everything],
+    )
+    start, end = rng.choice(values + names)
     bad = rng.choice(BAD_NAMES)[: end - start]
     place = rng.randint(start, max(start, end - len(bad) - 1))
     data[place : place + len(bad)] = bad
@@ -116,29 +120,29 @@ MUTATIONS: tuple[Callable[[bytearray, random.Random], None], ...] = (
 
 
 def mutant(data: bytes, seed: str) -> tuple[str, bytes]:
-    """What was done to a file, and the damaged file."""
-    rng, changed = random.Random(seed), bytearray(data)
+    """Damage a file, and return the name of the damage and the file."""
+    rng, damaged = random.Random(seed), bytearray(data)
     mutation = rng.choice(MUTATIONS)
-    mutation(changed, rng)
-    return mutation.__name__, bytes(changed)
+    mutation(damaged, rng)
+    return mutation.__name__, bytes(damaged)
 
 
 def mutants(pairs: list[tuple[Path, Path]], folder: Path, count: int, seed: int) -> Iterator[tuple[str, Path, Path]]:
-    """Write damaged pairs to ``folder``, one at a time; yields what was done, the LRHS and the HRLS."""
+    """Write damaged pairs to ``folder``, one at a time, and yield the damage in words, the LRHS and the HRLS."""
     rng = random.Random(seed)
     for number in range(count):
         pair = [*pairs[number % len(pairs)]]
         side = int(rng.random() < 0.75)
-        what, data = mutant(pair[side].read_bytes(), f"{seed} {number}")
+        damage, data = mutant(pair[side].read_bytes(), f"{seed} {number}")
         damaged = folder / pair[side].name
         damaged.write_bytes(data)
         pair[side] = damaged
-        yield f"{number}: {what} in {pairs[number % len(pairs)][side]}", pair[0], pair[1]
+        yield f"{number}: {damage} in {pairs[number % len(pairs)][side]}", pair[0], pair[1]
         damaged.unlink()
 
 
 def fault(code: int, output: str, seconds: float, peak: int, limit: int) -> str:
-    """What a run did that no run may do, or an empty string.
+    """Return the fault of a run in words, or an empty string.
 
     Args:
         code: exit code; negative for a signal.

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The programs as users run them."""
+"""Runs the programs as users run them."""
 
+import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -18,8 +20,20 @@ def fuse(*arguments):
     return run("msspl_fuse", *arguments)
 
 
+def start(command, **options):
+    """Start a process that signals can end, even if this one ignores some of them, as under nohup."""
+
+    def listen():
+        for name in ("SIGINT", "SIGTERM", "SIGHUP"):
+            signal.signal(getattr(signal, name), signal.SIG_DFL)
+
+    listening = {"preexec_fn": listen} if os.name == "posix" else {}
+    streams = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True}
+    return subprocess.Popen([*map(str, command)], **(listening | streams | options))
+
+
 def leave_temporary(target):
-    """The temporary file of a process that was killed while it wrote ``target``."""
+    """Return the temporary file of a process that was killed while it wrote ``target``."""
     code = (
         "import sys, os; from pathlib import Path; from oiio_msspl.exr import atomic\n"
         "atomic._machine = lambda: sys.argv[2]\n"

@@ -1,2 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The command lines ``msspl-fuse`` and ``msspl``. A command parses, calls one library function, and prints."""
+"""Holds the command lines ``msspl-fuse``, ``msspl-render`` and ``msspl``.
+
+A command parses, calls one library function, and prints.
+"""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The programs. Heavy modules are imported inside the commands, so that ``--help`` answers at once."""
+"""Builds the programs. Commands import heavy modules when they run, so that ``--help`` answers at once."""
 
 from __future__ import annotations
 

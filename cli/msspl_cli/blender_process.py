@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Blender as a process: finding it, starting it with the add-on's headless.py, and reading what that tells."""
+"""Finds Blender, starts it with the add-on's headless.py, and reads what that prints."""
 
 from __future__ import annotations
 
@@ -20,18 +20,19 @@ from msspl_cli.installed import shipped_folder
 from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import temporary_folder
 
-#: What Blender prints while it renders.
+#: The line that Blender prints while it renders.
 _SAMPLES = re.compile(r"Sample (\d+)/(\d+)")
-#: What a Python without bpy prints: one that is too old for bpy, or one that lacks the module.
+#: The message of a Python that is too old for bpy, or that lacks the module.
 _NO_BPY = re.compile(r"unknown option:? -P|No module named 'bpy'", re.IGNORECASE)
-#: What to do about a program that is no Blender.
+#: The advice about another program than Blender.
 _NAME_ANOTHER = "name Blender, or a Python that has bpy, with --blender or MSSPL_BLENDER"
 #: Seconds that Blender gets to end.
 _GRACE = 15
+_POSIX = os.name == "posix"
 
 
 def find_blender(named: str | None) -> str:
-    """Blender's program, or a Python that has bpy.
+    """Find Blender, or a Python that has bpy.
 
     Args:
         named: a program or its name. None: the one that MSSPL_BLENDER names, or else ``blender`` on the path.
@@ -39,16 +40,13 @@ def find_blender(named: str | None) -> str:
     Raises:
         InputError: there is no such program.
     """
-    for where, name in (("--blender", named), ("MSSPL_BLENDER", os.environ.get("MSSPL_BLENDER"))):
-        if name:
-            found = shutil.which(os.path.expanduser(name))
-            if found is None:
-                raise InputError(f"{where} {name}: no such program")
-            return found
-    found = shutil.which("blender")
-    if found is None:
-        raise InputError("blender is not on the path; name it with --blender or MSSPL_BLENDER")
-    return found
+    for where, name in (("--blender", named), ("MSSPL_BLENDER", os.environ.get("MSSPL_BLENDER")), ("", "blender")):
+        program = shutil.which(os.path.expanduser(name)) if name else None
+        if program is not None:
+            return program
+        if name and where:
+            raise InputError(f"{where} {name}: no such program")
+    raise InputError("blender is not on the path; name it with --blender or MSSPL_BLENDER")
 
 
 def render_frames(
@@ -66,12 +64,12 @@ def render_frames(
     Args:
         program: Blender, or a Python that has bpy.
         scene: a .blend.
-        job: what headless.py reads: frames and settings.
-        folder: of the results. The renders lie in it, so that one that is kept is only renamed.
-        on_event: called with each event: a step that begins, the share of samples that is done, or the report of a
+        job: the frames and the settings that headless.py reads.
+        folder: the folder of the results. The renders lie in it, so that a render that is kept is only renamed.
+        on_event: called with each event: a step that begins, the fraction of samples that is done, or the report of a
             frame that ended.
         fuse: called with the files of the LRHS and of the HRLS of each frame. Its errors name the frame.
-        verbose: print what Blender prints.
+        verbose: pass on the messages of Blender.
 
     Raises:
         InputError, MssplError: a frame failed. The message names it if the job has several.
@@ -102,7 +100,7 @@ def render_frames(
 
 
 def command(program: str, scene: Path, job: Path) -> list[str]:
-    """The arguments that make Blender, or a Python that has bpy, do the job of a file."""
+    """Return the arguments that make Blender, or a Python that has bpy, do the job of a file."""
     script = str(shipped_folder("blender_addon") / "headless.py")
     if Path(program).name.lower().startswith("python"):
         return [program, "-P", script, str(job)]  # -P: modules beside the script must not hide others
@@ -116,33 +114,20 @@ def run_blender(
 
     Args:
         arguments: of :func:`command`.
-        fuse: see :func:`render_frames`.
-        verbose: print what Blender prints.
+        fuse: called with the files of the LRHS and of the HRLS of each frame.
+        verbose: pass on the messages of Blender.
 
     Yields:
-        The events that headless.py prints, and ``{"samples": share}`` for each line about samples.
+        The events that headless.py prints, and ``{"samples": fraction}`` for each line about samples.
 
     Raises:
         InputError, MssplError: the job failed. The message is that of headless.py.
-        Exception: what ``fuse`` raised, once Blender has ended.
+        Exception: an error of ``fuse``, once Blender has ended.
     """
-    posix = os.name == "posix"
-    try:
-        started = subprocess.Popen(
-            arguments,
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            text=True,
-            errors="replace",
-            start_new_session=posix,  # a process group, which can be ended as a whole
-        )
-    except OSError as refused:
-        raise InputError(f"{arguments[0]}: can't be started ({refused.strerror}); {_NAME_ANOTHER}") from refused
-    with started as process:
+    last: deque[str] = deque(maxlen=5)
+    error: dict[str, Any] | None = None
+    with _start(arguments) as process:
         assert process.stdin is not None and process.stdout is not None
-        last: deque[str] = deque(maxlen=5)
-        error, failure = None, None
         try:
             for line in process.stdout:
                 if line.startswith("MSSPL "):
@@ -150,14 +135,7 @@ def run_blender(
                     if "error" in event:
                         error = event
                     elif "fuse" in event:
-                        try:
-                            fuse(*(Path(event["fuse"][key]) for key in ("lrhs", "hrls")))
-                        except Exception as raised:
-                            failure = raised
-                            process.stdin.close()  # Blender ends by itself
-                        else:
-                            with contextlib.suppress(BrokenPipeError):  # Blender has ended; its exit code says why
-                                print("fused", file=process.stdin, flush=True)
+                        _fuse(process, event["fuse"], fuse)
                     else:
                         yield event
                     continue
@@ -170,11 +148,9 @@ def run_blender(
             process.wait()
         finally:
             if process.poll() is None:
-                _end(process, group=posix)
+                _end(process)
             with contextlib.suppress(BrokenPipeError):  # leaving the `with` would write what Blender has not read
                 process.stdin.close()
-    if failure is not None:
-        raise failure
     if error is not None:
         raise (InputError if error["code"] == 2 else MssplError)(error["error"])
     if process.returncode:
@@ -184,10 +160,40 @@ def run_blender(
         raise MssplError(f"{arguments[0]}: ended with code {process.returncode}" + (f": {said}" if said else ""))
 
 
-def _end(process: subprocess.Popen[str], *, group: bool) -> None:
-    """End a process, or its whole group: first with SIGTERM, then with SIGKILL."""
+def _start(arguments: Sequence[str]) -> subprocess.Popen[str]:
+    """Start a process in a group of its own, which can be ended as a whole."""
+    try:
+        return subprocess.Popen(
+            arguments,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
+            text=True,
+            errors="replace",
+            start_new_session=_POSIX,
+        )
+    except OSError as refused:
+        raise InputError(f"{arguments[0]}: can't be started ({refused.strerror}); {_NAME_ANOTHER}") from refused
+
+
+def _fuse(process: subprocess.Popen[str], files: dict[str, str], fuse: Callable[[Path, Path], None]) -> None:
+    """Fuse a frame, and tell Blender to go on. An error lets Blender end by itself, because its input ends."""
+    assert process.stdin is not None and process.stdout is not None
+    try:
+        fuse(Path(files["lrhs"]), Path(files["hrls"]))
+    except Exception:
+        process.stdin.close()
+        process.stdout.read()
+        process.wait()
+        raise
+    with contextlib.suppress(BrokenPipeError):  # Blender has ended; its exit code says why
+        print("fused", file=process.stdin, flush=True)
+
+
+def _end(process: subprocess.Popen[str]) -> None:
+    """End a process and its group: first with SIGTERM, then with SIGKILL."""
     for end in (signal.SIGTERM, getattr(signal, "SIGKILL", signal.SIGTERM)):
-        if group:
+        if _POSIX:
             os.killpg(process.pid, end)
         else:
             process.send_signal(end)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tables and progress bars, drawn by rich on a terminal.
+"""Prints tables and progress bars, which rich draws on a terminal.
 
 In a pipe or a file a table is plain text with aligned columns: no colours, no boxes, and no line is wrapped. A progress
 bar is drawn on a terminal only. Results go to standard output, messages and progress to standard error.
@@ -8,7 +8,7 @@ bar is drawn on a terminal only. Results go to standard output, messages and pro
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import printable
@@ -24,30 +24,19 @@ _STYLES = {"fused": "green", "failed": "red", "missing": "red", "not done": "yel
 
 
 def say(text: str, *, error: bool = False) -> None:
-    """Print a line that may contain names out of a file, see :func:`oiio_msspl.errors.printable`.
-
-    Args:
-        text: one line.
-        error: print to standard error instead of standard output.
-    """
+    """Print a line, on standard error if it is an ``error``. Control characters in names out of a file are escaped."""
     print(printable(text), file=sys.stderr if error else sys.stdout, flush=True)
 
 
 def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 2) -> None:
-    """Print rows with aligned columns on standard output.
-
-    Args:
-        rows: cells, equally many in each row.
-        header: whether the first row holds the columns' titles.
-        indent: spaces in front of each row.
-    """
+    """Print rows of equally many cells, as aligned columns. With ``header``, the first row holds the titles."""
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text
 
     console = _console(stderr=False)
     grid = Table(box=None, show_header=False, pad_edge=False, padding=(0, 2, 0, 0))
-    # rich would fold the cells before a column that is empty.
+    # rich would fold the cells before an empty column.
     filled = [column for column in range(len(rows[0])) if any(row[column] for row in rows)]
     for _ in filled:
         grid.add_column(overflow="fold")
@@ -62,27 +51,32 @@ def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 
         print(line.rstrip())
 
 
-def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
+def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str], mapped: Collection[str] = ()) -> None:
     """Print which layer each feature is read from.
+
+    A feature that the model does not read is left out, unless the user may wonder why.
 
     Args:
         rows: of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` or
             :meth:`oiio_msspl.jobs.report.FrameReport.aovs`.
         notes: sentences printed below.
+        mapped: features that the user has mapped.
     """
     from oiio_msspl.aovs.mapped_render import origin
 
-    table([(row["feature"], origin(row)) for row in rows])
+    shown = [row for row in rows if row["status"] != "unused" or (row["source"] and row["feature"] in mapped)]
+    table([(row["feature"], origin(row)) for row in shown])
     for note in notes:
         say(f"  note: {note}")
 
 
-class ProgressBar:
-    """A progress bar on standard error, for a ``with`` statement. It appears at the first update and then vanishes.
+def views_in_words(names: Sequence[str]) -> str:
+    """Continue a sentence with the views that were fused, if there are several in the file."""
+    return f", view{'s' if len(names) > 1 else ''} {', '.join(names)}" if names else ""
 
-    Args:
-        shown: whether it may appear. It also needs a terminal.
-    """
+
+class ProgressBar:
+    """A progress bar for a ``with`` statement. It appears on standard error at the first update, on a terminal only."""
 
     def __init__(self, shown: bool = True) -> None:
         self.shown = shown and sys.stderr.isatty()
@@ -123,7 +117,7 @@ class ProgressBar:
 
 
 def _console(*, stderr: bool) -> Console:
-    """A console that prints text as it is: layer names may contain brackets, which rich would take for markup."""
+    """Make a console that prints text as it is, because rich would take brackets in layer names for markup."""
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout

@@ -32,7 +32,7 @@ def run(app: typer.Typer) -> None:
 
 
 def _make_streams_usable() -> None:
-    """A name that a stream's encoding lacks is escaped, and a stream that is closed, as daemons have it, takes all."""
+    """Escape characters that a stream's encoding lacks, and discard what goes to a closed stream (daemons have one)."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None:
@@ -50,12 +50,12 @@ def _exit_on_signals() -> None:
     ending = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
     def leave(number: int, _frame: object) -> None:
-        for each in ending:
-            signal.signal(each, signal.SIG_IGN)
+        for other in ending:
+            signal.signal(other, signal.SIG_IGN)
         if number == signal.SIGINT:
             raise KeyboardInterrupt
         sys.exit(128 + number)
 
-    for each in ending:
-        if signal.getsignal(each) is not signal.SIG_IGN:  # nohup ignores SIGHUP
-            signal.signal(each, leave)
+    for number in ending:
+        if signal.getsignal(number) is not signal.SIG_IGN:  # nohup ignores SIGHUP
+            signal.signal(number, leave)

@@ -9,12 +9,12 @@ from pathlib import Path
 
 
 def shipped_folder(name: str) -> Path:
-    """A folder shipped with the package: inside it, or in the source tree of an editable installation."""
+    """Return a folder shipped with the package: inside it, or in the source tree of an editable installation."""
     package = Path(__file__).resolve().parent
     installed = package / name
     return installed if installed.is_dir() else package.parents[1] / name
 
 
 def find_msspl_fuse() -> str | None:
-    """msspl-fuse beside this Python, or else on the path. Hosts seldom run in an activated virtual environment."""
+    """Find msspl-fuse beside this Python, or else on the path: hosts seldom run in an activated environment."""
     return shutil.which("msspl-fuse", path=sysconfig.get_path("scripts")) or shutil.which("msspl-fuse")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Options that several commands share, and how they become values of the library.
+"""Holds the options that several commands share, and turns them into values of the library.
 
 ``--help`` shows the options of everyday work. Those marked ``hidden`` appear in ``--help-all``.
 """
@@ -18,13 +18,19 @@ from oiio_msspl.errors import InputError, printable
 if TYPE_CHECKING:
     from oiio_msspl.exr.write_options import WriteOptions
     from oiio_msspl.jobs.inputs import InputOptions
-    from oiio_msspl.jobs.plan import TemporalOptions
 
 #: Bytes above which a size is a slip. Larger numbers are infinite as floats.
 LARGEST_MEMORY = 1 << 62
 
 #: Groups of options in the help text.
 INPUT, MODEL, OUTPUT, SHOT = "Input", "Model", "Output", "Shot"
+
+
+def option(
+    group: str | None, text: str, *names: str, metavar: str | None = None, hidden: bool = False, **more: Any
+) -> Any:
+    """Describe an option, and its group in the help text. Without names, it is called as its parameter."""
+    return typer.Option(*names, help=text, metavar=metavar, hidden=hidden, rich_help_panel=group, **more)
 
 
 def _show_all(context: typer.Context, wanted: bool) -> None:
@@ -36,196 +42,78 @@ def _show_all(context: typer.Context, wanted: bool) -> None:
         raise typer.Exit
 
 
-LowRender = Annotated[
-    Path,
-    typer.Argument(
-        metavar="LR",
-        help="Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr.",
-        show_default=False,
-    ),
-]
-HighRender = Annotated[
-    Path, typer.Argument(metavar="HR", help="High-resolution, low-spp render, in the same form.", show_default=False)
-]
-Map = Annotated[
-    list[str],
-    typer.Option(
-        "--map",
-        metavar="FEATURE=LAYER",
-        help="Read a feature (rgb, albedo, normal, diffuse, specular, variance) from this layer, from a sum of layers "
-        "(lighting+GI) or from another EXR. rgb takes a single layer. May be repeated.",
-        rich_help_panel=INPUT,
-    ),
-]
-MapFile = Annotated[
-    Path | None,
-    typer.Option(
-        "--map-file",
-        metavar="TOML",
-        help="Read mappings (see --map) from a file.",
-        rich_help_panel=INPUT,
-        hidden=True,
-    ),
-]
-ViewLayer = Annotated[
-    str | None,
-    typer.Option(
-        "--view-layer",
-        metavar="NAME",
-        help="Only this view (left) or view layer. \\[default: all]",
-        rich_help_panel=INPUT,
-    ),
-]
-Quality = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="fast, balanced or best. \\[default: balanced]",
-        rich_help_panel=MODEL,
-    ),
-]
-Model = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help="Instead of a quality: a family (paper), a shipped model (see msspl models) or an ONNX file.",
-        rich_help_panel=MODEL,
-        hidden=True,
-    ),
-]
-Device = Annotated[
-    str,
-    typer.Option(
-        metavar="NAME",
-        help="cpu, cuda, tensorrt, openvino, coreml or directml.",
-        rich_help_panel=MODEL,
-    ),
-]
-Layout = Annotated[str, typer.Option(metavar="NAME", help="spec, nuke or multilayer.", rich_help_panel=OUTPUT)]
+_LR = "Low-resolution, high-spp render: an EXR. For a shot: a folder, or a pattern such as lr.####.exr."
+LowRender = Annotated[Path, typer.Argument(metavar="LR", help=_LR, show_default=False)]
+_HR = "High-resolution, low-spp render, in the same form."
+HighRender = Annotated[Path, typer.Argument(metavar="HR", help=_HR, show_default=False)]
+
+_MAP = (
+    "Read a feature (rgb, albedo or normal; for the model paper also diffuse, specular or variance) from this layer, "
+    "from a sum of layers (lighting+GI) or from another EXR. rgb takes a single layer. May be repeated."
+)
+Map = Annotated[list[str], option(INPUT, _MAP, "--map", metavar="FEATURE=LAYER")]
+_MAP_FILE = "Read mappings (see --map) from a file."
+MapFile = Annotated[Path | None, option(INPUT, _MAP_FILE, "--map-file", metavar="TOML", hidden=True)]
+_VIEW_LAYER = "Read only this view (left) or view layer. \\[default: all]"
+ViewLayer = Annotated[str | None, option(INPUT, _VIEW_LAYER, "--view-layer", metavar="NAME")]
+_COLOURSPACE = (
+    "Read both renders in this linear RGB space instead of that of their headers: lin_rec709, acescg, aces2065-1, "
+    "lin_rec2020 or lin_p3d65. \\[default: as their headers say, or lin_rec709]"
+)
+Colourspace = Annotated[str | None, option(INPUT, _COLOURSPACE, "--colorspace", metavar="NAME", hidden=True)]
+_SUM = "Fuse layers of HR that sum to the beauty under unusual names. May be repeated."
+Sum = Annotated[list[str], option(INPUT, _SUM, "--sum", metavar="NAME=A+B+C*D", hidden=True)]
+_MOTION_FORMAT = (
+    "Read motion vectors in this format, if the pixels can't tell it: layer=NAME, and any of channels=XY, "
+    "to=next|previous, x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5, premultiplied. A "
+    "second layer follows after +."
+)
+MotionFormat = Annotated[str | None, option(INPUT, _MOTION_FORMAT, "--motion-format", metavar="FORMAT", hidden=True)]
+
+_QUALITY = "Choose fast for previews, best for final frames that can wait, or balanced. \\[default: balanced]"
+Quality = Annotated[str | None, option(MODEL, _QUALITY, metavar="NAME")]
+_MODEL = "Choose a family (paper), a shipped model (see msspl models) or an ONNX file instead of a quality."
+Model = Annotated[str, option(MODEL, _MODEL, metavar="NAME", hidden=True)]
+_DEVICE = "Run the model on cpu, cuda, tensorrt, openvino, coreml or directml."
+Device = Annotated[str, option(MODEL, _DEVICE, metavar="NAME")]
+_MAX_MEMORY = "Stay below this memory. The result does not depend on it."
+MaxMemory = Annotated[str, option(MODEL, _MAX_MEMORY, metavar="SIZE")]
+
+_LAYOUT = "Arrange parts for any program (spec), for Nuke (nuke) or as a single part (multilayer)."
+Layout = Annotated[str, option(OUTPUT, _LAYOUT, metavar="NAME")]
+_PASSES = "Fuse these passes with the beauty: auto (all that sum to it), none, or names of sets or layers (light*)."
+Passes = Annotated[list[str], option(OUTPUT, _PASSES, metavar="PATTERN")]
 ErrorLayer = Annotated[
-    bool,
-    typer.Option(
-        "--error-layer",
-        help="Add a layer 'error': the error that the model expects.",
-        rich_help_panel=OUTPUT,
-    ),
+    bool, option(OUTPUT, "Add a layer 'error': the error that the model expects in each pixel.", "--error-layer")
 ]
-DataPasses = Annotated[
-    bool,
-    typer.Option(
-        "--data-passes",
-        help="Add the layers 'denoised_albedo' and 'denoised_normal'. For --quality best.",
-        rich_help_panel=OUTPUT,
-        hidden=True,
-    ),
-]
-Frames = Annotated[
-    str | None,
-    typer.Option(metavar="RANGE", help="1001-1100x2 or 1001,1005-1010. \\[default: all]", rich_help_panel=SHOT),
-]
-SkipExisting = Annotated[
-    bool,
-    typer.Option("--skip-existing", help="Skip frames that exist. This resumes a run.", rich_help_panel=SHOT),
-]
-Colourspace = Annotated[
-    str | None,
-    typer.Option(
-        "--colorspace",
-        metavar="NAME",
-        help="Linear RGB space of both renders: lin_rec709, acescg, aces2065-1, lin_rec2020 or lin_p3d65. "
-        "\\[default: as their headers say, or lin_rec709]",
-        rich_help_panel=INPUT,
-        hidden=True,
-    ),
-]
+_DATA_PASSES = "Add the layers 'denoised_albedo' and 'denoised_normal'. It needs --quality best."
+DataPasses = Annotated[bool, option(OUTPUT, _DATA_PASSES, "--data-passes", hidden=True)]
+Overwrite = Annotated[bool, option(OUTPUT, "Replace existing files.", "--overwrite")]
+Json = Annotated[bool, option(OUTPUT, "Print a report as JSON on standard output.", "--json")]
+
+_FRAMES = "Take only these frames: 1001-1100x2 or 1001,1005-1010. \\[default: all]"
+Frames = Annotated[str | None, option(SHOT, _FRAMES, metavar="RANGE")]
+_TEMPORAL = "Remove flicker: average each frame with N frames before and after, along motion; or off. auto: 4"
+_WHERE_KNOWN = " where motion is known, 6 with --quality best."
+Temporal = Annotated[str, option(SHOT, _TEMPORAL + _WHERE_KNOWN, "--temporal", metavar="N")]
+_BLURRED = ", or off where motion blur is on."
+RenderedTemporal = Annotated[str, option(SHOT, _TEMPORAL + _BLURRED, "--temporal", metavar="N")]
+_FRAMES_LAYER = "Add a layer 'frames': the number of frames that each pixel is the average of."
+FramesLayer = Annotated[bool, option(SHOT, _FRAMES_LAYER, "--frames-layer", hidden=True)]
+SkipExisting = Annotated[bool, option(SHOT, "Skip frames that exist, to resume a run.", "--skip-existing")]
+
 Verbose = Annotated[
     int, typer.Option("--verbose", "-v", count=True, metavar="", help="Print more; -vv prints all.", hidden=True)
 ]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.", hidden=True)]
-Json = Annotated[
-    bool, typer.Option("--json", help="Print a report as JSON on standard output.", rich_help_panel=OUTPUT)
-]
 Debug = Annotated[bool, typer.Option("--debug", help="Show tracebacks.", hidden=True)]
-Overwrite = Annotated[bool, typer.Option("--overwrite", help="Replace existing files.", rich_help_panel=OUTPUT)]
 HelpAll = Annotated[
-    bool,
-    typer.Option("--help-all", help="Show all options and exit.", is_eager=True, callback=_show_all),
-]
-
-
-Passes = Annotated[
-    list[str],
-    typer.Option(
-        metavar="PATTERN",
-        help="Passes to fuse with the beauty: auto (all that sum to it), none, or names of sets or layers (light*).",
-        rich_help_panel=OUTPUT,
-    ),
-]
-Sum = Annotated[
-    list[str],
-    typer.Option(
-        "--sum",
-        metavar="NAME=A+B+C*D",
-        help="Layers of HR that sum to the beauty, if their names are not known. May be repeated.",
-        rich_help_panel=INPUT,
-        hidden=True,
-    ),
-]
-
-
-MaxMemory = Annotated[
-    str,
-    typer.Option(
-        metavar="SIZE",
-        help="Memory to stay below; the result does not depend on it.",
-        rich_help_panel=MODEL,
-    ),
-]
-Temporal = Annotated[
-    str,
-    typer.Option(
-        "--temporal",
-        metavar="N",
-        help="Average each frame with N frames before and after it, along their motion; or off. auto: 4 where motion "
-        "is known, 6 with --quality best.",
-        rich_help_panel=SHOT,
-    ),
-]
-RenderedTemporal = Annotated[
-    str,
-    typer.Option(
-        "--temporal",
-        metavar="N",
-        help="Average each frame with N frames before and after it, along their motion; or off. auto: 4, or off where "
-        "motion blur is on.",
-        rich_help_panel=SHOT,
-    ),
-]
-FramesLayer = Annotated[
-    bool,
-    typer.Option(
-        "--frames-layer",
-        help="Add a layer 'frames': the number of frames that each pixel is the average of.",
-        rich_help_panel=SHOT,
-        hidden=True,
-    ),
-]
-MotionFormat = Annotated[
-    str | None,
-    typer.Option(
-        "--motion-format",
-        metavar="FORMAT",
-        help="How motion vectors are stored, if the pixels can't tell: layer=NAME, and any of channels=XY, "
-        "to=next|previous, x=right|left, y=down|up, unit=pixels|ndc|screen|width, scale=2, offset=0.5, premultiplied. "
-        "A second layer follows after +.",
-        rich_help_panel=INPUT,
-        hidden=True,
-    ),
+    bool, typer.Option("--help-all", help="Show all options and exit.", is_eager=True, callback=_show_all)
 ]
 
 
 class _OneLine(logging.Formatter):
-    """Prints a message on one line: it may contain names out of a file. A traceback follows on lines of its own.
+    """A format that keeps a message on one line, whatever names it contains. A traceback follows on further lines.
 
     Nuke's node reads lines that begin with ``warning:`` and ``error:``, as the commands print them.
     """
@@ -251,7 +139,7 @@ def make_inputs(
     colourspace: str | None = None,
     sums: list[str] | None = None,
 ) -> InputOptions:
-    """The options that describe the input files. ``--map`` wins over ``--map-file``.
+    """Return the options that describe the input files. ``--map`` wins over ``--map-file``.
 
     Raises:
         InputError: a mapping can't be read.
@@ -265,7 +153,7 @@ def make_inputs(
 
 
 def choose_model(model: str, quality: str | None) -> str:
-    """The model that ``--model`` and ``--quality`` name.
+    """Return the model that ``--model`` and ``--quality`` name.
 
     Raises:
         InputError: both are given, or there is no such quality.
@@ -291,7 +179,7 @@ def make_write_options(
     frames_layer: bool = False,
     data_passes: bool = False,
 ) -> WriteOptions:
-    """The options that describe the result.
+    """Return the options that describe the result.
 
     Raises:
         InputError: an unknown layout or compression.
@@ -307,19 +195,8 @@ def make_write_options(
     )
 
 
-def make_temporal_options(frames: str, motion_format: str | None) -> TemporalOptions:
-    """The options of a shot that is fused over time.
-
-    Raises:
-        InputError: no such number of frames.
-    """
-    from oiio_msspl.jobs.plan import TemporalOptions
-
-    return TemporalOptions(frames, motion_format)
-
-
 def parse_bytes(text: str) -> int:
-    """The number of bytes that ``3G``, ``800M`` or a plain number means.
+    """Return the number of bytes that ``3G``, ``800M`` or a plain number means.
 
     Raises:
         InputError: the text can't be read, or no machine has so much memory.

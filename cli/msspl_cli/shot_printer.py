@@ -11,6 +11,8 @@ from msspl_cli import console
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
+    from collections.abc import Collection
+
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
 
 #: The forms of ``--progress``, which prints to standard output after each frame.
@@ -20,24 +22,25 @@ PROGRESS = ("openjd", "json")
 class ShotPrinter:
     """The ``progress`` of :func:`oiio_msspl.jobs.shot.fuse_shot`: prints errors and warnings as frames end.
 
-    Of sentences that differ only in their numbers, the first is printed; the table counts the frames of all.
+    Of sentences that differ only in their numbers, the first is printed. The table at the end counts their frames.
 
     Raises:
         InputError: an unknown form of progress, or one that would mix with ``--json``.
     """
 
-    def __init__(self, verbose: int, quiet: bool, as_json: bool, progress: str | None) -> None:
+    def __init__(self, verbose: int, quiet: bool, as_json: bool, progress: str | None, mapped: Collection[str]) -> None:
         if progress is not None and progress not in PROGRESS:
             raise InputError(f"--progress {progress!r}: use one of {', '.join(PROGRESS)}")
         if progress is not None and as_json:
             raise InputError("--json and --progress both print to standard output; use --report FILE for the report")
         self._verbose, self._quiet, self._as_json, self._progress = verbose, quiet, as_json, progress
+        self._mapped = mapped
         self._bar = console.ProgressBar(shown=not verbose and not quiet and progress is None)
         self._report: ShotReport | None = None
         self._printed: set[str] = set()
 
     def __call__(self, result: FrameResult, report: ShotReport) -> None:
-        """Print what there is to say of a frame that ended."""
+        """Print the progress, the errors and the warnings of a frame that ended."""
         self._report = report
         if self._progress == "openjd":
             _print_openjd(result, report)
@@ -51,7 +54,7 @@ class ShotPrinter:
             times = ", ".join(f"{stage} {seconds:.2f} s" for stage, seconds in result.seconds.items())
             console.say(f"frame {result.frame}: {result.status}" + (f" ({times})" if times else ""), error=True)
         done, count = len(report.results), len(report.shot.frames)
-        bad = sum(bool(each.message) for each in report.results.values())
+        bad = sum(bool(ended.message) for ended in report.results.values())
         self._bar.update(f"{done} of {count} frames" + (f", {bad} not fused" if bad else ""), done, count)
 
     def end(self) -> None:
@@ -62,7 +65,7 @@ class ShotPrinter:
         if self._as_json:
             print(json.dumps(self._report.as_dict(), indent=2))
         elif not self._quiet and self._progress != "json":
-            print_table(self._report)
+            _print_table(self._report, self._mapped)
 
     def _print_once(self, kind: str, frame: int, text: str) -> None:
         if (key := _without_numbers(text)) not in self._printed:
@@ -71,7 +74,7 @@ class ShotPrinter:
 
 
 def _without_numbers(text: str) -> str:
-    """A sentence without what differs between the frames of a shot, such as the number in a file's name."""
+    """Replace the numbers of a sentence, which differ between the frames of a shot."""
     return re.sub(r"-?[\d.]+", "0", text)
 
 
@@ -90,19 +93,18 @@ def _print_json(result: FrameResult, report: ShotReport) -> None:
     print(json.dumps({**line, "done": len(report.results), "count": len(report.shot.frames)}), flush=True)
 
 
-def print_table(report: ShotReport) -> None:
+def _print_table(report: ShotReport, mapped: Collection[str]) -> None:
     """Print which layers were read, and which frames ended in which way and why."""
     from oiio_msspl.aovs.views import name_of
     from oiio_msspl.jobs.sequence import format_frames
 
     if first := report.first:
-        fused = [name_of(each["view"]) for each in first.get("fused_views", ())]
-        view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
+        views = console.views_in_words([name_of(entry["view"]) for entry in first.get("fused_views", ())])
         pairs = f"{first['renderer']} pairs at x{first['scale']}, {first['model']}"
-        console.say(f"{pairs}{view}; layers of frame {first['frame']}:")
-        console.aov_table(first["aovs"], first["notes"])
-        for name, done in first["passes"].items():
-            console.say(f"  {name}: {done}")
+        console.say(f"{pairs}{views}; layers of frame {first['frame']}:")
+        console.aov_table(first["aovs"], first["notes"], mapped)
+        for name, outcome in first["passes"].items():
+            console.say(f"  {name}: {outcome}")
     if report.temporal and any(result.status == "fused" for result in report.results.values()):
         console.say(f"Fused {report.temporal}")
     # Sentences that differ only in their numbers share a row, which shows the first of them.

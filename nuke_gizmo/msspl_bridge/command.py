@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What to start: the program msspl-fuse, its command line and its environment."""
+"""Finds msspl-fuse, and builds its command line and its environment."""
 
 from __future__ import annotations
 
@@ -51,9 +51,9 @@ def build_command(
     settings: Settings,
     numbers: tuple[int, int] | None = None,
 ) -> list[str]:
-    """The command line for one frame or, given the first and last file number, for a range.
+    """Build the command line for one frame or, given the first and last file number, for a range.
 
-    A single frame is averaged with the neighbours that a range would give it, so that both have the same pixels. It is
+    A single frame is averaged with its neighbours, too, so that it has the pixels that a range would give it. It is
     fused alone if its files have no numbers, or different ones: msspl-fuse pairs the files of neighbours by number.
 
     Raises:
@@ -61,7 +61,7 @@ def build_command(
     """
     first, last = numbers or (out.number, out.number)
     in_shot = numbers is not None or (settings.temporal != "off" and lrhs.number == hrls.number == first is not None)
-    files = [each.pattern if in_shot else each.path for each in (lrhs, hrls, out)]
+    files = [file.pattern if in_shot else file.path for file in (lrhs, hrls, out)]
     command = [program, files[0], files[1], "-o", files[2], "--device", settings.device]
     if in_shot:
         frames = f"{first}" if first == last else f"{first}-{last}"
@@ -90,29 +90,26 @@ def build_command(
 
 
 def find_program(chosen: str, environment: Mapping[str, str]) -> str:
-    """Path of msspl-fuse: the chosen one, otherwise ``MSSPL_FUSE``, otherwise the first on ``PATH``.
+    """Find msspl-fuse: the chosen one, otherwise ``MSSPL_FUSE``, otherwise the first on ``PATH``.
 
     Raises:
         FuseError: no program is found there.
     """
-    search = environment.get("PATH")
-    for source, value in (("the program knob", chosen), ("MSSPL_FUSE", environment.get("MSSPL_FUSE", ""))):
-        if value:
-            found = shutil.which(os.path.expanduser(value), path=search)
-            if found is None:
-                raise FuseError(f"{source} names {value}, but there is no such program; give the path of msspl-fuse")
-            return found
-    found = shutil.which("msspl-fuse", path=search)
-    if found is None:
-        raise FuseError(
-            "msspl-fuse was not found; install oiio_msspl, and put the path of msspl-fuse into the program knob or "
-            "into the environment variable MSSPL_FUSE"
-        )
-    return found
+    variable = environment.get("MSSPL_FUSE", "")
+    for source, name in (("the program knob", chosen), ("MSSPL_FUSE", variable), ("", "msspl-fuse")):
+        program = shutil.which(os.path.expanduser(name), path=environment.get("PATH")) if name else None
+        if program is not None:
+            return program
+        if name and source:
+            raise FuseError(f"{source} names {name}, but there is no such program; give the path of msspl-fuse")
+    raise FuseError(
+        "msspl-fuse was not found; install oiio_msspl, and put the path of msspl-fuse into the program knob or "
+        "into the environment variable MSSPL_FUSE"
+    )
 
 
 def clean_environment(environment: Mapping[str, str], host_folder: str) -> dict[str, str]:
-    """The environment without the host's Python and libraries, which would break another Python.
+    """Remove the host's Python and libraries from an environment, because they would break another Python.
 
     Library folders outside the host's folder stay, because drivers and the site's libraries may be found through them.
     """

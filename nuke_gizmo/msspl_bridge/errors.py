@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How a fusion ends when it does not succeed."""
+"""The exceptions that end a fusion."""
 
 
 class FuseError(Exception):
-    """One sentence for the artist that says what is wrong and what to do."""
+    """A sentence for the artist that says what is wrong and what to do."""
 
 
 class Cancelled(Exception):

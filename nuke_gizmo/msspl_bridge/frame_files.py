@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""File names of numbered frames: finding the number, naming the output, checking a range."""
+"""Reads file names of numbered frames: finds the number, names the output, and checks a range."""
 
 from __future__ import annotations
 
@@ -72,12 +72,12 @@ def find_number(pattern: str, path: str) -> FrameFile:
 
 
 def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:
-    """The file to write.
+    """Name the file to write.
 
     Args:
-        text: the output knob. If it is empty, the output goes beside the HRLS, with ``_fused`` added to its name.
-        hrls: its number becomes the output's number.
-        frame: becomes the output's number if the HRLS is a still.
+        text: the output knob. If it is empty, the output goes beside the HRLS, with ``_fused`` added to the name.
+        hrls: the HRLS, whose number becomes the output's number.
+        frame: the output's number if the HRLS is a still.
 
     Raises:
         FuseError: the path is relative, so every program would take it from another folder.
@@ -98,7 +98,7 @@ def name_output(text: str, hrls: FrameFile, frame: int) -> FrameFile:
 
 
 def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: int) -> tuple[int, int]:
-    """First and last number in the file names of a range, which need not be the host's frames.
+    """Return the first and last number in the file names of a range, which need not be the host's frames.
 
     msspl-fuse pairs the files of a range by number, so the files of all inputs must have the same numbers.
 
@@ -108,15 +108,15 @@ def file_numbers(inputs: Sequence[ReadRange], out: FrameFile, first: int, last: 
     Raises:
         FuseError: an input has no file per frame, the numbers of the inputs differ, or the output has no number.
     """
-    for each in inputs:
-        begin, end = each.first.number, each.last.number
+    for source in inputs:
+        begin, end = source.first.number, source.last.number
         if begin is None or end is None or end - begin != last - first:
             raise FuseError(
-                f"{each.read} does not have one numbered file per frame from {first} to {last}; "
+                f"{source.read} does not have one numbered file per frame from {first} to {last}; "
                 "change the range or the Read"
             )
-    if len({each.first.number for each in inputs}) > 1:
-        seen = " and ".join(f"{each.read} reads file number {each.first.number}" for each in inputs)
+    if len({source.first.number for source in inputs}) > 1:
+        seen = " and ".join(f"{source.read} reads file number {source.first.number}" for source in inputs)
         raise FuseError(f"at frame {first}, {seen}; for a range, both need the same numbers in their file names")
     if out.number is None:
         raise FuseError(f"output {out.path}: a range needs a frame number in the name, such as name.####.exr")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of a fused file that sum to its beauty."""
+"""Finds the layers of a fused file that sum to its beauty."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class FusedSet:
 
 
 def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
-    """The fused sets of a file whose layers are all there.
+    """Return the fused sets of a file that have all their layers.
 
     Args:
         attribute: value of :data:`ATTRIBUTE`; None in a file without it.
@@ -38,19 +38,19 @@ def fused_sets(attribute: object, channels: Iterable[str]) -> list[FusedSet]:
     if not stored:
         raise FuseError("the file has no fused passes; fuse it again with passes that sum to the beauty")
     layers = {_spelling(layer): layer for layer in (channel.rpartition(".")[0] for channel in channels)}
-    found, missing = [], []
-    for each in stored:
-        lacking = [name for term in each["layers"] for name in term if _spelling(name) not in layers]
-        missing += [(name, each["name"]) for name in lacking]
+    complete, missing = [], []
+    for entry in stored:
+        lacking = [name for term in entry["layers"] for name in term if _spelling(name) not in layers]
+        missing += [(name, entry["name"]) for name in lacking]
         if not lacking:
-            terms = [[layers[_spelling(name)] for name in term] for term in each["layers"]]
-            found.append(FusedSet(each["name"], terms))
-    if not found:
+            terms = [[layers[_spelling(name)] for name in term] for term in entry["layers"]]
+            complete.append(FusedSet(entry["name"], terms))
+    if not complete:
         layer, name = missing[0]
         raise FuseError(f"the file has no layer {layer}; fuse it again with all layers of {name}")
-    return found
+    return complete
 
 
 def _spelling(layer: str) -> str:
-    """A layer's name without what Nuke replaces: dots, spaces and other signs become ``_``."""
+    """Return the lower-case name of a layer with the signs that Nuke replaces, such as dots and spaces, as ``_``."""
     return re.sub(r"[^0-9a-z]", "_", layer.lower())

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running msspl-fuse: its progress, its messages, and cancelling it."""
+"""Runs msspl-fuse, reads its progress and its messages, and cancels it."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def run(
 
     Args:
         report: called with (percent, None) or with (None, the current step).
-        cancelled: called ten times a second. When it returns True, the process and its children are ended.
+        cancelled: asked ten times a second. When it returns True, the process and its children are ended.
 
     Returns:
         Warnings, one sentence each.

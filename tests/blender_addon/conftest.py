@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the tests start msspl-render."""
+"""Starts msspl-render for the tests."""
 
 import os
 import sys
@@ -10,6 +10,6 @@ posix = pytest.mark.skipif(os.name != "posix", reason="the program in place of B
 
 
 def render_command(*arguments):
-    """The command line of msspl-render in this Python."""
+    """Return the command line of msspl-render in this Python."""
     main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
     return [sys.executable, "-c", main, *map(str, arguments)]

@@ -42,7 +42,7 @@ def python(request):
 
 @pytest.fixture(scope="module")
 def results(python, tmp_path_factory):
-    """The folder with the files that the checks inside Blender have written."""
+    """Return the folder with the files that the checks inside Blender have written."""
     folder, resources = tmp_path_factory.mktemp("work"), tmp_path_factory.mktemp("resources")
     environment = {
         **os.environ,
@@ -57,7 +57,7 @@ def results(python, tmp_path_factory):
 
 
 def layer(path, name, components):
-    """A layer of a single-part EXR as float32 (height, width, components)."""
+    """Return a layer of a single-part EXR as float32 (height, width, components)."""
     file = open_exr(path)
     channels = {c.name: c for part in file.parts for c in part.channels}
     names = [name + component for component in components]
@@ -132,8 +132,8 @@ def test_the_beauty_that_the_compositor_builds_from_fused_passes_is_the_fused_be
     assert (np.abs(rebuilt - total) <= rounding).all()
     assert (np.abs(rebuilt - beauty) <= rounding)[holds_light].all()
     fused = json.loads(open_exr(path).metadata["msspl/passes"])
-    assert {each["name"]: len(each["layers"]) for each in fused}[name] == len(terms)
-    assert sum(each.max() > 0.05 for each in layers) >= 3
+    assert {entry["name"]: len(entry["layers"]) for entry in fused}[name] == len(terms)
+    assert sum(layer.max() > 0.05 for layer in layers) >= 3
 
 
 def test_light_in_no_group_stays_out_of_the_fused_groups(results):
@@ -172,7 +172,7 @@ def test_cycles_motion_vectors_are_as_the_table_says(results, monkeypatch):
     assert source.kind == "vectors" and source.fields == frames[0].motion.fields
     for here, there, step in ((0, 1, 1), (1, 0, -1)):
         vectors, known = source.read(motion.MotionFrame(frames[here]), motion.MotionFrame(frames[there]), step)
-        places = [each.file.read(each.motion.position, each.data_window) for each in frames]
+        places = [frame.file.read(frame.motion.position, frame.data_window) for frame in frames]
         y, x = np.mgrid[0:128, 0:192].astype(np.float32)
         fetched = sample_linear(places[there], x + vectors[..., 0], y + vectors[..., 1])
         cube = known & (places[here][..., 2] > 0.2)
@@ -271,7 +271,7 @@ def test_msspl_render_averages_frames_along_the_vectors_that_cycles_writes(pytho
     errors = np.zeros(2)
     for number, averaged in whole.items():
         alone, truth = beauty(tmp_path / f"alone/out.{number:04d}.exr"), beauty(results / f"clean.{number:04d}.exr")
-        errors += [np.square(np.log((each + 0.01) / (truth + 0.01))).mean() for each in (alone, averaged)]
+        errors += [np.square(np.log((pixels + 0.01) / (truth + 0.01))).mean() for pixels in (alone, averaged)]
     assert errors[1] < 0.98 * errors[0]
     for path in (tmp_path / "whole").glob("out.0002*.exr"):
         path.unlink()

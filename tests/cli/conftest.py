@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Files for the tests of the programs."""
+"""Writes files for the tests of the programs."""
 
 import numpy as np
 import pytest
@@ -9,7 +9,7 @@ from tests.conftest import downsample, noisy, picture, rgb, write_exr
 
 @pytest.fixture
 def files(tmp_path):
-    """A x4 pair with albedo, alpha and a mask, and its reference."""
+    """Write a x4 pair with albedo, alpha and a mask, and its reference."""
     clean = picture(96, 128)
     ones = np.ones((96, 128), np.float16)
     channels = rgb(noisy(clean, 1).astype(np.float16)) | {"A": ones} | rgb((clean > 0.3).astype(np.float16), "albedo.")

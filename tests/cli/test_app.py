@@ -53,7 +53,7 @@ SHOWN = {
 
 
 def options_in(text):
-    """The long names that begin a row of the help text's tables. Of a pair (--half, --float) only the first counts."""
+    """Return the long names that begin a row of the help text. Of a pair (--half, --float) only the first counts."""
     return set(re.findall(r"^│[ *]+(--[a-z-]+)", text, re.MULTILINE))
 
 

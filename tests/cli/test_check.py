@@ -32,7 +32,7 @@ def test_a_shot_is_checked_frame_by_frame(tmp_path):
     assert lines[-1].startswith("frame 1003: can't be fused: ") and "no such file" in lines[-1]
     assert run("msspl", "check", tmp_path / "lr", tmp_path / "hr", "--frames", "1001").returncode == 0
     data = json.loads(run("msspl", "check", tmp_path / "lr", tmp_path / "hr", "--json").stdout)
-    assert [(each["frame"], each["fits"]) for each in data] == [(1001, True), (1002, False), (1003, False)]
+    assert [(pair["frame"], pair["fits"]) for pair in data] == [(1001, True), (1002, False), (1003, False)]
 
 
 def test_a_wrong_pair_is_said_before_a_farm_is_asked(tmp_path):

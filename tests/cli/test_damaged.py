@@ -177,7 +177,7 @@ def test_what_a_file_claims_to_be_is_refused_in_words_that_help(tmp_path):
     """Not by advice for the programmers of the library."""
     path = write_exr(tmp_path / "hr.exr", layers(1), compression=OpenEXR.NO_COMPRESSION)
     data = bytearray(path.read_bytes())
-    window = next(each for each in mutants.attributes(data) if each.name == "dataWindow")
+    window = next(attribute for attribute in mutants.attributes(data) if attribute.name == "dataWindow")
     data[window.size + 12 : window.size + 16] = (2**24).to_bytes(4, "little")
     path.write_bytes(data)
     with pytest.raises(InputError, match="can't be opened as an EXR") as caught:

@@ -16,7 +16,7 @@ from msspl_cli.commands.fuse import tiles_in_words
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import EXAMPLES, picture, rgb, write_exr
-from tests.programs import fuse, run
+from tests.programs import fuse, run, start
 
 
 def test_the_main_job(files, bilinear_models):
@@ -262,21 +262,27 @@ def test_the_readmes_first_command_shows_a_result(tmp_path):
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="needs POSIX signals")
-@pytest.mark.parametrize("name", ["SIGTERM", "SIGINT", "SIGHUP"])
-def test_a_signal_leaves_nothing_half_written(files, bilinear_models, name):
-    """Ended by a farm or by Ctrl-C at any moment: the old file stays and no temporary file is left."""
-    (files / "out.exr").write_text("old")
-    before = sorted(p.name for p in files.iterdir())
-    code = "import sys; from msspl_cli.app import msspl_fuse; print('on', flush=True); msspl_fuse()"
-    for delay in (0.3, 0.6):
-        arguments = [files / "lr.exr", files / "hr.exr", "-o", files / "out.exr", "--model", bilinear_models[4]]
-        command = [sys.executable, "-c", code, *map(str, arguments), "--overwrite", "--no-preview"]
-        process = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
-        process.stdout.readline()
-        time.sleep(delay)
-        process.send_signal(getattr(signal, name))
-        process.communicate(timeout=60)
-        assert sorted(p.name for p in files.iterdir()) == before
+@pytest.mark.parametrize(("name", "exit_code"), [("SIGTERM", 143), ("SIGINT", 130), ("SIGHUP", 129)])
+def test_a_signal_leaves_nothing_half_written(tmp_path, bilinear_models, name, exit_code):
+    """The signal of a farm, of Ctrl-C or of a closed terminal comes while the EXR is written: the old file stays."""
+    noise = np.random.default_rng(0).integers(0, 2**31, (512, 512), dtype=np.uint32)
+    write_exr(tmp_path / "hr.exr", rgb(picture(512, 512)) | {f"id{i}.X": noise + i for i in range(40)})
+    write_exr(tmp_path / "lr.exr", rgb(picture(128, 128)))
+    (tmp_path / "out.exr").write_text("old")
+    before = sorted(path.name for path in tmp_path.iterdir())
+    code = "from msspl_cli.app import msspl_fuse; msspl_fuse()"
+    options = ("--model", bilinear_models[4], "--overwrite", "--no-preview")
+    process = start(
+        [sys.executable, "-c", code, tmp_path / "lr.exr", tmp_path / "hr.exr", "-o", tmp_path / "out.exr", *options]
+    )
+    while not any(path.stat().st_size > 1000 for path in tmp_path.glob(".out.*")):
+        assert process.poll() is None, process.communicate()
+        time.sleep(0.001)
+    process.send_signal(getattr(signal, name))
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == exit_code, err
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+    assert (tmp_path / "out.exr").read_bytes() == b"old"
 
 
 def test_a_signal_that_interrupts_the_start_of_a_thread_does_not_keep_the_program_from_ending():
@@ -328,7 +334,7 @@ def write(path: Path) -> None:
 run(app)
 """
     out = files / "new.exr"
-    process = subprocess.Popen([sys.executable, "-c", code, str(out)], stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    process = start([sys.executable, "-c", code, out])
     process.stdout.readline()
     for name in names:
         process.send_signal(getattr(signal, name))

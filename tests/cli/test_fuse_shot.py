@@ -14,7 +14,7 @@ import pytest
 
 from oiio_msspl.exr.preview import write_png
 from tests.conftest import read_bits, write_exr
-from tests.programs import fuse, leave_temporary
+from tests.programs import fuse, leave_temporary, start
 from tests.shots import HEIGHT, WIDTH, contents, layers, make_shot
 
 
@@ -124,11 +124,10 @@ def test_a_full_disk_and_a_link_to_nowhere_leave_nothing_half_written(tmp_path, 
     assert names == {f"beauty.{n}.{e}" for n in (1001, 1004) for e in ("exr", "png")}
 
 
-def start(folder, model, *more):
+def start_shot(folder, model, *more):
     code = "import sys; from msspl_cli.app import msspl_fuse; msspl_fuse()"
     arguments = [folder / "lr", folder / "hr", "-o", folder / "out", "--model", model, "--report", folder / "r.json"]
-    command = [sys.executable, "-c", code, *map(str, arguments), "--skip-existing", *more]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return start([sys.executable, "-c", code, *arguments, "--skip-existing", *more])
 
 
 def wait_for(folder, count, process):
@@ -141,13 +140,13 @@ def wait_for(folder, count, process):
 def test_a_shot_killed_three_times_and_resumed_is_whole(tmp_path, bilinear_models):
     """100 frames; every file is there, and bit for bit that of a run that nobody disturbed; nothing else is."""
     folder = make_shot(tmp_path, 100)
-    undisturbed = start(folder, bilinear_models[4])
+    undisturbed = start_shot(folder, bilinear_models[4])
     assert undisturbed.communicate() and undisturbed.returncode == 0
     (folder / "out").rename(folder / "expected")
     (folder / "r.json").unlink()
 
     for count, delay in ((1, 0.0), (40, 0.003), (75, 0.007)):
-        process = start(folder, bilinear_models[4])
+        process = start_shot(folder, bilinear_models[4])
         wait_for(folder, count, process)
         time.sleep(delay)
         process.kill()
@@ -162,7 +161,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(tmp_path, bilinear_model
     leave_temporary(folder / "out/beauty.1100.exr")
     write_png(folder / "out/beauty.1100.png", np.zeros((2, 2, 3)), overwrite=True)
 
-    last = start(folder, bilinear_models[4])
+    last = start_shot(folder, bilinear_models[4])
     last.communicate()
     assert last.returncode == 0
     assert contents(folder / "out") == contents(folder / "expected")
@@ -174,7 +173,7 @@ def test_a_shot_killed_three_times_and_resumed_is_whole(tmp_path, bilinear_model
 @pytest.mark.parametrize(("name", "code"), [("SIGINT", 130), ("SIGTERM", 143)])
 def test_ctrl_c_ends_with_the_table_and_whole_frames(tmp_path, bilinear_models, name, code):
     folder = make_shot(tmp_path, 100)
-    process = start(folder, bilinear_models[4], "--no-preview")
+    process = start_shot(folder, bilinear_models[4], "--no-preview")
     wait_for(folder, 5, process)
     process.send_signal(getattr(signal, name))
     out, err = process.communicate()

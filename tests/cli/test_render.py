@@ -27,7 +27,7 @@ from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot import fuse_shot
 from tests.conftest import EXAMPLES
 from tests.jobs.test_temporal import make_moving_shot
-from tests.programs import leave_temporary
+from tests.programs import leave_temporary, start
 from tests.shots import pixels
 
 posix = pytest.mark.skipif(os.name != "posix", reason="the stand-in for Blender is a script")
@@ -95,24 +95,24 @@ for number, output in job["frames"]:
 
 @pytest.fixture
 def farm(tmp_path):
-    """Runs msspl-render with a stand-in for Blender that does ``code`` while it renders."""
+    """Return functions that run msspl-render with a stand-in for Blender, which does ``code`` while it renders."""
     (tmp_path / "scene.blend").write_text("")
 
-    def start(*arguments, code="pass", stderr=subprocess.PIPE):
+    def start_render(*arguments, code="pass", stderr=subprocess.PIPE):
         blender = tmp_path / "blender"
         blender.write_text(f"#!{sys.executable}\n{FAKE.replace('{code}', code)}")
         blender.chmod(0o755)
         main = "import sys; from msspl_cli.app import msspl_render as main; sys.argv[0] = 'msspl-render'; main()"
         command = [sys.executable, "-c", main, "scene.blend", "-o", "out.exr", "--blender", str(blender), *arguments]
-        return subprocess.Popen(command, cwd=tmp_path, stdout=subprocess.PIPE, stderr=stderr, text=True)
+        return start(command, cwd=tmp_path, stderr=stderr)
 
     def run(*arguments, code="pass"):
-        with start(*arguments, code=code) as process:
+        with start_render(*arguments, code=code) as process:
             out, err = process.communicate()
         left = sorted(p.name for p in tmp_path.iterdir() if p.name not in ("blender", "scene.blend", "log"))
         return process.returncode, out, err, left
 
-    return start, run, tmp_path
+    return start_render, run, tmp_path
 
 
 @posix
@@ -138,7 +138,7 @@ ASKS = f"""
     work = Path(job["work"])
     log = open(Path(job["scene"]).with_name("log"), "a")
     print(number, len(list(work.glob("*.exr"))), file=log, flush=True)
-    pair = [work / f"{{each}}.{{number}}.exr" for each in ("lr", "hr")]
+    pair = [work / f"{{render}}.{{number}}.exr" for render in ("lr", "hr")]
     for path, name in zip(pair, ("LR", "HR")):
         shown = os.environ.get(name, {str(EXAMPLES)!r} + f"/{{name.lower()}}.exr")
         if Path(shown.format(number)).exists(): shutil.copy(shown.format(number), path)
@@ -155,7 +155,7 @@ ASKS = f"""
 
 @pytest.fixture
 def model(bilinear_models, tmp_path, monkeypatch):
-    """A copy of a model, which ASKS spoils."""
+    """Copy a model, which ASKS spoils."""
     path = tmp_path.parent / f"{tmp_path.name}.onnx"
     shutil.copy(bilinear_models[4], path)
     monkeypatch.setenv("MODEL", str(path))
@@ -188,7 +188,7 @@ def test_a_frame_that_cannot_be_fused_ends_the_shot_with_its_sentence(farm, mode
 
 @pytest.fixture(scope="module")
 def moving(tmp_path_factory, bilinear_models):
-    """A shot with motion vectors, fused by fuse_shot frame by frame and with neighbours: alone/ and whole/."""
+    """Make a shot with motion vectors, fused by fuse_shot frame by frame and with neighbours: alone/ and whole/."""
     folder = make_moving_shot(tmp_path_factory.mktemp("moving"), count=7)
     for name, temporal in (("alone", "off"), ("whole", "auto")):
         options = {"model": str(bilinear_models[4]), "temporal": TemporalOptions(temporal)}
@@ -239,9 +239,9 @@ def test_vectors_of_a_rendered_frame_are_decoded_once_with_its_pixels(tmp_path, 
     frames = [FrameFiles(number, None, None, tmp_path / f"{number}.exr") for number in (1001, 1002, 1003)]
     shot = RenderedShot(Settings(model=str(bilinear_models[4])), frames, frames, TemporalOptions("auto"))
     for frame in shot.order:
-        pair = [moving / f"{each}/{each}.{frame.number}.exr" for each in ("lr", "hr")]
+        pair = [moving / f"{render}/{render}.{frame.number}.exr" for render in ("lr", "hr")]
         shot.fuse(*(Path(shutil.copy(path, tmp_path)) for path in pair))
-    assert [list(each.vectors) for each in loaded] == [[1]] * 3
+    assert [list(frame.vectors) for frame in loaded] == [[1]] * 3
     assert counted and all(counted)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["1001.exr", "1002.exr", "1003.exr"]
 
@@ -405,9 +405,9 @@ def test_a_shot_that_fails_midway_says_where_and_is_resumed(farm):
 @posix
 def test_the_progress_bar_is_wiped_before_an_error(farm, monkeypatch):
     monkeypatch.setenv("TERM", "xterm")
-    start, _, _ = farm
+    start_render, _, _ = farm
     reader, terminal = os.openpty()
-    with start(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
+    with start_render(code="tell(error='disk full', code=1); sys.exit(1)", stderr=terminal) as process:
         process.wait()
         said = os.read(reader, 10000).decode()
     assert "LRHS 16x9, 16 spp" in said
@@ -451,12 +451,12 @@ def test_nothing_is_overwritten_unasked(farm):
 @posix
 @pytest.mark.parametrize("how", [signal.SIGTERM, signal.SIGINT])
 def test_cancelling_ends_blender_and_what_it_started(farm, how):
-    start, _, folder = farm
+    start_render, _, folder = farm
     code = (
         "import subprocess; child = subprocess.Popen(['sleep', '60']); "
         "Path('pids').write_text(f'{os.getpid()} {child.pid}'); child.wait()"
     )
-    process = start(code=code)
+    process = start_render(code=code)
     while not (folder / "pids").exists() or not (folder / "pids").read_text():
         time.sleep(0.02)
         assert process.poll() is None
@@ -475,8 +475,8 @@ def test_cancelling_ends_blender_and_what_it_started(farm, how):
 @posix
 def test_what_a_killed_run_left_is_deleted_by_the_next_one(farm):
     """And nothing of a run that is alive, nor what only looks like it."""
-    start, run, folder = farm
-    process = start(
+    start_render, run, folder = farm
+    process = start_render(
         code="Path('pid').write_text(str(os.getpid())); Path(job['work'], 'lr.exr').touch(); time.sleep(60)"
     )
     while not (folder / "pid").exists() or not (folder / "pid").read_text():

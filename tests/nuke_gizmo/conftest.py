@@ -18,7 +18,7 @@ GIZMO = (FOLDER / "MSSPLFuse.gizmo").read_text(encoding="utf-8")
 
 @pytest.fixture(scope="session")
 def nodes():
-    """{number: node} of the gizmo's file, as a real Tcl interpreter reads it."""
+    """Return {number: node} of the gizmo's file, as a real Tcl interpreter reads it."""
     if not tcl_interpreters():
         pytest.skip("no Tcl interpreter: neither tkinter nor tclsh")
     return read_script(GIZMO, tcl_interpreters()[0])
@@ -32,7 +32,7 @@ def button_scripts(nodes):
 
 @pytest.fixture
 def host(nodes, monkeypatch, tmp_path):
-    """The fake Nuke with a gizmo. Its inputs are two Reads of frames 1001 to 1003, copies of the example pair."""
+    """Set up the fake Nuke with a gizmo and two Reads of frames 1001 to 1003, which are copies of the example pair."""
     nuke = FakeNuke(nodes)
     monkeypatch.setitem(sys.modules, "nuke", nuke)
     monkeypatch.delitem(sys.modules, "msspl_nuke", raising=False)

@@ -127,7 +127,7 @@ class Node:
         """Nuke takes another name if this one is taken."""
         taken = {n.name() for n in self.nuke.nodes_of(self._parent) if n is not self}
         names = itertools.chain([name], (f"{name}{i}" for i in itertools.count(1)))
-        self._knobs["name"].setValue(next(each for each in names if each not in taken))
+        self._knobs["name"].setValue(next(name for name in names if name not in taken))
 
     def fullName(self):
         above = self.parent()
@@ -171,7 +171,7 @@ class Node:
         ]
 
     def metadata(self, key, time):
-        """The file that a Read reads at a frame, or an attribute of it. The frame modes follow Foundry's guide."""
+        """Return the file of a Read at a frame, or an attribute of the file. Frame modes follow Foundry's guide."""
         assert self._kind == "Read"
         if key.startswith("exr/"):
             return open_exr(Path(self.metadata("input/filename", time))).metadata.get(key.removeprefix("exr/"))
@@ -324,7 +324,7 @@ class FakeNuke(types.ModuleType):
         n._deleted = True
 
     def createNode(self, typ):
-        """A gizmo with the knobs of its file."""
+        """Make a gizmo with the knobs of its file."""
         assert typ == "MSSPLFuse"
         definition = self._gizmo[1]
         knobs = []

@@ -71,7 +71,7 @@ class ScriptNode:
 
 
 def tcl_interpreters():
-    """The Tcl interpreters of this machine: the one inside Python, the program tclsh, both or none."""
+    """Return the Tcl interpreters of this machine: the one inside Python, the program tclsh, both or none."""
     here = [("tkinter", importlib.util.find_spec("_tkinter")), ("tclsh", shutil.which("tclsh"))]
     return [name for name, found in here if found]
 
@@ -99,7 +99,7 @@ def evaluate(script: str, interpreter: str, code: str = "set lines") -> list[lis
 
 
 def read_script(script: str, interpreter: str) -> dict[int, ScriptNode]:
-    """{number: node} of a .gizmo file, in file order."""
+    """Return {number: node} of a .gizmo file, in file order."""
     nodes: dict[int, ScriptNode] = {}
     for what, *words in evaluate(script, interpreter):
         if what == "node":

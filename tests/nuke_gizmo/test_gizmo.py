@@ -13,7 +13,7 @@ from tests.nuke_gizmo.gizmo_file import read_script, tcl_interpreters
 
 
 def knob(nodes, name):
-    return next(each for each in nodes[1].user_knobs if each.name == name)
+    return next(knob for knob in nodes[1].user_knobs if knob.name == name)
 
 
 @pytest.mark.skipif(not tcl_interpreters(), reason="no Tcl interpreter: neither tkinter nor tclsh")

@@ -16,7 +16,7 @@ from tests.shots import contents
 
 
 def results(nuke):
-    """The Reads that the gizmo made."""
+    """Return the Reads that the gizmo made."""
     return [n for n in nuke.everything if n.Class() == "Read" and n not in nuke.reads]
 
 

@@ -16,7 +16,7 @@ HEIGHT, WIDTH = 64, 96
 
 
 def write_pair(folder):
-    """A x4 pair with light groups, and with a product and an emission, as Blender names them."""
+    """Write a x4 pair with light groups, and with a product and an emission, as Blender names them."""
     for name, scale, spp in (("lr", 4, 64), ("hr", 1, 4)):
         random = np.random.default_rng(scale)
         shape = (HEIGHT // scale, WIDTH // scale, 3)
@@ -32,8 +32,8 @@ def write_pair(folder):
 
 
 def evaluate(node, layers, group):
-    """The rgb of a node's output, where the input of the group has these layers; the alpha is not evaluated."""
-    kind, inputs = node.Class(), [evaluate(each, layers, group) for each in node._inputs]
+    """Compute the rgb of a node's output, where the input of the group has these layers."""
+    kind, inputs = node.Class(), [evaluate(source, layers, group) for source in node._inputs]
     if kind == "Input":
         return layers["rgba"]
     if kind == "Shuffle":

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl check``."""
+"""Defines ``msspl check``."""
 
 from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -48,30 +48,27 @@ def check(
     from oiio_msspl.jobs.sequence import find_shot, is_sequence
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None, colorspace)
-    found: list[tuple[int | None, PairCheck]] = []
+    pairs: list[tuple[int | None, PairCheck]] = []
     if is_sequence(lr) or is_sequence(hr):
         shot = find_shot(lr, hr, Path(), frames)
         for frame in shot.frames:
             low, high = frame.lr or shot.lr.pattern.path(frame.number), frame.hr or shot.hr.pattern.path(frame.number)
-            pair = check_files(low, high, inputs)
-            found.append((frame.number, pair))
-            _print(frame.number, pair, as_json)
+            pairs.append((frame.number, check_files(low, high, inputs)))
+            _print(*pairs[-1], as_json)
     elif frames:
         raise InputError("--frames is for shots: give folders, or patterns such as lr.####.exr")
     else:
-        found.append((None, check_files(lr, hr, inputs)))
-        _print(*found[0], as_json)
+        pairs.append((None, check_files(lr, hr, inputs)))
+        _print(*pairs[0], as_json)
     if as_json:
-        data: list[dict[str, Any]] = [
-            ({} if number is None else {"frame": number}) | pair.as_dict() for number, pair in found
-        ]
-        print(json.dumps(data[0] if found[0][0] is None else data, indent=2))
-    if not all(pair.fits for _, pair in found):
+        data = [pair.as_dict() if number is None else {"frame": number} | pair.as_dict() for number, pair in pairs]
+        print(json.dumps(data[0] if pairs[0][0] is None else data, indent=2))
+    if not all(pair.fits for _, pair in pairs):
         raise typer.Exit(2)
 
 
 def _print(number: int | None, pair: PairCheck, as_json: bool) -> None:
-    """Print what was found about a pair, unless JSON is printed in the end."""
+    """Print the outcome of a pair, unless JSON is printed in the end."""
     if as_json:
         return
     name = f"{pair.lr} and {pair.hr}" if number is None else f"frame {number}"

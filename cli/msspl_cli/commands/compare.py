@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl compare``."""
+"""Defines ``msspl compare``."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from msspl_cli import console, options
+from msspl_cli.options import option
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
@@ -27,42 +28,24 @@ EXAMPLES = """[bold]Examples[/bold]
   msspl compare out.exr hr.exr lr.exr -r ref.exr --html page.html --layers 'light*'
 """
 
-#: Bytes from which a page loads slowly.
+#: A page of more bytes loads slowly.
 LARGE_PAGE = 60_000_000
+
+
+_REFERENCE = "Measure against this converged render. Only --html works without it."
+_ERROR_MAP = "Write a picture of the first image's error (log RelMSE; dark is small)."
+_HTML = "Write a page to look at all pictures in a browser, with their layers."
+_LAYERS = "Show these layers on the page (light*). May be repeated. \\[default: those that sum to the beauty]"
+_MAP = "Compare this layer of all files instead of their beauty."
 
 
 def compare(
     images: Annotated[list[Path], typer.Argument(metavar="IMAGE...", help="EXRs to measure.", show_default=False)],
-    reference: Annotated[
-        Path | None,
-        typer.Option(
-            "--reference",
-            "-r",
-            metavar="EXR",
-            help="The converged render. Only --html works without it.",
-            show_default=False,
-        ),
-    ] = None,
-    error_map: Annotated[
-        Path | None,
-        typer.Option(metavar="PNG", help="Write a picture of the first image's error (log RelMSE; dark is small)."),
-    ] = None,
-    html: Annotated[
-        Path | None,
-        typer.Option(metavar="HTML", help="Write a page to look at all pictures in a browser, with their layers."),
-    ] = None,
-    layers: Annotated[
-        list[str],
-        typer.Option(
-            metavar="PATTERN",
-            help="Layers that the page shows beside the beauty (light*). May be repeated. "
-            "\\[default: those that sum to the beauty]",
-        ),
-    ] = [],  # noqa: B006
-    mapping: Annotated[
-        list[str],
-        typer.Option("--map", metavar="rgb=LAYER", help="Compare this layer of all files instead of their beauty."),
-    ] = [],  # noqa: B006
+    reference: Annotated[Path | None, option(None, _REFERENCE, "--reference", "-r", metavar="EXR")] = None,
+    error_map: Annotated[Path | None, option(None, _ERROR_MAP, metavar="PNG")] = None,
+    html: Annotated[Path | None, option(None, _HTML, metavar="HTML")] = None,
+    layers: Annotated[list[str], option(None, _LAYERS, metavar="PATTERN")] = [],  # noqa: B006
+    mapping: Annotated[list[str], option(None, _MAP, "--map", metavar="rgb=LAYER")] = [],  # noqa: B006
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     debug: options.Debug = False,
@@ -118,7 +101,7 @@ def compare(
 
 
 def _layer(mapping: list[str]) -> str | None:
-    """The layer that ``--map`` names; None for the beauty."""
+    """Return the layer that ``--map`` names; None for the beauty."""
     from oiio_msspl.aovs.features import RGB
     from oiio_msspl.aovs.mapping import parse_map_options
 
@@ -130,22 +113,15 @@ def _layer(mapping: list[str]) -> str | None:
 
 def _print(images: list[Path], results: list[dict[str, float]]) -> None:
     """Print the scores as a table."""
-    table = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
+    rows = [("image", "PSNR", "RelMSE (0.5, 0.01)", "RelMSE (1, 1e-4)", "SSIM")]
     for path, scores in zip(images, results, strict=True):
-        table.append(
-            (
-                str(path),
-                f"{scores['psnr']:.2f} dB",
-                f"{scores['relmse']:.5f}",
-                f"{scores['relmse_gharbi']:.5f}",
-                f"{scores['ssim']:.4f}",
-            )
-        )
-    console.table(table, header=True, indent=0)
+        psnr, ssim = f"{scores['psnr']:.2f} dB", f"{scores['ssim']:.4f}"
+        rows.append((str(path), psnr, f"{scores['relmse']:.5f}", f"{scores['relmse_gharbi']:.5f}", ssim))
+    console.table(rows, header=True, indent=0)
 
 
 def _write_page(html: Path, comparison: Comparison, layers: list[str], overwrite: bool) -> str:
-    """Write the page. Returns a sentence about it."""
+    """Write the page, and return a sentence about it."""
     from oiio_msspl.compare_page import write_page
 
     with console.ProgressBar() as bar:

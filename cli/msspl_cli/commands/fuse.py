@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl-fuse``."""
+"""Defines ``msspl-fuse``."""
 
 from __future__ import annotations
 
@@ -13,12 +13,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from msspl_cli import console, options
+from msspl_cli.options import INPUT, MODEL, OUTPUT, SHOT, option
 from msspl_cli.shot_printer import ShotPrinter
 from oiio_msspl.errors import InputError
 from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Collection, Sequence
     from contextlib import AbstractContextManager
 
     from dask.distributed import Client
@@ -50,6 +51,13 @@ EXAMPLES = """[bold]Examples[/bold]
   129, 130, 143: stopped by SIGHUP, by Ctrl-C, by SIGTERM
 """
 
+_OUTPUT = "Write this EXR. For a shot: a pattern or a folder."
+_LAYERS = (
+    "Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is left out, too. "
+    "May be repeated. \\[default: all]"
+)
+_COMPRESSION = "Compress the fused layer by zip, zips, piz, dwaa, ... \\[default: as HR]"
+
 
 def fuse(
     lr: options.LowRender,
@@ -60,24 +68,10 @@ def fuse(
     map_file: options.MapFile = None,
     view_layer: options.ViewLayer = None,
     lr_spp: Annotated[
-        float | None,
-        typer.Option(
-            "--lr-spp",
-            metavar="N",
-            help="Samples per pixel of LR, if its header does not say.",
-            rich_help_panel=options.INPUT,
-            hidden=True,
-        ),
+        float | None, option(INPUT, "Set LR's samples per pixel, if its header does not.", metavar="N", hidden=True)
     ] = None,
     hr_spp: Annotated[
-        float | None,
-        typer.Option(
-            "--hr-spp",
-            metavar="N",
-            help="Samples per pixel of HR, if its header does not say.",
-            rich_help_panel=options.INPUT,
-            hidden=True,
-        ),
+        float | None, option(INPUT, "Set HR's samples per pixel, if its header does not.", metavar="N", hidden=True)
     ] = None,
     colorspace: options.Colourspace = None,
     sums: options.Sum = [],  # noqa: B006
@@ -87,68 +81,21 @@ def fuse(
     device: options.Device = "cpu",
     max_memory: options.MaxMemory = "3G",
     threads: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=MOST_THREADS,
-            metavar="N",
-            help="CPU threads. 0: one on each core.",
-            rich_help_panel=options.MODEL,
-            hidden=True,
-        ),
+        int, option(MODEL, "Use N CPU threads. 0: one on each core.", metavar="N", min=0, max=MOST_THREADS, hidden=True)
     ] = 0,
     # Output
-    output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="EXR to write. For a shot: a pattern or a folder.",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-        ),
-    ],
+    output: Annotated[Path, option(OUTPUT, _OUTPUT, "--output", "-o", metavar="OUT", show_default=False)],
     layout: options.Layout = "spec",
-    layers: Annotated[
-        list[str],
-        typer.Option(
-            metavar="PATTERN",
-            help="Write only these layers of HR (crypto*) beside the beauty, or none. A pass that does not match is "
-            "left out, too. May be repeated. \\[default: all]",
-            rich_help_panel=options.OUTPUT,
-        ),
-    ] = [],  # noqa: B006
+    layers: Annotated[list[str], option(OUTPUT, _LAYERS, metavar="PATTERN")] = [],  # noqa: B006
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     data_passes: options.DataPasses = False,
-    compression: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NAME",
-            help="Compression of the fused layer: zip, zips, piz, dwaa, ... \\[default: as HR]",
-            rich_help_panel=options.OUTPUT,
-            hidden=True,
-        ),
-    ] = None,
+    compression: Annotated[str | None, option(OUTPUT, _COMPRESSION, metavar="NAME", hidden=True)] = None,
     half: Annotated[
-        bool | None,
-        typer.Option(
-            "--half/--float",
-            help="Pixel type of the fused layer. \\[default: as HR]",
-            rich_help_panel=options.OUTPUT,
-            hidden=True,
-        ),
+        bool | None, option(OUTPUT, "Set the fused layer's type. \\[default: as HR]", "--half/--float", hidden=True)
     ] = None,
-    preview: Annotated[
-        bool, typer.Option(help="Write an sRGB PNG beside OUT.", rich_help_panel=options.OUTPUT, hidden=True)
-    ] = True,
-    view: Annotated[
-        str | None,
-        typer.Option(
-            metavar="VIEW", help="OpenColorIO view of the preview.", rich_help_panel=options.OUTPUT, hidden=True
-        ),
-    ] = None,
+    preview: Annotated[bool, option(OUTPUT, "Write an sRGB PNG beside OUT.", hidden=True)] = True,
+    view: Annotated[str | None, option(OUTPUT, "Preview in an OpenColorIO view.", metavar="VIEW", hidden=True)] = None,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
@@ -158,41 +105,17 @@ def fuse(
     frames_layer: options.FramesLayer = False,
     skip_existing: options.SkipExisting = False,
     update: Annotated[
-        bool,
-        typer.Option(
-            "--update",
-            help="Skip frames that exist and are newer than their inputs.",
-            rich_help_panel=options.SHOT,
-            hidden=True,
-        ),
+        bool, option(SHOT, "Skip frames that exist and are newer than their inputs.", "--update", hidden=True)
     ] = False,
     report_file: Annotated[
-        Path | None,
-        typer.Option(
-            "--report",
-            metavar="FILE",
-            help="JSON report, kept up to date frame by frame.",
-            rich_help_panel=options.SHOT,
-            hidden=True,
-        ),
+        Path | None, option(SHOT, "Write a JSON report after each frame.", "--report", metavar="FILE", hidden=True)
     ] = None,
     progress: Annotated[
-        str | None,
-        typer.Option(
-            metavar="FORM",
-            help="Print progress for programs: openjd or json.",
-            rich_help_panel=options.SHOT,
-            hidden=True,
-        ),
+        str | None, option(SHOT, "Print progress for programs: openjd or json.", metavar="FORM", hidden=True)
     ] = None,
     scheduler: Annotated[
         str | None,
-        typer.Option(
-            metavar="ADDRESS",
-            help="Fuse on the workers of this Dask scheduler (tcp://HOST:8786).",
-            rich_help_panel=options.SHOT,
-            hidden=True,
-        ),
+        option(SHOT, "Fuse on the workers of this Dask scheduler (tcp://HOST:8786).", metavar="ADDRESS", hidden=True),
     ] = None,
     verbose: options.Verbose = 0,
     quiet: options.Quiet = False,
@@ -210,7 +133,7 @@ def fuse(
     """
     options.set_up_logging(verbose, quiet)
     from oiio_msspl.exr.reader import use_threads
-    from oiio_msspl.jobs.files import fuse_files
+    from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import check_exists, is_sequence
 
     for path in (lr, hr):
@@ -227,35 +150,16 @@ def fuse(
         "view_transform": view,
         "overwrite": overwrite,
     }
-    over_time = options.make_temporal_options(temporal, motion_format)
+    over_time = TemporalOptions(temporal, motion_format)
     use_threads(threads)
     if is_sequence(lr) or is_sequence(hr):
-        from oiio_msspl.jobs.shot import fuse_shot
-
         if debug:
             logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)  # the traceback of each failed frame
-        printer = ShotPrinter(verbose, quiet, as_json, progress)
-        try:
-            with _cluster(scheduler) as client:
-                shot_report = fuse_shot(
-                    lr,
-                    hr,
-                    output,
-                    frames=frames,
-                    temporal=over_time,
-                    previews=preview,
-                    skip_existing=skip_existing,
-                    update=update,
-                    report_path=report_file,
-                    progress=printer,
-                    client=client,
-                    **common,
-                )
-        finally:
-            printer.end()
-        raise typer.Exit(shot_report.exit_code)
-
-    for option, value in (
+        printer = ShotPrinter(verbose, quiet, as_json, progress, common["inputs"].mapping)
+        shot = {"frames": frames, "temporal": over_time, "previews": preview, "report_path": report_file}
+        skipping = {"skip_existing": skip_existing, "update": update}
+        _fuse_shot((lr, hr, output), scheduler, printer, **shot, **skipping, **common)
+    for name, value in (
         ("--frames", frames),
         ("--skip-existing", skip_existing),
         ("--update", update),
@@ -267,83 +171,94 @@ def fuse(
         ("--frames-layer", frames_layer),
     ):
         if value:
-            raise InputError(f"{option} is for shots: give folders, or patterns such as lr.####.exr")
+            raise InputError(f"{name} is for shots: give folders, or patterns such as lr.####.exr")
+    png = output.with_suffix(".png") if preview and output.name else None
+    _fuse_pair((lr, hr, output), verbose, quiet, as_json, preview_path=png, **common)
+
+
+def _fuse_shot(files: tuple[Path, Path, Path], scheduler: str | None, printer: ShotPrinter, **settings: Any) -> None:
+    """Fuse a shot, on a Dask cluster if ``--scheduler`` names one, and exit with its code."""
+    from oiio_msspl.jobs.shot import fuse_shot
+
+    cluster: AbstractContextManager[Client | None] = nullcontext()
+    if scheduler is not None:
+        from oiio_msspl.jobs.farm.dask import connect
+
+        cluster = connect(scheduler)
+    try:
+        with cluster as client:
+            report = fuse_shot(*files, progress=printer, client=client, **settings)
+    finally:
+        printer.end()
+    raise typer.Exit(report.exit_code)
+
+
+def _fuse_pair(files: tuple[Path, Path, Path], verbose: int, quiet: bool, as_json: bool, **settings: Any) -> None:
+    """Fuse a single frame, and print its report."""
+    from oiio_msspl.jobs.files import fuse_files
+
     start = time.perf_counter()
     with console.ProgressBar(shown=not quiet and not verbose) as bar:
 
-        def show_step(done: int, count: int) -> None:
+        def show_tile(done: int, count: int) -> None:
             logging.info("step %d of %d", done, count)
             bar.update("fusing", done, count)
 
-        report = fuse_files(
-            lr,
-            hr,
-            output,
-            preview_path=output.with_suffix(".png") if preview and output.name else None,
-            progress=show_step,
-            **common,
-        )
+        report = fuse_files(*files, progress=show_tile, **settings)
     if as_json:
         print(json.dumps(report.as_dict(), indent=2))
     elif not quiet:
-        _print(report, time.perf_counter() - start)
-    if not quiet:
-        for warning in report.warnings:
-            console.say(f"warning: {warning}", error=True)
+        _print(report, settings["inputs"].mapping, time.perf_counter() - start)
+    for warning in () if quiet else report.warnings:
+        console.say(f"warning: {warning}", error=True)
 
 
-def _cluster(scheduler: str | None) -> AbstractContextManager[Client | None]:
-    """A client of the Dask cluster that ``--scheduler`` names, or None without one."""
-    if scheduler is None:
-        return nullcontext()
-    from oiio_msspl.jobs.farm.dask import connect
-
-    return connect(scheduler)
-
-
-def _print(report: FrameReport, seconds: float) -> None:
-    """Print which layers were used, what was repaired, and the time of each step."""
+def _print(report: FrameReport, mapped: Collection[str], seconds: float) -> None:
+    """Print which layers were used, what was repaired, and the time of each stage."""
     from oiio_msspl.aovs.views import name_of
 
-    spp = report.spp_avg
     renderer = "Pair" if report.hr.renderer == "unknown" else f"{report.hr.renderer} pair"
-    fused = [name_of(each.hr.view) for each in report.fused_views()]
-    view = f", view{'s' if len(fused) > 1 else ''} {', '.join(fused)}" if fused else ""
+    average = "" if report.spp_avg is None else f", {report.spp_avg:g} spp on average"
+    fused = [name_of(view.hr.view) for view in report.fused_views()]
     rest = [name for name in map(name_of, report.hr.other_views) if name not in fused]
     others = f" (also there: {', '.join(rest)})" if rest else ""
-    average = f", {spp:g} spp on average" if spp is not None else ""
-    console.say(f"{renderer} at x{report.scale}{average}{view}{others}")
-    console.aov_table(report.aovs(), report.hr.notes)
-    for other in report.other_views:
-        rows = other.aovs()
+    console.say(f"{renderer} at x{report.scale}{average}{console.views_in_words(fused)}{others}")
+    console.aov_table(report.aovs(), report.hr.notes, mapped)
+    for view in report.other_views:
+        rows = view.aovs()
         read = [f"{row['feature']} {row['source']}" for row in rows if row["status"] in ("found", "computed")]
         if any((row["feature"], row["status"]) == ("albedo", "default") for row in rows):
             read.append("albedo none: expect blur")
-        console.say(f"  view {name_of(other.hr.view)}: {', '.join(read)}")
+        console.say(f"  view {name_of(view.hr.view)}: {', '.join(read)}")
     if lrhs_aovs := report.found_lrhs_aovs():
         console.say("  also read from LR: " + ", ".join(f"{name} ({layer})" for name, layer in lrhs_aovs.items()))
-    for name, done in report.passes.items():
-        console.say(f"  {name}: {done}")
+    for name, outcome in report.passes.items():
+        console.say(f"  {name}: {outcome}")
     for text, counts in (
         ("Repaired values that were NaN or infinite", report.repaired),
         ("Set negative values to 0 (colours out of gamut)", report.negative),
     ):
         if counts:
             console.say(f"{text}: {', '.join(f'{count} in {name}' for name, count in counts.items())}")
-    provider = report.provider.removesuffix("ExecutionProvider")
-    where = "on the CPU" if provider == "CPU" else f"on {provider}"
-    on_cpu = report.convolutions.get("CPUExecutionProvider", 0)
-    if provider != "CPU" and on_cpu:
-        where += f", {on_cpu} of {sum(report.convolutions.values())} convolutions on the CPU,"
+    stages = {"read": "loading", "fuse": "fusing", "write": "writing"}
+    times = ", ".join(f"{report.seconds[key]:.1f} s {stage}" for key, stage in stages.items())
     tiles = tiles_in_words(report.tiles_of_views)
-    steps = {"read": "loading", "fuse": "fusing", "write": "writing"}
-    times = ", ".join(f"{report.seconds[key]:.1f} s {step}" for key, step in steps.items())
-    console.say(f"Fused with {report.model} {where}{tiles} in {seconds:.1f} s ({times}).")
+    console.say(f"Fused with {report.model} {_device(report)}{tiles} in {seconds:.1f} s ({times}).")
     console.say(f"Wrote {report.output}" + (f" and {report.preview}" if report.preview else ""))
 
 
+def _device(report: FrameReport) -> str:
+    """Return where the model ran, in words."""
+    provider = report.provider.removesuffix("ExecutionProvider")
+    if provider == "CPU":
+        return "on the CPU"
+    on_cpu = report.convolutions.get("CPUExecutionProvider", 0)
+    rest = f", {on_cpu} of {sum(report.convolutions.values())} convolutions on the CPU," if on_cpu else ""
+    return f"on {provider}{rest}"
+
+
 def tiles_in_words(tiles: Sequence[int]) -> str:
-    """In how many tiles each view was fused, from their numbers by view; empty if each view is one tile."""
+    """Say in how many tiles each view was fused, from their numbers by view; nothing if each view is one tile."""
     least, most = min(tiles), max(tiles)
     if most == 1:
         return ""

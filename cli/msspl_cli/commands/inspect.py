@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl inspect``."""
+"""Defines ``msspl inspect``."""
 
 from __future__ import annotations
 
@@ -39,25 +39,26 @@ def inspect(
 
     If a file can't be used, the reason is printed and the exit code is 2.
     """
+    from oiio_msspl.aovs.features import FEATURES
     from oiio_msspl.inspection import inspect_file, inspect_noise
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
-    found = [inspect_file(path, inputs, model, motion_format) for path in files]
-    inspect_noise(found)
+    inspections = [inspect_file(path, inputs, model, motion_format) for path in files]
+    inspect_noise(inspections)
     if as_json:
-        data = [inspection.as_dict() for inspection in found]
+        data = [inspection.as_dict() for inspection in inspections]
         print(json.dumps(data if len(data) > 1 else data[0], indent=2))
     else:
-        for inspection in found:
+        for inspection in inspections:
             console.say(str(inspection.path))
             for line in inspection.facts:
                 console.say(f"  {line}")
             if inspection.render is not None:
                 console.say(f"  what {inspection.model} would read:")
-                console.aov_table(inspection.aovs(), inspection.render.notes)
+                console.aov_table(inspection.aovs(), inspection.render.notes, FEATURES)
                 if inspection.unused:
                     console.say(f"  neither read nor fused: {', '.join(inspection.unused)}")
             for problem in inspection.problems:
                 console.say(f"  can't be used: {problem}")
-    if any(inspection.problems for inspection in found):
+    if any(inspection.problems for inspection in inspections):
         raise typer.Exit(2)

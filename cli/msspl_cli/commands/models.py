@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl models``."""
+"""Defines ``msspl models``."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ EXAMPLES = """[bold]Examples[/bold]
 def models(as_json: options.Json = False, debug: options.Debug = False, help_all: options.HelpAll = False) -> None:
     """List the models in the package, and the devices that ONNX Runtime was built for.
 
-    PSNR and RelMSE are those of five scenes with 2 and 8 samples per pixel in all, for
-    models with -spread of the same scenes with a filter that spreads each sample.
+    PSNR and RelMSE are the means of five scenes, at 2 and at 8 samples per pixel in
+    all. Models with -spread were measured with a filter that spreads each sample.
     Time is a multiple of that of Open Image Denoise, on processors with AMX, with
-    VNNI and with neither. Layers are those that a model reads beside the beauty.
+    VNNI and with neither. Each model reads the beauty and the layers of its row.
     """
     from oiio_msspl.aovs.features import RGB
     from oiio_msspl.model.catalogue import QUALITIES, measured, shipped_models
@@ -57,19 +57,19 @@ def models(as_json: options.Json = False, debug: options.Debug = False, help_all
 
 
 def _cells(row: dict[str, Any]) -> tuple[str, ...]:
-    """A model's line of the table."""
+    """Return the line of a model in the table."""
     figures: dict[str, float] = row["measured"]
 
-    def both(form: str, *names: str) -> str:
+    def values(form: str, *names: str) -> str:
         return " / ".join(form.format(figures[name]) if name in figures else "-" for name in names)
 
     same_file = row["files"]["gpu"] == row["files"]["cpu"]
     return (
         row["name"],
         row["quality"] or "",
-        both("{:.2f}", "psnr_2spp", "psnr_8spp"),
-        both("{:.4f}", "relmse_2spp", "relmse_8spp"),
-        both("{:.2g}", "time_amx", "time_vnni", "time_neither"),
+        values("{:.2f}", "psnr_2spp", "psnr_8spp"),
+        values("{:.4f}", "relmse_2spp", "relmse_8spp"),
+        values("{:.2g}", "time_amx", "time_vnni", "time_neither"),
         ", ".join(row["layers"]),
         "the same" if same_file else "half floats",
     )

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl nuke-install``."""
+"""Defines ``msspl nuke-install``."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ MARKER = "# added by msspl nuke-install"
 
 
 def nuke_install(
-    folder: Annotated[Path, typer.Option("--dir", metavar="DIR", help="The user's or the site's Nuke folder.")] = Path(
-        "~/.nuke"
-    ),
+    folder: Annotated[
+        Path, typer.Option("--dir", metavar="DIR", help="Use this Nuke folder, of a user or a site.")
+    ] = Path("~/.nuke"),
     uninstall: Annotated[bool, typer.Option("--uninstall", help="Remove the line.")] = False,
     debug: options.Debug = False,
     help_all: options.HelpAll = False,
@@ -49,7 +49,7 @@ def nuke_install(
 
 
 def install_line(gizmo: Path, program: str | None) -> str:
-    """The line for init.py. A program that the environment or a knob names has priority."""
+    """Build the line for init.py. A program that the environment or a knob names has priority."""
     environment = f'os.environ.setdefault("MSSPL_FUSE", {Path(program).as_posix()!r}); ' if program else ""
     return f"import os, nuke; {environment}nuke.pluginAddPath({gizmo.as_posix()!r})  {MARKER}"
 
@@ -74,7 +74,7 @@ def set_line(path: Path, line: str | None) -> bool:
     except OSError as error:
         raise InputError(f"{path}: can't be read ({error.strerror}); nothing was changed") from error
     newline = b"\r\n" if b"\r\n" in before else b"\n"
-    kept = b"".join(each for each in before.splitlines(keepends=True) if not each.rstrip().endswith(MARKER.encode()))
+    kept = b"".join(row for row in before.splitlines(keepends=True) if not row.rstrip().endswith(MARKER.encode()))
     after = kept
     if line is not None:
         after += (newline if kept and not kept.endswith(b"\n") else b"") + line.encode() + newline

@@ -1,31 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl-render``."""
+"""Defines ``msspl-render``."""
 
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
 from msspl_cli import console, options
 from msspl_cli.blender_process import find_blender, render_frames
+from msspl_cli.options import INPUT, OUTPUT, SHOT, option
 from oiio_msspl.errors import InputError
-from oiio_msspl.exr.atomic import (
-    check_folder,
-    check_separate,
-    check_target,
-    make_folder,
-    remove_left_folders,
-    remove_leftovers,
-)
+from oiio_msspl.exr import atomic
 from oiio_msspl.image.parallel import MOST_THREADS
-
-if TYPE_CHECKING:
-    from oiio_msspl.jobs.blender_source import RenderedShot
-    from oiio_msspl.jobs.settings import Settings
 
 EXAMPLES = """[bold]Examples[/bold]
 
@@ -42,6 +32,22 @@ EXAMPLES = """[bold]Examples[/bold]
 
 #: Group of options in the help text.
 RENDER = "Render"
+#: Number and file of a frame. The number is None for the frame at which the scene was saved.
+Target = tuple[int | None, Path]
+
+_SCENE_NAME = "Render this scene, if the file has several. Without it: the one that was active when it was saved."
+_BLENDER = "Run this Blender (4.5 or later) or Python with bpy. Without it: MSSPL_BLENDER, or blender on the path."
+_SCALE = "Divide width and height of the low-resolution render by 2, 4 or 8."
+_LR_SPP = (
+    "Render N samples per pixel at low resolution. \\[default: a third as many samples in total as the "
+    "full-resolution render has, but at least 4, 16 or 64 at x2, x4 or x8]"
+)
+_FILTER = "Filter pixels with box, which is sharpest, or scene for the scene's own filter."
+_COMPONENTS = "Render all component passes, from diffuse to volume, besides the passes that the scene has on."
+_THREADS = "Use N CPU threads. 0: as the scene says, or one on each core."
+_FRAMES = (
+    "Render only these frames: 7, 1001-1100x2 or 1001,1005-1010. Without it: the frame at which the scene was saved."
+)
 
 
 def render(
@@ -49,89 +55,17 @@ def render(
     *,
     # Input
     view_layer: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="View layer to render, if several are on.",
-            show_default=False,
-            rich_help_panel=options.INPUT,
-        ),
+        str, option(INPUT, "Render this view layer, if several are on.", metavar="NAME", show_default=False)
     ] = "",
-    scene_name: Annotated[
-        str,
-        typer.Option(
-            metavar="NAME",
-            help="Scene to render, if the file has several. Without it: the one that was active when it was saved.",
-            show_default=False,
-            rich_help_panel=options.INPUT,
-            hidden=True,
-        ),
-    ] = "",
-    blender: Annotated[
-        str | None,
-        typer.Option(
-            metavar="PROGRAM",
-            help="Blender 4.5 or later, or a Python that has bpy. Without it: MSSPL_BLENDER, or blender on the path.",
-            rich_help_panel=options.INPUT,
-        ),
-    ] = None,
+    scene_name: Annotated[str, option(INPUT, _SCENE_NAME, metavar="NAME", show_default=False, hidden=True)] = "",
+    blender: Annotated[str | None, option(INPUT, _BLENDER, metavar="PROGRAM")] = None,
     # Render
-    scale: Annotated[
-        int,
-        typer.Option(
-            "--scale",
-            "-s",
-            metavar="N",
-            help="2, 4 or 8: the low-resolution render has 1/N of the width and height.",
-            rich_help_panel=RENDER,
-        ),
-    ] = 4,
-    lr_spp: Annotated[
-        int | None,
-        typer.Option(
-            min=1,
-            metavar="N",
-            help="Samples per pixel of the low-resolution render. \\[default: a third as many samples in total as the "
-            "full-resolution render has, but at least 4, 16 or 64 at x2, x4 or x8]",
-            show_default=False,
-            rich_help_panel=RENDER,
-        ),
-    ] = None,
-    hr_spp: Annotated[
-        int,
-        typer.Option(
-            min=1, metavar="N", help="Samples per pixel of the full-resolution render.", rich_help_panel=RENDER
-        ),
-    ] = 1,
-    pixel_filter: Annotated[
-        str,
-        typer.Option(
-            "--filter",
-            metavar="NAME",
-            help="Pixel filter: box, which is sharpest, or scene for the scene's own.",
-            rich_help_panel=RENDER,
-            hidden=True,
-        ),
-    ] = "box",
-    components: Annotated[
-        bool,
-        typer.Option(
-            "--components",
-            help="Render all component passes, from diffuse to volume, besides the passes that the scene has on.",
-            rich_help_panel=RENDER,
-        ),
-    ] = False,
-    threads: Annotated[
-        int,
-        typer.Option(
-            min=0,
-            max=MOST_THREADS,
-            metavar="N",
-            help="CPU threads. 0: as the scene says, or one on each core.",
-            rich_help_panel=RENDER,
-            hidden=True,
-        ),
-    ] = 0,
+    scale: Annotated[int, option(RENDER, _SCALE, "--scale", "-s", metavar="N")] = 4,
+    lr_spp: Annotated[int | None, option(RENDER, _LR_SPP, min=1, metavar="N", show_default=False)] = None,
+    hr_spp: Annotated[int, option(RENDER, "Render N samples per pixel at full resolution.", min=1, metavar="N")] = 1,
+    pixel_filter: Annotated[str, option(RENDER, _FILTER, "--filter", metavar="NAME", hidden=True)] = "box",
+    components: Annotated[bool, option(RENDER, _COMPONENTS, "--components")] = False,
+    threads: Annotated[int, option(RENDER, _THREADS, min=0, max=MOST_THREADS, metavar="N", hidden=True)] = 0,
     # Model
     quality: options.Quality = None,
     model: options.Model = "auto",
@@ -139,50 +73,22 @@ def render(
     max_memory: options.MaxMemory = "3G",
     # Output
     output: Annotated[
-        Path,
-        typer.Option(
-            "--output",
-            "-o",
-            metavar="OUT",
-            help="EXR to write, or a pattern.",
-            show_default=False,
-            rich_help_panel=options.OUTPUT,
-        ),
+        Path, option(OUTPUT, "Write this EXR, or a pattern.", "--output", "-o", metavar="OUT", show_default=False)
     ],
     layout: options.Layout = "multilayer",
     passes: options.Passes = ["auto"],  # noqa: B006
     error_layer: options.ErrorLayer = False,
     data_passes: options.DataPasses = False,
     keep: Annotated[
-        bool,
-        typer.Option(
-            "--keep",
-            help="Keep both renders beside OUT: OUT_lr.exr, OUT_hr.exr.",
-            rich_help_panel=options.OUTPUT,
-            hidden=True,
-        ),
+        bool, option(OUTPUT, "Keep both renders beside OUT: OUT_lr.exr, OUT_hr.exr.", "--keep", hidden=True)
     ] = False,
     compare: Annotated[
-        bool,
-        typer.Option(
-            "--compare",
-            help="Also render the ordinary way, with OIDN, in the same time: OUT_oidn.exr.",
-            rich_help_panel=options.OUTPUT,
-        ),
+        bool, option(OUTPUT, "Also render the ordinary way, with OIDN, in the same time: OUT_oidn.exr.", "--compare")
     ] = False,
     overwrite: options.Overwrite = False,
     as_json: options.Json = False,
     # Shot
-    frames: Annotated[
-        str | None,
-        typer.Option(
-            "--frames",
-            "--frame",
-            metavar="RANGE",
-            help="7, 1001-1100x2 or 1001,1005-1010. Without it: the frame at which the scene was saved.",
-            rich_help_panel=options.SHOT,
-        ),
-    ] = None,
+    frames: Annotated[str | None, option(SHOT, _FRAMES, "--frames", "--frame", metavar="RANGE")] = None,
     temporal: options.RenderedTemporal = "off",
     skip_existing: options.SkipExisting = False,
     verbose: options.Verbose = 0,
@@ -197,64 +103,43 @@ def render(
     """
     if not scene.is_file():
         raise InputError(f"{scene}: no such file")
+    from msspl_cli.rendered_frames import RenderedFrames, beside
     from oiio_msspl.exr.reader import use_threads
-    from oiio_msspl.jobs.blender_source import RenderedShot, beside
-    from oiio_msspl.jobs.sequence import FrameFiles
-    from oiio_msspl.jobs.settings import Settings
+    from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.model.contract import SCALES
 
-    if scale not in SCALES:
-        raise InputError(f"--scale {scale}: use one of {', '.join(map(str, SCALES))}")
-    if pixel_filter not in ("box", "scene"):
-        raise InputError(f"--filter {pixel_filter!r}: use one of box, scene")
+    for name, value, choices in (("--scale", scale, SCALES), ("--filter", pixel_filter, ("box", "scene"))):
+        if value not in choices:
+            raise InputError(f"{name} {value!r}: use one of {', '.join(map(str, choices))}")
     program = find_blender(blender)
+    over_time = TemporalOptions(temporal)
     if overwrite and skip_existing:
         raise InputError("--overwrite and --skip-existing exclude each other: replace frames, or leave them")
-    over_time = options.make_temporal_options(temporal, None)
-    targets = name_targets(output, frames)
-    folder = output.parent
-    makes_folder = is_pattern(output) and not folder.exists()
-    if makes_folder:
-        check_folder(folder)
-    suffixes = [*(["lr", "hr"] if keep else []), *(["oidn"] if compare else [])]
-    for _, target in targets:
-        if target.suffix.lower() != ".exr":
-            raise InputError(f"{target}: the result is an EXR; name it .exr")
-    shot = targets
-    if skip_existing:
-        targets = [(number, target) for number, target in targets if not target.exists()]
-    written = [[target, *(beside(target, suffix) for suffix in suffixes)] for _, target in targets]
-    for target, *more in [] if makes_folder else written:
-        check_target(target, overwrite=overwrite)
-        for path in more:
-            # A resumed shot replaces what an earlier run left beside a frame that it could not complete.
-            check_target(path, overwrite=overwrite or skip_existing)
-    check_separate([scene], [path for paths in written for path in paths])
-    write = options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes)
-    model = options.choose_model(model, quality)
+    shot = name_targets(output, frames)
+    targets = [path for _, path in shot if not (skip_existing and path.exists())]
+    extras = [
+        beside(path, name) for path in targets for name, on in (("lr", keep), ("hr", keep), ("oidn", compare)) if on
+    ]
+    _check_files(scene, output, targets, extras, overwrite=overwrite, skip_existing=skip_existing)
     use_threads(threads)
-    settings = Settings(
-        write=write,
-        model=model,
+    fused = RenderedFrames(
+        shot,
+        targets,
+        scale,
+        over_time,
+        keep=keep,
+        write=options.make_write_options(layout, None, None, [], error_layer, passes, data_passes=data_passes),
+        model=options.choose_model(model, quality),
         device=device,
         threads=threads,
         max_memory=options.parse_bytes(max_memory),
         overwrite=overwrite,
     )
-    _load_model(settings, scale)
-    frames_of_shot = [FrameFiles(number or 0, None, None, target.absolute()) for number, target in shot]
-    wanted = {target.absolute() for _, target in targets}
-    fuser = RenderedShot(
-        settings, frames_of_shot, [each for each in frames_of_shot if each.output in wanted], over_time, keep=keep
-    )
     job = {
         "scene": str(scene.absolute()),
         "scene_name": scene_name,
-        # A neighbour of a frame has no result. Without a range, there is one frame: that at which the scene was saved.
-        "frames": [
-            (None if frames is None else frame.number, str(frame.output) if frame.output in wanted else None)
-            for frame in fuser.order
-        ],
+        # Without a range, there is one frame: that at which the scene was saved.
+        "frames": [(None if frames is None else number, result) for number, result in fused.order],
         "options": {
             "scale": scale,
             "hr_spp": hr_spp,
@@ -262,130 +147,48 @@ def render(
             "filter": pixel_filter.upper(),
             "view_layer": view_layer,
             "components": components,
-            "vectors": fuser.averages,
+            "vectors": fused.averages,
             "threads": threads,
         },
         "overwrite": overwrite,
         "compare": compare,
     }
-    if makes_folder:
-        make_folder(folder)
-    remove_leftovers(target for _, target in shot)
-    remove_left_folders(folder)
-    reports = _Reports(fuser, keep=keep, quiet=quiet, bar=console.ProgressBar(shown=not quiet and not verbose))
+    atomic.make_folder(output.parent)
+    atomic.remove_leftovers(path for _, path in shot)
+    atomic.remove_left_folders(output.parent)
+    printer = _Printer(quiet, bool(verbose))
+
+    def show(event: dict[str, Any]) -> None:
+        fused.take(event)
+        printer.show(event)
+        printer.add(fused.written())
+
     try:
         if targets:
-            render_frames(program, scene, job, folder, reports.show, fuser.fuse, verbose=bool(verbose))
+            render_frames(program, scene, job, output.parent, show, fused.fuse, verbose=bool(verbose))
     finally:
-        reports.end()  # frames that are written are reported even if a later one failed
-        if as_json:
-            print(json.dumps(reports.written, indent=2))
-        elif reports.written and not quiet:
-            _print(reports.written, alone=not fuser.averages)
-            if fuser.text:
-                print(f"Fused {fuser.text}")
+        printer.add(fused.written())  # frames that are written are reported even if a later one failed
+        printer.end(as_json, fused.text, alone=not fused.averages)
     if not (targets or as_json or quiet):
         print(f"{output}: every frame exists")
 
 
-def _load_model(settings: Settings, scale: int) -> None:
-    """Load the model of all frames.
-
-    Raises:
-        InputError: the model or the device can't be had. No frame was rendered for nothing.
-    """
-    from oiio_msspl.model.catalogue import family_of
-
-    settings = replace(settings, model=family_of(settings.model) or settings.model)
-    session = settings.load(scale)
-    if session.contract.scale != scale:
-        raise InputError(f"--model {settings.model}: is for x{session.contract.scale}, but --scale is {scale}")
-    settings.session(scale)  # refuses a model that does not make the layers that are asked for
-
-
-class _Reports:
-    """The reports of a shot's frames, while they are rendered.
-
-    Args:
-        fuser: what fuses the frames.
-        keep: whether the renders are kept.
-        quiet: print no warnings.
-        bar: shows the progress.
-    """
-
-    def __init__(self, fuser: RenderedShot, *, keep: bool, quiet: bool, bar: console.ProgressBar) -> None:
-        self._fuser, self._keep, self._quiet, self._bar = fuser, keep, quiet, bar
-        self.written: list[dict[str, Any]] = []
-        """Reports of the frames that are written."""
-        self._waiting: list[dict[str, Any]] = []  # of frames that wait for their neighbours
-        self._warnings: list[str] = []  # about all frames
-        self._label = ""
-
-    def show(self, event: dict[str, Any]) -> None:
-        """Take an event of :func:`msspl_cli.blender_process.render_frames`.
-
-        Raises:
-            InputError: the frames that it is about could not be fused.
-        """
-        if "no_vectors" in event:
-            self._fuser.fuse_alone(event["no_vectors"])
-        if "size" in event:
-            self._fuser.check(event["size"], event["layers"], event["pixel_bytes"])
-        if "warning" in event:
-            self._warnings.append(event["warning"])
-        if "report" in event:
-            self._waiting.append(event["report"])
-            self._report()
-            return
-        if "step" in event:
-            number = event.get("frame")
-            self._label = event["step"] if number is None else f"frame {number}: {event['step']}"
-        self._bar.update(self._label, event.get("samples", 0), 1)
-
-    def end(self) -> None:
-        """Report what is written, and hide the progress."""
-        self._report()
-        self._bar.hide()
-
-    def _report(self) -> None:
-        from oiio_msspl.jobs.blender_source import beside
-
-        while self._waiting and not self._fuser.waits(result := Path(self._waiting[0]["output"])):
-            report = self._waiting.pop(0)
-            report["temporal"] = self._fuser.text
-            report["warnings"] += [*self._warnings, *self._fuser.warnings(result)]
-            for render, suffix in (("lrhs", "lr"), ("hrls", "hr")):
-                report[render]["file"] = str(beside(result, suffix)) if self._keep else None
-            self.written.append(report)
-            self._bar.hide()
-            for warning in [] if self._quiet else report["warnings"]:
-                console.say(f"warning: frame {report['frame']}: {warning}", error=True)
-
-
-def is_pattern(output: Path) -> bool:
-    """Whether OUT names several frames."""
-    from oiio_msspl.jobs.sequence import is_sequence
-
-    return is_sequence(output) and not output.is_dir()
-
-
-def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Path]]:
+def name_targets(output: Path, frames: str | None) -> list[Target]:
     """Pair frame numbers with files.
 
     Args:
         output: an EXR, or a pattern.
         frames: a range; None for the frame at which the scene was saved.
 
-    Returns:
-        (number, file) of each frame. The number is None for the frame at which the scene was saved.
-
     Raises:
-        InputError: one name for several frames, or a pattern without frames.
+        InputError: one name for several frames, a pattern without frames, or a name of another kind of file.
     """
     from oiio_msspl.jobs.sequence import parse_frames, parse_pattern
 
     numbers = [] if frames is None else parse_frames(frames)
-    if is_pattern(output):
+    if output.suffix.lower() != ".exr":
+        raise InputError(f"{output}: the result is an EXR; name it .exr")
+    if _is_pattern(output):
         if not numbers:
             raise InputError(f"{output}: is a pattern; name the frames with --frames")
         pattern = parse_pattern(output)
@@ -395,12 +198,69 @@ def name_targets(output: Path, frames: str | None) -> list[tuple[int | None, Pat
     return [(numbers[0] if numbers else None, output)]
 
 
-def _print(reports: list[dict[str, Any]], *, alone: bool) -> None:
-    """Print the time of each step, and what ordinary rendering gives in the same time. If frames are not fused alone,
-    the time of one does not say what it costs: it holds the work for frames that have waited for it."""
-    first = reports[0]
-    for key, name in (("lrhs", "LRHS"), ("hrls", "HRLS")):
-        print(f"{name} {first[key]['size'][0]}x{first[key]['size'][1]}, {first[key]['spp']} spp")
+def _is_pattern(output: Path) -> bool:
+    from oiio_msspl.jobs.sequence import is_sequence
+
+    return is_sequence(output) and not output.is_dir()
+
+
+def _check_files(
+    scene: Path, output: Path, targets: Sequence[Path], extras: Sequence[Path], *, overwrite: bool, skip_existing: bool
+) -> None:
+    """Refuse results, and extra files beside them, that can't be written."""
+    if _is_pattern(output) and not output.parent.exists():
+        atomic.check_folder(output.parent)  # the shot makes the folder
+    else:
+        for path in targets:
+            atomic.check_target(path, overwrite=overwrite)
+        for path in extras:
+            # A resumed shot replaces the files that an earlier run left beside a frame that it could not complete.
+            atomic.check_target(path, overwrite=overwrite or skip_existing)
+    atomic.check_separate([scene], [*targets, *extras])
+
+
+class _Printer:
+    """The progress and the reports of a shot, as they are printed."""
+
+    def __init__(self, quiet: bool, verbose: bool) -> None:
+        self._quiet, self._bar, self._label = quiet, console.ProgressBar(shown=not quiet and not verbose), ""
+        self._reports: list[dict[str, Any]] = []
+
+    def show(self, event: dict[str, Any]) -> None:
+        """Show the step that Blender works on."""
+        if "step" in event:
+            number = event.get("frame")
+            self._label = event["step"] if number is None else f"frame {number}: {event['step']}"
+        if "report" not in event:
+            self._bar.update(self._label, event.get("samples", 0), 1)
+
+    def add(self, reports: Sequence[dict[str, Any]]) -> None:
+        """Keep the reports of frames that are written, and print their warnings."""
+        for report in reports:
+            self._reports.append(report)
+            self._bar.hide()
+            for warning in () if self._quiet else report["warnings"]:
+                console.say(f"warning: frame {report['frame']}: {warning}", error=True)
+
+    def end(self, as_json: bool, fused: str, *, alone: bool) -> None:
+        """Print the reports: as JSON, or the times as a table, and how frames were averaged."""
+        self._bar.hide()
+        if as_json:
+            print(json.dumps(self._reports, indent=2))
+        elif self._reports and not self._quiet:
+            _print_times(self._reports, alone=alone)
+            if fused:
+                print(f"Fused {fused}")
+
+
+def _print_times(reports: Sequence[dict[str, Any]], *, alone: bool) -> None:
+    """Print the time of each step and, if it is known, what ordinary rendering gives in the time of the frame.
+
+    The time of a frame that is averaged does not tell, because it holds the work for frames that waited for it.
+    """
+    first, last = reports[0], reports[-1]
+    for key in ("lrhs", "hrls"):
+        print(f"{key.upper()} {first[key]['size'][0]}x{first[key]['size'][1]}, {first[key]['spp']} spp")
     titles = ("frame", "LRHS s", "HRLS s", "fuse s", "all s", "plain rendering in that time")
     columns = len(titles) if alone or any("oidn" in report for report in reports) else len(titles) - 1
     rows: list[tuple[str, ...]] = [titles[:columns]]
@@ -414,4 +274,4 @@ def _print(reports: list[dict[str, Any]], *, alone: bool) -> None:
         seconds = report["lrhs"]["seconds"], report["hrls"]["seconds"], report["fuse_seconds"], report["seconds"]
         rows.append((str(report["frame"]), *(f"{value:.2f}" for value in seconds), plain)[:columns])
     console.table(rows, header=True)
-    print(f"Wrote {reports[0]['output']}" + (f" to {reports[-1]['output']}" if len(reports) > 1 else ""))
+    print(f"Wrote {first['output']}" + (f" to {last['output']}" if last is not first else ""))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""``msspl submit``."""
+"""Defines ``msspl submit``."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ _PATHS = ("lr", "hr", "output", "map_file")
 
 def submit(
     context: typer.Context,
-    bundle: Annotated[Path, typer.Option(metavar="DIR", help="New folder for the job bundle.", show_default=False)],
-    chunk: Annotated[int, typer.Option(metavar="N", min=1, help="Frames per task.")] = 10,
+    bundle: Annotated[Path, typer.Option(metavar="DIR", help="Write to this new folder.", show_default=False)],
+    chunk: Annotated[int, typer.Option(metavar="N", min=1, help="Fuse N frames in each task.")] = 10,
     timeout: Annotated[
-        int, typer.Option(metavar="SECONDS", min=1, help="Time limit of a frame. A task gets N times as long.")
+        int, typer.Option(metavar="SECONDS", min=1, help="Limit the time of a frame. A task gets N times as long.")
     ] = 1800,
     # Typer splits a short option that it does not know into letters: in -o/path it would find the -h of --help.
     output: Annotated[str | None, typer.Option("--output", "-o", metavar="OUT", hidden=True)] = None,
@@ -65,30 +65,20 @@ def submit(
     from oiio_msspl.image.parallel import limit_threads
     from oiio_msspl.jobs.checks import check_first_pair, check_temporal, check_wanted_outputs
     from oiio_msspl.jobs.farm.openjd import OPENJD_VALUES, TEMPLATE, make_job, write_bundle
+    from oiio_msspl.jobs.plan import TemporalOptions
     from oiio_msspl.jobs.sequence import format_frames
 
-    # Options with a wrong value are refused here, and not by every task.
+    # A wrong value is refused here, and not by every task.
     names = ("mapping", "map_file", "view_layer", "lr_spp", "hr_spp", "colorspace", "sums")
     inputs = options.make_inputs(*(given[name] for name in names))
     written = ("layout", "compression", "half", "layers", "error_layer", "frames_layer", "passes", "data_passes")
     write = options.make_write_options(**{name: given[name] for name in written})
-    temporal = options.make_temporal_options(given["temporal"], given["motion_format"])
+    temporal = TemporalOptions(given["temporal"], given["motion_format"])
     max_memory = options.parse_bytes(given["max_memory"])
     model = options.choose_model(given["model"], given["quality"])
-    job = make_job(
-        given["lr"],
-        given["hr"],
-        given["output"],
-        frames=given["frames"],
-        inputs=inputs,
-        model=model,
-        map_file=given["map_file"],
-        device=given["device"],
-        view=given["view"],
-        options=passed_on,
-        chunk=chunk,
-        timeout=timeout,
-    )
+    settings: dict[str, Any] = {name: given[name] for name in ("frames", "map_file", "device", "view")}
+    settings |= {"inputs": inputs, "model": model, "options": passed_on, "chunk": chunk, "timeout": timeout}
+    job = make_job(given["lr"], given["hr"], given["output"], **settings)
     check_wanted_outputs(job.shot.frames, inputs, write, model, max_memory)
     with limit_threads(given["threads"]):
         check_temporal(job.shot, inputs, temporal, model, write)
@@ -138,15 +128,15 @@ def _parse(arguments: list[str]) -> tuple[dict[str, Any], list[str]]:
         elif getattr(parameter, "count", False):
             passed_on += [parameter.opts[0]] * value
         else:
-            for each in value if isinstance(value, list | tuple) else [value]:
-                passed_on += [parameter.opts[0], _full_path(each) if name == "mapping" else str(each)]
+            for text in value if isinstance(value, list | tuple) else [value]:
+                passed_on += [parameter.opts[0], _full_path(text) if name == "mapping" else str(text)]
     # Some versions of typer convert paths only when they call the command.
     paths = {name: Path(context.params[name]) for name in _PATHS if context.params[name] is not None}
     return context.params | paths, passed_on
 
 
 def _full_path(mapping: str) -> str:
-    """A ``--map`` with an absolute path if it names an EXR, because tasks run in other folders."""
+    """Make the path of a ``--map`` absolute if it names an EXR, because tasks run in other folders."""
     from oiio_msspl.aovs.mapping import is_exr
 
     feature, equals, layer = mapping.partition("=")

@@ -13,7 +13,7 @@ from support import BLENDER_5, WORK, fake_fuse, module, sentence, snapshot
 
 
 def check_button(scene):
-    """The button shows the fused file in the compositor and leaves the scene unchanged."""
+    """Check that the button shows the fused file in the compositor and leaves the scene unchanged."""
     before = snapshot(scene)
     assert bpy.ops.msspl.fuse() == {"FINISHED"}
     assert snapshot(scene) == before
@@ -31,7 +31,7 @@ def check_button(scene):
     tree.links.new(blur.outputs[0], output.inputs[0])
     scene.frame_set(12)
     assert bpy.ops.msspl.fuse() == {"FINISHED"}
-    assert [each.name for each in tree.nodes if each.bl_idname == "CompositorNodeImage"] == ["MSSPL Fused"]
+    assert [node.name for node in tree.nodes if node.bl_idname == "CompositorNodeImage"] == ["MSSPL Fused"]
     assert blur.inputs[0].links[0].from_node == node
     assert output.inputs[0].links[0].from_node == blur
     assert node.image.filepath == "//fused_012.exr"
@@ -130,7 +130,7 @@ def check_panel():
 
 
 def check_modes(scene):
-    """A script waits for its render, and a window does not. A render that wrote no file was cancelled by the user, or
+    """Check that a script waits for its render, and a window does not. A render without a file was cancelled, or
     failed if Blender has no window."""
     render, errors = module("render"), module("errors")
     modes = []

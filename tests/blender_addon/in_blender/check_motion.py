@@ -25,9 +25,9 @@ def render_motion():
     for frame, way in enumerate((0.0, 0.06, 0.15, 0.3), start=1):
         cube.location, cube.rotation_euler = (2 * way - 0.3, 0, 0.6), (0, 0, way)
         camera.location, camera.rotation_euler = (way, way - 5, 2 + way / 2), (math.radians(72), 0, way / 7)
-        for each in (cube, camera):
-            each.keyframe_insert("location", frame=frame)
-            each.keyframe_insert("rotation_euler", frame=frame)
+        for moved in (cube, camera):
+            moved.keyframe_insert("location", frame=frame)
+            moved.keyframe_insert("rotation_euler", frame=frame)
     render, layer, image = scene.render, scene.view_layers[0], scene.render.image_settings
     render.engine, scene.cycles.samples = "CYCLES", 4
     render.resolution_x, render.resolution_y, render.resolution_percentage = 192, 128, 100
@@ -54,7 +54,7 @@ def render_motion():
 
 
 def _texture(scale):
-    """A material with sharp spots."""
+    """Make a material with sharp spots."""
     material = bpy.data.materials.new("Spots")
     material.use_nodes = True
     nodes, links = material.node_tree.nodes, material.node_tree.links

@@ -45,7 +45,7 @@ def _fuse(scene, name):
 
 
 def _build():
-    """A scene of glass, metal and paint with two lamps and a world, each in a light group."""
+    """Build a scene of glass, metal and paint, with two lamps and a world that have a light group each."""
     scene = build_scene()
     scene.msspl.scale, scene.msspl.hr_spp, scene.msspl.lr_spp, scene.msspl.components = "2", 2, 8, True
     scene.render.use_persistent_data = True
@@ -83,7 +83,7 @@ def _rebuild(scene, image, terms, name):
 
 
 def _mix(tree, blend, first, second):
-    """A node that adds or multiplies two colours."""
+    """Make a node that adds or multiplies two colours."""
     node = tree.nodes.new("ShaderNodeMix" if BLENDER_5 else "CompositorNodeMixRGB")
     if BLENDER_5:
         node.data_type = "RGBA"

@@ -44,7 +44,7 @@ def check_sentences(scene):
 
 
 def check_samples():
-    """The LRHS gets the samples of the table in docs/guide/render.md, always more than the HRLS has."""
+    """Check that the LRHS gets the samples of the table in docs/guide/render.md, always more than the HRLS has."""
     options = module("options").Options
     table = {1: (4, 16, 64), 3: (4, 16, 64), 4: (6, 22, 86), 6: (8, 32, 128), 8: (11, 43, 171)}
     for hr_spp, expected in table.items():
@@ -53,7 +53,7 @@ def check_samples():
 
 
 def check_animated(scene):
-    """A keyframe or a driver on an overridden setting is refused, and the message names the setting."""
+    """Check that a keyframe or a driver on an overridden setting is refused, by a message that names the setting."""
     before = snapshot(scene)
     scene.driver_add("cycles.seed").driver.expression = "frame"
     scene.frame_set(1)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""The tiny scene that the checks render, and what they share."""
+"""Builds the tiny scene that the checks render, and holds their common functions."""
 
 import importlib
 import sys
@@ -15,7 +15,7 @@ BLENDER_5 = bpy.app.version >= (5, 0, 0)
 
 
 def module(name):
-    """A module of the installed add-on."""
+    """Import a module of the installed add-on."""
     return importlib.import_module(f"{MODULE}.{name}")
 
 
@@ -51,7 +51,7 @@ def build_scene():
 def snapshot(scene):
     """Every simple value of the settings of the scene, as text."""
     owners = [scene.render, scene.render.image_settings, scene.cycles]
-    owners += [each for layer in scene.view_layers for each in (layer, layer.cycles)]
+    owners += [owner for layer in scene.view_layers for owner in (layer, layer.cycles)]
     kinds = ("BOOLEAN", "INT", "FLOAT", "STRING", "ENUM")
     return [
         {p.identifier: repr(getattr(owner, p.identifier)) for p in owner.bl_rna.properties if p.type in kinds}
@@ -60,7 +60,7 @@ def snapshot(scene):
 
 
 def sentence(operator="fuse", **values):
-    """The error of an operator while ``{data path: value}`` is set. Also checks that the operator changes nothing."""
+    """Return the error of an operator while ``{data path: value}`` is set, and check that it changes nothing."""
     scene = bpy.context.scene
     with module("overrides").override(scene, values):
         before = snapshot(scene)
@@ -73,7 +73,7 @@ def sentence(operator="fuse", **values):
 
 
 def fake_fuse(code):
-    """A program in place of msspl-fuse that runs this Python code."""
+    """Make a program in place of msspl-fuse that runs this Python code."""
     path = WORK / "fake-fuse"
     path.write_text(f"#!{sys.executable}\nimport os, sys, time\n{code}\n")
     path.chmod(0o755)

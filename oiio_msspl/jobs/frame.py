@@ -24,7 +24,6 @@ from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.report import FrameReport
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.timeline import Key
-from oiio_msspl.jobs.views import OtherViews
 from oiio_msspl.model.session import Session
 
 
@@ -55,7 +54,7 @@ class ShotFrame:
 
     files: FrameFiles
     view: str | None = None
-    """The name of a view beside the first one that is averaged with its neighbours; None for the first one."""
+    """The name of a view beside the first one; None for the first one, whose name may differ from frame to frame."""
     plan: ViewPlan = field(default_factory=ViewPlan)
     state: State = State.FOUND
     error: Exception | None = None
@@ -78,8 +77,10 @@ class ShotFrame:
     """The budget of this view's frames; None if there is only one frame."""
     vectors: Mapping[int, tuple[Array, Mask]] = field(default_factory=dict)
     """Motion vectors that were read with the pixels, see :class:`oiio_msspl.fusion.motion.source.MotionFrame`."""
-    others: OtherViews = field(default_factory=OtherViews)
-    """Of the first view: the views that are fused by themselves."""
+    others: list[ShotFrame] = field(default_factory=list)
+    """Of the first view: the views without neighbours, which are fused before it."""
+    passed_on: tuple[str, ...] = ()
+    """Of the first view: why further views are not fused, one sentence each."""
 
     # From AVERAGED on
     averaged: RenderPair = field(init=False)
@@ -96,9 +97,7 @@ class ShotFrame:
     fused: FusedFrame | None = None
     """As the network fused it, for as long as a frame needs it."""
     replaced: ReplacedChannels | None = None
-    """Of the first view: the channels of ``others``, fused."""
-    other_reports: list[FrameReport] = field(default_factory=list)
-    """Of the first view: on ``others``."""
+    """Of the first view: the channels of other views, fused."""
 
     progress: Progress | None = None
     """Joins the progress of the parts of the work, if somebody wants to know it."""
@@ -107,7 +106,7 @@ class ShotFrame:
     picture: FusedFrame | None = None
     """What is written, until it is."""
     report: FrameReport = field(init=False)
-    """Of the first view: on all views."""
+    """On this view; that of the first view is about all views."""
 
     @property
     def number(self) -> int:

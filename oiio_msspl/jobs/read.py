@@ -37,7 +37,8 @@ def read_frame(files: FrameFiles, settings: Settings, plan: ShotPlan, *, only_fr
         only_frame: no other frame needs memory. Pixels are then read from the files as the network needs them.
 
     Returns:
-        A record for each view of the plan, the first view in front. One that can't be used has an ``error``.
+        A record for each view of the plan, the first view in front. One that can't be used has an ``error``. Views
+        that the plan lacks are the ``others`` of the first one.
     """
     start = time.perf_counter()
     frames = [ShotFrame(files, view, own) for view, own in plan.views.items()]
@@ -77,7 +78,11 @@ def _open(frames: Sequence[ShotFrame], settings: Settings) -> list[ShotFrame]:
             view = views.pop(frame.view)
             _set_pair(frame, view.lr, view.hr, settings)
             present.append(frame)
-    first.others = replace(others, views=tuple(views.values()))
+    for name, view in views.items():
+        frame = ShotFrame(files, name, state=State.READ)
+        _set_pair(frame, view.lr, view.hr, settings)
+        first.others.append(frame)
+    first.passed_on = others.passed_on
     return present
 
 

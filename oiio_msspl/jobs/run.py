@@ -17,7 +17,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.replaced import ReplacedChannels
-from oiio_msspl.fusion.fuse import FusedFrame, fuse
+from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
 from oiio_msspl.fusion.motion.shot import ShotMotion
 from oiio_msspl.fusion.motion.source import MotionFrame
 from oiio_msspl.fusion.neighbours.average import average_renders, average_results
@@ -25,6 +25,7 @@ from oiio_msspl.fusion.neighbours.hops import find_hops
 from oiio_msspl.fusion.neighbours.path import Hop
 from oiio_msspl.fusion.neighbours.renders import RenderPair, lacking_passes
 from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.tiling import require_memory
 from oiio_msspl.image.arrays import kept
 from oiio_msspl.jobs.existing import ExistingResults
 from oiio_msspl.jobs.frame import NoSuchView, ShotFrame, State
@@ -36,7 +37,7 @@ from oiio_msspl.jobs.report import FrameReport, add_other_views, report_on, writ
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Key
-from oiio_msspl.jobs.views import View, fuse_other_views, store_view
+from oiio_msspl.jobs.views import View, store_view
 
 
 class ShotRun:
@@ -133,36 +134,48 @@ class ShotRun:
             return
         start = time.perf_counter()
         with frame.attempt():
-            progress = self._progress(frame)
-            if frame.view is None and frame.number in self._wanted:
-                frame.replaced, frame.other_reports = fuse_other_views(
-                    frame.others,
-                    frame.session,
-                    self.settings.write,
-                    self.settings.max_memory,
-                    held=frame.held_bytes,
-                    progress=progress,
-                )
-            frame.fused = self.fuse(frame, progress)
-            frame.averaged, frame.progress = RenderPair(*frame.stored), progress
+            frame.progress = self._progress(frame)
+            if frame.number in self._wanted:
+                self._fuse_others(frame)
+            frame.fused = self.fuse(frame)
+            frame.averaged = RenderPair(*frame.stored)
             frame.state = State.FUSED
             if frame.plan.reach.results:
                 frame.keep_result()
         frame.seconds["fuse"] += time.perf_counter() - start
 
-    def fuse(self, frame: ShotFrame, progress: Callable[[int, int], None] | None = None) -> FusedFrame:
+    def _fuse_others(self, first: ShotFrame) -> None:
+        """Fuse the views without neighbours, and store them, so that memory holds one at a time."""
+        for view in first.others:
+            alignment = align(view.lr, view.hr)
+            needed = memory_to_fuse(alignment, first.session, error=False) + first.held_bytes
+            require_memory(needed, first.session.contract, self.settings.max_memory)
+        for view in first.others:
+            view.session, view.memory, view.progress = first.session, first.memory, first.progress
+            view.averaged = view.renders
+            self._store_view(first, view, self.fuse(view))
+
+    def _store_view(self, first: ShotFrame, view: ShotFrame, picture: FusedFrame) -> None:
+        """Fuse the passes of a view, and store it among the channels that all views of a frame replace."""
+        picture.replaced = first.replaced = first.replaced or ReplacedChannels()
+        self._fuse_passes(view, picture)
+        view.report = store_view(View(view.lr, view.hr), picture, view.session)
+
+    def fuse(self, frame: ShotFrame) -> FusedFrame:
         """Fuse the averaged renders of a frame."""
-        half = stored_type(frame.hr.beauty_channels, frame.write) == "half"
+        # Other views are stored as float first, and fused frames that are averaged are float.
+        half = frame.view is None and not self.plan.count
+        half = half and stored_type(frame.hr.beauty_channels, frame.write) == "half"
         fused = fuse(
             frame.averaged.lr,
             frame.averaged.hr,
             frame.session,
             error=frame.write.error_layer,
             clean_aovs=uses_clean_aovs(frame.hr, frame.write),
-            half=half and not self.plan.count,  # fused frames that are averaged are float
+            half=half,
             max_memory=self.settings.max_memory,
             held=frame.held_bytes,
-            progress=progress,
+            progress=frame.progress,
         )
         fused.frames = frame.frame_counts
         return fused
@@ -183,32 +196,22 @@ class ShotRun:
             if self.plan.count and self.existing.skips(first.files):
                 raise InputError("another run has fused it")  # is recorded as skipped
             picture = self._average_results(first)
-            picture.replaced, reports = first.replaced, list(first.other_reports)
             for frame in views[1:]:
-                other = self._average_results(frame)
-                # All views of a frame share the channels that are replaced.
-                other.replaced = picture.replaced or ReplacedChannels()
-                self._fuse_passes(frame, other)
-                picture.replaced = other.replaced
-                reports.append(store_view(View(frame.lr, frame.hr), other, frame.session))
+                self._store_view(first, frame, self._average_results(frame))
+            picture.replaced = first.replaced
             self._fuse_passes(first, picture)
-            first.picture, first.report = picture, self._report(first, picture, reports)
+            first.picture, first.report = picture, self._report(first, picture, [*first.others, *views[1:]])
             busy = sum(frame.seconds["fuse"] for frame in views) + time.perf_counter() - start
             network = first.report.network_seconds
             first.report.seconds = {"read": first.seconds["read"], "fuse": busy, "network": network}
             first.state = State.SETTLED
 
-    def _report(self, first: ShotFrame, picture: FusedFrame, others: Sequence[FrameReport]) -> FrameReport:
-        """Report on a frame that is settled.
-
-        Args:
-            first, picture: its first view.
-            others: reports on the other views.
-        """
+    def _report(self, first: ShotFrame, picture: FusedFrame, others: Sequence[ShotFrame]) -> FrameReport:
+        """Report on a frame that is settled: its first view with the final picture, and its other views."""
         report = report_on(first.lr, first.hr, first.session, picture, first.files.output, first.files.preview)
         report.layers = written_layers(first.hr, first.write)
         views = sorted(others, key=lambda other: first.hr.other_views.index(other.hr.view))
-        add_other_views(report, views, [*first.others.passed_on, *self._unplanned_views(first)])
+        add_other_views(report, [view.report for view in views], [*first.passed_on, *self._unplanned_views(first)])
         return report
 
     def _average_results(self, frame: ShotFrame) -> FusedFrame:
@@ -230,7 +233,7 @@ class ShotRun:
 
     def _unplanned_views(self, first: ShotFrame) -> list[str]:
         """Return a sentence for each view that is fused frame by frame because the plan does not know it."""
-        names = [view.hr.view for view in first.others.views if self.plan.count]
+        names = [view.hr.view for view in first.others if self.plan.count]
         new = [name_of(name) for name in names if name not in self.plan.looked_at]
         return [f"{name} is fused frame by frame: the frames by which its motion is found lack it" for name in new]
 
@@ -261,7 +264,7 @@ class ShotRun:
         """Return what joins the progress of all parts of the work on a single frame."""
         if self._tell is None:
             return None
-        pairs = [(frame.lr, frame.hr), *frame.others.views]
+        pairs = [(view.lr, view.hr) for view in (frame, *frame.others)]
         return Progress(self._tell, steps_of(pairs, frame.session, frame.write))
 
     def _release(self) -> None:

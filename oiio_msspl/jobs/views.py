@@ -1,16 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The views and view layers of a pair.
+"""Finds the views and view layers of a pair, and stores what is fused of those beside the first one.
 
-The first view goes the way of a file that has only one. The others are fused one after the other into a temporary file.
-A single frame does that before its first view, so memory holds one view at a time. In a shot, each view whose motion is
-known is averaged with its own neighbours instead (:mod:`oiio_msspl.jobs.view_windows`), and memory holds frames of all
-these views.
+Every view goes the same way. A view whose motion is unknown has no neighbours, so it is fused and stored in a temporary
+file just before the first view: memory holds one such view at a time.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import NamedTuple
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
@@ -20,12 +17,10 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
+from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import require_memory
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
-from oiio_msspl.jobs.passes import fuse_frame_passes, sets_to_fuse
 from oiio_msspl.jobs.report import FrameReport, report_on
 from oiio_msspl.model.session import Session
 
@@ -42,7 +37,7 @@ class View(NamedTuple):
 
 @dataclass(frozen=True)
 class OtherViews:
-    """The views beside the first one."""
+    """The views of a pair beside the first one."""
 
     views: tuple[View, ...] = ()
     """Those that are fused."""
@@ -55,14 +50,10 @@ class OtherViews:
         return [view.hr for view in self.views]
 
 
-#: Views beside the first one that are fused: their channels, None if there are none; and a report on each.
-FusedViews = tuple[ReplacedChannels | None, list[FrameReport]]
-
-
 def find_other_views(
     lr: MappedRender, hr: MappedRender, inputs: InputOptions, write: WriteOptions = WriteOptions()
 ) -> OtherViews:
-    """The views and view layers to fuse beside the first one: those of which the beauty or a pass is written.
+    """Find the views and view layers to fuse beside the first one: those whose beauty or passes are written.
 
     Args:
         lr, hr: the pair, mapped for its first view.
@@ -101,55 +92,12 @@ def find_other_views(
 
 
 def _channels(hr: MappedRender) -> set[object]:
-    """The channels that may be fused for a view."""
+    """Return the channels that may be fused for a view."""
     return {*hr.beauty_channels}.union(*map(_channels_of_set, hr.additive_sets))
 
 
 def _channels_of_set(additive_set: AdditiveSet) -> set[object]:
     return {channel for layer in additive_set.layers for channel in layer.channels}
-
-
-def fuse_other_views(
-    others: OtherViews,
-    session: Session,
-    write: WriteOptions,
-    max_memory: int,
-    *,
-    held: int = 0,
-    progress: Callable[[int, int], None] | None = None,
-) -> FusedViews:
-    """Fuse the views beside the first one.
-
-    Args:
-        others: from :func:`find_other_views`.
-        session: the model of the first view.
-        write: which passes are fused.
-        max_memory: bytes that the process should stay below.
-        held: bytes of these that other frames need.
-        progress: called with (steps done, steps in all) of each part of the work, see
-            :class:`oiio_msspl.jobs.passes.Progress`.
-
-    Returns:
-        The fused channels, None without other views; and a report on each view.
-
-    Raises:
-        InputError: a view does not fit into memory, or pixels can't be decoded.
-        MssplError: the network failed.
-    """
-    for view in others.views:
-        needed = memory_to_fuse(align(view.lr, view.hr), session, error=False) + held
-        require_memory(needed, session.contract, max_memory)
-    replaced = ReplacedChannels() if others.views else None
-    reports = []
-    for view in others.views:
-        clean = bool(sets_to_fuse(view.hr, write))
-        fused = fuse(view.lr, view.hr, session, clean_aovs=clean, max_memory=max_memory, held=held, progress=progress)
-        fused.replaced = replaced
-        # The pixel type that is asked for is that of the first view.
-        own = replace(write, pixel_type=None)
-        fuse_frame_passes(view.lr, view.hr, fused, session, own, max_memory - held, progress)
-        reports.append(store_view(view, fused, session))
-    return replaced, reports
 
 
 def store_view(view: View, fused: FusedFrame, session: Session) -> FrameReport:

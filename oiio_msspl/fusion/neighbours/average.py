@@ -35,22 +35,13 @@ from oiio_msspl.image.colour import luminance
 BYTES_OF_RENDERS, BYTES_OF_RESULTS = 44, 96
 
 
-class Averaged(Protocol):
-    """What is averaged: :class:`RenderPair` or :class:`FusedFrame`."""
-
-    @property
-    def alignment(self) -> Alignment:
-        """How the frame's pair lies over each other."""
+F = TypeVar("F", RenderPair, FusedFrame)
 
 
-F = TypeVar("F", bound=Averaged)
-C = TypeVar("C", bound=Averaged, contravariant=True)
+class Band(Protocol[F]):
+    """Some rows of a frame, to which those of neighbours are added: :class:`RenderBand` or :class:`ResultBand`."""
 
-
-class Band(Protocol[C]):
-    """Some rows of a frame, to which those of neighbours are added."""
-
-    def add(self, hop: Hop[C], path: Path, judge: Judge) -> None:
+    def add(self, hop: Hop[F], path: Path, judge: Judge) -> None:
         """Add a neighbour.
 
         Args:

@@ -58,7 +58,7 @@ class FieldCheck:
     by_user: bool = False
     """The user has described them, and nothing verifies that."""
     silent: frozenset[str] = frozenset()
-    """Axes, ``x`` or ``y``, along which hardly anything moves in these frames. So the frames do not tell the sign of the
+    """Axes, ``x`` or ``y``, along which hardly anything moves in these frames. So they do not tell the sign of the
     vectors, and the expected one is taken."""
 
     @property

@@ -36,12 +36,13 @@ BYTES_OF_RENDERS, BYTES_OF_RESULTS = 44, 96
 
 
 F = TypeVar("F", RenderPair, FusedFrame)
+C = TypeVar("C", RenderPair, FusedFrame, contravariant=True)
 
 
-class Band(Protocol[F]):
+class Band(Protocol[C]):
     """Some rows of a frame, to which those of neighbours are added: :class:`RenderBand` or :class:`ResultBand`."""
 
-    def add(self, hop: Hop[F], path: Path, judge: Judge) -> None:
+    def add(self, hop: Hop[C], path: Path, judge: Judge) -> None:
         """Add a neighbour.
 
         Args:

@@ -72,7 +72,7 @@ class ShotMotion:
 
     def keep(self, numbers: Collection[int]) -> None:
         """Forget the motion of all frames but these."""
-        self._motions = {both: ways for both, ways in self._motions.items() if set(both) <= set(numbers)}
+        self._motions = {pair: ways for pair, ways in self._motions.items() if set(pair) <= set(numbers)}
 
     def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion]:
         """Read the motion between two frames, forwards and backwards."""

@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averages a frame with its neighbours: both of its renders before they are fused, and the fused frame after that.
 
-One engine does both. It works in bands of rows, follows the surfaces of a band from neighbour to neighbour, judges how
-much each pixel there counts, and sums up the weighted pixels. A neighbour counts
-
-- where it shows the same surface: a vector leads to it, and its own vector leads back (:class:`Path`);
-- as far as it shows the surface in the same light (:class:`Light`).
-
-The strategies :class:`RenderBand` and :class:`ResultBand` fetch the pixels. A value that no neighbour may change keeps
-its bits.
+One engine does both averages, in bands of rows. It follows the surfaces of a band from neighbour to neighbour, judges
+how much each pixel counts there, and sums up the weighted pixels. A neighbour counts where it shows the same surface,
+so that its vectors lead back (:class:`Path`), and the more, the less the light has changed (:class:`Light`). What
+differs between renders and fused frames is a strategy each: :class:`RenderBand` and :class:`ResultBand`. A value that
+no neighbour may change keeps its bits.
 """
 
 from __future__ import annotations

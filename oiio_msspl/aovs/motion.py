@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Layers about the movement of surfaces: motion vectors, position and depth.
+"""Finds the layers about the motion of surfaces: motion vectors, position and depth.
 
 The table of renderers names the layers, and the format in which a renderer usually writes its vectors. Manuals leave
 too much open to believe that format: :mod:`oiio_msspl.fusion.motion.source` verifies it on two frames of the shot.
@@ -32,8 +32,10 @@ _PAIRS = (("R", "G"), ("X", "Y"), ("u", "v"), ("U", "V"))
 
 @dataclass(frozen=True)
 class MotionFormat:
-    """How two channels say where a surface is in another frame: ``(stored - offset) * scale``, in a unit and along two
-    axes, is the way from the pixel to the surface's place in the other frame."""
+    """How two channels say where a surface is in another frame.
+
+    ``(stored - offset) * scale``, in a unit and along two axes, is the way from the pixel to the surface's place there.
+    """
 
     to: str = "next"
     """The other frame: ``next`` or ``previous``."""
@@ -52,12 +54,12 @@ class MotionFormat:
     """Vectors are multiplied by alpha."""
 
     @property
-    def step(self) -> int:
+    def hop(self) -> int:
         """1 for the next frame, -1 for the previous one."""
         return 1 if self.to == "next" else -1
 
     def pixels_per_unit(self, width: int, height: int) -> tuple[float, float]:
-        """Pixels to the right and pixels down that a stored 1 means, offset aside, in a frame of this size."""
+        """Return how many pixels to the right and down a stored 1 means in a frame of this size, without the offset."""
         x, y = {
             "pixels": (1.0, 1.0),
             "ndc": (float(width), float(height)),
@@ -67,7 +69,7 @@ class MotionFormat:
         return (x if self.x == "right" else -x) * self.scale, (y if self.y == "down" else -y) * self.scale
 
     def __str__(self) -> str:
-        """As the user may write it behind ``layer=NAME,``."""
+        """Return the words that the user may write behind ``layer=NAME,``."""
         words = [f"to={self.to}", f"x={self.x}", f"y={self.y}", f"unit={self.unit}"]
         words += [f"scale={self.scale:g}"] if self.scale != 1 else []
         words += [f"offset={self.offset:g}"] if self.offset else []
@@ -84,7 +86,7 @@ class MotionField:
     """Such as ``X`` and ``Y``."""
     channels: tuple[Channel, Channel]
     format: MotionFormat
-    """What is expected; not verified."""
+    """The expected format; nothing has verified it yet."""
     fixed: frozenset[str] = frozenset()
     """The words of the format that the user has given."""
 
@@ -96,7 +98,7 @@ class MotionField:
 
 @dataclass(frozen=True)
 class MotionLayers:
-    """What one view and view layer of a file says of the movement and the place of surfaces."""
+    """The layers of one view and view layer that tell the motion and the place of surfaces."""
 
     fields: tuple[MotionField, ...] = ()
     """Motion vectors, in the order of the table."""
@@ -108,11 +110,11 @@ class MotionLayers:
     """All layers of the view and view layer, by name without the view layer."""
 
     def channels(self, layer: str, components: tuple[str, str]) -> tuple[Channel, Channel] | None:
-        """The channels of a vector that was found in another frame; None if this frame lacks them."""
-        found = self.layers[layer].channels if layer in self.layers else {}
-        if not all(c in found for c in components):
+        """Return the channels of a vector that was found in another frame; None if this frame lacks them."""
+        channels = self.layers[layer].channels if layer in self.layers else {}
+        if not all(c in channels for c in components):
             return None
-        return found[components[0]], found[components[1]]
+        return channels[components[0]], channels[components[1]]
 
 
 def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], beauty: Beauty) -> MotionLayers:
@@ -128,17 +130,17 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
     named = dict(_layers_of_view(layers, beauty))
     common = renderers()[-1]
     entries = [*renderer.get("motion", ()), *common["motion"]]
-    found: dict[tuple[Channel, Channel], MotionField] = {}
+    vectors: dict[tuple[Channel, Channel], MotionField] = {}
     for entry in entries:
         words = {key: value for key, value in entry.items() if key not in ("layer", "channels")}
-        for each in _fields(named, entry["layer"], entry.get("channels"), MotionFormat(**words)):
-            found.setdefault(each.channels, each)
+        for vector in _fields(named, entry["layer"], entry.get("channels"), MotionFormat(**words)):
+            vectors.setdefault(vector.channels, vector)
     positions = (_named(named, alias) for alias in [*renderer.get("position", ()), *common["position"]])
     depths = [d[1] for alias in [*renderer.get("depth", ()), *common["depth"]] if (d := _named(named, alias))]
     # Of the layer without a name only Z can be a depth: R and Y are light.
     plain = [Layer("", "", {"Z": beauty.layer.channels["Z"]})] if "Z" in beauty.layer.channels else []
     return MotionLayers(
-        tuple(found.values()),
+        tuple(vectors.values()),
         next((triple for _, layer in filter(None, positions) if (triple := layer.triple())), None),
         next((layer.channels[c] for layer in [*depths, *plain] for c in "ZRVYT" if c in layer.channels), None),
         named,
@@ -146,43 +148,40 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
 
 
 def user_fields(layers: MotionLayers, text: str, path: str = "") -> list[MotionField]:
-    """The motion vectors that the user's ``--motion-format`` describes.
+    """Find the motion vectors that the user's ``--motion-format`` describes.
 
     Args:
         layers: of the file.
         text: ``layer=NAME`` and any of ``channels=XY``, ``to=``, ``x=``, ``y=``, ``unit=``, ``scale=``, ``offset=`` and
-            ``premultiplied``, separated by commas. Further layers follow behind ``+``. Words that are left out are
-            found by the pixels.
+            ``premultiplied``, separated by commas. Further layers follow behind ``+``. The pixels decide words that are
+            left out.
         path: of the file, for messages.
 
     Raises:
         InputError: the text can't be read, or the file has no such layer.
     """
-    found = []
+    described = []
     for words in read_format(text):
         layer = words.pop("layer")
         letters = words.pop("channels", "")
-        # Words that the user leaves out keep what the table says, as long as the pixels agree.
+        # Words that the user leaves out keep the values of the table, as long as the pixels agree.
         named = _named(layers.layers, layer)
-        known = [each for each in layers.fields if named and each.layer == named[0]]
-        matching = [each for each in known if not letters or "".join(each.components) == letters] or list(
+        in_table = [f for f in layers.fields if named and f.layer == named[0]]
+        matching = [f for f in in_table if not letters or "".join(f.components) == letters] or list(
             _fields(layers.layers, layer, list(letters) or None, MotionFormat())
         )
         # A layer may hold vectors to both frames, in different channels.
-        matching = [each for each in matching if each.format.to == words.get("to", each.format.to)] or matching
+        matching = [f for f in matching if f.format.to == words.get("to", f.format.to)] or matching
         if not matching:
             raise InputError(
                 f"--motion-format {text!r}: {path} has no layer {layer!r} with two channels {letters}".strip()
             )
-        formats = [replace(each.format, **words) for each in matching]
-        found += [
-            replace(each, format=form, fixed=frozenset(words)) for each, form in zip(matching, formats, strict=True)
-        ]
-    return found
+        described += [replace(f, format=replace(f.format, **words), fixed=frozenset(words)) for f in matching]
+    return described
 
 
 def read_format(text: str) -> list[dict[str, Any]]:
-    """The words of each layer of a ``--motion-format``, see :func:`user_fields`.
+    """Read a ``--motion-format``, see :func:`user_fields`: the words of each layer.
 
     Raises:
         InputError: the text can't be read.
@@ -191,43 +190,45 @@ def read_format(text: str) -> list[dict[str, Any]]:
 
 
 def _words(part: str, text: str) -> dict[str, Any]:
-    """The words of one layer's format."""
+    """Read the words of one layer's format."""
     words: dict[str, Any] = {}
-    known = ["layer", "channels", *(f.name for f in fields(MotionFormat))]
     for word in part.split(","):
         key, equals, value = (piece.strip() for piece in word.partition("="))
-        problem = ""
-        if key not in known:
-            problem = f"{key!r} is none of {', '.join(known)}"
-        elif key in words:
-            problem = f"{key} is given twice"
-        elif key in CHOICES and value not in CHOICES[key]:
-            problem = f"{key} is {' or '.join(CHOICES[key])}"
-        elif key in ("scale", "offset"):
-            try:
-                words[key] = float(value)
-            except ValueError:
-                words[key] = math.nan
-            if not math.isfinite(words[key]) or (key, words[key]) == ("scale", 0):
-                problem = f"{key} is a number" + (", but not 0" if key == "scale" else "")
-        elif key == "channels" and len(value) != 2:
-            problem = "channels are two letters, such as XY"
-        elif key == "premultiplied":
-            words[key] = True
-            problem = "premultiplied stands alone; leave it out if they are not" if equals else ""
-        elif not equals or not value:
-            problem = f"write {key}=..."
-        else:
-            words[key] = value
+        problem = f"{key} is given twice" if key in words else _problem_of_word(key, equals, value)
         if problem:
             raise InputError(f"--motion-format {text!r}: {problem}; an example is layer=velocity,to=next,y=up,scale=2")
+        words[key] = True if key == "premultiplied" else float(value) if key in ("scale", "offset") else value
     if "layer" not in words:
         raise InputError(f"--motion-format {text!r}: starts with layer=NAME")
     return words
 
 
+def _problem_of_word(key: str, equals: str, value: str) -> str:
+    """Return why a word of a format can't be read; nothing if it can."""
+    keys = ["layer", "channels", *(f.name for f in fields(MotionFormat))]
+    if key not in keys:
+        return f"{key!r} is none of {', '.join(keys)}"
+    if key in CHOICES:
+        return "" if value in CHOICES[key] else f"{key} is {' or '.join(CHOICES[key])}"
+    if key in ("scale", "offset"):
+        good = _is_number(value) and (key, float(value)) != ("scale", 0)
+        return "" if good else f"{key} is a number" + (", but not 0" if key == "scale" else "")
+    if key == "channels":
+        return "" if len(value) == 2 else "channels are two letters, such as XY"
+    if key == "premultiplied":
+        return "premultiplied stands alone; leave it out if they are not" if equals else ""
+    return "" if equals and value else f"write {key}=..."
+
+
+def _is_number(value: str) -> bool:
+    try:
+        return math.isfinite(float(value))
+    except ValueError:
+        return False
+
+
 def _layers_of_view(layers: Sequence[Layer], beauty: Beauty) -> Iterator[tuple[str, Layer]]:
-    """The layers of the beauty's view and view layer, and those of none, by their short name."""
+    """Yield the layers of the beauty's view and view layer, and those of none, with their short names."""
     for layer in layers:
         if layer.view not in (beauty.view, "") or not layer.name:
             continue
@@ -236,7 +237,7 @@ def _layers_of_view(layers: Sequence[Layer], beauty: Beauty) -> Iterator[tuple[s
 
 
 def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
-    """The layer that an alias means, and its short name."""
+    """Return the layer that an alias means, and its short name."""
     for name, layer in layers.items():
         if view_layer_of(name, alias) == "" or same_spelling(name) == same_spelling(alias):
             return name, layer
@@ -246,7 +247,7 @@ def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:
 def _fields(
     layers: Mapping[str, Layer], alias: str, components: Sequence[str] | None, form: MotionFormat
 ) -> Iterator[MotionField]:
-    """The vectors in the layer that an alias means: in the channels that are named, or the first usual ones."""
+    """Yield the vectors of the layer that an alias means: in these channels, or in the first usual ones."""
     named = _named(layers, alias)
     if named is None:
         return

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Movement of the picture by the camera alone: from the camera's matrices in the headers, and positions or depth.
+"""Computes the motion that the camera causes, from its matrices in the headers and from positions or depth.
 
-Renderers disagree on what their matrices mean, and some write a matrix under the wrong name. So each is tried: the
+Renderers disagree on the meaning of their matrices, and some write a matrix under the wrong name. So all are tried: the
 right one projects the positions of a frame onto the pixels that hold them. Without positions, the right one makes
 albedo and normals of two frames agree.
 """
@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.fusion.motion.guides import FramePair
+from oiio_msspl.fusion.motion.guides import TwoFrames
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import for_row_blocks
@@ -26,13 +26,13 @@ MATRICES = ("worldtoscreen", "worldtondc", "np", "worldtocamera", "nl")
 SAMPLES = 4096
 #: A matrix is right if positions land this close to their pixel, in pixels. A single sample lies anywhere in it.
 CLOSE = 0.75
-#: With depth instead of positions, a matrix must fit so many times as well as no motion.
+#: With depth instead of positions, a matrix must fit this many times as well as no motion.
 MARGIN = 1.5
 
 
 @dataclass(frozen=True)
 class Projection:
-    """What the pixels of a frame have told about a matrix."""
+    """How a matrix is to be read, as the pixels of a frame have shown."""
 
     attribute: str
     """Name of the header attribute."""
@@ -42,33 +42,33 @@ class Projection:
     shift: tuple[float, float]
     """pixel = projected * scale + shift, in x and y."""
     depth: str = ""
-    """How positions follow from depth, for frames without them: it is measured along the ``axis`` or the ``ray``."""
+    """How depth is measured, along the ``axis`` or the ``ray``; empty if frames have positions."""
 
     def matrix(self, render: MappedRender) -> NDArray[np.float32] | None:
-        """The matrix of a frame, for row vectors; None if its header has none."""
+        """Return the matrix of a frame, for row vectors; None if its header has none."""
         return _matrix(render, self.attribute)
 
     def project(self, positions: Array, matrix: NDArray[np.float32]) -> Array:
-        """Where positions (..., 3) lie in the frame: (..., 2), x and y in pixels; NaN behind the camera."""
+        """Project positions (..., 3) to pixels of the frame, x and y (..., 2); NaN behind the camera."""
         seen = positions @ matrix[:3] + matrix[3]
         with np.errstate(divide="ignore", invalid="ignore"):
             result: Array = seen[..., :2] / seen[..., self.divisor : self.divisor + 1]
         return result * np.array(self.scale, np.float32) + np.array(self.shift, np.float32)
 
 
-def find_projection(pair: FramePair) -> Projection | None:
-    """How the matrices of a shot are to be read; None if there are none, or none fits.
+def find_projection(frames: TwoFrames) -> Projection | None:
+    """Find out how the matrices of a shot are to be read; None if there are none, or none fits.
 
     Raises:
         InputError: pixels can't be decoded.
     """
-    if not any(key.lower() in MATRICES for key in pair.first.metadata):
+    if not any(key.lower() in MATRICES for key in frames.first.metadata):
         return None
-    return _by_position(pair.first) if pair.first.motion.position else _by_depth(pair)
+    return _by_position(frames.first) if frames.first.motion.position else _by_depth(frames)
 
 
 def _by_position(render: MappedRender) -> Projection | None:
-    """The matrix of the header that projects positions onto their pixels."""
+    """Find the matrix of the header that projects positions onto their pixels."""
     assert render.motion.position is not None
     window = render.data_window
     positions = render.file.read(render.motion.position, window)
@@ -82,13 +82,13 @@ def _by_position(render: MappedRender) -> Projection | None:
     for name in MATRICES:
         for attribute in (key for key in render.metadata if key.lower() == name):
             matrix = _matrix(render, attribute)
-            if matrix is not None and (found := _fit(attribute, matrix, points, pixels)):
-                return found
+            if matrix is not None and (projection := _fit(attribute, matrix, points, pixels)):
+                return projection
     return None
 
 
 def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Projection) -> tuple[Array, Mask]:
-    """Vectors to a neighbour (h, w, 2) as if all surfaces stood still, and where there are any (h, w).
+    """Compute vectors to a neighbour (h, w, 2) as if all surfaces stood still, and where there are any (h, w).
 
     Raises:
         InputError: pixels can't be decoded.
@@ -121,28 +121,28 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     return vectors, known
 
 
-def _by_depth(pair: FramePair) -> Projection | None:
-    """The matrix to the screen, and the kind of depth, that make the guides of both frames agree."""
-    frame = pair.first.display_window
+def _by_depth(frames: TwoFrames) -> Projection | None:
+    """Find the matrix to the screen, and the kind of depth, that make the guides of both frames agree."""
+    window = frames.first.display_window
     best, best_left = None, 1.0
-    for attribute in (key for key in pair.first.metadata if key.lower() in MATRICES):
+    for attribute in (key for key in frames.first.metadata if key.lower() in MATRICES):
         for (low, high), up, depth in itertools.product(((-1, 1), (0, 1)), (True, False), ("axis", "ray")):
-            x, y = frame.width / (high - low), frame.height / (high - low)
-            shift = (frame.x0 - 0.5 - low * x, frame.y0 - 0.5 + (high * y if up else -low * y))
+            x, y = window.width / (high - low), window.height / (high - low)
+            shift = (window.x0 - 0.5 - low * x, window.y0 - 0.5 + (high * y if up else -low * y))
             projection = Projection(attribute, 3, (x, -y if up else y), shift, depth)
-            left = _left(pair, *camera_vectors(pair.first, pair.second, projection))
+            left = _left(frames, *camera_vectors(frames.first, frames.second, projection))
             if left < best_left:
                 best, best_left = projection, left
     return best if best_left * MARGIN < 1 else None
 
 
-def _left(pair: FramePair, vectors: Array, known: Mask) -> float:
-    """What is left of the differences between both frames' guides, geometric mean; 1 without motion."""
-    step = pair.reduction
-    rows, columns = (slice(s.start + step // 2, s.stop, step) for s in pair.window.slices(pair.first.data_window))
-    vectors, known = vectors[rows, columns] / np.float32(step), known[rows, columns]
+def _left(frames: TwoFrames, vectors: Array, known: Mask) -> float:
+    """Return the share of the differences between the guides that is left, geometric mean; 1 without motion."""
+    side = frames.reduction
+    rows, columns = (slice(s.start + side // 2, s.stop, side) for s in frames.window.slices(frames.first.data_window))
+    vectors, known = vectors[rows, columns] / np.float32(side), known[rows, columns]
     left = []
-    for guide in pair.guides:
+    for guide in frames.guides:
         here, there = guide.images
         height, width = here.shape[:2]
         steep = guide.steepness[0]
@@ -151,13 +151,13 @@ def _left(pair: FramePair, vectors: Array, known: Mask) -> float:
         if use.any() and np.median(still) > 0:
             y, x = np.nonzero(use)
             way = vectors[y, x]
-            found = sample_linear(there, x + way[:, 0], y + way[:, 1])
-            left.append(float(np.median(np.abs(found - here[use]).mean(axis=-1)) / np.median(still)))
+            moved = sample_linear(there, x + way[:, 0], y + way[:, 1])
+            left.append(float(np.median(np.abs(moved - here[use]).mean(axis=-1)) / np.median(still)))
     return float(np.exp(np.mean(np.log(np.maximum(left, 1e-9))))) if left else 1.0
 
 
 def _positions(render: MappedRender, projection: Projection) -> Array | None:
-    """World positions (h, w, 3) of the pixels, read or computed from depth; None if the frame has neither."""
+    """Read the world positions (h, w, 3) of the pixels, or compute them from depth; None if the frame has neither."""
     window = render.data_window
     if not projection.depth:
         return render.file.read(render.motion.position, window) if render.motion.position else None
@@ -186,7 +186,7 @@ def _positions(render: MappedRender, projection: Projection) -> Array | None:
 
 
 def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:
-    """A matrix of the header. OpenEXR and OpenImageIO store it for row vectors."""
+    """Read a matrix of the header. OpenEXR and OpenImageIO store it for row vectors."""
     try:
         values = np.array(render.metadata.get(attribute), np.float32).reshape(4, 4)
     except (TypeError, ValueError):
@@ -195,7 +195,7 @@ def _matrix(render: MappedRender, attribute: str) -> NDArray[np.float32] | None:
 
 
 def _fit(attribute: str, matrix: NDArray[np.float32], points: Array, pixels: Array) -> Projection | None:
-    """The scale and shift with which a matrix projects points (n, 3) onto pixels (n, 2); None if no such fit."""
+    """Fit the scale and shift with which a matrix projects points (n, 3) onto pixels (n, 2); None if it does not."""
     seen = points @ matrix[:3] + matrix[3]
     divisor = 2 if np.allclose(matrix[:, 3], (0, 0, 0, 1)) else 3
     if np.abs(seen[:, divisor]).min() < 1e-9:

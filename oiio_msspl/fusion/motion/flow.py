@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Movement of the picture, computed from the picture: OpenCV's DIS (Kroeger et al. 2016, "Fast optical flow using dense
-inverse search"). OpenCV is optional and imported where it is used."""
+"""Optical flow: motion computed from the fused pictures, by OpenCV's DIS.
+
+Kroeger et al. 2016, "Fast optical flow using dense inverse search". OpenCV is optional and imported where it is used.
+"""
 
 from __future__ import annotations
 
@@ -23,12 +25,12 @@ SMALLEST = 16
 
 
 def has_optical_flow() -> bool:
-    """Whether OpenCV is installed."""
+    """Return whether OpenCV is installed."""
     return find_spec("cv2") is not None
 
 
 def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: Window) -> tuple[Array, Mask]:
-    """Vectors to a neighbour (h, w, 2), and where they can be believed (h, w): nowhere in frames of a few pixels.
+    """Compute vectors to a neighbour (h, w, 2), and where they can be believed (h, w): nowhere in tiny frames.
 
     Args:
         frame, neighbour: fused beauties (h, w, 3), which have little noise.
@@ -57,14 +59,14 @@ def flow_vectors(frame: Array, neighbour: Array, window: Window, other_window: W
 
 
 def _mean_brightness(image: Array) -> float:
-    """Geometric mean of the lit pixels."""
+    """Return the geometric mean of the lit pixels."""
     values = luminance(image)
     lit = values[np.isfinite(values) & (values > 0)]
     return float(np.exp(np.mean(np.log(lit)))) if lit.size else 1.0
 
 
 def _eight_bit(image: Array, key: float) -> NDArray[np.uint8]:
-    """Logarithm of the luminance: it looks the same in light and shade."""
+    """Encode the logarithm of the luminance, in which texture is as strong in shade as in light."""
     values = np.maximum(np.nan_to_num(luminance(image), posinf=key), 0) / np.float32(key)
     stops = np.log2(values + np.float32(2**-STOPS_BELOW)) + np.float32(STOPS_BELOW)
     return np.clip(stops * np.float32(255 / (STOPS_BELOW + STOPS_ABOVE)), 0, 255).astype(np.uint8)

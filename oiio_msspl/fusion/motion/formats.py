@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How are motion vectors stored? Manuals leave it open, so two frames of the shot decide.
+"""Finds out how motion vectors are stored, by two frames of the shot, because manuals leave it open.
 
-Every format that renderers are known to write is tried: it fetches albedo, normals and positions of the other frame,
-and the right format is the one that finds those of this frame.
+Every format that renderers are known to write is tried: it fetches albedo, normals and positions of the other frame.
+The right format is the one that finds those of this frame.
 """
 
 from __future__ import annotations
@@ -15,27 +15,27 @@ from functools import partial
 import numpy as np
 
 from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
-from oiio_msspl.fusion.motion.guides import POSITION, FramePair, Guide
+from oiio_msspl.fusion.motion.guides import POSITION, Guide, TwoFrames
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import in_parallel
 
-#: The best format must fit so many times as well as no motion, and as the runner-up.
+#: The best format must fit this many times as well as no motion, and as the runner-up.
 MARGIN = 1.5
 #: Differences that are smaller than this share of those without motion are equally small.
 FLOOR = 1e-3
-#: Or a vote of the pixels must be so many standard deviations from a tie.
+#: Or a vote of the pixels must be this many standard deviations from a tie.
 SURE = 4.0
 #: Pixels that are compared, for each guide.
 SAMPLES = 4096
-#: A verdict needs so many of them.
+#: A verdict needs this many of them.
 FEWEST = 64
 #: Two formats are different if they say different places for a pixel, in pixels.
 DIFFERENT = 0.25
 #: Scales of vectors that are known to occur; 2 is a shutter of 180 degrees.
 VECTOR_SCALES = (1.0, 2.0, 0.5)
-#: Where none of these fits, any scale is tried, because a shutter may have any length. So many formats may fit by
-#: chance, so the best one must fit ``MARGIN`` times better still. One at either end of this range is not the best.
+#: Where none of these fits, any scale is tried, because a shutter may have any length. One of that many formats may fit
+#: by chance, so the best one must fit ``MARGIN`` times better still, and must not be at either end of this range.
 ANY_SCALES = tuple(2.0 ** (k / 8) for k in range(-40, 41))
 #: The other units only repeat the scales of these two.
 ANY_SCALES_OF = ("pixels", "ndc")
@@ -45,25 +45,25 @@ ENCODED_SCALES = tuple(2.0 ** (k / 2) for k in range(2, 23))
 
 @dataclass(frozen=True)
 class FieldCheck:
-    """What two frames say of one layer of motion vectors."""
+    """The verdict of two frames on one layer of motion vectors."""
 
     field: MotionField
-    """With the format that was found, if it was."""
+    """With the format that was found, if one was."""
     problem: str = ""
     """Why the vectors can't be used; empty if they are verified."""
     zero: bool = False
     """The vectors are 0 everywhere."""
     fit: float = 1.0
-    """What is left of the differences between the frames; without motion it is 1."""
+    """The share of the differences between the frames that is left; without motion it is 1."""
     by_user: bool = False
     """The user has described them, and nothing verifies that."""
     silent: frozenset[str] = frozenset()
-    """Axes, ``x`` or ``y``, along which hardly anything moves in these frames. So they don't tell its sign, and the one
-    that was expected is taken."""
+    """Axes, ``x`` or ``y``, along which hardly anything moves in these frames. So they do not tell the sign of the
+    vectors, and the expected one is taken."""
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The verdict in words."""
         if self.problem:
             return f"{self.field.name}: {self.problem}"
         if self.by_user:
@@ -72,31 +72,31 @@ class FieldCheck:
 
 
 def check_field(
-    pair: FramePair, field: MotionField, stored: tuple[Array, Array], *, verified: bool = False
+    frames: TwoFrames, field: MotionField, stored: tuple[Array, Array], *, verified: bool = False
 ) -> FieldCheck:
     """Find the format of motion vectors.
 
     Args:
-        pair: frames t and t+1.
+        frames: frames t and t+1.
         field: the layer, with the format that is expected. Words in ``fixed`` are not varied.
-        stored: its pixels (h, w, 2) in both frames, over the pair's window and reduced as the guides are.
-        verified: other frames of the shot have shown the expected format, so only one that fits clearly better is
-            taken instead.
+        stored: its pixels (h, w, 2) in both frames, over their window and reduced as the guides are.
+        verified: other frames of the shot have shown the expected format. Only one that fits clearly better is taken
+            instead.
     """
-    checks = [_check_offset(pair, field, stored, offset, verified) for offset in _offsets(field, stored)]
+    checks = [_check_offset(frames, field, stored, offset, verified) for offset in _offsets(field, stored)]
     return min(checks, key=lambda check: (bool(check.problem), not check.zero, check.fit))
 
 
 def _check_offset(
-    pair: FramePair, field: MotionField, stored: tuple[Array, Array], offset: float, verified: bool
+    frames: TwoFrames, field: MotionField, stored: tuple[Array, Array], offset: float, verified: bool
 ) -> FieldCheck:
     """Find the format of vectors whose offset is known."""
     field = replace(field, format=replace(field.format, offset=offset))
     if all(not _moving(values, offset).any() for values in stored):
         return FieldCheck(field, "is zero everywhere", zero=True)
-    if not pair.guides:
+    if not frames.guides:
         return FieldCheck(field, "there is no albedo, world-space normal or position to verify it by")
-    trial = _Trial(pair, stored, offset)
+    trial = _Trial(frames, stored, offset)
     if not trial.usable:
         return FieldCheck(field, "albedo, normal and position are too even to verify it by")
     fits = trial.fits(_formats(field, encoded=offset != 0))
@@ -120,7 +120,7 @@ def _check_offset(
     best = next(form for form in (field.format, best) if form == best or trial.is_same(form, best, fits))
     at_end = offset == 0 and "scale" not in field.fixed and not ANY_SCALES[0] < best.scale < ANY_SCALES[-1]
     if fits[best] * needed > 1 or at_end:
-        return FieldCheck(field, _no_format(pair, fits[best]), fit=fits[best])
+        return FieldCheck(field, _no_format(frames, fits[best]), fit=fits[best])
     expected = replace(best, **{axis: getattr(field.format, axis) for axis in trial.silent(best)})
     fits[expected], best = fits[best], expected
     if verified and fits.get(field.format, np.inf) < MARGIN * max(fits[best], FLOOR):
@@ -135,16 +135,16 @@ def _check_offset(
 def _with_any_scale(
     trial: _Trial, field: MotionField, fits: dict[MotionFormat, float]
 ) -> tuple[MotionFormat, dict[MotionFormat, float]]:
-    """The best format of any scale, and how well it and those of ``fits`` fit.
+    """Find the best format of any scale. Return it, and how well it and the formats of ``fits`` fit.
 
-    Others of these scales are left out. They lie so close that several fit about as well.
+    Other formats of these scales are left out, because several neighbouring scales fit about as well.
     """
     units = (field.format.unit,) if "unit" in field.fixed else ANY_SCALES_OF
     formats = (form for form in _formats(field, encoded=False, scales=ANY_SCALES) if form.unit in units)
     every = trial.fits(formats)
     for to, unit in itertools.product(CHOICES["to"], units):
-        if each := [form for form in every if (form.to, form.unit) == (to, unit)]:
-            best = min(each, key=lambda form: every[form])
+        if forms := [form for form in every if (form.to, form.unit) == (to, unit)]:
+            best = min(forms, key=lambda form: every[form])
             scale = trial.fit_scale(best, every[best], clearly=False)
             fits = fits | trial.fits(replace(form, scale=scale) for form in (best, _mirrored(best)) if form in every)
     best = min(fits, key=lambda form: fits[form])
@@ -153,13 +153,13 @@ def _with_any_scale(
     return next(same, best), fits
 
 
-def _no_format(pair: FramePair, fit: float) -> str:
-    names = ", ".join(guide.name for guide in pair.guides)
+def _no_format(frames: TwoFrames, fit: float) -> str:
+    names = ", ".join(guide.name for guide in frames.guides)
     return f"no known format makes {names} of both frames agree (at best {fit:.0%} of the differences are left)"
 
 
 def _offsets(field: MotionField, stored: tuple[Array, Array]) -> tuple[float, ...]:
-    """The stored values that may mean no motion. Vectors that are encoded as colours lie between 0 and 1."""
+    """Return the stored values that may mean no motion. Vectors that are encoded as colours lie between 0 and 1."""
     if "offset" in field.fixed:
         return (field.format.offset,)
     lowest, highest = (float(f([f(values) for values in stored])) for f in (np.min, np.max))
@@ -167,13 +167,13 @@ def _offsets(field: MotionField, stored: tuple[Array, Array]) -> tuple[float, ..
 
 
 def _moving(stored: Array, offset: float) -> Mask:
-    """Where (h, w) vectors are not 0."""
+    """Return where vectors are not 0, (h, w)."""
     x, y = (np.abs(stored[..., i] - np.float32(offset)) > 1e-6 for i in (0, 1))
     return x | y
 
 
 def _formats(field: MotionField, *, encoded: bool, scales: Iterable[float] = ()) -> Iterator[MotionFormat]:
-    """All formats that a layer may have; the expected one comes first."""
+    """Yield all formats that a layer may have; the expected one comes first."""
     expected, fixed = field.format, field.fixed
     yield expected
     words = [(getattr(expected, word),) if word in fixed else CHOICES[word] for word in ("to", "x", "y", "unit")]
@@ -184,7 +184,7 @@ def _formats(field: MotionField, *, encoded: bool, scales: Iterable[float] = ())
 
 
 def _mirrored(form: MotionFormat) -> MotionFormat:
-    """The format that says the opposite of the other frame: the same if all movement is even."""
+    """Return the format with the opposite vectors to the opposite frame, which fits as well if all motion is even."""
     to, x, y = (CHOICES[word][1 - CHOICES[word].index(getattr(form, word))] for word in ("to", "x", "y"))
     return replace(form, to=to, x=x, y=y)
 
@@ -206,18 +206,15 @@ class _Place:
 
 
 class _Trial:
-    """Compares what formats make of the guides."""
+    """Compares the guides of two frames as formats bring them to each other."""
 
-    def __init__(self, pair: FramePair, stored: tuple[Array, Array], offset: float) -> None:
-        self._frame = (pair.first.display_window.width, pair.first.display_window.height)
-        self._reduction = pair.reduction
+    def __init__(self, frames: TwoFrames, stored: tuple[Array, Array], offset: float) -> None:
+        self._frame = (frames.first.display_window.width, frames.first.display_window.height)
+        self._reduction = frames.reduction
         self._places: list[_Place] = []
-        for guide in pair.guides:
-            first, second = (
-                partial(_place, guide, frame, guide.steepness[frame], stored[frame], offset) for frame in (0, 1)
-            )
-            both = in_parallel(first, second)
-            self._places += [place for place in both if place]
+        for guide in frames.guides:
+            places = in_parallel(*(partial(_place, guide, frame, stored[frame], offset) for frame in (0, 1)))
+            self._places += [place for place in places if place]
 
     @property
     def usable(self) -> bool:
@@ -225,65 +222,69 @@ class _Trial:
         return bool(self._places)
 
     def fits(self, formats: Iterable[MotionFormat]) -> dict[MotionFormat, float]:
-        """What is left of the differences that are there without motion: the geometric mean over the guides that some
-        format explains."""
+        """Return the share of the differences without motion that each format leaves.
+
+        It is the geometric mean over the guides that some format explains.
+        """
         # 1 in a unit may be 2 in another one.
         formats = {(f.to, f.offset, *f.pixels_per_unit(*self._frame)): f for f in reversed(list(formats))}.values()
         left = {form: {p.guide.name: self._left(p, form) for p in self._of(form)} for form in formats}
-        names = {name for each in left.values() for name in each}
+        names = {name for shares in left.values() for name in shares}
         if not names:
             return dict.fromkeys(left, 1.0)  # nothing moves in the frames in which these formats are tried
-        deciding = [n for n in names if min(each.get(n, 1.0) for each in left.values()) * MARGIN < 1] or list(names)
+        deciding = [n for n in names if min(shares.get(n, 1.0) for shares in left.values()) * MARGIN < 1] or list(names)
         return {
-            form: float(np.exp(np.mean([np.log(max(each.get(n, 1.0), FLOOR)) for n in deciding])))
-            for form, each in left.items()
+            form: float(np.exp(np.mean([np.log(max(shares.get(n, 1.0), FLOOR)) for n in deciding])))
+            for form, shares in left.items()
         }
 
     def fit_scale(self, form: MotionFormat, fit: float, *, clearly: bool = True) -> float:
-        """The scale of a format that fits better than its own, ``clearly`` or not, if there is one: a shutter may have
-        any length."""
+        """Return a scale that fits better than that of a format, ``clearly`` or not; its own scale if there is none.
+
+        A shutter may have any length.
+        """
         best, best_fit = form, fit
-        for width, steps in ((2.0, 8), (2 ** (1 / 8), 8), (2 ** (1 / 64), 8)):
-            scales = [best.scale * width ** (k / steps) for k in range(-steps, steps + 1)]
+        for width in (2.0, 2 ** (1 / 8), 2 ** (1 / 64)):
+            scales = [best.scale * width ** (k / 8) for k in range(-8, 9)]
             fits = self.fits([replace(best, scale=float(f"{s:.4g}")) for s in scales] + [best])
             best = min(fits, key=lambda f: fits[f])
             best_fit = fits[best]
         return best.scale if best_fit * (MARGIN if clearly else 1) < fit else form.scale
 
     def is_same(self, form: MotionFormat, other: MotionFormat, fits: dict[MotionFormat, float]) -> bool:
-        """Whether two formats say the same places in these frames."""
+        """Return whether two formats say the same places in these frames."""
         if form not in fits or form.to != other.to:
             return False
         return not any(self._apart(place, form, other).any() for place in self._of(form))
 
     def silent(self, form: MotionFormat) -> frozenset[str]:
-        """Axes along which vectors of the other sign would lead to the same places."""
+        """Return the axes along which vectors of the other sign would lead to the same places."""
         vectors = np.concatenate([self._vectors(place, form) for place in self._of(form)])
         longest = np.abs(vectors).max(axis=0) * self._reduction
         return frozenset(axis for axis, length in zip("xy", longest, strict=True) if is_silent(length))
 
     def beats(self, form: MotionFormat, rival: MotionFormat) -> bool:
-        """Whether a format fits clearly better where the two say different places; True if they nowhere do.
+        """Return whether a format fits clearly better where the two say different places; True if they nowhere do.
 
-        In noise, the best format does not fit so many times as well as another one. Then pixels vote (sign test).
+        In noise, the best format does not fit many times as well as another one. Then pixels vote (sign test).
         """
         votes = []
         for place in self._of(form):
             apart = self._apart(place, form, rival)
             if np.count_nonzero(apart) < FEWEST or self._left(place, form) >= 1:
                 continue  # positions of a thing that has moved in the world tell nothing
-            mine, other = (self._errors(place, self._vectors(place, f)[apart], apart) for f in (form, rival))
-            if _median(mine) * MARGIN < _median(other):
+            errors, of_rival = (self._errors(place, self._vectors(place, f)[apart], apart) for f in (form, rival))
+            if _median(errors) * MARGIN < _median(of_rival):
                 return True
-            both = np.isfinite(mine) & np.isfinite(other)
-            for_form = float(np.mean(mine[both] < other[both])) if both.any() else 0.5
+            voters = np.isfinite(errors) & np.isfinite(of_rival)
+            for_form = float(np.mean(errors[voters] < of_rival[voters])) if voters.any() else 0.5
             # Smoothing has correlated the noise over 9 pixels.
-            votes.append((2 * for_form - 1) * np.sqrt(np.count_nonzero(both) / 9))
+            votes.append((2 * for_form - 1) * np.sqrt(np.count_nonzero(voters) / 9))
         return not votes or float(np.sum(votes) / np.sqrt(len(votes))) > SURE
 
     def _of(self, form: MotionFormat) -> list[_Place]:
-        """Vectors to the next frame are tried in the first one, vectors to the previous frame in the second."""
-        return [place for place in self._places if place.frame == (0 if form.step == 1 else 1)]
+        """Return the places where a format is tried: in the first frame if its vectors lead to the next one."""
+        return [place for place in self._places if place.frame == (0 if form.hop == 1 else 1)]
 
     def _vectors(self, place: _Place, form: MotionFormat) -> Array:
         factors = np.array(form.pixels_per_unit(*self._frame), np.float32) / np.float32(self._reduction)
@@ -292,24 +293,23 @@ class _Trial:
         return vectors
 
     def _apart(self, place: _Place, form: MotionFormat, other: MotionFormat) -> Mask:
-        """Where (n) two formats say different places."""
+        """Return where two formats say different places, (n)."""
         difference = self._vectors(place, form) - self._vectors(place, other)
         apart: Mask = np.hypot(difference[:, 0], difference[:, 1]) * self._reduction > DIFFERENT
         return apart
 
     def _errors(self, place: _Place, vectors: Array, which: Mask | slice = slice(None)) -> Array:
-        """Differences (n) between this frame and the places of the other one; NaN outside.
+        """Return the differences (n) between this frame and the places of the other one; NaN outside.
 
-        Args:
-            vectors: one for each pixel of the place that ``which`` names.
+        ``vectors`` has one for each pixel that ``which`` chooses.
         """
         other = place.guide.images[1 - place.frame]
         height, width = other.shape[:2]
         with np.errstate(invalid="ignore", over="ignore"):
             x, y = place.x[which] + vectors[:, 0], place.y[which] + vectors[:, 1]
             inside = (x >= 0) & (y >= 0) & (x <= width - 1) & (y <= height - 1)
-        found = sample_linear(other, np.where(inside, x, 0), np.where(inside, y, 0))
-        errors = np.abs(found - place.here[which]).mean(axis=-1)
+        there = sample_linear(other, np.where(inside, x, 0), np.where(inside, y, 0))
+        errors = np.abs(there - place.here[which]).mean(axis=-1)
         errors[~inside] = np.nan
         return errors
 
@@ -323,24 +323,19 @@ class _Trial:
 
 
 def is_silent(length: float) -> bool:
-    """Whether so short a movement, in pixels, does not tell its sign."""
+    """Return whether a movement, in pixels, is too short to tell its sign."""
     return bool(2 * length <= DIFFERENT)
 
 
 def _median(errors: Array) -> float:
-    """Median of the finite values; infinite if there are none."""
+    """Return the median of the finite values; infinity if there are none."""
     finite = errors[np.isfinite(errors)]
     return float(np.median(finite)) if finite.size else float("inf")
 
 
-def _place(guide: Guide, frame: int, steep: Array, stored: Array, offset: float) -> _Place | None:
-    """The pixels of a frame where a guide tells most: where it is steep, and where surfaces move.
-
-    Args:
-        steep: :attr:`Guide.steepness` of this frame.
-        stored: vectors (h, w, 2) of this frame.
-    """
-    here, other = guide.images[frame], guide.images[1 - frame]
+def _place(guide: Guide, frame: int, stored: Array, offset: float) -> _Place | None:
+    """Choose the pixels of a frame where a guide tells most: where it is steep, and where surfaces move."""
+    here, other, steep = guide.images[frame], guide.images[1 - frame], guide.steepness[frame]
     length = np.hypot(*np.moveaxis(stored - np.float32(offset), -1, 0))
     moving = np.isfinite(length) & _moving(stored, offset)
     if not moving.any():

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What tells whether surfaces have moved between two frames: their albedo, normals and positions.
+"""Guides: the albedo, normals and positions of two frames, which show how surfaces have moved between them.
 
-These layers have little noise and do not depend on the light. The beauty does.
+Unlike the beauty, these layers have little noise and do not depend on the light.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from oiio_msspl.image.parallel import in_parallel
 Reader = Callable[[Window], Array]
 
 POSITION = "position"
-#: Larger frames are averaged down to fewer pixels than this, which bounds memory.
+#: Larger frames are averaged down to fewer pixels, which bounds memory.
 MAX_PIXELS = 1 << 22
 #: Rows that are read at a time.
 ROWS = 256
@@ -47,13 +47,13 @@ class Guide:
 
     @cached_property
     def steepness(self) -> tuple[Array, Array]:
-        """How steeply both rise or fall at each pixel, (h, w) each."""
+        """How steeply each image rises or falls at a pixel, (h, w) each."""
         return in_parallel(*(partial(_steepness, image) for image in self.images))
 
 
 @dataclass(frozen=True)
-class FramePair:
-    """Two frames over the window that both have."""
+class TwoFrames:
+    """Two frames of a shot, over the window that both have."""
 
     first: MappedRender
     second: MappedRender
@@ -63,26 +63,26 @@ class FramePair:
     guides: tuple[Guide, ...]
 
     def read(self, frame: int, channels: Sequence[Channel]) -> Array:
-        """Channels of a frame (0 or 1), reduced as the guides are."""
+        """Read channels of a frame (0 or 1), reduced as the guides are."""
         render = (self.first, self.second)[frame]
         return reduced(partial(render.file.read, channels), self.window, self.reduction)
 
 
-def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None) -> FramePair:
+def open_frames(first: MappedRender, second: MappedRender, rows: int | None = None) -> TwoFrames:
     """Read the guides of two frames.
 
     Normals in camera space are left out, because they change with the camera.
 
     Args:
         first, second: the frames. If their data windows have nothing in common, the window is empty and no guide read.
-        rows: read so many rows in the middle only.
+        rows: read only this many rows in the middle.
 
     Raises:
         InputError: pixels can't be decoded.
     """
     window = first.data_window.intersect(second.data_window)
     if not window.width or not window.height:
-        return FramePair(first, second, window, 1, ())
+        return TwoFrames(first, second, window, 1, ())
     if rows is not None and window.height > rows:
         top = window.y0 + (window.height - rows) // 2
         window = Window(window.x0, top, window.x1, top + rows)
@@ -90,26 +90,25 @@ def open_pair(first: MappedRender, second: MappedRender, rows: int | None = None
     while window.width * window.height > MAX_PIXELS * reduction**2:
         reduction += 1
 
-    both = (first, second)
-    names = [name for name in (ALBEDO, NORMAL) if all(has_guide(each, name) for each in both)]
-    with_position = all(each.motion.position for each in both)
+    renders = (first, second)
+    names = [name for name in (ALBEDO, NORMAL) if all(has_guide(render, name) for render in renders)]
+    with_position = all(render.motion.position for render in renders)
 
     def images(render: MappedRender) -> dict[str, Array]:
-        found = _smoothed_features(render, names, window, reduction) if names else {}
+        features = _smoothed_features(render, names, window, reduction) if names else {}
         if with_position and render.motion.position:
-            found[POSITION] = reduced(partial(render.file.read, render.motion.position), window, reduction)
-        return found
+            features[POSITION] = reduced(partial(render.file.read, render.motion.position), window, reduction)
+        return features
 
-    of_first, of_second = in_parallel(*(partial(images, render) for render in both))
-    guides = [Guide(name, (image, of_second[name])) for name, image in of_first.items()]
-    return FramePair(first, second, window, reduction, tuple(guides))
+    of_first, of_second = in_parallel(*(partial(images, render) for render in renders))
+    guides = tuple(Guide(name, (image, of_second[name])) for name, image in of_first.items())
+    return TwoFrames(first, second, window, reduction, guides)
 
 
 def _smoothed_features(render: MappedRender, names: Sequence[str], window: Window, reduction: int) -> dict[str, Array]:
-    """Features of a frame, reduced, and averaged over 3 x 3 pixels, which lowers the noise of few samples. All are read
-    at once, because layers of a part are decoded together."""
+    """Read features, reduced and averaged over 3 x 3 pixels, which lowers the noise of few samples."""
 
-    def read(part: Window) -> Array:
+    def read(part: Window) -> Array:  # one read, because layers of a part are decoded together
         pixels = render.read(part, names)
         return np.concatenate([pixels[name] for name in names], axis=-1)
 
@@ -119,13 +118,13 @@ def _smoothed_features(render: MappedRender, names: Sequence[str], window: Windo
 
 
 def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
-    """Whether a frame has a feature that a surface keeps. If the camera moves, normals in camera space change."""
+    """Return whether a frame has a feature that a surface keeps: a moving camera changes normals in camera space."""
     formula = render.features.get(name)
     return formula is not None and not (moves and ("camera" in formula.note or "screen" in formula.note))
 
 
 def reduced(read: Reader, window: Window, reduction: int) -> Array:
-    """What ``read(window)`` gives over a window, in strips of rows and averaged down. NaN and infinities become 0."""
+    """Read a window in strips of rows and average it down. NaN and infinities become 0."""
     height, width = window.height // reduction, window.width // reduction
     result: Array | None = None
     for y in range(0, height, ROWS):
@@ -149,8 +148,8 @@ def _steepness(image: Array) -> Array:
     return total / np.float32(image.shape[-1])
 
 
-def still_and_moved(pair: FramePair) -> tuple[Mask, Mask]:
-    """Tiles of ``TILE`` x ``TILE`` pixels that show the same in both frames, and those whose content has moved.
+def still_and_moved(frames: TwoFrames) -> tuple[Mask, Mask]:
+    """Find the tiles of ``TILE`` x ``TILE`` pixels that are alike in both frames, and those whose content has moved.
 
     A tile is still if some guide differs less between the frames than between pixels that are ``NEAR`` pixels apart in
     one frame. It has moved if a guide differs much more than that, or if the movement that best explains its
@@ -160,9 +159,9 @@ def still_and_moved(pair: FramePair) -> tuple[Mask, Mask]:
     Returns:
         Two masks (rows of tiles, columns of tiles).
     """
-    shape = tuple(max(side // pair.reduction // TILE, 1) for side in (pair.window.height, pair.window.width))
+    shape = tuple(max(side // frames.reduction // TILE, 1) for side in (frames.window.height, frames.window.width))
     still, moved = np.zeros(shape, np.bool_), np.zeros(shape, np.bool_)
-    for guide in pair.guides:
+    for guide in frames.guides:
         first, second = guide.images
         if min(first.shape[:2]) < 2 * NEAR:
             continue
@@ -188,13 +187,13 @@ def still_and_moved(pair: FramePair) -> tuple[Mask, Mask]:
         length = np.hypot(x, y)
         uncertainty = np.sqrt(noise * (a + d) / determinant)
         textured = apart > floor
-        moved |= textured & ((tt > 1.5 * apart) | ((length * pair.reduction > MOVED) & (length > 3 * uncertainty)))
+        moved |= textured & ((tt > 1.5 * apart) | ((length * frames.reduction > MOVED) & (length > 3 * uncertainty)))
         still |= textured & (tt < 0.7 * apart)
     return still & ~moved, moved
 
 
 def _tile_sums(values: NDArray[np.float32], shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Sums over tiles; what is left at the right and at the bottom belongs to the last tile."""
+    """Sum up tiles. Pixels that are left over at the right and at the bottom belong to the last tile."""
     rows = np.minimum(np.arange(values.shape[0]) // TILE, shape[0] - 1)
     columns = np.minimum(np.arange(values.shape[1]) // TILE, shape[1] - 1)
     by_row = np.add.reduceat(values.astype(np.float64), np.flatnonzero(np.diff(rows, prepend=-1)), axis=0)

@@ -59,19 +59,20 @@ class ShotMotion:
         """
         # Always in the same order, so that pixels do not depend on which frame comes first.
         first, second = (here, there) if here.number < there.number else (there, here)
-        pair = first.number, second.number
-        if pair not in self._motions:
+        numbers = first.number, second.number
+        if numbers not in self._motions:
             motions = self._read(first, second)
             zero = any(motion.vectors is None and _any_known(motion) for motion in motions)
-            self._motions[pair] = None if zero and not self._source.zeros_are_right(first, second) else motions
-        found = self._motions[pair]
-        if found is None:
-            raise InputError(f"motion vectors between frames {pair[0]} and {pair[1]} are 0, though the picture moves")
-        return found if first is here else (found[1], found[0])
+            self._motions[numbers] = None if zero and not self._source.zeros_are_right(first, second) else motions
+        ways = self._motions[numbers]
+        if ways is None:
+            frames = f"frames {numbers[0]} and {numbers[1]}"
+            raise InputError(f"motion vectors between {frames} are 0, though the picture moves")
+        return ways if first is here else ways[::-1]
 
     def keep(self, numbers: Collection[int]) -> None:
         """Forget the motion of all frames but these."""
-        self._motions = {pair: motions for pair, motions in self._motions.items() if set(pair) <= set(numbers)}
+        self._motions = {pair: ways for pair, ways in self._motions.items() if set(pair) <= set(numbers)}
 
     def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion]:
         """Read the motion between two frames, forwards and backwards."""

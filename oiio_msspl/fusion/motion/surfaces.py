@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Does a pixel show another surface in a neighbouring frame? The albedo and the normals of both tell.
+"""Finds the pixels that show another surface in a neighbour, by the albedo and the normals of both frames.
 
 Without motion vectors, nothing else says that an object has moved in front of a surface, or away from it.
 """
@@ -16,10 +16,10 @@ from oiio_msspl.image.filters import grown, sum_3x3
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices
 
-#: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of what pixels of
-#: one surface differ by. That is the surface's texture and noise.
+#: A pixel differs between two frames if a layer has changed by more than a constant and a multiple of the difference of
+#: two pixels of one surface, which is its texture and noise.
 DIFFERENCE, MULTIPLE = 0.03, 3.0
-#: The surface is another one if so many of 3 x 3 pixels differ. Single ones are noise.
+#: The surface is another one if this many of 3 x 3 pixels differ. Single ones are noise.
 PIXELS = 4
 #: Rows and columns around a pixel that decide on it.
 REACH = 4
@@ -30,13 +30,13 @@ PIXELS_AT_ONCE = 1 << 22
 def other_surfaces(
     here: ReadableRender, there: ReadableRender, names: Sequence[str], vectors: Array | None, known: Mask
 ) -> Mask:
-    """Where a frame shows another surface than its neighbour, (h, w) over its data window, or lies beside such a pixel.
+    """Find the pixels (h, w) of a frame where its neighbour shows another surface, and those beside them.
 
     Args:
         here, there: the frame and its neighbour.
-        names: layers of both that have no light, such as the albedo. Without any, no surface is another one.
-        vectors: to the place of each surface in the neighbour, (h, w, 2) in HRLS pixels; None if it is the same place.
-        known: which of them can be believed, (h, w). The others are not compared.
+        names: layers of both frames that have no light, such as the albedo. Without any, no surface is another one.
+        vectors: to the places of the surfaces in the neighbour, (h, w, 2) in HRLS pixels; None if they stay.
+        known: which vectors can be believed, (h, w). Other pixels are not compared.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -49,11 +49,11 @@ def other_surfaces(
         around = slice(max(top - REACH, 0), min(last + REACH, height))
         area = Window(window.x0, window.y0 + around.start, window.x1, window.y0 + around.stop)
         if vectors is None and window == there.data_window:
-            found, compared = _layers(there, names, area), known[around]
+            layers, compared = _layers(there, names, area), known[around]
         else:
             way = np.zeros((area.height, area.width, 2), np.float32) if vectors is None else vectors[around]
-            found, compared = _at_places(there, names, area, way, known[around])
-        other = _differ(_layers(here, names, area), found, compared)
+            layers, compared = _at_places(there, names, area, way, known[around])
+        other = _differ(_layers(here, names, area), layers, compared)
         result[top:last] = other[top - around.start :][: last - top]
         for render in (here, there):
             render.unload()
@@ -63,7 +63,7 @@ def other_surfaces(
 def _at_places(
     render: ReadableRender, names: Sequence[str], area: Window, vectors: Array, known: Mask
 ) -> tuple[list[Array], Mask]:
-    """Layers of a frame at the pixels that vectors of an area lead to, and which of these are known and lie in it."""
+    """Read layers at the pixels that vectors of an area lead to; and which vectors are known and end in the frame."""
     window = render.data_window
     x = np.arange(area.x0, area.x1, dtype=np.float32) + vectors[..., 0]
     y = np.arange(area.y0, area.y1, dtype=np.float32)[:, None] + vectors[..., 1]
@@ -82,7 +82,7 @@ def _layers(render: ReadableRender, names: Sequence[str], window: Window) -> lis
 
 
 def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Mask:
-    """Where layers (h, w, c) show another surface, or lie beside such a pixel, (h, w)."""
+    """Find the pixels (h, w) where layers (h, w, c) show another surface, and those beside them."""
     height, width = compared.shape
     result = np.empty((height, width), np.bool_)
 
@@ -104,7 +104,7 @@ def _differ(here: Sequence[Array], there: Sequence[Array], compared: Mask) -> Ma
 
 
 def _planes(image: Array) -> Array:
-    """(h, w, c) as (c, h, w). NaN and infinities become 0."""
+    """Return (h, w, c) as (c, h, w). NaN and infinities become 0."""
     planes = np.moveaxis(image, -1, 0).copy(order="C")
     if not np.isfinite([planes.min(), planes.max()]).all():
         planes[~np.isfinite(planes)] = 0
@@ -112,27 +112,29 @@ def _planes(image: Array) -> Array:
 
 
 def _roughness(planes: Array) -> Array:
-    """What neighbouring pixels of one surface differ by, mean of 3 x 3 pixels (h, w): of two neighbours on opposite
-    sides, at least one lies on the surface of the pixel."""
+    """Return the usual difference of neighbouring pixels of one surface, mean of 3 x 3 pixels (h, w).
+
+    Of two neighbours on opposite sides, at least one lies on the surface of the pixel.
+    """
     total = np.zeros(planes.shape[1:], np.float32)
-    for steps, sums in (
+    for changes, sums in (
         (_distance(planes[:, 1:], planes[:, :-1]), total),
         (_distance(planes[:, :, 1:], planes[:, :, :-1]).T, total.T),
     ):
-        if len(steps):
-            sums[1:-1] += np.minimum(steps[1:], steps[:-1])
-            sums[0] += steps[0]
-            sums[-1] += steps[-1]
+        if len(changes):
+            sums[1:-1] += np.minimum(changes[1:], changes[:-1])
+            sums[0] += changes[0]
+            sums[-1] += changes[-1]
     result = sum_3x3(total)
     result /= 9
     return result
 
 
 def _distance(one: Array, two: Array) -> Array:
-    """Length of the difference of (c, h, w), (h, w)."""
+    """Return the length (h, w) of the difference of planes (c, h, w)."""
     total = np.zeros(one.shape[1:], np.float32)
     for a, b in zip(one, two, strict=True):
-        step = a - b
-        step *= step
-        total += step
+        difference = a - b
+        difference *= difference
+        total += difference
     return np.sqrt(total, out=total)

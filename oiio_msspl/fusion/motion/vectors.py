@@ -20,10 +20,11 @@ from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import grown
 from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.image.sampling import nearest_indices
 
 #: Shorter vectors are no movement, in pixels.
 NO_MOTION = 1e-3
-#: Vectors that change by more than this from pixel to pixel can't be followed, in pixels. Whether the way there and
+#: Vectors that change by more than this from pixel to pixel can't be followed, in pixels: whether the way there and
 #: back ends at its pixel would depend on how places are rounded to pixels.
 UNEVEN = 0.25
 #: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
@@ -31,14 +32,14 @@ INVERSION_ROUNDS, INVERSION_ERROR = 3, 0.5
 
 
 def channels_to_read(render: MappedRender, channels: tuple[Channel, Channel]) -> list[Channel]:
-    """The channels that :func:`judged_vectors` needs: two with vectors, and the alpha."""
+    """Return the channels that :func:`judged_vectors` needs: two with vectors, and the alpha if there is one."""
     return [*channels, *([render.alpha] if render.alpha else [])]
 
 
 def judged_vectors(
     render: MappedRender, stored: Array, channels: tuple[Channel, Channel], form: MotionFormat, pixels: ReadableRender
 ) -> tuple[Array, Mask]:
-    """Motion vectors over the data window, and where they can be believed.
+    """Decode motion vectors over the data window, and find where they can be believed.
 
     Args:
         render: the frame.
@@ -49,8 +50,8 @@ def judged_vectors(
 
     Returns:
         Vectors (h, w, 2), 0 where they can't be believed; and where they can (h, w): they are finite, shorter than the
-        frame, not clamped, alpha is not 0, they do not change too fast, see :func:`_uneven`, and they are not zeros of
-        a background, see :func:`_doubtful_zeros`.
+        frame and not clamped, alpha is not 0, they do not change too fast (:func:`_uneven`), and they are not zeros of
+        a background (:func:`_doubtful_zeros`).
 
     Raises:
         InputError: pixels can't be decoded.
@@ -72,11 +73,11 @@ def judged_vectors(
 def decode(
     stored: Array, form: MotionFormat, width: int, height: int, alpha: Array | None = None
 ) -> tuple[Array, Mask]:
-    """Vectors in pixels, x right and y down, from stored values (h, w, 2); and where they can be believed.
+    """Decode vectors to pixels, x right and y down, and find where they can be believed.
 
     Args:
-        stored: as the renderer wrote them.
-        form: how.
+        stored: as the renderer wrote them, (h, w, 2).
+        form: how it stores them.
         width, height: of the display window.
         alpha: (h, w); None if the render has none.
     """
@@ -103,7 +104,7 @@ def decode(
 
 
 def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask:
-    """Where a vector of 0 may mean that the renderer knows none.
+    """Find where a vector of 0 may mean that the renderer knows none.
 
     Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
     surfaces do not move either.
@@ -119,28 +120,28 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
 
 
 def _uneven(vectors: Array) -> Mask:
-    """Where vectors change by more than ``UNEVEN`` on both sides of a pixel, in the same direction: on what turns fast.
+    """Find where vectors change by more than ``UNEVEN`` on both sides of a pixel, in one direction: things turn fast.
 
-    At the border of two surfaces, they change on one side. On a surface as thin as a pixel, they change and change
+    At the border of two surfaces, vectors change on one side. On a surface as thin as a pixel, they change and change
     back.
     """
     motion = as_complex(vectors)
     result = np.zeros(motion.shape, np.bool_)
-    for turned, found in ((motion, result), (motion.T, result.T)):
+    for turned, uneven in ((motion, result), (motion.T, result.T)):
         with np.errstate(all="ignore"):  # vectors that are not believed may have any values
-            steps = np.diff(turned, axis=0)
-            fast = np.abs(steps) > UNEVEN
-            found[1:-1] |= fast[1:] & fast[:-1] & ((steps[1:] * steps[:-1].conj()).real > 0)
+            changes = np.diff(turned, axis=0)
+            fast = np.abs(changes) > UNEVEN
+            uneven[1:-1] |= fast[1:] & fast[:-1] & ((changes[1:] * changes[:-1].conj()).real > 0)
     return result
 
 
 def _all_planes(mask: Mask) -> Mask:
-    """Where a mask (h, w, c) is true in all channels: several times as fast as NumPy's ``all`` along the last axis."""
+    """Return where a mask (h, w, c) is true in all channels, several times as fast as ``all`` along the last axis."""
     return functools.reduce(np.logical_and, np.moveaxis(mask, -1, 0))
 
 
 def invert(own: Array, other: Array, other_known: Mask, window: Window, other_window: Window) -> tuple[Array, Mask]:
-    """The vectors to a neighbour, from those that lead from the neighbour to this frame.
+    """Compute the vectors to a neighbour from those that lead from the neighbour to this frame.
 
     The surface of pixel p is at the place q of the neighbour where q + other(q) = p. The iteration q <- p - other(q)
     finds it (Chen et al. 2008, "A simple fixed-point approach to invert a deformation field").
@@ -199,7 +200,7 @@ def as_complex(vectors: Array) -> NDArray[np.complex64]:
 
 
 def sample_linear(image: Array, x: Array, y: Array) -> Array:
-    """Bilinear samples of an image (h, w, c) at pixel positions; its edge is repeated outside."""
+    """Interpolate an image (h, w, c) linearly at pixel positions; its edge is repeated outside."""
     height, width, channels = image.shape
     # Two floats are fetched as one complex number, which takes half as long.
     pixels = np.ascontiguousarray(image).reshape(-1, channels)
@@ -220,9 +221,6 @@ def sample_linear(image: Array, x: Array, y: Array) -> Array:
 
 
 def nearest_values(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:
-    """The pixels (h, w) that are nearest to these positions."""
+    """Return the pixels of a mask that are nearest to positions (h, w)."""
     height, width = image.shape
-    rows = np.clip(np.rint(y), 0, height - 1).astype(np.int32)
-    columns = np.clip(np.rint(x), 0, width - 1).astype(np.int32)
-    result: Mask = image[rows, columns]
-    return result
+    return image.take(nearest_indices(x, y, (height, width)))

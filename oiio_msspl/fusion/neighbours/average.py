@@ -1,14 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """Averages a frame with its neighbours: both of its renders before they are fused, and the fused frame after that.
 
-One engine does both. It works in bands of rows, follows the surfaces of a band from neighbour to neighbour, judges how
-much each pixel there counts, and sums up the weighted pixels. A neighbour counts
-
-- where it shows the same surface: a vector leads to it, and its own vector leads back (:class:`Path`);
-- as far as it shows the surface in the same light (:class:`Light`).
-
-The strategies :class:`RenderBand` and :class:`ResultBand` fetch the pixels. A value that no neighbour may change keeps
-its bits.
+One engine does both averages, in bands of rows. It follows the surfaces of a band from neighbour to neighbour, judges
+how much each pixel counts there, and sums up the weighted pixels. A neighbour counts where it shows the same surface,
+so that its vectors lead back (:class:`Path`), and the more, the less the light has changed (:class:`Light`). What
+differs between renders and fused frames is a strategy each: :class:`RenderBand` and :class:`ResultBand`. A value that
+no neighbour may change keeps its bits.
 """
 
 from __future__ import annotations
@@ -35,20 +32,12 @@ from oiio_msspl.image.colour import luminance
 BYTES_OF_RENDERS, BYTES_OF_RESULTS = 44, 96
 
 
-class Averaged(Protocol):
-    """What is averaged: :class:`RenderPair` or :class:`FusedFrame`."""
-
-    @property
-    def alignment(self) -> Alignment:
-        """How the frame's pair lies over each other."""
-
-
-F = TypeVar("F", bound=Averaged)
-C = TypeVar("C", bound=Averaged, contravariant=True)
+F = TypeVar("F", RenderPair, FusedFrame)
+C = TypeVar("C", RenderPair, FusedFrame, contravariant=True)
 
 
 class Band(Protocol[C]):
-    """Some rows of a frame, to which those of neighbours are added."""
+    """Some rows of a frame, to which those of neighbours are added: :class:`RenderBand` or :class:`ResultBand`."""
 
     def add(self, hop: Hop[C], path: Path, judge: Judge) -> None:
         """Add a neighbour.

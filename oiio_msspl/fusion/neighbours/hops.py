@@ -35,9 +35,9 @@ def find_hops(
         motion: between the frames.
         number: of the frame.
         neighbours: their numbers, the nearest first.
-        frame_of: returns a frame, and what is averaged of it. Raises what is wrong with it: an InputError ends the
-            hops with a warning, because it is due to the files and occurs in every run. Any other error may not occur
-            again, and the pixels would depend on it, so it is passed on.
+        frame_of: returns a frame, and its renders or fused picture. If it raises an InputError, the hops end with a
+            warning, because the files are the reason, in every run. Any other error is passed on: it may not occur
+            again, and the pixels would depend on it.
         warnings: gets a sentence for each problem.
 
     Raises:

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the average of fused frames fetches of a neighbour, and how much a pixel of it counts.
 
-The pixels are interpolated. A pixel at the border of two surfaces has the light of both, in a mixture that changes from
-frame to frame. So at the borders of either frame a neighbour counts less the more its brightness differs.
+The pixels are interpolated. A pixel at the border of two surfaces shows a mixture of them, which changes from frame to
+frame. So at the borders of either frame a neighbour counts less, the more its brightness differs.
 """
 
 from __future__ import annotations

@@ -35,7 +35,7 @@ EQUAL = 1e-4
 #: them in the other frame.
 LAMP = 3.0
 
-#: See :meth:`Light.judge`.
+#: Says how much a neighbour counts by its light, as :meth:`Light.judge` does.
 Judge = Callable[[Array, Array], Array]
 
 

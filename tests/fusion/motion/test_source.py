@@ -54,7 +54,7 @@ def no_optical_flow(monkeypatch):
 def shot(folder, form, name="motion", camera=truck_and_dolly, change=lambda values: values, **options):
     """Three frames whose layer holds vectors in a format."""
     return [
-        frame(folder, t, layer(name, change(encode(vectors(camera, t, form.step), form))), camera, **options)
+        frame(folder, t, layer(name, change(encode(vectors(camera, t, form.hop), form))), camera, **options)
         for t in (0, 1, 2)
     ]
 
@@ -78,9 +78,9 @@ def test_every_format_is_found_by_the_pixels(tmp_path, form):
     frames = shot(tmp_path, form, "velocity")
     source = find_motion(frames[0], frames[1])
     assert source.kind == "vectors", source.text
-    assert right_share(source, frames, 1, form.step) == 1
+    assert right_share(source, frames, 1, form.hop) == 1
     # The opposite vectors come from the neighbour: right wherever the neighbour shows the surface.
-    assert right_share(source, frames, 1, -form.step) > 0.85
+    assert right_share(source, frames, 1, -form.hop) > 0.85
 
 
 @pytest.mark.parametrize(("renderer", "words"), TABLE, ids=lambda v: v if isinstance(v, str) else "")
@@ -90,7 +90,7 @@ def test_what_the_table_expects_is_what_is_found(tmp_path, renderer, words):
     alpha = {"A": np.full((HEIGHT, WIDTH), 0.5, np.float32)} if form.premultiplied else {}
     frames = []
     for t in (0, 1):
-        values = encode(vectors(truck_and_dolly, t, form.step), form) * (0.5 if form.premultiplied else 1)
+        values = encode(vectors(truck_and_dolly, t, form.hop), form) * (0.5 if form.premultiplied else 1)
         name = "motionvec" if form.premultiplied else "velocity"
         frames.append(frame(tmp_path, t, layer(name, values) | alpha))
     source = find_motion(*frames)

@@ -14,8 +14,9 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import DEFAULTS, VARIANCE
-from oiio_msspl.image.arrays import HALF_MAX, Array, box_downsample, map_rows, quantile
+from oiio_msspl.image.arrays import HALF_MAX, Array, map_rows, quantile
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import BLOCK_VALUES
 
 #: Log-mean luminance to which a scene is exposed: photographic mid-grey.

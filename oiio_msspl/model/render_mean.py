@@ -12,7 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.image.arrays import Array, box_downsample, clip
+from oiio_msspl.image.arrays import Array, clip
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance
 
 #: Features of one render, (h, w, c), in scene-linear units.

@@ -7,8 +7,8 @@ import pytest
 from oiio_msspl import Render, fuse
 from oiio_msspl.fusion.fuse import tile_count
 from oiio_msspl.fusion.tiles import tiling
-from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.image.colour import srgb
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture
 from tests.fusion.checks.test_spread_noise import spread

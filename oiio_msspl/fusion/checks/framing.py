@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.image.arrays import Array, box_downsample, interpolate, quantile
-from oiio_msspl.image.filters import blurred
+from oiio_msspl.image.arrays import Array, quantile
+from oiio_msspl.image.filters import blurred, box_downsample, interpolate
 
 #: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
 FRAMING_CORRELATION = 0.8

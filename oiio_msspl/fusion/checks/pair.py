@@ -22,8 +22,9 @@ from oiio_msspl.fusion.checks.framing import central_slices, find_framing, jackk
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, TilePair, in_hrls_pixels, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.image.arrays import Array, box_downsample, planes_of, quantile
+from oiio_msspl.image.arrays import Array, planes_of, quantile
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import for_row_blocks, in_background
 
 #: Two renders hardly show the same frame if the correlation of their log luminance is below this. Matching pairs with

@@ -16,8 +16,9 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, read_features, read_lrhs
-from oiio_msspl.image.arrays import Array, box_downsample
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
 
 #: Side of the blocks in which neighbouring pixels are compared; and of a sample of the frame, in LRHS pixels.

@@ -14,8 +14,8 @@ from oiio_msspl.aovs.features import NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, box_downsample, enlarged, filled, interpolate, repair
-from oiio_msspl.image.filters import max_3x3
+from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, repair
+from oiio_msspl.image.filters import box_downsample, enlarged, filled, interpolate, max_3x3
 
 Indices = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
@@ -181,7 +181,7 @@ def read_features(
     """Read and repair features over a window. Beyond the data window the picture is mirrored.
 
     Repeating the last pixel would turn its noise into lines, which networks take for texture. Pixels that are NaN or
-    minus infinity are filled from those around (:func:`oiio_msspl.image.arrays.filled`).
+    minus infinity are filled from those around (:func:`oiio_msspl.image.filters.filled`).
 
     Args:
         window, data_window: both relative to the top left of the display window, as all windows here.

@@ -14,8 +14,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TilePair
-from oiio_msspl.image.arrays import Array, Mask, box_downsample
-from oiio_msspl.image.filters import all_within, grown, max_3x3, neighbours
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, neighbours
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session

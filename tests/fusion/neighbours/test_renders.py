@@ -9,7 +9,7 @@ from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.neighbours import bands
 from oiio_msspl.fusion.neighbours.path import Step
 from oiio_msspl.fusion.neighbours.renders import RenderPair, average_renders, shared_noise
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import limit_threads
 from tests.conftest import rgb, write_exr
 from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, moved, rms, still, texture

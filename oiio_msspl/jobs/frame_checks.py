@@ -7,9 +7,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.write_options import ALBEDO_LAYER, ERROR_LAYER, FRAMES_LAYER, NORMAL_LAYER, WriteOptions
 from oiio_msspl.exr.writer import bytes_held, check_layout
-from oiio_msspl.fusion.fuse import memory_to_fuse, result_bytes
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, require_memory
+from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, memory_to_fuse, require_memory, result_bytes
 from oiio_msspl.model.session import Session
 
 
@@ -67,7 +66,7 @@ def require_frame_memory(
     Args:
         layers: bytes of other layers that writing holds at once.
     """
-    to_fuse = memory_to_fuse(alignment, session, error=write.error_layer)
+    to_fuse = memory_to_fuse(alignment, session.contract, error=write.error_layer)
     to_write = FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + layers
     only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
     hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""

@@ -11,9 +11,8 @@ from functools import cached_property
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.fusion.fuse import result_bytes
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, TILE_MEMORY
+from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, TILE_MEMORY, result_bytes
 from oiio_msspl.image.arrays import has_many_pixels
 from oiio_msspl.jobs.temporal import Temporal
 

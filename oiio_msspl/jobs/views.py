@@ -20,9 +20,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.fuse import FusedFrame, fuse, memory_to_fuse
+from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import require_memory
+from oiio_msspl.fusion.tiles.tiling import memory_to_fuse, require_memory
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.jobs.frame_passes import fuse_frame_passes, sets_to_fuse
 from oiio_msspl.jobs.inputs import InputOptions, map_other_view
@@ -137,7 +137,7 @@ def fuse_other_views(
         MssplError: the network failed.
     """
     for view in others.views:
-        needed = memory_to_fuse(align(view.lr, view.hr), session, error=False) + held
+        needed = memory_to_fuse(align(view.lr, view.hr), session.contract, error=False) + held
         require_memory(needed, session.contract, max_memory)
     replaced = ReplacedChannels() if others.views else None
     reports = []

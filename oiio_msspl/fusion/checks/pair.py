@@ -20,7 +20,7 @@ from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.edges import foreign_aovs
 from oiio_msspl.fusion.checks.framing import central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.features import RepairCounts, TilePair, in_hrls_pixels, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, in_hrls_pixels, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import Array, planes_of, quantile
 from oiio_msspl.image.colour import luminance
@@ -99,7 +99,7 @@ class HrlsAverages:
         self.noisy_pixels = self.equal_pixels = 0
         self.is_lost = True
 
-    def add(self, pair: TilePair) -> None:
+    def add(self, pair: TileFeatures) -> None:
         """Add the core of a tile."""
         self.is_lost &= pair.hrls_is_lost
         rows, columns = pair.core
@@ -110,7 +110,7 @@ class HrlsAverages:
         if centre.width and centre.height:
             self._add_aovs(pair, centre)
 
-    def _add_aovs(self, pair: TilePair, window: Window) -> None:
+    def _add_aovs(self, pair: TileFeatures, window: Window) -> None:
         """Fill ``albedo`` and ``normal_edges`` over a part of the central area."""
         target, size = window.slices(self._centre), (self._centre.height, self._centre.width)
         if ALBEDO in pair.hrls:
@@ -197,7 +197,7 @@ def _noise_variance(pixels: Array) -> Array:
     return variance
 
 
-def _hrls_pixels(pair: TilePair, feature: str, window: Window) -> Array:
+def _hrls_pixels(pair: TileFeatures, feature: str, window: Window) -> Array:
     """A feature of the HRLS over a window of LRHS pixels inside the tile."""
     return pair.hrls[feature][in_hrls_pixels(window, pair.scale).slices(pair.hrls_area)]
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.fusion.tiles.features import TilePair
+from oiio_msspl.fusion.tiles.features import TileFeatures
 from oiio_msspl.fusion.tiles.guards import check_finite, repeated
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import all_within
@@ -14,7 +14,7 @@ from oiio_msspl.model.render_mean import Images, Shares
 from oiio_msspl.model.session import Session
 
 
-def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
+def fuse_alpha(pair: TileFeatures, session: Session, shares: Shares) -> Array:
     """Alpha of a tile, (s*h, s*w, 1) in [0, 1].
 
     A pixel is exactly 1 or 0 if the LRHS pixel over it is, and the 3 x 3 HRLS pixels around it are. The network would
@@ -37,7 +37,7 @@ def fuse_alpha(pair: TilePair, session: Session, shares: Shares) -> Array:
     return np.where(solid, np.float32(1), np.where(empty, np.float32(0), fused))
 
 
-def alpha_as_colour(pair: TilePair) -> tuple[Images, Images]:
+def alpha_as_colour(pair: TileFeatures) -> tuple[Images, Images]:
     """Albedo and normal of both renders of a tile, with their alpha as a grey colour. Layers of light have no meaning
     beside it."""
     lrhs, hrls = (

@@ -46,7 +46,7 @@ class RepairCounts:
 
 
 @dataclass
-class TilePair:
+class TileFeatures:
     """The features of both renders over one tile."""
 
     lrhs: dict[str, Array]
@@ -76,7 +76,7 @@ def read_tile(
     alignment: Alignment,
     features: Iterable[str],
     counts: RepairCounts,
-) -> TilePair:
+) -> TileFeatures:
     """Read both renders over a tile.
 
     Where the beauty of one render is broken, it gets the light of the other one.
@@ -103,7 +103,7 @@ def read_tile(
     if lost_below.any():
         means = box_downsample(hrls[RGB], scale)
         low[RGB] = np.where((lost_below & ~_as_bright(means))[..., None], means, low[RGB])
-    return TilePair(
+    return TileFeatures(
         lrhs=low,
         hrls=hrls,
         scale=scale,

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TilePair
+from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TileFeatures
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, neighbours
 from oiio_msspl.image.parallel import for_row_blocks
@@ -33,7 +33,7 @@ NOISE_FREE = 1 / 512
 LIGHT = 4096.0
 
 
-def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
+def dim_fireflies(pair: TileFeatures) -> tuple[Array, dict[str, Array]]:
     """Limit the brightness of both renders to what the other one allows.
 
     Returns:
@@ -111,7 +111,7 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     return agreed
 
 
-def _brightness_limit(rgb: Array, pair: TilePair) -> Array:
+def _brightness_limit(rgb: Array, pair: TileFeatures) -> Array:
     """The largest values that the other render may have, (h, w, 3): none where this render is black.
 
     Where few samples find the light, all 3 x 3 pixels around may have missed it. So light that is rare, but in most
@@ -148,7 +148,7 @@ def _rare_light(rgb: Array, top: int, left: int) -> Array:
     return light[inside].transpose(1, 2, 0)
 
 
-def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
+def is_noise_free(pair: TileFeatures, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
     """Whether the two renders of a tile agree so well that there is no noise to remove.
 
     Args:
@@ -158,7 +158,7 @@ def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: fl
     return all(_largest_difference(pair, lrhs_rgb, hrls_rgb, exposure, step) <= NOISE_FREE for step in (32, 1))
 
 
-def _largest_difference(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
+def _largest_difference(pair: TileFeatures, lrhs_rgb: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
     """Largest log-encoded difference of the renders inside the grid, in one of ``step`` LRHS rows."""
     rows = hrls_rgb.reshape(-1, pair.scale, *hrls_rgb.shape[1:])[pair.inside[0]][::step]
     means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), pair.scale)
@@ -200,19 +200,19 @@ class EmptyRegions:
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
         reach: how far, in LRHS pixels. Tiles that overlap by less may differ at their borders.
-        of_layer: whether the pair shows a layer.
+        of_pass: whether the renders show a pass in place of the beauty.
     """
 
-    def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_layer: bool = False) -> None:
+    def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_pass: bool = False) -> None:
         self._reach = reach
         self._black = _is_zero(lrhs_rgb)
         self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
         self._has_rare_light = np.zeros_like(self._black)
-        if of_layer and self._black.any():
+        if of_pass and self._black.any():
             light = reduce(np.maximum, (lrhs_rgb[..., c : c + 1] for c in range(3)))
             self._has_rare_light = grown(_rare_light(light, 0, 0) > 0, _SQUARE)
 
-    def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
+    def mask(self, pair: TileFeatures, window: tuple[slice, slice]) -> Mask | None:
         """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
 
         Args:

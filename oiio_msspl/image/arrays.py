@@ -90,11 +90,6 @@ def reserve(file: IO[bytes], size: int) -> None:
         file.truncate(size)
 
 
-def planes(like: Array, channels: int) -> Array:
-    """Return an uninitialised image (h, w, channels), as high and wide as ``like``, with contiguous channels."""
-    return np.empty((channels, *like.shape[:2]), np.float32).transpose(1, 2, 0)
-
-
 def kept(values: NDArray[T], *, on_disk: bool | None = None) -> NDArray[T]:
     """Return an image that waits for other images: itself, or a copy in a temporary file.
 

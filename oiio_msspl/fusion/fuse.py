@@ -28,7 +28,7 @@ from oiio_msspl.model.session import Session
 
 @dataclass
 class FusedFrame(FusedPixels):
-    """A fused frame: its pixels, and what is known of it."""
+    """A fused frame: its pixels, the luminance of both renders, counts and warnings."""
 
     repaired: dict[str, int]
     """Numbers of values that were NaN or infinite, by layer, as ``lrhs.rgb``."""
@@ -38,7 +38,7 @@ class FusedFrame(FusedPixels):
     """(h, w): luminance of the HRLS, averaged over the LRHS's pixels."""
     frames: Array | None = None
     """(height, width, 1): number of frames that were averaged, see
-    :class:`oiio_msspl.fusion.neighbours.results.Accumulated`; None for a frame that was fused alone."""
+    :class:`oiio_msspl.fusion.neighbours.results.Accumulated`; None without neighbours."""
     negative: dict[str, int] = field(default_factory=dict)
     """Numbers of values that were negative and set to 0 (colours out of gamut), by layer; never of normals."""
     warnings: list[str] = field(default_factory=list)
@@ -49,7 +49,7 @@ class FusedFrame(FusedPixels):
     """New pixels of other channels of the HRLS: fused passes, and further views; None if there are none."""
     tiles: int = 1
     seconds: float = 0.0
-    """Time in the network alone."""
+    """Time in the network."""
 
     @property
     def nbytes(self) -> int:

@@ -136,7 +136,7 @@ def map_rows(function: Callable[[Array], object], source: Array, out: Array | No
     result = np.empty(np.shape(source), np.float32) if out is None else out
 
     def work(rows: slice) -> None:
-        # The copy keeps the memory layout of the source, whatever that of the result is.
+        # The copy keeps the memory layout of the source. That of the result may differ.
         block = np.array(source[rows], np.float32)
         function(block)
         result[rows] = block

@@ -160,13 +160,13 @@ def encoding_of(metadata: Mapping[str, Any]) -> str:
     return "" if np.allclose(bright, 2 * dark, rtol=1e-3) else name
 
 
-def same_space(one: ColourSpace, other: ColourSpace) -> bool:
+def same_space(first: ColourSpace, second: ColourSpace) -> bool:
     """Return whether two spaces are equal, except for the rounding of headers."""
-    return _alike(one.chromaticities, other.chromaticities)
+    return _alike(first.chromaticities, second.chromaticities)
 
 
-def _alike(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    return bool(np.allclose(one, other, rtol=0, atol=_SAME))
+def _alike(first: tuple[float, ...], second: tuple[float, ...]) -> bool:
+    return bool(np.allclose(first, second, rtol=0, atol=_SAME))
 
 
 def _edges(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:

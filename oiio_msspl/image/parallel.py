@@ -82,7 +82,7 @@ def for_row_blocks(work: Callable[[slice], object], rows: int, row_size: int, mu
     count = min(_thread_limit.get() or available_cores(), len(slices))
     # Each thread gets its slices at once: handing over a single slice takes a third of the time to compute it.
     parts = [slices[len(slices) * i // count : len(slices) * (i + 1) // count] for i in range(count)]
-    pending = [_row_pool(count).submit(_run_all, work, part) for part in parts[1:]]
+    pending = [_pool(f"rows {count}", count).submit(_run_all, work, part) for part in parts[1:]]
     try:
         _run_all(work, parts[0] if parts else [])
     finally:
@@ -127,7 +127,7 @@ def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
             for i in waiting:
                 results[i] = work(items[i])
 
-    pending = submit(_second_pool(), take)
+    pending = submit(_pool("second"), take)
     try:
         take()
     finally:
@@ -166,7 +166,7 @@ def submit(pool: Executor, work: Callable[..., T], *arguments: Any) -> Future[T]
 
 
 def _start(work: Callable[[], T]) -> Future[T]:
-    return submit(_background_pool(), work)
+    return submit(_pool("background", start=_yield_to_network), work)
 
 
 def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
@@ -197,22 +197,13 @@ def end_pools() -> None:
         _pools.pop(key).shutdown(wait=False)
 
 
-#: A pool for each number of threads that work on rows, one for work in the background, and one for every second item
-#: of :func:`two_at_a_time`.
-_pools: dict[int | str, ThreadPoolExecutor] = {}
+#: Pools by name: for rows, one for each number of threads; for work in the background; and for every second item of
+#: :func:`two_at_a_time`.
+_pools: dict[str, ThreadPoolExecutor] = {}
 
 
-def _row_pool(count: int) -> ThreadPoolExecutor:
-    return _pools.get(count) or _pools.setdefault(count, ThreadPoolExecutor(count, thread_name_prefix="rows"))
-
-
-def _second_pool() -> ThreadPoolExecutor:
-    return _pools.get("second") or _pools.setdefault("second", ThreadPoolExecutor(None, "second"))
-
-
-def _background_pool() -> ThreadPoolExecutor:
-    name = "background"
-    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(None, name, _yield_to_network))
+def _pool(name: str, threads: int | None = None, start: Callable[[], object] | None = None) -> ThreadPoolExecutor:
+    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(threads, name, start))
 
 
 if hasattr(os, "register_at_fork"):

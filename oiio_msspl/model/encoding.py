@@ -94,7 +94,7 @@ def encode_radiance(radiance: Array, exposure: float, out: Array | None = None) 
     """
 
     def encode(values: Array) -> None:
-        with np.errstate(over="ignore"):  # what overflows is clipped
+        with np.errstate(over="ignore"):  # values that overflow are clipped
             values *= np.float32(exposure)
         np.clip(values, 0.0, MAX_RADIANCE, out=values)
         values *= np.float32(MU)

@@ -123,18 +123,18 @@ class _Edges:
         contrast = fine / np.sqrt(power + np.float32(1e-3 * float(np.mean(np.square(fine))) + 1e-20))
         return cls(np.fft.rfft2(contrast), values.shape)
 
-    def fit(self, other: _Edges) -> float:
+    def fit(self, picture: _Edges) -> float:
         """Return by how many standard deviations two pictures fit better than with a shift."""
-        return _above_control(np.conj(self.spectrum) * other.spectrum, self.shape)
+        return _above_control(np.conj(self.spectrum) * picture.spectrum, self.shape)
 
-    def repeat_in(self, other: _Edges) -> bool:
-        """Return whether another picture has a pattern of these edges that repeats, as boards or tiles do.
+    def repeat_in(self, picture: _Edges) -> bool:
+        """Return whether ``picture`` has a pattern of these edges that repeats, as boards or tiles do.
 
         Shifted by a period, the pattern fits as well. But if both pictures have it, their correlation depends on the
         shift as the correlation of the pattern with itself.
         """
         auto, cross = (
-            _correlation(np.conj(self.spectrum) * edges.spectrum, self.shape).ravel() for edges in (self, other)
+            _correlation(np.conj(self.spectrum) * edges.spectrum, self.shape).ravel() for edges in (self, picture)
         )
         auto, cross = auto - auto.mean(), cross - cross.mean()
         # Written so that a picture without edges, whose correlations are all 0, does not match.

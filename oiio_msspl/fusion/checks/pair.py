@@ -248,16 +248,17 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
         return [BOTH_BLACK]
     if hrls.is_lost:
         raise _black_beauty(hr_name, lr_name)
-    for name, values, other, lit in ((lr_name, low, hr_name, high), (hr_name, high, lr_name, low)):
-        if not values.any():
+    for black_name, black, lit_name, lit in ((lr_name, low, hr_name, high), (hr_name, high, lr_name, low)):
+        if not black.any():
             if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
-                raise _black_beauty(name, other)
+                raise _black_beauty(black_name, lit_name)
             return []  # a dark frame in which few samples find the light
     warnings = []
-    for name, values, other, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
-        if _is_region(values, lit):
+    for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
+        if _is_region(black, lit):
             warnings.append(
-                f"the {name} is black outside of a rectangle, where the {other} is lit: was a render region on?"
+                f"the {black_name} is black outside of a rectangle, where the {lit_name} is lit: was a render region "
+                "on?"
             )
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
@@ -304,21 +305,21 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     return warnings
 
 
-def _black_beauty(name: str, other: str) -> InputError:
+def _black_beauty(name: str, lit_name: str) -> InputError:
     return InputError(
-        f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
+        f"{name}: the beauty is black (or NaN) everywhere, while that of {lit_name} is not; "
         "check which layer it is (--map rgb=LAYER)"
     )
 
 
-def _is_region(values: Array, other: Array) -> bool:
-    """Return whether a picture (h, w) is black around a rectangle, and the other one is not."""
-    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
-    outside = np.ones(values.shape, np.bool_)
+def _is_region(black: Array, lit: Array) -> bool:
+    """Return whether a picture (h, w) is black around a rectangle where the second one is lit."""
+    rows, columns = (np.flatnonzero(black.any(axis=axis)) for axis in (1, 0))
+    outside = np.ones(black.shape, np.bool_)
     # The pixel filter of the other render may reach further.
     outside[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3] = False
-    lit = np.count_nonzero(other[outside])
-    return bool(lit > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
+    lit_pixels = np.count_nonzero(lit[outside])
+    return bool(lit_pixels > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
 
 
 def _has_same_noise(hrls: HrlsAverages) -> bool:

@@ -144,5 +144,5 @@ class FramePair:
         if low is None or high is None:
             return None
         whole = Window(high.x0 // scale, high.y0 // scale, -(-high.x1 // scale), -(-high.y1 // scale))
-        both = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
-        return Window(*both).intersect(self.grid)
+        sides = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
+        return Window(*sides).intersect(self.grid)

@@ -48,7 +48,7 @@ BLOCK_GROUPS = ((4, 2, 16.0), (4, 3, 11.0), (8, 2, 12.0))
 #: Largest t of a single block.
 LARGEST_T = 6.0
 #: Pixel filters of different widths move light across edges, so this fraction of a block's contrast is no difference.
-FILTER_SHARE = 0.1
+FILTER_FRACTION = 0.1
 #: Side of the blocks, in LRHS pixels, over which noise and colours are summed.
 BLOCK = 4
 #: The LRHS has the noise of the HRLS if, in three of four blocks, they differ by less than this fraction of the HRLS's
@@ -378,7 +378,7 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
         contrast = np.sqrt(np.maximum(low_square - np.square(low_mean), 0))
         # Two percent of the brightness are no difference, even between renders without noise.
         unimportant = 0.02 * ((low_mean + high_mean) / 2 + floor)
-        error = (deviation + FILTER_SHARE * contrast) / size + unimportant
+        error = (deviation + FILTER_FRACTION * contrast) / size + unimportant
         t = np.minimum(np.abs(difference) / np.maximum(error, 1e-30), LARGEST_T)
         groups = np.lib.stride_tricks.sliding_window_view(np.square(t), (side, side))
         scores = groups.mean(axis=(-2, -1))

@@ -23,7 +23,7 @@ MAX_MEMORY = 3 << 30
 #: Bytes that do not grow with the frame: interpreter, libraries, weights.
 FIXED_MEMORY = 350 << 20
 #: Fraction of the memory for decoded rows that neighbouring tiles read. ``bytes_per_pixel`` of a model includes it.
-STRIPS_SHARE = 1 / 6
+STRIPS_FRACTION = 1 / 6
 #: Most bytes of a tile: what ``MAX_MEMORY`` leaves beside an 8K frame. Other tiles give other pixels, so this does not
 #: depend on the memory that the user allows.
 TILE_MEMORY = 1720 << 20
@@ -140,7 +140,7 @@ def memory_to_fuse(alignment: Alignment, contract: Contract, *, error: bool) -> 
 
 def strips_memory(max_memory: int, held: int) -> int:
     """Return the bytes for decoded rows that neighbouring tiles or bands read, beside ``held`` bytes."""
-    return max(0, int((max_memory - held) * STRIPS_SHARE))
+    return max(0, int((max_memory - held) * STRIPS_FRACTION))
 
 
 def require_memory(needed: int, contract: Contract, max_memory: int, hint: str = "") -> None:

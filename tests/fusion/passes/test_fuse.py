@@ -662,8 +662,8 @@ def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeyp
     monkeypatch.setattr("oiio_msspl.fusion.passes.fuse.BAND_ROWS", 16)
     decode, decoded, results = ExrFile._decode, [], []
     monkeypatch.setattr(ExrFile, "_decode", lambda *given: decoded.append(given) or decode(*given))
-    for share in (tiling.STRIPS_SHARE, 0):
-        monkeypatch.setattr(tiling, "STRIPS_SHARE", share)
+    for share in (tiling.STRIPS_FRACTION, 0):
+        monkeypatch.setattr(tiling, "STRIPS_FRACTION", share)
         fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), overwrite=True)
         results.append((read_bits(tmp_path / "out.exr"), len(decoded)))
         decoded.clear()

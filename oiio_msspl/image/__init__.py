@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Pixels in arrays: storage, filters, colour, measures, and work in parallel."""
+"""Pixels in arrays: storage, filters, sampling, colour, measures, and work on several cores."""

@@ -63,23 +63,23 @@ P3 = ColourSpace(
 )
 SPACES = (REC709, ACESCG, ACES2065, REC2020, P3)
 
-#: Names that files get which nobody gave a space, in lower case: OpenImageIO writes them by default.
+#: Names in lower case that OpenImageIO writes by default, so they say nothing of the space.
 _INDEFINITE = ("", "linear", "scene_linear", "lin_rec709")
-#: Chromaticities are the same if none differs by more.
+#: Chromaticities are equal if none differs by more than this.
 _SAME = 0.003
 
 
 def luminance(rgb: Array) -> Array:
-    """Rec. 709 luminance of linear RGB: (..., 3) to (...).
+    """Compute the Rec. 709 luminance of linear RGB: (..., 3) to (...).
 
-    The sum is written out. A matrix product rounds differently for pictures that lie differently in memory.
+    The sum is written out, because a matrix product rounds differently for other layouts in memory.
     """
     red, green, blue = (np.float32(weight) * rgb[..., i] for i, weight in enumerate(LUMINANCE_WEIGHTS))
     return np.asarray(red + green + blue)
 
 
 def srgb(linear: Array) -> Array:
-    """Scene-linear values to sRGB in [0, 1], clipped: the display transform s(x) of the paper, section 5.1."""
+    """Convert scene-linear values to sRGB, clipped to [0, 1]: the display transform s(x) of the paper, section 5.1."""
     x = np.clip(linear, 0.0, 1.0)
     return np.where(x <= 0.0031308, 12.92 * x, 1.055 * np.power(np.maximum(x, 1e-12), 1 / 2.4) - 0.055).astype(
         np.float32
@@ -87,12 +87,12 @@ def srgb(linear: Array) -> Array:
 
 
 def converted(rgb: Array, source: ColourSpace, target: ColourSpace) -> Array:
-    """Linear colours (..., 3) of one space in another one; the same array if the two are the same."""
+    """Convert linear colours (..., 3) from one space to another one; the array itself if the two are equal."""
     return rgb if same_space(source, target) else rgb @ conversion(source, target).T.astype(np.float32)
 
 
 def conversion(source: ColourSpace, target: ColourSpace) -> NDArray[np.float64]:
-    """The matrix (3, 3) that converts linear RGB: ``rgb @ matrix.T``. White stays white (Bradford adaptation)."""
+    """Return the matrix (3, 3) for ``rgb @ matrix.T``, linear RGB. White stays white (Bradford adaptation)."""
     to_cones = []
     for space in (source, target):
         matrix = _rgb_to_xyz(space.chromaticities)
@@ -102,7 +102,7 @@ def conversion(source: ColourSpace, target: ColourSpace) -> NDArray[np.float64]:
 
 
 def _rgb_to_xyz(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
-    """SMPTE RP 177: linear RGB to CIE XYZ, for a white of Y = 1."""
+    """Return the matrix from linear RGB to CIE XYZ, for a white of Y = 1 (SMPTE RP 177)."""
     xy = np.array(chromaticities, dtype=np.float64).reshape(4, 2)
     xyz = np.column_stack([xy, 1 - xy.sum(axis=1)]) / xy[:, 1:]
     primaries = xyz[:3].T
@@ -111,9 +111,9 @@ def _rgb_to_xyz(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
 
 
 def named_space(name: str) -> ColourSpace | None:
-    """The linear space that a header, an option or OpenColorIO means by a name; None for any other.
+    """Return the linear space of a name in a header, an option or OpenColorIO; None for other names.
 
-    A name that is not in the table is looked up in the configuration of ``$OCIO``, or in OpenImageIO's own.
+    Names that are not in the table are looked up in the configuration of ``$OCIO``, or in that of OpenImageIO.
     """
     wanted = name.strip().lower()
     for space in SPACES:
@@ -126,27 +126,29 @@ def named_space(name: str) -> ColourSpace | None:
 
 
 def space_of(metadata: Mapping[str, Any]) -> ColourSpace | None:
-    """The linear space that an EXR's header declares; None if it declares none.
+    """Return the linear space that an EXR's header declares; None if it declares none.
 
     ``chromaticities`` comes first, because it is OpenEXR's own attribute. ``oiio:ColorSpace`` counts only with a
     definite name.
     """
     values = metadata.get("chromaticities")
     if isinstance(values, tuple) and len(values) == 8 and all(isinstance(v, float) and np.isfinite(v) for v in values):
-        found: tuple[float, ...] = values
+        chromaticities: tuple[float, ...] = values
         for space in SPACES:
-            if _alike(found, space.chromaticities):
+            if _alike(chromaticities, space.chromaticities):
                 return space
-        degenerate = min(abs(v) for v in found[1::2]) < 1e-6 or abs(np.linalg.det(_edges(found))) < 1e-4
-        name = f"the space with the chromaticities {', '.join(f'{value:.4g}' for value in found)}"
-        return None if degenerate else ColourSpace(name, found)
+        degenerate = min(abs(v) for v in values[1::2]) < 1e-6 or abs(np.linalg.det(_edges(values))) < 1e-4
+        name = f"the space with the chromaticities {', '.join(f'{value:.4g}' for value in values)}"
+        return None if degenerate else ColourSpace(name, chromaticities)
     name = str(metadata.get("oiio:ColorSpace") or "")
     return None if name.lower() in _INDEFINITE else named_space(name)
 
 
 def encoding_of(metadata: Mapping[str, Any]) -> str:
-    """The name of the encoding that an EXR's header declares if it is not linear, such as ``srgb_rec709_scene``; empty
-    otherwise, and for names that neither ``$OCIO`` nor OpenImageIO knows."""
+    """Return the name of an encoding that is not linear, such as ``srgb_rec709_scene``, from an EXR's header.
+
+    It is empty for linear files, and for names that neither ``$OCIO`` nor OpenImageIO knows.
+    """
     name = str(metadata.get("oiio:ColorSpace") or "")
     if not name or named_space(name) is not None:
         return ""
@@ -158,16 +160,16 @@ def encoding_of(metadata: Mapping[str, Any]) -> str:
     return "" if np.allclose(bright, 2 * dark, rtol=1e-3) else name
 
 
-def same_space(one: ColourSpace, other: ColourSpace) -> bool:
-    """Whether two spaces are the same, but for the rounding of headers."""
-    return _alike(one.chromaticities, other.chromaticities)
+def same_space(first: ColourSpace, second: ColourSpace) -> bool:
+    """Return whether two spaces are equal, except for the rounding of headers."""
+    return _alike(first.chromaticities, second.chromaticities)
 
 
-def _alike(one: tuple[float, ...], other: tuple[float, ...]) -> bool:
-    return bool(np.allclose(one, other, rtol=0, atol=_SAME))
+def _alike(first: tuple[float, ...], second: tuple[float, ...]) -> bool:
+    return bool(np.allclose(first, second, rtol=0, atol=_SAME))
 
 
 def _edges(chromaticities: tuple[float, ...]) -> NDArray[np.float64]:
-    """Two edges (2, 2) of the triangle of the primaries."""
+    """Return two edges (2, 2) of the triangle of the primaries."""
     red, green, blue = np.array(chromaticities, dtype=np.float64).reshape(4, 2)[:3]
     return np.stack([green - red, blue - red])

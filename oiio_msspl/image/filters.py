@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Means, sums, extremes and masks over the pixels around each pixel."""
+"""Filters of images: resizing, holes that are filled, and means, sums, extremes and masks around each pixel."""
 
 from __future__ import annotations
 
@@ -11,13 +11,103 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.arrays import FLOAT_MAX, Array, Mask, planes_of
 from oiio_msspl.image.parallel import for_row_blocks
 
 
+def box_downsample(image: NDArray[Any], scale: int) -> Array:
+    """Return the mean of ``scale`` x ``scale`` pixels, half or float: (H, W, ...) to (H/s, W/s, ...).
+
+    The means are finite if the pixels are. They have the memory layout of ``image``.
+    """
+    height, width, *channels = image.shape
+    result = np.empty_like(image, np.float32, subok=False, shape=(height // scale, width // scale, *channels))
+
+    def work(rows: slice) -> None:
+        # Sums of strided views are ten times as fast as np.mean over short axes. Sums of half floats would be rounded.
+        block = image[rows].astype(np.float32, copy=False)
+        with np.errstate(over="ignore"):
+            row_sums = reduce(np.add, (block[y::scale] for y in range(scale)))
+            sums = reduce(np.add, (row_sums[:, x::scale] for x in range(scale)))
+        np.clip(sums, -FLOAT_MAX, FLOAT_MAX, out=sums)
+        np.multiply(sums, np.float32(1 / scale**2), out=result[rows.start // scale : rows.stop // scale])
+
+    for_row_blocks(work, height, image[0].size, multiple=scale)
+    return result
+
+
+def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Array:
+    """Sample an image linearly along one axis, at positions between pixels. The edge pixel is repeated outside.
+
+    Args:
+        values: (height, width, ...).
+        positions: pixel indices along ``axis``, one for each pixel of the result.
+
+    Returns:
+        The samples; the image itself if the positions are exactly its pixels.
+    """
+    last = values.shape[axis] - 1
+    if np.array_equal(positions, np.arange(last + 1)):
+        return values
+    positions = np.clip(positions, 0, last)
+    before = positions.astype(np.int64)
+    if np.array_equal(positions, before):
+        return values.take(before, axis)
+    after = np.minimum(before + 1, last)
+    weight = (positions - before).astype(np.float32).reshape([-1 if i == axis else 1 for i in range(values.ndim)])
+    return values.take(before, axis) * (1 - weight) + values.take(after, axis) * weight
+
+
+def enlarged(image: Array, scale: int) -> Array:
+    """Interpolate an image (h, w, c) linearly at ``scale`` times its resolution."""
+    rows = slice(0, len(image))
+    return np.stack([upsample_linear(plane, scale, rows) for plane in planes_of(image)], axis=-1)
+
+
+def filled(image: Array, missing: NDArray[np.bool_]) -> Array:
+    """Fill missing pixels (h, w) of a finite image (h, w, c) from those around.
+
+    Missing pixels are interpolated from the image at half the size, which is filled in the same way (push-pull, Gortler
+    et al. 1996, *The Lumigraph*). If all pixels are missing, the image is returned as it is.
+    """
+    if missing.all() or not missing.any():
+        return image
+    margins = [(0, side % 2) for side in missing.shape]
+    present = np.pad(~missing, margins)[..., None]
+    coverage = box_downsample(present.astype(np.float32), 2)
+    sums = box_downsample(np.pad(image, [*margins, (0, 0)]) * present, 2)
+    half = np.divide(sums, coverage, out=np.zeros_like(sums), where=coverage > 0)
+    half = filled(half, coverage[..., 0] == 0)
+    around = enlarged(half, 2)[: len(image), : image.shape[1]]
+    return np.where(missing[..., None], around, image)
+
+
+def upsample_linear(plane: Array, scale: int, rows: slice) -> Array:
+    """Interpolate the rows ``rows`` of a plane (h, w) linearly at ``scale`` times its resolution."""
+    padded = np.pad(plane, ((1, 1), (0, 0)), mode="edge")
+    tall = np.empty(((rows.stop - rows.start) * scale, plane.shape[1]), np.float32)
+    before, here, after = (padded[rows.start + i : rows.stop + i] for i in range(3))
+    _interleave(before, here, after, [tall[phase::scale] for phase in range(scale)])
+    padded = np.pad(tall, ((0, 0), (1, 1)), mode="edge")
+    result = np.empty((len(tall), plane.shape[1] * scale), np.float32)
+    before, here, after = (padded[:, i : i + plane.shape[1]] for i in range(3))
+    _interleave(before, here, after, [result[:, phase::scale] for phase in range(scale)])
+    return result
+
+
+def _interleave(before: Array, here: Array, after: Array, phases: Sequence[Array]) -> None:
+    """Fill the lines of an enlarged plane that lie in the lines ``here``."""
+    for phase, lines in enumerate(phases):
+        position = (phase + 0.5) / len(phases) - 0.5
+        nearest = before if position < 0 else after
+        lines[:] = here + np.float32(abs(position)) * (nearest - here)
+
+
 def neighbours(values: NDArray[Any], distance: int = 1) -> Iterator[NDArray[Any]]:
-    """The 3 x 3 neighbours of each pixel (h, w, ...) at a distance, one (h, w, ...) each; the edge pixel is
-    repeated."""
+    """Yield the 3 x 3 pixels around each pixel, ``distance`` apart, as nine shifted images (h, w, ...).
+
+    The edge pixel is repeated.
+    """
     height, width = values.shape[:2]
     margins = [(distance, distance) if axis < 2 else (0, 0) for axis in range(values.ndim)]
     padded = np.pad(values, margins, mode="edge")
@@ -26,7 +116,7 @@ def neighbours(values: NDArray[Any], distance: int = 1) -> Iterator[NDArray[Any]
 
 
 def all_within(mask: Mask, reach: int) -> Mask:
-    """Where a mask (h, w, ...) holds for all pixels up to ``reach`` rows and columns away."""
+    """Return where a mask (h, w, ...) is true for all pixels up to ``reach`` rows and columns away (erosion)."""
     distance = 1
     while reach > 0:
         mask = reduce(np.logical_and, neighbours(mask, min(distance, reach)))
@@ -35,12 +125,12 @@ def all_within(mask: Mask, reach: int) -> Mask:
 
 
 def grown(mask: Mask, reach: int = 1) -> Mask:
-    """A mask (h, w, ...) with all pixels up to ``reach`` rows and columns away, too."""
+    """Return a mask (h, w, ...) that is extended by ``reach`` rows and columns on all sides (dilation)."""
     return ~all_within(~mask, reach)
 
 
 def max_3x3(values: Array) -> Array:
-    """The largest of the 3 x 3 pixels around each, (h, w, ...)."""
+    """Return the largest of the 3 x 3 values around each pixel, (h, w, ...)."""
     largest = values.copy(order="K")
     for axis in (0, 1):  # a 3 x 3 maximum is one of three rows and one of three columns
         lines = largest.swapaxes(0, axis)
@@ -51,7 +141,7 @@ def max_3x3(values: Array) -> Array:
 
 
 def sum_3x3(values: Array) -> Array:
-    """Sum over 3 x 3 pixels (h, w, ...); the edge pixel is repeated."""
+    """Return the sum of the 3 x 3 values around each pixel, (h, w, ...). The edge pixel is repeated."""
     for axis in (1, 0):
         lines = values.swapaxes(0, axis)
         total = lines.copy(order="K")
@@ -62,7 +152,7 @@ def sum_3x3(values: Array) -> Array:
 
 
 def blurred(plane: Array, times: int = 1) -> Array:
-    """Mean over 3 x 3 pixels with the weights 1, 2, 1 in rows and in columns, so many times; the edge is repeated."""
+    """Blur a plane (h, w) with the weights 1, 2, 1 in rows and in columns, repeatedly. The edge pixel is repeated."""
     for axis in (0, 1) * times:
         lines = plane.swapaxes(0, axis)
         total = 2 * lines
@@ -76,10 +166,11 @@ def blurred(plane: Array, times: int = 1) -> Array:
 
 
 def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
-    """Means over the pixels up to so many rows and columns away that exist, in a time that does not depend on that.
+    """Return the mean of the pixels up to ``reach`` rows and columns away, one plane (h, w) for each reach.
 
-    Sums over the plane (h, w) are stored in 64 bits (Crow 1984, *Summed-area tables for texture mapping*). So means
-    that are below 1e-8 of that of all pixels are not exact.
+    Pixels beyond the edge do not count. The time does not depend on the reach, because sums of the plane are stored
+    first (Crow 1984, *Summed-area tables for texture mapping*). They have 64 bits, so means below 1e-8 of the mean of
+    all pixels are not exact.
     """
     height, width = plane.shape
     sums = np.zeros((height + 1, width + 1))
@@ -97,11 +188,7 @@ def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
 
 
 def _mean_of_sums(sums: NDArray[np.float64], reach: int) -> Array:
-    """The means (h, w) of a plane for one reach.
-
-    Args:
-        sums: of the values above and to the left of each corner of a pixel, (h + 1, w + 1).
-    """
+    """Return the means (h, w) for one reach. ``sums`` (h + 1, w + 1): of all values above and to the left."""
     height, width = (size - 1 for size in sums.shape)
     (top, bottom), (left, right) = (
         (np.maximum(np.arange(size) - reach, 0), np.minimum(np.arange(size) + reach + 1, size))

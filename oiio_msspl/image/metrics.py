@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures of how far a picture is from its reference: those of the paper (section 5), and SSIM.
+"""Measures of the error of a picture against its reference: those of the paper (section 5), and SSIM.
 
 All take scene-linear float32 (height, width, 3).
 """
@@ -16,20 +16,20 @@ from oiio_msspl.image.colour import luminance, srgb
 
 #: Constants (lambda_1, lambda_2) of RelMSE, as the paper uses them on its BCR data set (after KPCN).
 RELMSE_BCR = (0.5, 0.01)
-#: The same, as the paper uses them on the Gharbi data set.
+#: Constants of RelMSE, as the paper uses them on the Gharbi data set.
 RELMSE_GHARBI = (1.0, 1e-4)
 #: Side of SSIM's Gaussian window.
 SSIM_WINDOW = 11
 
 
 def psnr(image: Array, reference: Array) -> float:
-    """PSNR in dB of the pictures in sRGB, clipped to [0, 1]; infinite for equal pictures."""
+    """Compute the PSNR in dB of the pictures in sRGB, clipped to [0, 1]; infinite for equal pictures."""
     error = float(np.mean(np.square(srgb(image).astype(np.float64) - srgb(reference))))
     return math.inf if error == 0 else -10 * math.log10(error)
 
 
 def relmse_map(image: Array, reference: Array, convention: tuple[float, float] = RELMSE_BCR) -> NDArray[np.float64]:
-    """The relative squared error of each value, ``lambda_1 (I - R)^2 / (R^2 + lambda_2)``: (height, width, 3).
+    """Compute the relative squared error of each value, ``lambda_1 (I - R)^2 / (R^2 + lambda_2)``: (height, width, 3).
 
     Args:
         image, reference: I and R, scene linear.
@@ -41,12 +41,12 @@ def relmse_map(image: Array, reference: Array, convention: tuple[float, float] =
 
 
 def relmse(image: Array, reference: Array, convention: tuple[float, float] = RELMSE_BCR) -> float:
-    """RelMSE: the mean of :func:`relmse_map`."""
+    """Compute RelMSE, the mean of :func:`relmse_map`."""
     return float(relmse_map(image, reference, convention).mean())
 
 
 def ssim(image: Array, reference: Array) -> float:
-    """SSIM of the luma of the pictures in sRGB, in [-1, 1].
+    """Compute the SSIM of the luma of the pictures in sRGB, in [-1, 1].
 
     After Wang et al. 2004: Gaussian window of 11 x 11 pixels with sigma 1.5, K1 = 0.01, K2 = 0.03.
 
@@ -63,7 +63,7 @@ def ssim(image: Array, reference: Array) -> float:
 
 
 def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Gaussian filter of sigma 1.5 with 11 taps each way: (height, width) to (height - 10, width - 10)."""
+    """Filter by a Gaussian of sigma 1.5 with 11 taps each way: (height, width) to (height - 10, width - 10)."""
     taps = np.exp(-0.5 * np.square(np.arange(-5, 6) / 1.5))
     taps /= taps.sum()
     for axis in (0, 1):

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""NumPy on several cores: an image is worked on in blocks of rows, several at a time.
+"""Runs NumPy on several cores: an image is cut into blocks of rows, and threads work on several of them at a time.
 
-A block fits into a core's cache, so several in-place steps on it cost little more than one. NumPy releases the
+A block fits into a core's cache, so several in-place operations on it cost little more than one. NumPy releases the
 interpreter lock while it computes, so threads are enough.
 """
 
@@ -27,7 +27,7 @@ BLOCK_VALUES = 1 << 17
 T = TypeVar("T")
 U = TypeVar("U")
 
-#: The most threads that may be asked for.
+#: Largest number of threads that the caller may ask for.
 MOST_THREADS = 1024
 
 _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
@@ -35,7 +35,7 @@ _thread_limit: ContextVar[int] = ContextVar("thread_limit", default=0)
 
 @contextlib.contextmanager
 def limit_threads(count: int) -> Iterator[None]:
-    """Use at most ``count`` threads inside the ``with`` block; 0 means one for each available core.
+    """Use at most ``count`` threads inside of the ``with`` block; 0 means one for each available core.
 
     Raises:
         InputError: see :func:`check_threads`.
@@ -52,19 +52,19 @@ def check_threads(count: int) -> None:
     """Check a number of threads that the caller asks for.
 
     Raises:
-        InputError: it is below 0, or so large that the system could run out of them.
+        InputError: it is below 0, or so large that the system could run out of threads.
     """
     if not 0 <= count <= MOST_THREADS:
         raise InputError(f"--threads {count}: give a number from 0, which means one a core, to {MOST_THREADS}")
 
 
 def half_of_the_threads() -> AbstractContextManager[None]:
-    """Use half as many threads inside the ``with`` block, for work beside which other work is done."""
+    """Use half as many threads inside of the ``with`` block, because other work runs at the same time."""
     return limit_threads(max((_thread_limit.get() or available_cores()) // 2, 1))
 
 
 def available_cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -72,37 +72,36 @@ def for_row_blocks(work: Callable[[slice], object], rows: int, row_size: int, mu
     """Call ``work`` with slices that together cover ``rows`` rows, several at a time.
 
     Args:
-        work: takes a slice of rows; what it raises is raised here, when no thread works any more. Inside of it, rows
-            are worked on by one thread.
+        work: takes a slice of rows and uses one thread. Its exception is raised here, when all threads have ended.
         row_size: values in a row.
         multiple: the height of each slice, except the last, is a multiple of this.
     """
-    step = max(BLOCK_VALUES // max(row_size, 1), 1)
-    step = -(-step // multiple) * multiple
-    slices = [slice(start, min(start + step, rows)) for start in range(0, rows, step)]
+    height = max(BLOCK_VALUES // max(row_size, 1), 1)
+    height = -(-height // multiple) * multiple
+    slices = [slice(start, min(start + height, rows)) for start in range(0, rows, height)]
     count = min(_thread_limit.get() or available_cores(), len(slices))
-    # Each thread gets its slices at once: to hand over a single slice takes a third of the time to compute it.
-    shares = [slices[len(slices) * i // count : len(slices) * (i + 1) // count] for i in range(count)]
-    others = [_row_pool(count).submit(_run_all, work, share) for share in shares[1:]]
+    # Each thread gets its slices at once: handing over a single slice takes a third of the time to compute it.
+    parts = [slices[len(slices) * i // count : len(slices) * (i + 1) // count] for i in range(count)]
+    pending = [_pool(f"rows {count}", count).submit(_run_all, work, part) for part in parts[1:]]
     try:
-        _run_all(work, shares[0] if shares else [])
+        _run_all(work, parts[0] if parts else [])
     finally:
-        wait(others)
-    for other in others:
-        other.result()
+        wait(pending)
+    for future in pending:
+        future.result()
 
 
 def in_background(work: Callable[[], T]) -> Callable[[], T]:
-    """Start ``work`` on another thread, if more than one may be used.
+    """Start ``work`` on another thread.
 
     Returns:
-        A function that waits for the result and returns it: ``work`` itself if only one thread may be used.
+        A function that waits for the result and returns it; ``work`` itself, not started, if one thread may be used.
     """
     return work if _one_thread() else _start(work).result
 
 
 def in_parallel(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
-    """The results of two functions that run at the same time. Both have ended when this returns or raises."""
+    """Run two functions at the same time and return their results. Both have ended when this returns or raises."""
     waiting = in_background(second)
     try:
         result = first()
@@ -114,9 +113,9 @@ def in_parallel(first: Callable[[], T], second: Callable[[], U]) -> tuple[T, U]:
 
 
 def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
-    """The results of ``work`` for each item, in order. It works on two at a time, with half of the threads each.
+    """Return the results of ``work`` for each item, in order. Two items run at a time, with half of the threads each.
 
-    Work that is made of many short steps gains more by this than by threads within each step.
+    Work that consists of many short operations gains more by this than by threads inside of each operation.
     """
     if _one_thread() or len(items) < 2:
         return [work(item) for item in items]
@@ -128,20 +127,20 @@ def two_at_a_time(work: Callable[[T], U], items: Sequence[T]) -> list[U]:
             for i in waiting:
                 results[i] = work(items[i])
 
-    other = submit(_pair_pool(), take)
+    pending = submit(_pool("second"), take)
     try:
         take()
     finally:
-        failed = other.exception()
-    if failed is not None:
-        raise failed
+        error = pending.exception()
+    if error is not None:
+        raise error
     return [results[i] for i in range(len(items))]
 
 
 def one_ahead(items: Iterable[T]) -> Iterator[T]:
-    """Yield the items; while the caller uses one, the next one is computed in the background.
+    """Yield the items. While the caller uses one, the next one is computed in the background.
 
-    ``items`` never computes two at the same time. Nothing is computed any more when the caller has stopped.
+    ``items`` never computes two at the same time. Nothing is computed after the caller has stopped.
     """
     if _one_thread():
         yield from items
@@ -162,12 +161,12 @@ def _one_thread() -> bool:
 
 
 def submit(pool: Executor, work: Callable[..., T], *arguments: Any) -> Future[T]:
-    """Let a pool do ``work`` with the thread limit of the caller, which the threads of a pool do not know."""
+    """Submit ``work`` to a pool, with the thread limit of the caller, which the threads of a pool do not know."""
     return pool.submit(contextvars.copy_context().run, work, *arguments)
 
 
 def _start(work: Callable[[], T]) -> Future[T]:
-    return submit(_background_pool(), work)
+    return submit(_pool("background", start=_yield_to_network), work)
 
 
 def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
@@ -178,10 +177,10 @@ def _run_all(work: Callable[[slice], object], slices: list[slice]) -> None:
 
 
 def _yield_to_network() -> None:
-    """Let this thread work mainly while the network's threads wait for each other.
+    """Lower the priority of this thread, so that it runs mainly while the network's threads wait for each other.
 
-    The network needs all cores at once: if one of its threads has to share a core, the others wait for it. With a third
-    of their weight this thread still keeps pace on a machine that other programs use.
+    The network needs all cores at once: if one of its threads waits for a core, the others wait for it. With a third of
+    their weight, this thread still keeps pace on a machine that other programs use.
     """
     if sys.platform == "linux":  # elsewhere a thread has no priority of its own
         with contextlib.suppress(OSError):  # a sandbox may forbid it
@@ -189,31 +188,22 @@ def _yield_to_network() -> None:
 
 
 def end_pools() -> None:
-    """Let the threads of this module end as soon as they have no more work.
+    """End the threads of this module as soon as they have no more work.
 
-    A program calls this after a signal. An exception that a signal handler raises while a pool starts a thread leaves a
-    thread that Python does not know as one of a pool: at exit Python would wait for it forever.
+    A program calls this after a signal. If a signal handler raises an exception while a pool starts a thread, Python
+    does not know that the thread belongs to a pool, and would wait for it forever at exit.
     """
     for key in list(_pools):
         _pools.pop(key).shutdown(wait=False)
 
 
-#: A pool for each number of threads that share rows, one for work in the background, and one for every second item of
+#: Pools by name: for rows, one for each number of threads; for work in the background; and for every second item of
 #: :func:`two_at_a_time`.
-_pools: dict[int | str, ThreadPoolExecutor] = {}
+_pools: dict[str, ThreadPoolExecutor] = {}
 
 
-def _row_pool(count: int) -> ThreadPoolExecutor:
-    return _pools.get(count) or _pools.setdefault(count, ThreadPoolExecutor(count, thread_name_prefix="rows"))
-
-
-def _pair_pool() -> ThreadPoolExecutor:
-    return _pools.get("pairs") or _pools.setdefault("pairs", ThreadPoolExecutor(None, "pairs"))
-
-
-def _background_pool() -> ThreadPoolExecutor:
-    name = "background"
-    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(None, name, _yield_to_network))
+def _pool(name: str, threads: int | None = None, start: Callable[[], object] | None = None) -> ThreadPoolExecutor:
+    return _pools.get(name) or _pools.setdefault(name, ThreadPoolExecutor(threads, name, start))
 
 
 if hasattr(os, "register_at_fork"):

@@ -11,16 +11,16 @@ from numpy.typing import NDArray
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import for_row_blocks
 
-#: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer ones blur with every frame.
+#: Sharpness of the interpolation: the slope of Keys' cubic at the next pixel. Softer kernels blur with every frame.
 SHARPNESS = -1.0
-#: Pixels of a block are interpolated together, unless fewer than this share of them lie between pixels.
+#: All pixels of a block are interpolated, unless a smaller fraction of them than this lies between pixels.
 MOST_CHOSEN = 0.8
 
 
 def nearest_indices(x: Array, y: Array, size: tuple[int, int]) -> NDArray[np.intp]:
     """Return the flat indices of the pixels nearest to positions in an image of ``size`` (height, width)."""
     height, width = size
-    # 32 bits: four times as fast as to convert floats to 64 bits.
+    # Converting floats to 32 bits is four times as fast as to 64 bits.
     column = np.clip(np.rint(x), 0, width - 1).astype(np.int32)
     row = np.clip(np.rint(y), 0, height - 1).astype(np.int32)
     return row * np.intp(width) + column
@@ -32,16 +32,16 @@ def sample_cubic(
     size: tuple[int, int],
     valid: Mask | None = None,
 ) -> list[Array]:
-    """Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
+    """Sample images by Keys' cubic, within the range of the four nearest pixels. The edge pixel is repeated outside.
 
     Args:
         images: (h, w, c) each, of one size.
         positions: takes rows of the result, and returns x and y (n, width of the result) in pixels of the images.
         size: height and width of the result.
-        valid: where (height, width) the result counts, which saves time elsewhere; everywhere if None.
+        valid: (height, width), where the result is needed; everywhere if None.
 
     Returns:
-        (*size, c) each; their channels are contiguous in memory.
+        (*size, c) each, with channels that are contiguous in memory.
     """
     rows_in, columns_in = images[0].shape[:2]
     counts = [image.shape[-1] for image in images]
@@ -51,7 +51,7 @@ def sample_cubic(
     padded[:, :2, 2:-2], padded[:, -2:, 2:-2] = padded[:, 2:3, 2:-2], padded[:, -3:-2, 2:-2]
     padded[..., :2], padded[..., -2:] = padded[..., 2:3], padded[..., -3:-2]
     planes = padded.reshape(len(padded), -1)
-    even = [plane.min() == plane.max() for plane in planes]
+    constant = [plane.min() == plane.max() for plane in planes]
     stride = columns_in + 4
     height, width = size
     result = np.empty((len(padded), height, width), np.float32)
@@ -61,7 +61,7 @@ def sample_cubic(
         x = np.clip(x, -1, columns_in - 0.01)
         y = np.clip(y, -1, rows_in - 0.01)
         left, top = np.floor(x), np.floor(y)
-        # The pixel above and to the left of the four nearest ones.
+        # The pixel above and to the left of the four nearest pixels.
         first = (top.astype(np.intp) + 1) * stride + left.astype(np.intp) + 1
         right, down = x - left, y - top
         between = (right != 0) | (down != 0)
@@ -72,13 +72,13 @@ def sample_cubic(
             chosen, pixel = np.flatnonzero(between), first + (stride + 1)
             right, down, first = right.take(chosen), down.take(chosen), first.take(chosen)
         cubic = _Cubic(right, down, first, stride)
-        for plane, is_even, out in zip(planes, even, result[:, rows], strict=True):
-            if is_even:
+        for plane, is_constant, out in zip(planes, constant, result[:, rows], strict=True):
+            if is_constant:
                 out[:] = plane[0]
             elif chosen is None:
                 cubic.sample(plane, out)
             else:
-                # "wrap" makes NumPy write straight into the result; no index needs it.
+                # "wrap" makes NumPy write straight into the result. No index is outside.
                 plane.take(pixel, out=out, mode="wrap")
                 out.reshape(-1)[chosen] = cubic.sample(plane, np.empty(chosen.shape, np.float32))
 
@@ -102,7 +102,7 @@ class _Cubic:
     def sample(self, plane: Array, out: Array) -> Array:
         """Fill ``out`` with the samples of a plane (n), and return it."""
         line, low, high, values = self._buffers
-        # NumPy's settings for errors belong to the thread. The caller sorts out what is not finite.
+        # NumPy's settings for errors belong to the thread. The caller handles values that are not finite.
         with np.errstate(over="ignore", invalid="ignore"):
             for i, weight_y in enumerate(self._down):
                 for j, weight_x in enumerate(self._across):
@@ -125,7 +125,7 @@ class _Cubic:
 
 
 def _keys(t: Array) -> list[Array]:
-    """Weights of the four pixels around a position that lies ``t`` beyond the second one (Keys 1981)."""
+    """Return the weights of the four pixels around a position that lies ``t`` beyond the second one (Keys 1981)."""
     a = np.float32(SHARPNESS)
     near = [((a + 2) * d - (a + 3)) * d * d + 1 for d in (t, 1 - t)]
     far = [((a * d - 5 * a) * d + 8 * a) * d - 4 * a for d in (1 + t, 2 - t)]

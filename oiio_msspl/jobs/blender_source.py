@@ -15,10 +15,10 @@ from oiio_msspl.errors import InputError, MssplError, explain
 from oiio_msspl.exr.layers import Layer
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.fuse import result_bytes
 from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
 from oiio_msspl.fusion.neighbours.renders import USUAL_CHANNELS
 from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.tiling import result_bytes
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.memory import memory_to_average, require_frame_memory

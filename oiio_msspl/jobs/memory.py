@@ -16,10 +16,9 @@ from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.exr.writer import bytes_held
-from oiio_msspl.fusion.fuse import memory_to_fuse, result_bytes
 from oiio_msspl.fusion.neighbours.average import memory_to_average_renders, memory_to_average_results
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, TILE_MEMORY, require_memory
+from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, TILE_MEMORY, memory_to_fuse, require_memory, result_bytes
 from oiio_msspl.image.arrays import has_many_pixels
 from oiio_msspl.jobs.plan import ViewPlan
 from oiio_msspl.jobs.timeline import Reach
@@ -206,7 +205,7 @@ def require_frame_memory(
     Raises:
         InputError: it does not fit. The message says how much does.
     """
-    to_fuse = memory_to_fuse(alignment, session, error=write.error_layer)
+    to_fuse = memory_to_fuse(alignment, session.contract, error=write.error_layer)
     to_write = FIXED_MEMORY + result_bytes(alignment, error=write.error_layer) + layers
     only_layout = write.layout == "multilayer" and to_fuse + held <= max_memory
     hint = ", or use --layout spec, which does not hold all layers at once" if only_layout else ""

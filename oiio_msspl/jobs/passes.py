@@ -14,10 +14,11 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.contents import dropped_channels, stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.write_options import WriteOptions
-from oiio_msspl.fusion.fuse import FusedFrame, layer_fuser, tile_count
+from oiio_msspl.fusion.fuse import FusedFrame
 from oiio_msspl.fusion.passes.fuse import fuse_passes, pass_steps
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.fusion.tiles.tiling import strips_memory
+from oiio_msspl.fusion.tiles.network import layer_fuser
+from oiio_msspl.fusion.tiles.tiling import strips_memory, tile_count
 from oiio_msspl.image.arrays import HALF_MAX
 from oiio_msspl.image.parallel import limit_threads
 from oiio_msspl.model.session import Session
@@ -140,6 +141,6 @@ def steps_of(views: Sequence[tuple[MappedRender, MappedRender]], session: Sessio
     steps = 0
     for lr, hr in views:
         alignment = align(lr, hr)
-        steps += tile_count(alignment, session)
+        steps += tile_count(alignment, session.contract)
         steps += pass_steps(alignment, sets_to_fuse(hr, write), by_network=session.layers is not None)
     return steps

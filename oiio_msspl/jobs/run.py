@@ -148,7 +148,7 @@ class ShotRun:
         """Fuse the views without neighbours, and store them, so that memory holds one at a time."""
         for view in first.others:
             alignment = align(view.lr, view.hr)
-            needed = memory_to_fuse(alignment, first.session, error=False) + first.held_bytes
+            needed = memory_to_fuse(alignment, first.session.contract, error=False) + first.held_bytes
             require_memory(needed, first.session.contract, self.settings.max_memory)
         for view in first.others:
             view.session, view.memory, view.progress = first.session, first.memory, first.progress

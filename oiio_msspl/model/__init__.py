@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Networks: what they read (contract, encoding), where they are (catalogue, weights/), what runs them (session)."""
+"""Networks: what they read (contract, encoding), where they are (catalogue, weights/), and what runs them (session)."""

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What a model needs and how it was made, as JSON in the metadata of its ONNX file.
+"""The contract of a model: what it needs and how it was made, as JSON in the metadata of its ONNX file.
 
-Training writes the contract, inference reads it. A file whose contract does not fit this version of the code is
-refused, so training and inference cannot disagree on scale, channel order, encoding or defaults.
+Training writes the contract and inference reads it. A file whose contract does not fit this version of the code is
+refused, so that training and inference cannot disagree on scale, channel order, encoding or defaults.
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ if TYPE_CHECKING:
 #: Upsampling factors from the LRHS to the HRLS.
 SCALES = (2, 4, 8)
 
-#: Ending of the name of a family of models for renders whose pixel filter has spread the noise.
+#: Ending of the names of models for renders whose pixel filter has spread the noise.
 SPREAD = "-spread"
-#: Values of ``Contract.denoiser``: none; a denoiser of both renders' mean; its small version. ``SPREAD`` may follow.
+#: Values of ``Contract.denoiser``: none; a denoiser of both renders' mean; a small one. ``SPREAD`` may follow.
 NO_DENOISER, MEAN_DENOISER, SMALL_MEAN_DENOISER = "", "mean", "mean-small"
 DENOISERS = tuple(kind + noise for kind in (MEAN_DENOISER, SMALL_MEAN_DENOISER) for noise in ("", SPREAD))
 
@@ -36,7 +36,7 @@ FORMAT = 2
 
 
 def current_transforms() -> dict[str, Any]:
-    """The constants of :mod:`oiio_msspl.model.encoding`, as the contract records them."""
+    """Return the constants of :mod:`oiio_msspl.model.encoding`, as the contract records them."""
     return {
         "curve": "log1p",
         "mu": MU,
@@ -48,16 +48,16 @@ def current_transforms() -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class Contract:
-    """Everything that inference must know about a model.
+    """The properties of a model that inference must know.
 
     ONNX inputs, float32, see :attr:`inputs`:
 
-    - ``lrhs.rgb`` (1, 3, h, w), and ``hrls.rgb`` (1, 3, s*h, s*w): scene linear, finite and >= 0. The model clips what
-      is too bright.
+    - ``lrhs.rgb`` (1, 3, h, w), and ``hrls.rgb`` (1, 3, s*h, s*w): scene linear, finite and >= 0. The model clips
+      values that are too bright.
     - ``hrls.albedo`` and so on: further features, in the units of :mod:`oiio_msspl.aovs.features`.
     - ``exposure``: a number that multiplies radiance, see :func:`oiio_msspl.model.encoding.find_exposure`.
-    - ``share.rgb``: how much the LRHS counts in the mean of both renders, in [0, 1], if the model denoises that mean.
-      ``share.albedo`` and ``share.normal``: the same for these features, if it reads those of the LRHS.
+    - ``share.rgb``: weight of the LRHS in the mean of both renders, in [0, 1], if the model denoises that mean.
+      ``share.albedo`` and ``share.normal``: its weight for these features, if the model reads those of the LRHS.
 
     Output: ``fused`` (1, 3, s*h, s*w), scene linear, finite and >= 0. Some models also have ``log_error``
     (1, 1, s*h, s*w): the natural logarithm of the expected absolute error of the log-encoded RGB, mean of the channels.
@@ -75,7 +75,7 @@ class Contract:
     """LRHS pixels that a tile adds to its core on each side, a multiple of ``alignment``. Measured by training: the
     part of the receptive field that changes results."""
     bytes_per_pixel: int = 1000
-    """Peak memory of a tile for each of its HRLS pixels, rounded up. The size of tiles follows from it, so other values
+    """Peak memory of a tile for each of its HRLS pixels, rounded up. It decides the size of tiles, so other values
     change the result a little."""
     lrhs: list[str] = field(default_factory=lambda: [RGB])
     """Features of the LRHS that the model reads."""
@@ -86,7 +86,7 @@ class Contract:
     defaults: dict[str, float] = field(default_factory=lambda: dict(DEFAULTS))
     """Encoded values of missing features."""
     denoiser: str = NO_DENOISER
-    """What denoises the mean of both renders: ``NO_DENOISER`` or one of ``DENOISERS``."""
+    """The network that denoises the mean of both renders: ``NO_DENOISER`` or one of ``DENOISERS``."""
     training_spp: dict[str, list[int]] = field(default_factory=dict)
     """Lowest and highest spp in training: ``{"hrls": [1, 8], "lrhs": [4, 64]}``."""
     provenance: dict[str, Any] = field(default_factory=dict)
@@ -101,7 +101,7 @@ class Contract:
         return {name: HRLS_FEATURES[name[5:]] for name in images} | dict.fromkeys(["exposure", *shares], 0)
 
     def _wrong_field(self) -> str | None:
-        """The name of a field whose value has another type or is out of range; None if all can be used."""
+        """Return the name of a field whose value has a wrong type or is out of range; None if all are valid."""
         numbers = {
             "scale": (1, 64),
             "alignment": (1, 1024),
@@ -114,11 +114,11 @@ class Contract:
                 return name
         if not isinstance(self.name, str) or not 0 < len(self.name) <= 100:
             return "name"
-        for name in ("lrhs", "hrls"):
-            features = getattr(self, name)
-            known = isinstance(features, list) and all(isinstance(each, str) and each in FEATURES for each in features)
-            if not known or features[:1] != [RGB]:
-                return name
+        for render in ("lrhs", "hrls"):
+            features = getattr(self, render)
+            valid = isinstance(features, list) and all(isinstance(name, str) and name in FEATURES for name in features)
+            if not valid or features[:1] != [RGB]:
+                return render
         if self.denoiser not in (NO_DENOISER, *DENOISERS):
             return "denoiser"
         if not isinstance(self.provenance, dict):
@@ -167,7 +167,7 @@ class Contract:
             source: the file that errors name.
 
         Raises:
-            InputError: it is no contract, or does not fit this version.
+            InputError: the text is no contract, or does not fit this version.
         """
         try:
             contract = cls(**json.loads(text))
@@ -176,8 +176,8 @@ class Contract:
                 f"{source}: the '{METADATA_KEY}' metadata can't be read ({error}); export it again"
             ) from error
         if contract.format != FORMAT:
-            found = str(contract.format)[:20]
-            raise InputError(f"{source}: contract format {found}, this version reads {FORMAT}; update one of them")
+            version = str(contract.format)[:20]
+            raise InputError(f"{source}: contract format {version}, this version reads {FORMAT}; update one of them")
         wrong = contract._wrong_field()
         if wrong:
             raise InputError(f"{source}: the field {wrong} of its contract has a value that can't be; export it again")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Devices: the execution provider of each, its settings, and the file of a network that it runs.
+"""Devices: their execution providers, the settings of these, and the file of a network that a device runs.
 
 A network has a file for CPUs and may have one for GPUs. Convolutions in the first compute in 8 bits, for which GPUs
 have no operators, and in half floats in the second. The rest of both is float32.
@@ -31,14 +31,14 @@ PACKAGES = {
     "coreml": "onnxruntime",
     "directml": "onnxruntime-directml",
 }
-#: Devices that have an operator for every convolution in half floats. On them, one on the CPU is an error.
+#: Devices that have an operator for every convolution in half floats. A convolution that stays on the CPU is an error.
 COMPLETE = ("cuda", "tensorrt")
-#: Folder of the files for GPUs, beside the files for CPUs. A file has the same name in both.
+#: Folder of the files for GPUs, beside the files for CPUs and with the same names.
 GPU_FOLDER = "gpu"
 
 
 def usable_devices() -> list[str]:
-    """Keys of ``PROVIDERS`` that the installed onnxruntime was built for."""
+    """Return the keys of ``PROVIDERS`` that the installed onnxruntime was built for."""
     available = available_providers()
     return [device for device, provider in PROVIDERS.items() if provider in available]
 
@@ -71,9 +71,9 @@ def _is_installed(package: str) -> bool:
 
 
 def providers(device: str) -> list[Provider]:
-    """The execution providers of a device with their settings. Each operator goes to the first that supports it."""
+    """Return the execution providers of a device with their settings. The first that supports an operator runs it."""
     if device == "tensorrt":
-        # Building an engine takes minutes, so the next run finds it in a file
+        # Building an engine takes minutes, so it is stored for the next run.
         settings = {
             "trt_engine_cache_enable": "1",
             "trt_engine_cache_path": str(_cache_folder("tensorrt")),
@@ -82,16 +82,16 @@ def providers(device: str) -> list[Provider]:
         return [(PROVIDERS[device], settings), (PROVIDERS["cuda"], {}), (CPU, {})]
     first: dict[str, list[Provider]] = {
         "cpu": [],
-        # Without these, OpenVINO takes the CPU, and GPUs compute the log curve in half floats, which overflow
+        # Without these, OpenVINO uses the CPU, and GPUs compute the log curve in half floats, which overflow.
         "openvino": [(PROVIDERS["openvino"], {"device_type": "AUTO:GPU,CPU", "precision": "ACCURACY"})],
-        # The older format, NeuralNetwork, has fewer operators
+        # The older format, NeuralNetwork, has fewer operators.
         "coreml": [(PROVIDERS["coreml"], {"ModelFormat": "MLProgram"})],
     }
     return [*first.get(device, [(PROVIDERS[device], {})]), (CPU, {})]
 
 
 def _cache_folder(name: str) -> Path:
-    """A folder for files that can be made again."""
+    """Make a folder for files that can be made again."""
     base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
     folder = Path(base, "oiio_msspl", name)
     folder.mkdir(parents=True, exist_ok=True)
@@ -99,11 +99,11 @@ def _cache_folder(name: str) -> Path:
 
 
 def gpu_file(path: Path) -> Path | None:
-    """The file for GPUs of a network, given its file for CPUs; None if it has none."""
+    """Return the file for GPUs of a network, given its file for CPUs; None if it has none."""
     file = path.parent / GPU_FOLDER / path.name
     return file if file.is_file() else None
 
 
 def file_for(path: Path, device: str) -> Path:
-    """The file of a network that a device runs, given its file for CPUs."""
+    """Return the file of a network that a device runs, given its file for CPUs."""
     return path if device == "cpu" else gpu_file(path) or path

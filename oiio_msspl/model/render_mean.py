@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How much each render counts in the mean of both, which `joint` denoises first.
+"""The shares of both renders in their mean, which `joint` denoises first.
 
 The LRHS and the HRLS are independent samples of one scene. At the LRHS's resolution, a weighted mean of the two has
-less noise than either. The models compute that mean; here its weights are found.
+less noise than either render. This module finds the weights, and the models compute the mean.
 """
 
 from __future__ import annotations
@@ -12,21 +12,22 @@ from collections.abc import Sequence
 import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.image.arrays import Array, box_downsample, clip
+from oiio_msspl.image.arrays import Array, clip
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance
 
 #: Features of one render, (h, w, c), in scene-linear units.
 Images = dict[str, Array]
-#: How much the LRHS counts in the mean of both renders, in [0, 1], by feature. A feature that is absent does not count.
+#: Weight of the LRHS in the mean of both renders, in [0, 1], by feature; 0 for features that are absent.
 Shares = dict[str, float]
 
-#: Bounds of the LRHS's share, because an estimate of "all" or "nothing" may be wrong.
+#: Bounds of the LRHS's share, because an estimate of 0 or 1 may be wrong.
 _BOUNDS = (0.05, 0.95)
-#: An albedo or normal of the LRHS shows something else than that of the HRLS if their mean squared difference exceeds
-#: this share of the latter's variance plus ``_VARIANCE_OFFSET``. At x2 and 1 spp in both renders, one in ten of 60
+#: An albedo or normal of the LRHS does not show the same as that of the HRLS if their mean squared difference exceeds
+#: this fraction of the latter's variance plus ``_VARIANCE_OFFSET``. At x2 and 1 spp in both renders, one in ten of 60
 #: views exceeds 0.2 (albedo) or 0.1 (normal); with the LRHS mirrored, one in twenty is below 0.55.
 _DIFFERENT, _VARIANCE_OFFSET = 0.5, 4e-4
-#: Of so many rows, one is compared.
+#: Every n-th row is compared.
 _COMPARED_ROWS = 4
 
 
@@ -34,12 +35,12 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float) -> Shar
     """Decide how both renders of a frame are averaged. A frame has one answer, so that its tiles agree.
 
     Args:
-        pairs: features of the LRHS and of the HRLS for parts of the frame, all equally large: ``rgb``, and of each
-            render ``albedo`` and ``normal`` as far as it has them.
+        pairs: features of the LRHS and of the HRLS for parts of the frame, all equally large: ``rgb``, and ``albedo``
+            and ``normal`` of the renders that have them.
         exposure: of the frame.
 
     Returns:
-        The share of ``rgb``, and the same for those AOVs of the LRHS that show the same as the HRLS's.
+        The share of ``rgb``, and this share for each AOV of the LRHS that agrees with the HRLS's.
     """
     scale = len(pairs[0][1][RGB]) // len(pairs[0][0][RGB])
 
@@ -51,24 +52,22 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float) -> Shar
 
     lrhs, hrls = (encode_radiance(images, exposure) for images in (low(RGB), high(RGB)))
     share = lrhs_share(lrhs, hrls)
-    both = set(pairs[0][0]) & set(pairs[0][1])
-    return {RGB: share} | {
-        name: share for name in (ALBEDO, NORMAL) if name in both and _show_the_same(low(name), high(name))
-    }
+    shared = set(pairs[0][0]) & set(pairs[0][1])
+    return {RGB: share} | {name: share for name in (ALBEDO, NORMAL) if name in shared and _agree(low(name), high(name))}
 
 
 def _comparable(name: str, image: Array) -> Array:
-    """A feature in the range in which the models average it."""
+    """Clip a feature to the range in which the models average it."""
     if name == RGB:
         return image
     return clip(image, 0.0 if name == ALBEDO else -1.0, 1.0)
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:
-    """Share of the LRHS in the mean of both renders that has the least noise.
+    """Return the share of the LRHS in the mean of both renders that has the least noise.
 
     High-pass filtered, each render is picture plus noise. The picture is the same in both and the noise is independent,
-    so their covariance is the variance of the picture. What each variance exceeds it by is noise.
+    so their covariance is the variance of the picture. The rest of each render's variance is noise.
 
     Args:
         lrhs, hrls: (..., h, w, 3), log-encoded, at one resolution.
@@ -84,8 +83,8 @@ def lrhs_share(lrhs: Array, hrls: Array) -> float:
     return float(np.clip(hrls_noise / (lrhs_noise + hrls_noise), *_BOUNDS))
 
 
-def _show_the_same(lrhs_aov: Array, hrls_aov: Array) -> bool:
-    """Whether two AOVs (..., h, w, 3) differ by no more than noise."""
+def _agree(lrhs_aov: Array, hrls_aov: Array) -> bool:
+    """Return whether two AOVs (..., h, w, 3) differ by no more than noise."""
     lrhs_aov, hrls_aov = (aov[..., ::_COMPARED_ROWS, :, :] for aov in (lrhs_aov, hrls_aov))
     variance = float(hrls_aov.var(axis=tuple(range(hrls_aov.ndim - 1))).mean())
     return float(np.square(lrhs_aov - hrls_aov).mean()) <= _DIFFERENT * (variance + _VARIANCE_OFFSET)

@@ -30,14 +30,14 @@ Provider = tuple[str, dict[str, str]]
 
 
 def available_providers() -> list[str]:
-    """Execution providers that the installed onnxruntime was built for."""
+    """Return the execution providers that the installed onnxruntime was built for."""
     import onnxruntime
 
     return list(onnxruntime.get_available_providers())
 
 
 def runtime_version() -> str:
-    """Version of the installed onnxruntime."""
+    """Return the version of the installed onnxruntime."""
     import onnxruntime
 
     return str(onnxruntime.__version__)
@@ -52,10 +52,10 @@ def load_network(
         path: an ONNX file.
         threads: CPU threads; 0 for one a core.
         providers: each operator goes to the first one that supports it.
-        optimise: transform the graph for speed. Loading is faster without it, for a network that does not run.
+        optimise: transform the graph for speed. False loads faster, for a network that does not run.
 
     Raises:
-        InputError: it cannot be loaded.
+        InputError: the file cannot be loaded.
     """
     import onnxruntime
 
@@ -76,7 +76,7 @@ def load_network(
     if not optimise:
         options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_DISABLE_ALL
     try:
-        # With its fallback, onnxruntime would go on without a provider that fails
+        # With its fallback, onnxruntime would go on without a provider that fails.
         return onnxruntime.InferenceSession(str(path), options, providers=list(providers), enable_fallback=False)
     except Exception as error:
         raise InputError(f"{path}: onnxruntime can't load it ({error})") from error
@@ -84,11 +84,11 @@ def load_network(
 
 @functools.cache
 def _share_memory() -> None:
-    """Make the arena from which all networks of this process take memory on the CPU."""
+    """Make the arena from which all networks of this process allocate memory on the CPU."""
     import onnxruntime
 
-    # Each request that no free block fits gets a block of its own size. In larger blocks, weights of a network that is
-    # loaded later would lie beside intermediate results, and keep them from being given back.
+    # A request that fits into no free block gets a block of its own size. In larger blocks, weights of a network that
+    # is loaded later would lie beside intermediate results, and such a block is never given back.
     arena = onnxruntime.OrtArenaCfg({"arena_extend_strategy": 1})
     kind = onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR
     place = onnxruntime.OrtMemoryInfo("Cpu", kind, 0, onnxruntime.OrtMemType.DEFAULT)
@@ -109,18 +109,18 @@ def release_memory(network: onnxruntime.InferenceSession, feed: Mapping[str, Arr
 
 
 def _load_cuda() -> None:
-    """Load the CUDA libraries that pip installs, which are in no folder that the system searches."""
+    """Load the CUDA libraries that pip installs. They are in no folder that the system searches."""
     import onnxruntime
 
     if hasattr(onnxruntime, "preload_dlls"):  # since 1.21
-        # It prints what it does not find; the libraries may be elsewhere
+        # It prints the libraries that it does not find. They may be elsewhere.
         with contextlib.redirect_stdout(io.StringIO()) as printed:
             onnxruntime.preload_dlls()
         log.debug("preload_dlls: %s", printed.getvalue())
 
 
 def convolutions(network: onnxruntime.InferenceSession) -> dict[str, int]:
-    """Number of convolutions on each execution provider; empty if the onnxruntime is too old to say."""
+    """Return the number of convolutions on each execution provider; empty if the onnxruntime is too old to say."""
     if not hasattr(network, "get_provider_graph_assignment_info"):
         return {}
     counts: collections.Counter[str] = collections.Counter()

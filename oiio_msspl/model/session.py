@@ -15,7 +15,6 @@ import numpy as np
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.image.arrays import planes
 from oiio_msspl.image.parallel import check_threads
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import COMPLETE, PROVIDERS, file_for, providers, require_device
@@ -33,16 +32,16 @@ class Session:
     """A loaded model on a device, with its contract.
 
     Args:
-        path: an ONNX file with a contract. A GPU runs the file of the same name in the folder ``gpu`` beside it, if
-            there is one.
+        path: an ONNX file with a contract. A GPU runs the file of this name in the folder ``gpu`` beside it, if there
+            is one.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`.
         threads: CPU threads of ONNX Runtime and NumPy alike; 0 for one a core.
-        layers: ONNX file of the model that fuses single layers of passes; None if no network does.
-        half_layers: the same for layers at half of the frame's resolution, and half of the scale.
+        layers: ONNX file of the model that fuses passes; None if no network does.
+        half_layers: ONNX file of the model that fuses passes at half of the frame's resolution, for half of the scale.
 
     Raises:
-        InputError: no model; no contract; a device that this onnxruntime was not built for or that cannot start; or a
-            model whose convolutions would stay on the CPU though the device has operators for them.
+        InputError: the file is no model or has no contract, this onnxruntime was not built for the device, the device
+            cannot start, or convolutions would stay on the CPU though the device has operators for them.
     """
 
     def __init__(
@@ -66,7 +65,7 @@ class Session:
             )
         self.contract = Contract.of_network(self._session, path)
         self._outputs = [output.name for output in self._session.get_outputs()]
-        inputs = [each.name for each in self._session.get_inputs()]
+        inputs = [node.name for node in self._session.get_inputs()]
         if inputs != list(self.contract.inputs) or "fused" not in self._outputs:
             raise InputError(
                 f"{path}: has the inputs {', '.join(inputs)[:99]} and the outputs {', '.join(self._outputs)[:99]}, not "
@@ -77,7 +76,7 @@ class Session:
         self.seconds = 0.0
         """Time spent in :meth:`run` so far."""
         self._largest = 0
-        """LRHS pixels of the largest picture since :meth:`release_memory`."""
+        """LRHS pixels of the largest picture since :meth:`release_memory` was called."""
         counts = collections.Counter(convolutions(self._session))
         self.convolutions = dict(counts)
         """Number of convolutions on each execution provider, see :func:`oiio_msspl.model.runtime.convolutions`."""
@@ -113,21 +112,20 @@ class Session:
 
     @functools.cached_property
     def layer_session(self) -> Session | None:
-        """The model that fuses single layers of passes, which is loaded when it is first needed; None if no network
-        does."""
+        """The model that fuses passes; None if no network does. It is loaded when it is first needed."""
         if self.layers is None:
             return None
         return Session(self.layers, self.device, self.threads)
 
     @functools.cached_property
     def half_layer_session(self) -> Session | None:
-        """The same for layers at half of the frame's resolution."""
+        """The model that fuses passes at half of the frame's resolution; None if no network does."""
         if self.half_layers is None:
             return None
         return Session(self.half_layers, self.device, self.threads)
 
     def release_layer_memory(self) -> None:
-        """:meth:`release_memory` of the models of single layers, if they were loaded."""
+        """Call :meth:`release_memory` of the models that fuse passes, if they were loaded."""
         for name in ("layer_session", "half_layer_session"):
             if (session := vars(self).get(name)) is not None:
                 session.release_memory()
@@ -145,12 +143,13 @@ class Session:
         """Run the model.
 
         Args:
-            lrhs: ``rgb`` (h, w, 3), scene linear, repaired; further features of the contract as far as they are there.
-            hrls: the same, (s*h, s*w, c). Features that the contract lacks are ignored.
+            lrhs: ``rgb`` (h, w, 3), scene linear, repaired; and further features. Features that the contract lacks are
+                ignored. Features that are missing get their default.
+            hrls: features (s*h, s*w, c), likewise.
             exposure: see :func:`oiio_msspl.model.encoding.find_exposure`.
             shares: see :func:`oiio_msspl.model.render_mean.find_shares`; only read if the model averages both renders.
-            error: also return the expected error of a model that predicts it.
-            aovs: those of :attr:`clean_aovs` that are also returned.
+            error: also return the expected error. The model must predict it.
+            aovs: names of :attr:`clean_aovs` to return, too.
 
         Returns:
             ``fused``: the fused image, scene linear (s*h, s*w, 3). ``error``: the expected absolute error of the
@@ -163,7 +162,7 @@ class Session:
         start = time.perf_counter()
         pixels = lrhs[RGB].shape[0] * lrhs[RGB].shape[1]
         if pixels > self._largest:
-            self.release_memory()  # it is divided for smaller pictures, and would be held beside that of this one
+            self.release_memory()  # memory of smaller pictures would be held beside that of this one
             self._largest = pixels
         wanted = ["fused", *(["log_error"] if error else []), *aovs]
         try:
@@ -184,7 +183,7 @@ class Session:
         return images
 
     def _feed(self, lrhs: Images, hrls: Images, exposure: float, shares: Shares) -> dict[str, Any]:
-        """The inputs of the contract."""
+        """Return the inputs of the contract."""
         numbers = {"exposure": exposure} | {f"share.{name}": shares.get(name, 0.0) for name in self.contract.lrhs}
         feed: dict[str, Any] = {}
         for key, channels in self.contract.inputs.items():
@@ -193,15 +192,15 @@ class Session:
                 feed[key] = np.asarray(numbers[key], np.float32)
                 continue
             images = lrhs if render == "lrhs" else hrls
-            image = images.get(name)
-            if image is None:
-                image = planes(images[RGB], channels)
-                image[...] = default_value(name, exposure)
-            feed[key] = np.ascontiguousarray(image.transpose(2, 0, 1)[None], np.float32)
+            if name in images:
+                feed[key] = np.ascontiguousarray(images[name].transpose(2, 0, 1)[None], np.float32)
+            else:
+                size = 1, channels, *images[RGB].shape[:2]
+                feed[key] = np.full(size, default_value(name, exposure), np.float32)
         return feed
 
     def release_memory(self) -> None:
-        """Give the memory of intermediate results on the CPU back to the system. The next run asks for it again."""
+        """Give the memory of intermediate results on the CPU back to the system. The next run allocates it again."""
         self._largest = 0
         if self.provider != CPU:
             return

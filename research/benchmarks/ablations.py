@@ -31,7 +31,7 @@ from torch.optim.lr_scheduler import LambdaLR
 
 from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
 from oiio_msspl.compare import upsample_bicubic
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from research.benchmarks import results

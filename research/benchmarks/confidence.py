@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from oiio_msspl import fuse
-from oiio_msspl.image.arrays import Array, box_downsample
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance

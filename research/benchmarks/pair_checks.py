@@ -37,8 +37,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.checks.pair import BOTH_BLACK, check_renders
-from oiio_msspl.image.arrays import Array, box_downsample, interpolate
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import ACESCG, REC709, conversion
+from oiio_msspl.image.filters import box_downsample, interpolate
 from research.benchmarks import results
 
 #: Sets of scenes: those by which thresholds were chosen, and others.

@@ -60,9 +60,9 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.fuse import layer_fuser
 from oiio_msspl.fusion.passes.fuse import DARKEST_COLOUR, fuse_passes
 from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
+from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.image.metrics import psnr, relmse

@@ -9,7 +9,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.compare import upsample_bicubic
 from oiio_msspl.exr.render import ReadableRender
 from oiio_msspl.fusion.tiles.features import read_features
-from oiio_msspl.image.arrays import Array, box_downsample, clip, repair
+from oiio_msspl.image.arrays import Array, clip, repair
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from oiio_msspl.model.render_mean import find_shares
 from research.benchmarks.every_second_pixel import on_every_second_pixel, without_grid

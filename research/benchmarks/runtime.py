@@ -68,7 +68,7 @@ def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
 def pair(height: int, width: int, scale: int) -> tuple[Any, Any]:
     """Both renders of such a frame, with as many samples in each."""
     from oiio_msspl import Render
-    from oiio_msspl.image.arrays import box_downsample
+    from oiio_msspl.image.filters import box_downsample
 
     low = {name: box_downsample(values, scale) for name, values in frame(height, width, 1).items()}
     return Render.from_arrays("lr", **low), Render.from_arrays("hr", **frame(height, width))

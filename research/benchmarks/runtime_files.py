@@ -31,7 +31,7 @@ def write_frame(path: Path, width: int, height: int, scale: int = 1, groups: int
     import numpy as np
     import OpenEXR
 
-    from oiio_msspl.image.arrays import box_downsample
+    from oiio_msspl.image.filters import box_downsample
 
     pixels = {name: box_downsample(values, scale) for name, values in frame(height, width, scale).items()}
     lights = {f"light_{i}": pixels["rgb"] / groups for i in range(groups)}

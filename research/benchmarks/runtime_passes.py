@@ -33,11 +33,12 @@ from oiio_msspl import FusedFrame, fuse, map_render, open_exr
 from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.fusion.fuse import layer_fuser
 from oiio_msspl.fusion.passes.fuse import fuse_passes
 from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, strips_memory
-from oiio_msspl.image.arrays import Array, box_downsample, planes_of
+from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.session import Session
 from research.benchmarks import results

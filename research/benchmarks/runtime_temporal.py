@@ -24,7 +24,8 @@ from typing import Any
 import numpy as np
 import OpenEXR
 
-from oiio_msspl.image.arrays import Array, box_downsample, enlarged
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.filters import box_downsample, enlarged
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.runtime import in_process, peak_mb, processor

@@ -20,7 +20,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.exr.render import ReadableRender, Render
-from oiio_msspl.image.arrays import Array, box_downsample, repair
+from oiio_msspl.image.arrays import Array, repair
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import find_exposure
 from research.datagen.views import Folder, View, as_float32, mean_lrhs, read_hrls, split_features
 

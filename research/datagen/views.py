@@ -37,8 +37,9 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import HRLS_FEATURES, NORMAL, VARIANCE
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.image.arrays import box_downsample, repair
+from oiio_msspl.image.arrays import repair
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.contract import SCALES
 from research.datagen.quality import log_mean
 

@@ -88,7 +88,7 @@ def test_the_result_depends_neither_on_memory_nor_on_threads(scale, family, monk
     monkeypatch.setattr(ExrFile, "_decode", lambda *given: decoded.append(given) or decode(*given))
     once = fuse(*files, session)
     kept = len(decoded)
-    monkeypatch.setattr(tiling, "STRIPS_SHARE", 0)
+    monkeypatch.setattr(tiling, "STRIPS_FRACTION", 0)
     again = fuse(*files, session)
     assert once.tiles == again.tiles == 2 and len(decoded) > 2 * kept
     np.testing.assert_array_equal(once.rgb, again.rgb)

@@ -5,10 +5,9 @@ import numpy as np
 import pytest
 
 from oiio_msspl import Render, fuse
-from oiio_msspl.fusion.fuse import tile_count
 from oiio_msspl.fusion.tiles import tiling
-from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.image.colour import srgb
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import noisy, picture
 from tests.fusion.checks.test_spread_noise import spread
@@ -63,7 +62,7 @@ def test_tiles_give_nearly_the_same_as_a_whole_frame(monkeypatch):
     pair = spread_pair(picture(512, 768), 2)
     whole = fuse(*pair, session)
     monkeypatch.setattr(tiling, "TILE_MEMORY", 130 << 20)
-    assert tile_count(whole.alignment, session) > 1
+    assert tiling.tile_count(whole.alignment, session.contract) > 1
     tiled = fuse(*pair, session)
     assert tiled.tiles > 1
     assert np.abs(srgb(tiled.rgb) - srgb(whole.rgb)).max() < 0.02

@@ -1,9 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Operations on images."""
+"""Where images are stored."""
 
 import errno
 import os
-import warnings
 from pathlib import Path
 
 import numpy as np
@@ -13,39 +12,6 @@ from oiio_msspl import MssplError
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.image import arrays
-from oiio_msspl.image.arrays import box_downsample, filled
-
-
-@pytest.mark.parametrize("dtype", [np.float16, np.float32])
-def test_means_are_exact_and_finite_up_to_the_largest_value(dtype):
-    """Also where the sum of the pixels does not fit into their type."""
-    image = np.full((8, 8, 3), np.finfo(dtype).max, dtype)
-    image[4:] = 0.1
-    with warnings.catch_warnings():
-        warnings.simplefilter("error")
-        means = box_downsample(image, 4)
-    assert means.dtype == np.float32
-    np.testing.assert_allclose(means[1], np.float32(dtype(0.1)), rtol=1e-6)
-    # Sums of floats are limited
-    expected = np.float32(65504) if dtype is np.float16 else np.finfo(np.float32).max / 16
-    np.testing.assert_allclose(means[0], expected, rtol=1e-6)
-
-
-@pytest.mark.parametrize("size", [(64, 64), (37, 51), (5, 29)])
-def test_missing_pixels_are_filled_from_those_around(size):
-    ramp = np.linspace(1, 2, size[1], dtype=np.float32)[None, :, None] * np.ones((*size, 3), np.float32)
-    missing = np.zeros(size, bool)
-    missing[size[0] // 3 : size[0] // 3 + 12, size[1] // 3 : size[1] // 3 + 5] = True
-    image = np.where(missing[..., None], np.float32(0), ramp)
-    result = filled(image, missing)
-    np.testing.assert_array_equal(result[~missing], ramp[~missing])
-    assert np.abs(result - ramp)[missing].max() < 0.2
-
-
-def test_without_any_known_pixel_nothing_is_filled():
-    image = np.zeros((5, 7, 3), np.float32)
-    assert filled(image, np.ones((5, 7), bool)) is image
-    assert filled(image, np.zeros((5, 7), bool)) is image
 
 
 def test_unloaded_images_keep_their_pixels(monkeypatch):

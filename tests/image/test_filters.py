@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
 """Tests of :mod:`oiio_msspl.image.filters`."""
 
+import warnings
+
 import numpy as np
 import pytest
 
-from oiio_msspl.image.filters import means_around
+from oiio_msspl.image.filters import box_downsample, filled, means_around
 
 
 @pytest.mark.parametrize("size", [(40, 27), (9, 5), (1, 30)])
@@ -22,3 +24,35 @@ def test_a_dark_region_beside_a_lamp_keeps_its_mean():
     plane[:4, :4] = 65504
     (means,) = means_around(plane, [2])
     np.testing.assert_allclose(means[50:], 1e-3, rtol=1e-4)
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32])
+def test_means_are_exact_and_finite_up_to_the_largest_value(dtype):
+    """Also where the sum of the pixels does not fit into their type."""
+    image = np.full((8, 8, 3), np.finfo(dtype).max, dtype)
+    image[4:] = 0.1
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        means = box_downsample(image, 4)
+    assert means.dtype == np.float32
+    np.testing.assert_allclose(means[1], np.float32(dtype(0.1)), rtol=1e-6)
+    # Sums of floats are limited
+    expected = np.float32(65504) if dtype is np.float16 else np.finfo(np.float32).max / 16
+    np.testing.assert_allclose(means[0], expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("size", [(64, 64), (37, 51), (5, 29)])
+def test_missing_pixels_are_filled_from_those_around(size):
+    ramp = np.linspace(1, 2, size[1], dtype=np.float32)[None, :, None] * np.ones((*size, 3), np.float32)
+    missing = np.zeros(size, bool)
+    missing[size[0] // 3 : size[0] // 3 + 12, size[1] // 3 : size[1] // 3 + 5] = True
+    image = np.where(missing[..., None], np.float32(0), ramp)
+    result = filled(image, missing)
+    np.testing.assert_array_equal(result[~missing], ramp[~missing])
+    assert np.abs(result - ramp)[missing].max() < 0.2
+
+
+def test_without_any_known_pixel_nothing_is_filled():
+    image = np.zeros((5, 7, 3), np.float32)
+    assert filled(image, np.ones((5, 7), bool)) is image
+    assert filled(image, np.zeros((5, 7), bool)) is image

@@ -8,7 +8,7 @@ import pytest
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.image import parallel
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import (
     _thread_limit,
     for_row_blocks,

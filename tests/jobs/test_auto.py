@@ -5,7 +5,7 @@ import pytest
 
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot, open_exr
 from oiio_msspl.fusion.motion.source import VECTORS, MotionSource
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.jobs.checks import model_of_shot
 from oiio_msspl.jobs.farm.openjd import make_job
 from oiio_msspl.jobs.plan import TemporalOptions, _is_slow, plan_temporal

@@ -10,7 +10,7 @@ from oiio_msspl import Render, Session, find_model, fuse, fuse_files
 from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, NORMAL, RGB, SPECULAR
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.model.catalogue import WEIGHTS, shipped_models
 from oiio_msspl.model.contract import SCALES

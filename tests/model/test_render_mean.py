@@ -4,7 +4,7 @@
 import numpy as np
 import pytest
 
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.render_mean import find_shares, lrhs_share
 from tests.conftest import noisy, picture

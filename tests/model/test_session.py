@@ -11,7 +11,7 @@ import pytest
 
 from oiio_msspl.aovs.features import HRLS_FEATURES
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import METADATA_KEY, SCALES, Contract
 from oiio_msspl.model.devices import PROVIDERS, usable_devices

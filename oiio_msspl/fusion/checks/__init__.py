@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Do both renders of a pair belong together?"""
+"""Checks that both renders of a pair belong together."""

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Is one of two renders in another colour space, or are its channels in another order?"""
+"""Checks whether one of two renders is in another colour space, or has its channels in another order."""
 
 from __future__ import annotations
 
@@ -10,17 +10,17 @@ from numpy.typing import NDArray
 
 from oiio_msspl.image.colour import ACES2065, ACESCG, REC709, conversion
 
-#: Another reading of the colours counts if it leaves at most this share of the difference of chromaticity.
+#: Another reading of the colours counts if it leaves at most this fraction of the difference of chromaticity.
 BETTER = 0.85
 
-#: By how many standard errors it must be better.
+#: It must be better by this many standard errors.
 CERTAIN = 4.0
-#: With fewer blocks nothing is said of colours.
+#: Colours are not compared if there are fewer blocks.
 MIN_BLOCKS = 64
 
 _SPACES = {"linear Rec.709": REC709, "ACEScg": ACESCG, "ACES2065-1": ACES2065}
 
-#: What the colours of the HRLS are to those of the LRHS -> the matrix from LRHS to HRLS.
+#: A difference of colours -> the matrix from the LRHS to the HRLS.
 READINGS = {"red and blue are swapped in one of the two renders": np.eye(3)[::-1]} | {
     f"the LRHS looks like {low} and the HRLS like {high}": conversion(_SPACES[low], _SPACES[high])
     for low, high in itertools.permutations(_SPACES, 2)
@@ -28,10 +28,10 @@ READINGS = {"red and blue are swapped in one of the two renders": np.eye(3)[::-1
 
 
 def different_colours(low: NDArray[np.float64], high: NDArray[np.float64]) -> str | None:
-    """How the colours of two renders differ, as a key of `READINGS`; None if they do not.
+    """Return how the colours of two renders differ, as a key of `READINGS`; None if they agree.
 
-    Every reading is tried both ways, on the LRHS and reversed on the HRLS: a matrix that makes colours paler also makes
-    their noise paler, but then its inverse does the opposite.
+    Every matrix is tried on the LRHS, and its inverse on the HRLS, and the worse of the two counts: a matrix that makes
+    colours paler also makes their noise paler, but then its inverse does the opposite.
 
     Args:
         low, high: RGB of the same blocks of both renders, (n, 3).
@@ -61,11 +61,11 @@ def different_colours(low: NDArray[np.float64], high: NDArray[np.float64]) -> st
 
 
 def _chromaticities(rgb: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The share of each channel in the sum of colours (3, n)."""
+    """Divide colours (3, n) by the sum of their channels."""
     return rgb / np.maximum(rgb.sum(axis=0), 1e-30)
 
 
 def _differences(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Distances (n,) of chromaticities (3, n)."""
+    """Return the distances (n,) of chromaticities (3, n)."""
     # The limit keeps single blocks full of coloured noise from dominating.
     return np.minimum(np.abs(a - b).sum(axis=0), 0.5)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the framing of one picture differs from another's: shift and zoom, found by least squares.
+"""Finds the shift and zoom of one picture against another, by least squares.
 
-The method is Lucas and Kanade 1981, coarse to fine. It finds the shift and zoom whose first-order effect on the LRHS
-explains the difference best. Two pictures of one frame may also differ by a tone curve, since noise changes the mean of
+The method is Lucas and Kanade 1981, coarse to fine: shift and zoom whose first-order effect on the LRHS explains the
+difference best. Two pictures of one frame may also differ by a tone curve, since noise changes the mean of
 display values, and by a blur, since pixel filters differ. Both are fitted along with shift and zoom, as a polynomial of
 the LRHS and its Laplacian. The gradients are those of the LRHS, so noise of the HRLS makes the estimate vary and does
 not bias it.
@@ -15,13 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.image.arrays import Array, box_downsample, interpolate, quantile
-from oiio_msspl.image.filters import blurred
+from oiio_msspl.image.arrays import Array, quantile
+from oiio_msspl.image.filters import blurred, box_downsample, interpolate
 
 #: A framing counts only if the smoothed pictures, moved by it, correlate at least this much.
 FRAMING_CORRELATION = 0.8
-#: It must also explain the first share of the difference that is left after tone curve and blur, because noise looks
-#: like a shift where a picture has few edges. In a large picture, noise explains less: so many pixels suffice.
+#: It must also explain this fraction of the difference that tone curve and blur leave, because noise looks like a shift
+#: in a picture with few edges. In a large picture noise explains less, and the second number is enough, in pixels.
 MIN_EXPLAINED, MIN_EXPLAINED_PIXELS = 0.3, 2000
 #: A difference must be this many standard errors from none.
 CERTAIN = 8.0
@@ -39,20 +39,20 @@ LARGEST_ZOOM_SEARCHED = 0.1
 
 @dataclass(frozen=True)
 class Framing:
-    """How the HRLS's picture lies over the LRHS's. All numbers are 0 where the difference is not certain."""
+    """The shift and zoom of the HRLS against the LRHS. All numbers are 0 if the difference is not certain."""
 
     x: float = 0.0
     """Shift to the right in LRHS pixels."""
     y: float = 0.0
     """Shift down in LRHS pixels."""
     zoom: float = 0.0
-    """By how much larger the HRLS's picture is: 0.03 for 3 %."""
+    """Growth of the HRLS's picture: 0.03 for 3 %."""
     zoom_at_edge: float = 0.0
     """Pixels of the LRHS by which the zoom moves the edge of the area in which it was measured."""
 
 
 def find_framing(low: Array, high: Array) -> Framing:
-    """Compare two pictures (h, w) of luminance, LRHS and HRLS."""
+    """Find the framing of the HRLS against the LRHS, both luminance (h, w)."""
     if min(low.shape) < SMALLEST:
         return Framing()
     low, high = central_area(low), central_area(high)
@@ -81,12 +81,12 @@ class _Fit:
     error: NDArray[np.float64]
     """Standard error of ``estimate``."""
     explained: float
-    """Share of the squared difference that shift and zoom explain, of what tone curve and blur leave."""
+    """Fraction of the squared difference left by tone curve and blur that shift and zoom explain."""
     correlation: float
 
 
 def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
-    """Refine an estimate: repeated least squares over it, gain and offset, with the LRHS moved each time."""
+    """Refine an estimate by repeated least squares, each time with the LRHS moved by the last estimate."""
     height, width = low.shape
     half = max(low.shape) / 2
     across, down = ((np.arange(n, dtype=np.float32) - (n - 1) / 2) / np.float32(half) for n in (width, height))
@@ -100,14 +100,14 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
         gy, gx = np.gradient(moved)
         zoom = gx * across + gy * down[:, None]
         blur = blurred(moved, 2) - moved
-        known = [-gx, -gy, -zoom, moved, np.square(moved), blur, np.ones_like(moved)]
-        planes = np.stack([*known, high - moved])[:, inner, inner]
+        terms = [-gx, -gy, -zoom, moved, np.square(moved), blur, np.ones_like(moved)]
+        planes = np.stack([*terms, high - moved])[:, inner, inner]
         # For each part of the frame, the products of all planes with all planes. Double precision, because the planes
         # are nearly linearly dependent.
         flat = (part.reshape(len(planes), -1).astype(np.float64) for part in parts(planes))
         dots = np.stack([part @ part.T for part in flat])
         squares, products = dots[:, :-1, :-1], dots[:, :-1, -1]
-        total = squares.sum(0) + 1e-9 * squares.sum(0).trace() * np.eye(len(known))  # solvable without any gradient
+        total = squares.sum(0) + 1e-9 * squares.sum(0).trace() * np.eye(len(terms))  # solvable without any gradient
         step = np.linalg.pinv(total, hermitian=True) @ products.sum(0)
         estimate = np.clip(estimate + np.clip(step[:3], -1, 1), -largest, largest)
         if np.abs(step[:3]).max() < 0.01:
@@ -123,9 +123,9 @@ def _fit(low: Array, high: Array, start: NDArray[np.float64]) -> _Fit:
 
 
 def _unmoved_residual(low: Array, high: Array, inner: slice) -> float:
-    """Squared difference within rows and columns that a tone curve and a blur of the LRHS do not explain."""
-    known = [low, np.square(low), blurred(low, 2) - low, np.ones_like(low)]
-    planes = np.stack([*known, high - low])[:, inner, inner].reshape(5, -1).astype(np.float64)
+    """Return the squared difference inside ``inner`` that a tone curve and a blur of the LRHS leave."""
+    terms = [low, np.square(low), blurred(low, 2) - low, np.ones_like(low)]
+    planes = np.stack([*terms, high - low])[:, inner, inner].reshape(5, -1).astype(np.float64)
     dots = planes @ planes.T
     coefficients = np.linalg.lstsq(dots[:4, :4], dots[:4, 4], rcond=None)[0]
     return float(dots[4, 4] - coefficients @ dots[:4, 4])
@@ -141,12 +141,12 @@ def _move(values: Array, by: NDArray[np.float64]) -> Array:
 
 
 def central_area(values: Array) -> Array:
-    """The middle of a picture (h, w), at most `AREA` pixels wide and high."""
+    """Return the middle of a picture (h, w), at most `AREA` pixels wide and high."""
     return values[central_slices(values.shape)]
 
 
 def central_slices(shape: tuple[int, int]) -> tuple[slice, slice]:
-    """Rows and columns of the middle of a picture, at most `AREA` of each."""
+    """Return rows and columns of the middle of a picture, at most `AREA` of each."""
     height, width = (slice(max(0, n - AREA) // 2, min(n, (n + AREA) // 2)) for n in shape)
     return height, width
 
@@ -158,11 +158,11 @@ def parts(values: Array) -> list[Array]:
 
 
 def jackknife_error(without_part: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Standard error of an estimate, from the estimates (n, ...) that leave out one of n parts each."""
+    """Return the standard error of an estimate, from n estimates (n, ...) that leave out one of n parts each."""
     return np.sqrt((len(without_part) - 1) * without_part.var(axis=0))
 
 
 def downsample_4(values: Array) -> Array:
-    """Mean of 4 x 4 pixels; incomplete blocks at the end are left out."""
+    """Average 4 x 4 pixels. Incomplete blocks at the end are left out."""
     height, width = (n // 4 for n in values.shape)
     return box_downsample(values[: height * 4, : width * 4], 4)

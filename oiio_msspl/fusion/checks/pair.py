@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Checks whether two renders show the same frame, at the LRHS's resolution.
 
-`research.benchmarks.pair_checks` measures how many wrong pairs each check notices, and how many right pairs it doubts.
+`research.benchmarks.pair_checks` measures how many wrong pairs each check finds, and how many right pairs it doubts.
 """
 
 from __future__ import annotations
@@ -20,69 +20,70 @@ from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.edges import foreign_aovs
 from oiio_msspl.fusion.checks.framing import central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.features import RepairCounts, TilePair, in_hrls_pixels, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, in_hrls_pixels, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.image.arrays import Array, box_downsample, planes_of, quantile
+from oiio_msspl.image.arrays import Array, planes_of, quantile
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import for_row_blocks, in_background
 
 #: Two renders hardly show the same frame if the correlation of their log luminance is below this. Matching pairs with
 #: clean references reach 0.83 to 0.99, one lit almost only by fireflies 0.31, different scenes -0.2 to 0.25.
 LOW_CORRELATION = 0.3
 #: Exposures differ if the ratio of the mean luminances, without the brightest percent, exceeds this. Matching pairs
-#: reach at most 1.21.
+#: reach 1.21.
 EXPOSURE_RATIO = 4 / 3
-#: Framings differ if the shift exceeds this in HRLS pixels, because the paper's nearest-neighbour LRHS is half a pixel
-#: off by its nature, and this in LRHS pixels.
+#: Framings differ if the shift exceeds the first number in HRLS pixels and the second one in LRHS pixels. The paper's
+#: nearest-neighbour LRHS is half a pixel off.
 MAX_SHIFT = (0.75, 0.5)
-#: Or if the zoom moves the edge of the frame by more LRHS pixels than this.
+#: Framings also differ if the zoom moves the edge of the frame by more LRHS pixels than this.
 MAX_ZOOM_AT_EDGE = 0.8
 #: A difference of exposure must be this many standard errors from none.
 CERTAIN = 6.0
-#: Brighter pixels count as this bright, because sums of squares over a frame would overflow float32.
+#: Brighter pixels are clipped to this, because sums of squares over a frame would overflow float32.
 BRIGHTEST = np.float32(1e15)
-#: Groups of blocks show different things: the side of a block in LRHS pixels, how many blocks the group has along each
-#: side, and the mean of t^2 from which on it counts. Groups of matching views reach 12.9, 8.2 and 9.8.
+#: Groups of blocks that show different things: side of a block in LRHS pixels, blocks along each side of the group, and
+#: the mean of t^2 above which the group differs. Groups of matching views reach 12.9, 8.2 and 9.8.
 BLOCK_GROUPS = ((4, 2, 16.0), (4, 3, 11.0), (8, 2, 12.0))
-#: No single block counts for more than this t.
+#: Largest t of a single block.
 LARGEST_T = 6.0
-#: Pixel filters of different widths move light across edges: this share of a block's contrast is no difference.
-FILTER_SHARE = 0.1
+#: Pixel filters of different widths move light across edges, so this fraction of a block's contrast is no difference.
+FILTER_FRACTION = 0.1
 #: Side of the blocks, in LRHS pixels, over which noise and colours are summed.
 BLOCK = 4
-#: The LRHS shares the HRLS's noise if, in three of four blocks, they differ by less than this share of the HRLS's
-#: noise. Independent renders differ by both renders' noise, so by more than one.
-SHARED_NOISE = 0.75
-#: A block has noise if its RMS is this share of the block's brightness.
+#: The LRHS has the noise of the HRLS if, in three of four blocks, they differ by less than this fraction of the HRLS's
+#: noise. Independent renders differ by the noise of both, so by more than 1.
+SAME_NOISE = 0.75
+#: A block has noise if its RMS is this fraction of the block's brightness.
 NOISY = 0.01
-#: With fewer noisy blocks nothing is said of noise.
+#: Noise is not compared if there are fewer noisy blocks.
 MIN_NOISY_BLOCKS = 64
-#: The LRHS is the HRLS's nearest pixels if this share of its noisy pixels equal an HRLS pixel.
+#: The LRHS consists of HRLS pixels if this fraction of its noisy pixels equal an HRLS pixel.
 EQUAL_PIXELS = 0.5
-#: A render is black by chance if no more pixels of the other one are lit: so many. Around a rectangle, also this share
-#: of them.
+#: A render may be black by chance if at most this many pixels of the other render are lit. Around a rectangle, this
+#: fraction of the pixels may be lit as well.
 MOST_BY_CHANCE, REGION = 64, 0.05
-#: The warning for a pair that fits, and shows nothing.
+#: The warning for a pair that is black.
 BOTH_BLACK = "both renders are black (or NaN) everywhere: the result is black"
 #: Pixels of the HRLS that :func:`check_renders` reads at a time.
 PIXELS_PER_READ = 1024 * 1024
 
 
 class HrlsAverages:
-    """The HRLS at the LRHS's resolution, and how both differ; filled tile by tile.
+    """The HRLS at the LRHS's resolution, and its difference to the LRHS; filled tile by tile.
 
     Attributes:
         rgb: luminance (h, w) over the grid of the alignment.
         albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
         normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
             none.
-        normal_noise: how long that difference would be, root mean square, by the noise of the normals alone; None as
-            above.
+        normal_noise: root mean square of that difference if the normals were constant, by their noise; None if there
+            are no normals.
         blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
-            difference of luminance, and how large it would be by the noise of the HRLS alone.
-        noisy_pixels, equal_pixels: LRHS pixels over which the HRLS is noisy, and those of them that equal one of its
-            pixels.
-        is_lost: whether the HRLS's beauty is NaN in all tiles, so that its averages are those of the LRHS.
+            difference of luminance, and that which the noise of the HRLS explains.
+        noisy_pixels, equal_pixels: numbers of LRHS pixels over which the HRLS is noisy, and of those among them that
+            equal an HRLS pixel.
+        is_lost: the HRLS's beauty is NaN in all tiles, so its averages are those of the LRHS.
     """
 
     def __init__(self, alignment: Alignment) -> None:
@@ -98,7 +99,7 @@ class HrlsAverages:
         self.noisy_pixels = self.equal_pixels = 0
         self.is_lost = True
 
-    def add(self, pair: TilePair) -> None:
+    def add(self, pair: TileFeatures) -> None:
         """Add the core of a tile."""
         self.is_lost &= pair.hrls_is_lost
         rows, columns = pair.core
@@ -109,7 +110,7 @@ class HrlsAverages:
         if centre.width and centre.height:
             self._add_aovs(pair, centre)
 
-    def _add_aovs(self, pair: TilePair, window: Window) -> None:
+    def _add_aovs(self, pair: TileFeatures, window: Window) -> None:
         """Fill ``albedo`` and ``normal_edges`` over a part of the central area."""
         target, size = window.slices(self._centre), (self._centre.height, self._centre.width)
         if ALBEDO in pair.hrls:
@@ -163,7 +164,7 @@ class HrlsAverages:
 
 
 def _edge_lengths(normal: Array) -> Array:
-    """Length of the difference of normals (h, w, 3) to the next pixels, to the right and down, (h, w)."""
+    """Return the length of the difference of normals (h, w, 3) to the next pixels, to the right and down, (h, w)."""
     squares = np.zeros(normal.shape[:2], np.float32)
     for plane in planes_of(normal):
         squares[:-1] += np.square(np.diff(plane, axis=0))
@@ -172,8 +173,7 @@ def _edge_lengths(normal: Array) -> Array:
 
 
 def _noise_of_edges(pixels: Array, scale: int) -> Array:
-    """How long :func:`_edge_lengths` would be by the noise of the HRLS's normals (s*h, s*w, 3) alone, root mean square,
-    (h, w)."""
+    """Return :func:`_edge_lengths` of constant normals with the noise of the HRLS's (s*h, s*w, 3), RMS, (h, w)."""
     result = np.empty([side // scale for side in pixels.shape[:2]], np.float32)
 
     def work(rows: slice) -> None:
@@ -187,17 +187,17 @@ def _noise_of_edges(pixels: Array, scale: int) -> Array:
 
 
 def _noise_variance(pixels: Array) -> Array:
-    """Variance by noise (h / 2, w / 2, ...) of the pixels (h, w, ...), over 2 x 2 of them each.
+    """Estimate the variance of noise (h / 2, w / 2, ...) from 2 x 2 pixels each.
 
-    Gradients and straight edges cancel out of a diagonal difference, and the variance of noise is a quarter.
+    Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
     """
     quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
     variance: Array = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
     return variance
 
 
-def _hrls_pixels(pair: TilePair, feature: str, window: Window) -> Array:
-    """A feature of the HRLS over a window of LRHS pixels inside the tile."""
+def _hrls_pixels(pair: TileFeatures, feature: str, window: Window) -> Array:
+    """Return a feature of the HRLS over a window of LRHS pixels inside the tile."""
     return pair.hrls[feature][in_hrls_pixels(window, pair.scale).slices(pair.hrls_area)]
 
 
@@ -225,7 +225,7 @@ def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
 
 
 def bounded_luminance(rgb: Array) -> Array:
-    """Luminance of repaired colours, at most `BRIGHTEST`: (..., 3) to (...)."""
+    """Return the luminance of repaired colours, at most `BRIGHTEST`: (..., 3) to (...)."""
     return np.minimum(luminance(rgb), BRIGHTEST)
 
 
@@ -235,34 +235,34 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     Args:
         low: luminance of the LRHS (h, w) over the grid of the alignment, see :func:`bounded_luminance`.
         hrls: averages of all tiles.
-        lr_name, hr_name: what messages call the renders.
+        lr_name, hr_name: names of the renders in messages.
 
     Returns:
         Warnings, one sentence each.
 
     Raises:
-        InputError: one render is black, most likely a wrong layer, and the other is not: more of it is lit than by
-            chance.
+        InputError: one render is black, most likely a wrong layer, and the other one is lit by more than chance.
     """
     high, alignment = hrls.rgb, hrls.alignment
     if not low.any() and not high.any():
         return [BOTH_BLACK]
     if hrls.is_lost:
         raise _black_beauty(hr_name, lr_name)
-    for name, values, other, lit in ((lr_name, low, hr_name, high), (hr_name, high, lr_name, low)):
-        if not values.any():
+    for black_name, black, lit_name, lit in ((lr_name, low, hr_name, high), (hr_name, high, lr_name, low)):
+        if not black.any():
             if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
-                raise _black_beauty(name, other)
+                raise _black_beauty(black_name, lit_name)
             return []  # a dark frame in which few samples find the light
     warnings = []
-    for name, values, other, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
-        if _is_region(values, lit):
+    for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
+        if _is_region(black, lit):
             warnings.append(
-                f"the {name} is black outside of a rectangle, where the {other} is lit: was a render region on?"
+                f"the {black_name} is black outside of a rectangle, where the {lit_name} is lit: was a render region "
+                "on?"
             )
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
-    if _shares_noise(hrls):
+    if _has_same_noise(hrls):
         warnings.append(
             "the LRHS has the noise of the HRLS, so fusing can't remove it: an LRHS is rendered at the smaller size "
             "with more spp, and not made by scaling the HRLS down"
@@ -283,18 +283,18 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
         f"the {aov}'s edges are not in the picture: is it this frame's {aov}? (--map {aov}=LAYER says which)"
         for aov in foreign()
     ]
-    scale, grid, found = alignment.scale, alignment.grid, framing()
-    x, y = found.x * scale, found.y * scale
+    scale, grid, difference = alignment.scale, alignment.grid, framing()
+    x, y = difference.x * scale, difference.y * scale
     if max(abs(x), abs(y)) > max(MAX_SHIFT[0], MAX_SHIFT[1] * scale):
         warnings.append(
             f"the HRLS is shifted against the LRHS by {abs(x):.1f} pixels to the {'right' if x > 0 else 'left'} and "
             f"{abs(y):.1f} pixels {'down' if y > 0 else 'up'}: are camera, crop and overscan the same?"
         )
-    if abs(found.zoom_at_edge) > MAX_ZOOM_AT_EDGE:
-        tighter = "HRLS" if found.zoom > 0 else "LRHS"
+    if abs(difference.zoom_at_edge) > MAX_ZOOM_AT_EDGE:
+        tighter = "HRLS" if difference.zoom > 0 else "LRHS"
         warnings.append(
-            f"the {tighter} is framed {100 * abs(found.zoom):.1f} % tighter than the other render: are focal length, "
-            "crop and overscan the same?"
+            f"the {tighter} is framed {100 * abs(difference.zoom):.1f} % tighter than the other render: are focal "
+            "length, crop and overscan the same?"
         )
     if not warnings and (place := _different_place(low, high)) is not None:
         x, y = (start + scale * at for start, at in zip((grid.x0 * scale, grid.y0 * scale), place, strict=True))
@@ -305,39 +305,38 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
     return warnings
 
 
-def _black_beauty(name: str, other: str) -> InputError:
+def _black_beauty(name: str, lit_name: str) -> InputError:
     return InputError(
-        f"{name}: the beauty is black (or NaN) everywhere, while that of {other} is not; "
+        f"{name}: the beauty is black (or NaN) everywhere, while that of {lit_name} is not; "
         "check which layer it is (--map rgb=LAYER)"
     )
 
 
-def _is_region(values: Array, other: Array) -> bool:
-    """Whether a picture (h, w) is black around a rectangle, though the other one is not."""
-    rows, columns = (np.flatnonzero(values.any(axis=axis)) for axis in (1, 0))
-    outside = np.ones(values.shape, np.bool_)
-    # The other render's filter may reach further.
+def _is_region(black: Array, lit: Array) -> bool:
+    """Return whether a picture (h, w) is black around a rectangle where the second one is lit."""
+    rows, columns = (np.flatnonzero(black.any(axis=axis)) for axis in (1, 0))
+    outside = np.ones(black.shape, np.bool_)
+    # The pixel filter of the other render may reach further.
     outside[max(rows[0] - 2, 0) : rows[-1] + 3, max(columns[0] - 2, 0) : columns[-1] + 3] = False
-    lit = np.count_nonzero(other[outside])
-    return bool(lit > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
+    lit_pixels = np.count_nonzero(lit[outside])
+    return bool(lit_pixels > max(MOST_BY_CHANCE, REGION * np.count_nonzero(outside)))
 
 
-def _shares_noise(hrls: HrlsAverages) -> bool:
-    """Whether the LRHS is the HRLS scaled down, by averaging pixels or by keeping some of them."""
+def _has_same_noise(hrls: HrlsAverages) -> bool:
+    """Return whether the LRHS is the HRLS scaled down, by averaging pixels or by keeping some of them."""
     colours, difference, expected = hrls.blocks[..., :6], hrls.blocks[..., 6], hrls.blocks[..., 7]
     brightness = colours.sum(axis=-1) / 6
     noisy = expected * BLOCK**2 > np.square(NOISY * brightness)
     if int(np.count_nonzero(noisy)) < max(MIN_NOISY_BLOCKS, int(np.count_nonzero(brightness)) // 4):
         return False
-    shares = difference[noisy] / expected[noisy]
-    scaled_down = float(np.quantile(shares, 0.75)) < SHARED_NOISE
+    scaled_down = float(np.quantile(difference[noisy] / expected[noisy], 0.75)) < SAME_NOISE
     return scaled_down or hrls.equal_pixels > EQUAL_PIXELS * max(hrls.noisy_pixels, 1)
 
 
 def _log_correlation(hrls: HrlsAverages) -> float:
-    """Pearson correlation of the log brightness of blocks: noise averages out, framing stays.
+    """Return the Pearson correlation of the log brightness of blocks: noise averages out, framing stays.
 
-    1 if there is no framing to compare, because the blocks of either render differ by little more than noise.
+    It is 1 if the blocks of either render differ by little more than noise, so that there is no framing to compare.
     """
     low, high = hrls.blocks[..., :3].sum(axis=-1), hrls.blocks[..., 3:6].sum(axis=-1)
     logs = [np.log(v + 1e-3 * v.mean() + 1e-20).ravel() for v in (low, high)]
@@ -348,8 +347,8 @@ def _log_correlation(hrls: HrlsAverages) -> float:
 
 
 def _brightness_ratio(low: Array, high: Array) -> tuple[float, bool]:
-    """How many times as bright the HRLS is, and whether that is more than noise."""
-    # Fireflies dominate a plain mean. So only pixels count that are not in the brightest percent of either render.
+    """Return by which factor the HRLS is brighter, and whether that is more than noise."""
+    # Fireflies dominate a plain mean, so pixels in the brightest percent of either render do not count.
     lit = (low > 0) | (high > 0)
     ordinary = lit & (low <= quantile(low[lit], 0.99)) & (high <= quantile(high[lit], 0.99))
     low_sums, high_sums = (
@@ -362,11 +361,11 @@ def _brightness_ratio(low: Array, high: Array) -> tuple[float, bool]:
 
 
 def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
-    """Where (x, y), in LRHS pixels, the two pictures differ by more than noise explains; None if nowhere.
+    """Return the place (x, y), in LRHS pixels, where the pictures differ by more than noise; None if there is none.
 
-    A paired t-test for each block: what both pictures show cancels out, and a single firefly has a t of about 1,
-    however bright it is. The mean of t^2 over neighbouring blocks is 1 for noise. A thing that moved stands out from
-    it, and from the frame's median, which a difference of the whole frame raises as well.
+    Each block gets a paired t-test: the picture cancels out, and a single firefly has a t of about 1, however bright it
+    is. The mean of t^2 over neighbouring blocks is 1 for noise. A thing that moved exceeds it, and also the median of
+    the frame, which a difference of the whole frame raises.
     """
     floor = 0.05 * quantile((low + high).ravel(), 0.5)
     means = {size: _block_means(low, high, size) for size in {size for size, _, _ in BLOCK_GROUPS}}
@@ -377,9 +376,9 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
         difference = low_mean - high_mean
         deviation = np.sqrt(np.maximum(difference_square - np.square(difference), 0))
         contrast = np.sqrt(np.maximum(low_square - np.square(low_mean), 0))
-        # Two percent of the brightness do not count, even between renders without noise.
+        # Two percent of the brightness are no difference, even between renders without noise.
         unimportant = 0.02 * ((low_mean + high_mean) / 2 + floor)
-        error = (deviation + FILTER_SHARE * contrast) / size + unimportant
+        error = (deviation + FILTER_FRACTION * contrast) / size + unimportant
         t = np.minimum(np.abs(difference) / np.maximum(error, 1e-30), LARGEST_T)
         groups = np.lib.stride_tricks.sliding_window_view(np.square(t), (side, side))
         scores = groups.mean(axis=(-2, -1))
@@ -391,7 +390,7 @@ def _different_place(low: Array, high: Array) -> tuple[int, int] | None:
 
 
 def _block_means(low: Array, high: Array, size: int) -> NDArray[np.float64]:
-    """Means over blocks of size x size pixels: LRHS, HRLS, square of the LRHS and of the difference, 4 x (h/s, w/s).
+    """Average blocks of size x size pixels: LRHS, HRLS, square of the LRHS and of the difference, 4 x (h/s, w/s).
 
     In double precision, because a squared firefly overflows float32. Incomplete blocks at the end are left out.
     """

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Whether a pixel filter has spread the noise of a pair over neighbouring pixels.
+"""Checks whether a pixel filter has spread the noise of a pair over neighbouring pixels.
 
-Some renderers add each sample to all pixels that the filter reaches. Noise of neighbouring pixels is then alike, and
-denoisers that learnt from independent pixels take it for detail.
+Some renderers add each sample to all pixels that the filter reaches. The noise of neighbouring pixels is then alike,
+and denoisers that learnt from independent pixels take it for detail.
 """
 
 from __future__ import annotations
@@ -16,15 +16,16 @@ from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, read_features, read_lrhs
-from oiio_msspl.image.arrays import Array, box_downsample
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance, find_exposure
 
 #: Side of the blocks in which neighbouring pixels are compared; and of a sample of the frame, in LRHS pixels.
 BLOCK, SAMPLE = 8, 32
 #: Samples along each side of the frame.
 SAMPLES = 3
-#: Blocks with noise that a judgement needs.
+#: The fewest blocks with noise for a judgement.
 FEWEST = 4
 #: Bytes of decoded rows that neighbouring samples share.
 CACHE_BYTES = 256 << 20
@@ -34,14 +35,13 @@ SPREAD_HRLS, SPREAD_DIFFERENCE = 0.15, 0.02
 
 
 def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment) -> bool | None:
-    """Whether the noise of neighbouring pixels is alike in both renders. None if there is hardly any noise, as in a
-    black frame.
+    """Return whether the noise of neighbouring pixels is alike in both renders; None if there is hardly any noise.
 
-    The HRLS alone does not tell: fine texture also makes neighbours alike. Texture is the same in both renders and
-    cancels in the difference of the LRHS and the averaged HRLS, noise does not. So both must correlate. Small samples
-    all over the frame are read.
+    Fine texture in the HRLS also makes neighbours alike. It cancels in the difference of the LRHS and the averaged
+    HRLS, and noise does not. So neighbours must correlate in the HRLS and in this difference. Small samples all over
+    the frame are read.
     """
-    scale, found = alignment.scale, []
+    scale, correlations = alignment.scale, []
     with hr.cache_strips(CACHE_BYTES):
         for window in _samples(alignment.grid):
             low = read_lrhs(lr, alignment, window, [RGB], RepairCounts())[RGB]
@@ -52,15 +52,15 @@ def is_noise_spread(lr: ReadableRender, hr: ReadableRender, alignment: Alignment
                 encode_radiance(luminance(image)[..., None], exposure)[..., 0]
                 for image in (box_downsample(high, scale), low, high)
             )
-            found.append((_correlations(high), _correlations(low - mean)))
-    hrls, difference = (np.concatenate(parts) for parts in zip(*found, strict=True))
+            correlations.append((_correlations(high), _correlations(low - mean)))
+    hrls, difference = (np.concatenate(parts) for parts in zip(*correlations, strict=True))
     if min(len(hrls), len(difference)) < FEWEST:
         return None
     return bool(np.median(hrls) > SPREAD_HRLS and np.median(difference) > SPREAD_DIFFERENCE)
 
 
 def _samples(grid: Window) -> list[Window]:
-    """Squares of at most ``SAMPLE`` pixels, evenly spread over the grid, each once."""
+    """Return different squares of at most ``SAMPLE`` pixels, evenly spread over the grid."""
 
     def starts(first: int, side: int) -> list[int]:
         size = min(SAMPLE, side)
@@ -73,7 +73,7 @@ def _samples(grid: Window) -> list[Window]:
 
 
 def _correlations(image: Array) -> NDArray[np.float64]:
-    """Correlation of neighbouring pixels in each block of an image (h, w), without the block's smooth course."""
+    """Return the correlation of neighbouring pixels in each block of an image (h, w), without its smooth course."""
     rows, columns = (side // BLOCK for side in image.shape)
     blocks = image[: rows * BLOCK, : columns * BLOCK].reshape(rows, BLOCK, columns, BLOCK).swapaxes(1, 2)
     residual = (blocks.reshape(-1, BLOCK**2).astype(np.float64) @ _without_course()).reshape(-1, BLOCK, BLOCK)
@@ -90,7 +90,7 @@ def _neighbours(blocks: NDArray[np.float64]) -> NDArray[np.float64]:
 
 @functools.cache
 def _without_course() -> NDArray[np.float64]:
-    """The matrix that removes the best-fitting quadratic polynomial from a flattened block."""
+    """Return the matrix that removes the best-fitting quadratic polynomial from a flattened block."""
     y, x = (np.mgrid[:BLOCK, :BLOCK] - (BLOCK - 1) / 2).reshape(2, -1)
     basis, _ = np.linalg.qr(np.stack([np.ones_like(x), x, y, x * y, x * x, y * y], axis=1))
     return np.eye(BLOCK**2) - basis @ basis.T
@@ -98,7 +98,7 @@ def _without_course() -> NDArray[np.float64]:
 
 @functools.cache
 def _neighbours_of_white_noise() -> float:
-    """The correlation of neighbours that removing the polynomial gives independent pixels."""
+    """Return the correlation that independent neighbours get when the polynomial is removed."""
     covariance = _without_course().reshape((BLOCK,) * 4)
     i = np.arange(BLOCK - 1)
     across = np.mean([covariance[y, i, y, i + 1] for y in range(BLOCK)])

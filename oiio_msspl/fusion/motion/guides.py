@@ -17,8 +17,8 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
-from oiio_msspl.image.arrays import Array, Mask, box_downsample
-from oiio_msspl.image.filters import sum_3x3
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.filters import box_downsample, sum_3x3
 from oiio_msspl.image.parallel import in_parallel
 
 #: Reads a window of a frame, (h, w, c).

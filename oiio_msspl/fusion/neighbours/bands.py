@@ -9,7 +9,8 @@ from typing import TypeVar
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import mirrored
-from oiio_msspl.image.arrays import Array, box_downsample, upsample_linear
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.filters import box_downsample, upsample_linear
 from oiio_msspl.image.parallel import two_at_a_time
 from oiio_msspl.model.contract import SCALES
 

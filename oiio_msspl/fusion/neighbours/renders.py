@@ -29,8 +29,8 @@ from oiio_msspl.fusion.neighbours.trust import Judge, Light, relative_difference
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
-from oiio_msspl.image.arrays import Array, Mask, blank, interpolate, repair, unload
-from oiio_msspl.image.filters import grown, means_around
+from oiio_msspl.image.arrays import Array, Mask, blank, repair, unload
+from oiio_msspl.image.filters import grown, interpolate, means_around
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
 

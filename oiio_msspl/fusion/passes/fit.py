@@ -12,8 +12,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
-from oiio_msspl.image.arrays import Array, box_downsample, planes_of
-from oiio_msspl.image.filters import blurred
+from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.image.filters import blurred, box_downsample
 from oiio_msspl.image.parallel import for_row_blocks
 
 #: Rows of a band whose weights stay in a core's cache while several planes are averaged.

@@ -37,18 +37,8 @@ from oiio_msspl.fusion.passes.plan import PassJob, plan_passes
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH
-from oiio_msspl.image.arrays import (
-    HALF_MAX,
-    Array,
-    Mask,
-    blank,
-    box_downsample,
-    planes_of,
-    repair,
-    unload,
-    upsample_linear,
-)
-from oiio_msspl.image.filters import blurred, grown, max_3x3
+from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, blank, planes_of, repair, unload
+from oiio_msspl.image.filters import blurred, box_downsample, grown, max_3x3, upsample_linear
 from oiio_msspl.image.parallel import for_row_blocks, half_of_the_threads, in_parallel, one_ahead
 
 T = TypeVar("T", bound=np.generic)

@@ -16,8 +16,8 @@ from oiio_msspl.fusion.passes.fit import downsampled
 from oiio_msspl.fusion.passes.plan import PassJob
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
-from oiio_msspl.image.arrays import Array, box_downsample, filled, planes_of
-from oiio_msspl.image.filters import max_3x3
+from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.image.filters import box_downsample, filled, max_3x3
 
 T = TypeVar("T", bound=np.generic)
 

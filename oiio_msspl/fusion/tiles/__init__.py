@@ -1,2 +1,2 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Tiles of a pair: how both renders align, which features a tile has, and its guards against outliers."""
+"""The tiles of a pair: alignment, cutting, features, guards, and the network that fuses them."""

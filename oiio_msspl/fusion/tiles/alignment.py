@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""How the pixels of a pair lie over each other.
+"""The alignment of a pair: how its pixels lie over each other.
 
 It follows from the display windows: the low-resolution frame shows the same picture with 1/s of the pixels. The data
-windows then say which part of the frame was rendered (overscan, crop region).
+windows say which part of the frame was rendered (overscan, crop region).
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from oiio_msspl.model.contract import SCALES
 
 @dataclass(frozen=True)
 class Alignment:
-    """How the pixels of a pair lie over each other. Windows count from the top left of the display window."""
+    """The position of a pair's pixels over each other. Windows count from the top left of the display window."""
 
     scale: int
     grid: Window
@@ -37,7 +37,7 @@ def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
     the ratio. The pixel aspects are equal, or differ by that ratio, so that both frames have one shape.
 
     Raises:
-        InputError: the inputs are swapped, or their pixel aspects, framing or ratio do not fit.
+        InputError: the inputs are swapped, or their pixel aspects, framing or sizes do not fit.
     """
     low, high = lr.display_window, hr.display_window
     scale = _scale(low, high)
@@ -62,18 +62,14 @@ def align(lr: ReadableRender, hr: ReadableRender) -> Alignment:
 
 
 def _shape(render: ReadableRender) -> float:
-    """Width by height of the frame as it is displayed."""
+    """Return width by height of the frame as it is displayed."""
     return render.display_window.width * render.pixel_aspect / render.display_window.height
 
 
 def _scale(low: Window, high: Window) -> int | None:
-    for s in SCALES:
-        if all(
-            small in (large // s, -(-large // s))
-            for small, large in ((low.width, high.width), (low.height, high.height))
-        ):
-            return s
-    return None
+    sides = (low.width, high.width), (low.height, high.height)
+    fitting = (s for s in SCALES if all(small in (large // s, -(-large // s)) for small, large in sides))
+    return next(fitting, None)
 
 
 def _wrong_ratio(lr: ReadableRender, hr: ReadableRender) -> InputError:

@@ -14,8 +14,8 @@ from oiio_msspl.aovs.features import NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, box_downsample, enlarged, filled, interpolate, repair
-from oiio_msspl.image.filters import max_3x3
+from oiio_msspl.image.arrays import HALF_MAX, Array, Mask, repair
+from oiio_msspl.image.filters import box_downsample, enlarged, filled, interpolate, max_3x3
 
 Indices = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
@@ -23,22 +23,22 @@ T = TypeVar("T", bound=np.generic)
 #: Features that may be negative.
 SIGNED_FEATURES = {NORMAL}
 #: A pixel may be at most this many times as bright as the brightest of the 3 x 3 LRHS pixels around it in the other
-#: render, but for rare light (:mod:`oiio_msspl.fusion.tiles.guards`). The LRHS is the mean of s x s HRLS pixels, so
-#: s^2 would be the exact bound without noise; 64 leaves room for the noise of the LRHS.
+#: render, except for rare light (:mod:`oiio_msspl.fusion.tiles.guards`). The LRHS is the mean of s x s HRLS pixels, so
+#: s^2 would be the exact bound without noise. 64 leaves room for the noise of the LRHS.
 FIREFLY_FACTOR = 64.0
 
 
 @dataclass
 class RepairCounts:
-    """How many values of a render were changed, by feature."""
+    """The numbers of values of a render that were changed, by feature."""
 
     repaired: dict[str, int] = field(default_factory=dict)
     """NaN or infinite."""
     negative: dict[str, int] = field(default_factory=dict)
-    """Negative and set to 0: colours out of gamut, in files that are otherwise sound."""
+    """Negative and set to 0: colours out of gamut."""
 
     def add(self, feature: str, values: Array, changed: Mask) -> None:
-        """Count values; ``changed`` is the mask of :func:`oiio_msspl.image.arrays.repair`."""
+        """Count the changed values of a feature. ``changed`` is the mask of :func:`oiio_msspl.image.arrays.repair`."""
         broken = int(np.count_nonzero(~np.isfinite(values)))
         for counts, count in ((self.repaired, broken), (self.negative, int(np.count_nonzero(changed)) - broken)):
             if count:
@@ -46,7 +46,7 @@ class RepairCounts:
 
 
 @dataclass
-class TilePair:
+class TileFeatures:
     """The features of both renders over one tile."""
 
     lrhs: dict[str, Array]
@@ -63,9 +63,9 @@ class TilePair:
     core: tuple[slice, slice]
     """Rows and columns of ``lrhs`` that the tile contributes and that are inside the alignment's grid."""
     inside: tuple[slice, slice]
-    """Rows and columns of ``lrhs`` that are inside the alignment's grid. The others only fill up the tile's size."""
+    """Rows and columns of ``lrhs`` that are inside the alignment's grid. Others only fill the tile up to its size."""
     hrls_is_lost: bool = False
-    """The HRLS's beauty is broken in all pixels, so it is filled from the LRHS alone."""
+    """All pixels of the HRLS's beauty are broken, so it is filled from the LRHS."""
 
 
 def read_tile(
@@ -76,15 +76,15 @@ def read_tile(
     alignment: Alignment,
     features: Iterable[str],
     counts: RepairCounts,
-) -> TilePair:
+) -> TileFeatures:
     """Read both renders over a tile.
 
-    Where the beauty of one render is broken, it gets the light of the other one.
+    Where the beauty of one render is broken, it gets the light of the other render.
 
     Args:
         lrhs: features of the LRHS over ``grid``, see :func:`read_lrhs`.
         features: names of the HRLS's features to read.
-        counts: repaired values of the HRLS; those of the tile's core are added.
+        counts: gets the numbers of repaired values in the tile's core.
     """
     scale = alignment.scale
     area, core = in_hrls_pixels(tile.area, scale), in_hrls_pixels(tile.core, scale)
@@ -103,7 +103,7 @@ def read_tile(
     if lost_below.any():
         means = box_downsample(hrls[RGB], scale)
         low[RGB] = np.where((lost_below & ~_as_bright(means))[..., None], means, low[RGB])
-    return TilePair(
+    return TileFeatures(
         lrhs=low,
         hrls=hrls,
         scale=scale,
@@ -117,12 +117,12 @@ def read_tile(
 
 
 def _infinite(rgb: Array) -> Mask:
-    """Where pixels (h, w) of a repaired beauty were infinite: as bright as half floats can be."""
+    """Return where pixels (h, w) of a repaired beauty were infinite: as bright as half floats can be."""
     return np.logical_or.reduce([rgb[..., c] == HALF_MAX for c in range(3)])
 
 
 def _as_bright(rgb: Array) -> Mask:
-    """Where pixels of one render (h, w, 3), or those beside them, confirm an infinite pixel of the other one.
+    """Return where the 3 x 3 pixels of one render (h, w, 3) confirm an infinite pixel of the other render.
 
     A lamp that overflows half floats is bright in both renders. A sample or a bucket that failed is not.
     """
@@ -138,16 +138,16 @@ def read_lrhs(
     *,
     exact: bool = False,
 ) -> dict[str, Array]:
-    """Read features of the LRHS over ``grid``, those that it has.
+    """Read features of the LRHS over ``grid``. Features that it lacks are left out.
 
-    Each grid pixel gets the LRHS pixel that is nearest to where its HRLS pixels are in the frame, on average. Where an
-    odd size was rounded, that is off by half an LRHS pixel at most. To interpolate would be exact, but neighbouring
-    pixels would share their noise, and networks take such noise for texture. Behind the last whole LRHS pixel, where
-    the HRLS is mirrored, the LRHS is interpolated.
+    Each grid pixel gets the LRHS pixel that is nearest to the mean position of its HRLS pixels. If an odd size was
+    rounded, that is off by half an LRHS pixel at most. Interpolation would be exact, but neighbouring pixels would
+    share their noise, and networks take such noise for texture. Beyond the last whole LRHS pixel, where the HRLS
+    is mirrored, the LRHS is interpolated.
 
     Args:
-        counts: repaired values are added here.
-        exact: interpolate everywhere, for what compares both renders.
+        counts: gets the numbers of repaired values.
+        exact: interpolate everywhere, for comparisons of both renders.
     """
     data, scale = alignment.lr_data_window, alignment.scale
     hrls_rows, hrls_columns = _mirrored_pixels(in_hrls_pixels(grid, scale), alignment.hr_data_window)
@@ -160,8 +160,10 @@ def read_lrhs(
 
 
 def _lrhs_positions(hrls_pixels: Indices, scale: int, stretch: float, exact: bool) -> NDArray[np.float64]:
-    """Where in the LRHS, in its pixels, the mean of every ``scale`` HRLS pixels of a line is; unless ``exact``, a whole
-    pixel where these are not mirrored."""
+    """Return the mean position of every ``scale`` HRLS pixels, in LRHS pixels.
+
+    Unless ``exact``, positions of pixels that are not mirrored are rounded.
+    """
     groups = hrls_pixels.reshape(-1, scale)
     positions = (groups.mean(axis=1) + 0.5) / scale * stretch - 0.5
     in_place = (groups[:, 0] % scale == 0) & (groups[:, -1] - groups[:, 0] == scale - 1)
@@ -181,13 +183,13 @@ def read_features(
     """Read and repair features over a window. Beyond the data window the picture is mirrored.
 
     Repeating the last pixel would turn its noise into lines, which networks take for texture. Pixels that are NaN or
-    minus infinity are filled from those around (:func:`oiio_msspl.image.arrays.filled`).
+    minus infinity are filled from those around (:func:`oiio_msspl.image.filters.filled`).
 
     Args:
-        window, data_window: both relative to the top left of the display window, as all windows here.
-        features: names of features; all if None. Those that the render lacks are left out.
-        counts: repaired values; those inside ``counted`` are added, because overlaps are read twice.
-        broken: gets a mask (h, w) of the pixels that were filled, for each feature that has some.
+        window, data_window: both relative to the top left of the display window.
+        features: names of features; all if None. Features that the render lacks are left out.
+        counts: gets the numbers of repaired values inside ``counted``. Overlaps of tiles are read twice.
+        broken: gets a mask (h, w) of the filled pixels, for each feature that has some.
     """
     rows, columns = _mirrored_pixels(window, data_window)
     stored = Window(int(columns.min()), int(rows.min()), int(columns.max()) + 1, int(rows.max()) + 1)
@@ -208,16 +210,16 @@ def read_features(
 
 
 def mirrored(image: NDArray[T], inside: Window, window: Window) -> NDArray[T]:
-    """An image (h, w, ...) over ``inside`` at the pixels of another window, mirrored where that reaches beyond."""
+    """Return an image (h, w, ...) over ``inside`` at the pixels of ``window``, mirrored beyond ``inside``."""
     rows, columns = _mirrored_pixels(window, inside)
     return _at(image, rows - inside.y0, columns - inside.x0)
 
 
 def _at(values: NDArray[T], rows: Indices, columns: Indices) -> NDArray[T]:
-    """Some rows and columns of an image (h, w, ...), in the same layout in memory."""
+    """Return some rows and columns of an image (h, w, ...), in its layout in memory."""
     for axis, indices in enumerate((rows, columns)):
         lines = values.swapaxes(0, axis)
-        # Nearly all lines follow each other. To copy these together is faster than to take each one.
+        # Nearly all lines follow each other. Copying these together is faster than taking each one.
         starts = np.flatnonzero(np.diff(indices, prepend=indices[0] - 2) != 1)
         lengths = np.diff(starts, append=len(indices))
         start, length = starts[lengths.argmax()], lengths.max()
@@ -234,8 +236,7 @@ def _at(values: NDArray[T], rows: Indices, columns: Indices) -> NDArray[T]:
 
 
 def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
-    """The rows and the columns of ``inside`` that a window shows if the picture is mirrored at the sides of
-    ``inside``."""
+    """Return the rows and columns of ``inside`` that a window shows if the picture is mirrored at its sides."""
     return (
         _mirrored_line(np.arange(window.y0, window.y1), inside.y0, inside.y1),
         _mirrored_line(np.arange(window.x0, window.x1), inside.x0, inside.x1),
@@ -243,11 +244,12 @@ def _mirrored_pixels(window: Window, inside: Window) -> tuple[Indices, Indices]:
 
 
 def _mirrored_line(pixels: Indices, start: int, stop: int) -> Indices:
-    """The pixels from ``start`` to ``stop`` that these indices show if the line is mirrored at both ends."""
+    """Return the pixels from ``start`` to ``stop`` that indices show if the line is mirrored at both ends."""
     length = stop - start
     offsets = (pixels - start) % (2 * length)
     return start + np.minimum(offsets, 2 * length - 1 - offsets)
 
 
 def in_hrls_pixels(window: Window, scale: int) -> Window:
+    """Return a window of LRHS pixels in HRLS pixels."""
     return Window(window.x0 * scale, window.y0 * scale, window.x1 * scale, window.y1 * scale)

@@ -1,6 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Guards around the network: fireflies are dimmed, lights stay whole, empty regions stay empty, noise-free tiles pass
-through."""
+"""Guards around the network.
+
+Fireflies are dimmed, lights keep their brightness, empty regions stay empty, and tiles without noise skip the network.
+"""
 
 from __future__ import annotations
 
@@ -13,47 +15,45 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TilePair
-from oiio_msspl.image.arrays import Array, Mask, box_downsample
-from oiio_msspl.image.filters import all_within, grown, max_3x3, neighbours
+from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TileFeatures
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, neighbours
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 
 T = TypeVar("T", bound=np.generic)
 
-#: LRHS pixels on a side of the squares in which rare light is looked for, and the share of their pixels that it reaches
-#: at most. What reaches more is a surface or a lamp.
+#: LRHS pixels on a side of the squares in which rare light is looked for, and the largest fraction of their pixels that
+#: it reaches. Light that reaches more is a surface or a lamp.
 _SQUARE, _RARE = 8, 0.25
-#: A tile has no noise to remove if its renders differ nowhere by more than this, log-encoded: half a step of an 8-bit
-#: picture.
+#: A tile has no noise if its renders differ nowhere by more than this, log-encoded: half a code of an 8-bit picture.
 NOISE_FREE = 1 / 512
-#: Exposed radiance above which light that both renders show is that of the HRLS. Noise is hardly ever so bright in
+#: Exposed radiance above which light that both renders show is taken from the HRLS. Noise is hardly ever so bright in
 #: both. At a quarter of this, one of 38 rendered views has a firefly that would pass.
 LIGHT = 4096.0
 
 
-def dim_fireflies(pair: TilePair) -> tuple[Array, dict[str, Array]]:
-    """Limit the brightness of both renders to what the other one allows.
+def dim_fireflies(tile: TileFeatures) -> tuple[Array, dict[str, Array]]:
+    """Limit the brightness of each render by the other one.
 
     Returns:
-        The LRHS's colour (h, w, 3), and the HRLS's features with its radiance limited.
+        The LRHS's colour (h, w, 3), and the HRLS's features, both with limited radiance.
     """
-    lrhs_rgb, hrls = pair.lrhs[RGB], pair.hrls
-    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], pair.scale), pair)
-    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb, pair), pair.scale)
-    dimmed = {name: _limit(hrls[name], hrls_limit, pair.scale) for name in RADIANCE_FEATURES if name in hrls}
+    lrhs_rgb, hrls = tile.lrhs[RGB], tile.hrls
+    lrhs_limit = _brightness_limit(box_downsample(hrls[RGB], tile.scale), tile)
+    hrls_limit = _as_wide_as_hrls(_brightness_limit(lrhs_rgb, tile), tile.scale)
+    dimmed = {name: _limit(hrls[name], hrls_limit, tile.scale) for name in RADIANCE_FEATURES if name in hrls}
     return np.minimum(lrhs_rgb, lrhs_limit), hrls | dimmed
 
 
 def _as_wide_as_hrls(limit: Array, scale: int) -> Array:
-    """(h, w, c) to (h, s*w, c). Each channel is contiguous, as in the HRLS: NumPy then compares them three times as
-    fast."""
+    """Repeat columns: (h, w, c) to (h, s*w, c). Contiguous channels make NumPy's comparisons three times as fast."""
     return limit.transpose(2, 0, 1).repeat(scale, axis=2).transpose(1, 2, 0)
 
 
 def _limit(hrls: Array, limit: Array, scale: int) -> Array:
-    """HRLS values (s*h, s*w, c), at most the limit (h, s*w, c) of their LRHS pixel."""
+    """Limit HRLS values (s*h, s*w, c) to the limit (h, s*w, c) of their LRHS pixel."""
     result = np.empty_like(hrls)
 
     def work(rows: slice) -> None:
@@ -66,14 +66,14 @@ def _limit(hrls: Array, limit: Array, scale: int) -> Array:
 
 
 def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | None:
-    """The colour of pixels with radiance above ``LIGHT`` divided by the exposure, where both renders have it.
+    """Return the colour of pixels with radiance above ``LIGHT`` divided by the exposure, where both renders have it.
 
     Networks average log-encoded radiance, which is clipped for them. So a lamp of a few pixels would lose most of its
-    light, and its rim would be too bright. It is as bright as in the HRLS, and at most as bright as the brightest of
-    the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter than that. The LRHS then
+    light, and its rim would be too bright. Instead, a lamp is as bright as in the HRLS, and at most as bright as the
+    brightest of the 3 x 3 LRHS pixels around. A light that is smaller than an LRHS pixel may be brighter. The LRHS then
     has more light than the clipped HRLS, and the difference is spread over the clipped pixels: evenly, or in the
-    proportions of the HRLS, whichever gives a pixel more. Pixel filters move light between neighbours, so both are
-    counted over 3 x 3 LRHS pixels. A pixel that is more than twice as bright as the clipped pixels are on average is a
+    proportions of the HRLS, whichever gives a pixel more. Pixel filters move light between neighbours, so the light is
+    counted over 3 x 3 LRHS pixels. A pixel that is more than twice as bright as the clipped pixels on average is a
     firefly in a lamp. The light around it is spread evenly.
 
     Args:
@@ -86,17 +86,17 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     if hrls_rgb.max() <= least:
         return None
     scale = len(hrls_rgb) // len(lrhs_rgb)
-    clipped_share = box_downsample((hrls_rgb > least).astype(np.float32), scale)
+    coverage = box_downsample((hrls_rgb > least).astype(np.float32), scale)
     clipped = box_downsample(np.minimum(hrls_rgb, least), scale)
     with np.errstate(over="ignore", invalid="ignore"):  # a limit that overflows is no limit
         excesses = [np.maximum(mean - clipped, 0) for mean in (lrhs_rgb, box_downsample(hrls_rgb, scale))]
-        light, own, share = (reduce(np.add, neighbours(values)) for values in (*excesses, clipped_share))
-        even = least + light / np.maximum(share, np.float32(1 / scale**2))
+        light, hrls_light, covered = (reduce(np.add, neighbours(values)) for values in (*excesses, coverage))
+        even = least + light / np.maximum(covered, np.float32(1 / scale**2))
         limit = np.maximum(max_3x3(lrhs_rgb), even)
-        factor = np.nan_to_num(np.minimum(light / np.maximum(own, np.float32(1e-30)), 1))
+        factor = np.nan_to_num(np.minimum(light / np.maximum(hrls_light, np.float32(1e-30)), 1))
         blocks = hrls_rgb.reshape(len(lrhs_rgb), scale, -1, scale, 3)
-        factor[(max_3x3(blocks.max(axis=(1, 3))) - least) * share > 2 * own] = 0
-        # In its own LRHS pixel there must be light too, or it is a firefly beside a lamp.
+        factor[(max_3x3(blocks.max(axis=(1, 3))) - least) * covered > 2 * hrls_light] = 0
+        # The LRHS pixel must have light, too. Otherwise the HRLS pixel is a firefly beside a lamp.
         most = lrhs_rgb * np.float32(FIREFLY_FACTOR)
     agreed = np.empty_like(hrls_rgb)
 
@@ -111,25 +111,25 @@ def bright_lights(lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> Array | 
     return agreed
 
 
-def _brightness_limit(rgb: Array, pair: TilePair) -> Array:
-    """The largest values that the other render may have, (h, w, 3): none where this render is black.
+def _brightness_limit(rgb: Array, tile: TileFeatures) -> Array:
+    """Return the largest values that the other render may have, (h, w, 3): infinity where this render is black.
 
-    Where few samples find the light, all 3 x 3 pixels around may have missed it. So light that is rare, but in most
-    squares of pixels around, counts, too. A single sample of it may be s^2 times as bright as the mean of s x s.
+    Where few samples find the light, all 3 x 3 pixels around may have missed it. So rare light counts, too, if it is in
+    most squares of pixels around. One sample of it may be s^2 times as bright as the mean of s x s samples.
     """
     brightest = max_3x3(rgb)
     with np.errstate(over="ignore"):  # a limit that overflows is no limit
         limit = brightest * np.float32(FIREFLY_FACTOR)
-        rare = _rare_light(rgb, pair.lrhs_area.y0 % _SQUARE, pair.lrhs_area.x0 % _SQUARE)
-        limit = np.where(rare > limit, rare * np.float32(pair.scale**2), limit)
+        rare = _rare_light(rgb, tile.lrhs_area.y0 % _SQUARE, tile.lrhs_area.x0 % _SQUARE)
+        limit = np.where(rare > limit, rare * np.float32(tile.scale**2), limit)
         return np.where(brightest > 0, limit, np.float32(np.inf))
 
 
 def _rare_light(rgb: Array, top: int, left: int) -> Array:
-    """How bright the light is that reaches a few pixels in most of the 3 x 3 squares around each pixel, (h, w, 3).
+    """Return the brightness of light that reaches a few pixels in most of the 3 x 3 squares around, (h, w, 3).
 
     Args:
-        top, left: rows and columns that the first square begins before the tile, so that tiles have the same squares.
+        top, left: rows and columns of the first square that lie before the tile, so that tiles have equal squares.
     """
     height, width, channels = rgb.shape
     rows, columns = (-(-side // _SQUARE) for side in (top + height, left + width))
@@ -148,29 +148,26 @@ def _rare_light(rgb: Array, top: int, left: int) -> Array:
     return light[inside].transpose(1, 2, 0)
 
 
-def is_noise_free(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
-    """Whether the two renders of a tile agree so well that there is no noise to remove.
+def is_noise_free(tile: TileFeatures, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:
+    """Return whether the two renders of a tile agree so well that there is no noise to remove.
 
     Args:
         lrhs_rgb, hrls_rgb: their colour, scene linear.
     """
     # A few rows are enough to find noise; all rows are read only if these have none.
-    return all(_largest_difference(pair, lrhs_rgb, hrls_rgb, exposure, step) <= NOISE_FREE for step in (32, 1))
+    return all(_largest_difference(tile, lrhs_rgb, hrls_rgb, exposure, nth) <= NOISE_FREE for nth in (32, 1))
 
 
-def _largest_difference(pair: TilePair, lrhs_rgb: Array, hrls_rgb: Array, exposure: float, step: int) -> float:
-    """Largest log-encoded difference of the renders inside the grid, in one of ``step`` LRHS rows."""
-    rows = hrls_rgb.reshape(-1, pair.scale, *hrls_rgb.shape[1:])[pair.inside[0]][::step]
-    means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), pair.scale)
-    one, other = means[:, pair.inside[1]], lrhs_rgb[pair.inside][::step]
-    return float(np.abs(encode_radiance(one, exposure) - encode_radiance(other, exposure)).max())
+def _largest_difference(tile: TileFeatures, lrhs_rgb: Array, hrls_rgb: Array, exposure: float, nth: int) -> float:
+    """Return the largest log-encoded difference of the renders inside the grid, in every n-th LRHS row."""
+    rows = hrls_rgb.reshape(-1, tile.scale, *hrls_rgb.shape[1:])[tile.inside[0]][::nth]
+    means = box_downsample(rows.reshape(-1, *hrls_rgb.shape[1:]), tile.scale)
+    high, low = means[:, tile.inside[1]], lrhs_rgb[tile.inside][::nth]
+    return float(np.abs(encode_radiance(high, exposure) - encode_radiance(low, exposure)).max())
 
 
 def check_finite(session: Session, *images: Array) -> None:
-    """Raise MssplError if the output of a network, whose input is always finite, is not.
-
-    A frame with repaired holes would look finished.
-    """
+    """Raise MssplError if an output of a network is not finite. A frame with repaired holes would look finished."""
     if not all(np.isfinite(image).all() for image in images):
         raise MssplError(
             f"{session.contract.name} on {session.provider} returned NaN or infinite values, so this frame is not "
@@ -178,61 +175,61 @@ def check_finite(session: Session, *images: Array) -> None:
         )
 
 
-#: LRHS pixels around a surface that are black where it becomes black: as far as networks look.
+#: A surface becomes black if this many LRHS pixels around are black. Networks look as far.
 FAR = 15
-#: HRLS pixels around a surface over which a layer without light makes it black. Black layers are common, and a network
+#: A surface becomes black in a pass if this many HRLS pixels around are black. Black passes are common, and a network
 #: leaves a trace of light in them.
 LAYER_REACH = 16
 
 
 class EmptyRegions:
-    """Where neither render has any light, not even around: the result is black there, and a transparent film stays
-    empty.
+    """The regions where neither render has light, and that become black, so that a transparent film stays empty.
 
-    A dark surface may have no lit sample near. So a pixel that shows a surface is empty only where both renders are
-    black far around: a network spreads the light of a single sample that far, and black pixels in it would be holes.
+    A pixel is empty if it and the 3 x 3 LRHS pixels around are black. A dark surface may have no lit sample near, and a
+    network spreads the light of a single sample far. So a pixel that shows a surface is empty only if both renders are
+    black over ``reach`` pixels around. Otherwise the result would have black holes.
 
-    The same holds for layers where light is rare. Few samples find a lamp that is out of focus, and the others find
-    the empty background behind it. If the lamp's layer were black there, the light that the beauty has would go to
-    other layers. In a beauty, rare light in front of an empty background is more often that of stars, and the space
-    between them stays black.
+    In a pass, this also holds without a surface where light is rare. Few samples find a lamp that is out of focus, and
+    the others find the empty background behind it. If the pass of the lamp were black there, its light in the beauty
+    would go to other passes. In a beauty, rare light before an empty background is more often that of stars, and the
+    space between them stays black.
 
     Args:
         lrhs_rgb: the whole LRHS (h, w, 3).
-        reach: how far, in LRHS pixels. Tiles that overlap by less may differ at their borders.
-        of_layer: whether the pair shows a layer.
+        reach: in LRHS pixels. Tiles that overlap by less may differ at their borders.
+        of_pass: the renders show a pass in place of the beauty.
     """
 
-    def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_layer: bool = False) -> None:
+    def __init__(self, lrhs_rgb: Array, reach: int = FAR, *, of_pass: bool = False) -> None:
         self._reach = reach
         self._black = _is_zero(lrhs_rgb)
         self._black_far_around = all_within(self._black, reach) if self._black.any() else self._black
         self._has_rare_light = np.zeros_like(self._black)
-        if of_layer and self._black.any():
+        if of_pass and self._black.any():
             light = reduce(np.maximum, (lrhs_rgb[..., c : c + 1] for c in range(3)))
             self._has_rare_light = grown(_rare_light(light, 0, 0) > 0, _SQUARE)
 
-    def mask(self, pair: TilePair, window: tuple[slice, slice]) -> Mask | None:
-        """Empty HRLS pixels of a tile, (s*h, s*w, 1); None if there are none.
+    def mask(self, tile: TileFeatures, window: tuple[slice, slice]) -> Mask | None:
+        """Return the empty HRLS pixels of a tile, (s*h, s*w, 1); None if no LRHS pixel is black.
 
         Args:
             window: rows and columns of the tile's area in the whole LRHS.
         """
         if not self._black[window].any():
             return None
-        black = _is_zero(pair.hrls[RGB])
-        empty = _holds_around(self._black[window], black, pair.scale)
-        no_surface = _shows_no_surface(pair.hrls) & ~repeated(self._has_rare_light[window], pair.scale)
+        black = _is_zero(tile.hrls[RGB])
+        empty = _holds_around(self._black[window], black, tile.scale)
+        no_surface = _shows_no_surface(tile.hrls) & ~repeated(self._has_rare_light[window], tile.scale)
         far = self._black_far_around[window]
         if far.any():
-            blocks = black.reshape(len(far), pair.scale, -1, pair.scale, 1)
+            blocks = black.reshape(len(far), tile.scale, -1, tile.scale, 1)
             far = far & all_within(np.logical_and.reduce(blocks, axis=(1, 3)), self._reach)
-        empty &= no_surface | repeated(far, pair.scale)
+        empty &= no_surface | repeated(far, tile.scale)
         return empty
 
 
 def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
-    """The smallest rectangle with all pixels that are not black, and ``margin`` pixels around; None if all are.
+    """Return the smallest rectangle around all lit pixels, ``margin`` pixels wider on each side; None if none is lit.
 
     Args:
         rgb: (h, w, 3) over ``window``.
@@ -247,23 +244,23 @@ def lit_window(rgb: Array, window: Window, margin: int) -> Window | None:
 
 
 def _holds_around(lrhs: Mask, hrls: Mask, scale: int) -> Mask:
-    """Where something holds for an HRLS pixel (s*h, s*w, 1) and for the 3 x 3 LRHS pixels (h, w, 1) around it."""
+    """Return where a mask of HRLS pixels (s*h, s*w, 1) and all 3 x 3 LRHS pixels (h, w, 1) around are true."""
     return repeated(reduce(np.logical_and, neighbours(lrhs)), scale) & hrls
 
 
 def repeated(lrhs: NDArray[T], scale: int) -> NDArray[T]:
-    """(h, w, c) to (s*h, s*w, c): each pixel becomes s x s equal ones."""
+    """Repeat each pixel s x s times: (h, w, c) to (s*h, s*w, c)."""
     return lrhs.repeat(scale, axis=0).repeat(scale, axis=1)
 
 
 def _is_zero(values: Array) -> Mask:
-    """Where all channels of an image (h, w, c) are 0, (h, w, 1)."""
-    # NumPy is slow to reduce an axis as short as that of the channels.
+    """Return where all channels of an image (h, w, c) are 0, (h, w, 1)."""
+    # NumPy reduces short axes, such as that of the channels, slowly.
     return reduce(np.logical_and, (values[..., c : c + 1] == 0 for c in range(values.shape[-1])))
 
 
 def _shows_no_surface(hrls: dict[str, Array]) -> Mask:
-    """Where alpha or normal is zero, or the albedo if there are neither, (h, w, 1); everywhere without any of these."""
+    """Return where alpha or normal is 0, or the albedo if there are neither; everywhere if there is none of these."""
     names = [name for name in ("alpha", NORMAL) if name in hrls] or [name for name in (ALBEDO,) if name in hrls]
     signs = [_is_zero(hrls[name]) for name in names]
     return reduce(np.logical_or, signs) if signs else np.ones((*hrls[RGB].shape[:2], 1), dtype=bool)

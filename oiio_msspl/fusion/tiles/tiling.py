@@ -1,31 +1,35 @@
 # SPDX-License-Identifier: Apache-2.0
 """Cuts a frame into overlapping tiles, so that memory depends on the tile and not on the frame.
 
-The tiles depend on the model and on the size of the frame, and those of a pass on where it has light, but never on
-memory. A network sees only a part of the frame in each tile, so other tiles would give slightly other pixels. Frames of
-one shot must not differ because machines have more or less memory.
+Tiles depend on the model and on the size of the frame, and those of a pass also on where it has light. They never
+depend on memory: a network sees only a part of the frame in each tile, so other tiles give slightly other pixels, and
+frames of one shot must not differ because machines have more or less memory.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
+from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.model.contract import Contract
 
-#: Memory that a run may use by default.
+#: Bytes that a process may use by default.
 MAX_MEMORY = 3 << 30
-#: Memory that does not grow with the frame: interpreter, libraries, weights.
+#: Bytes that do not grow with the frame: interpreter, libraries, weights.
 FIXED_MEMORY = 350 << 20
-#: Share of the memory for decoded rows that neighbouring tiles read. ``bytes_per_pixel`` of a model leaves room for it.
-STRIPS_SHARE = 1 / 6
-#: Memory of a tile. It is as large as ``MAX_MEMORY`` allows beside an 8K frame. Other tiles give other pixels, so this
-#: does not depend on what the user allows.
+#: Fraction of the memory for decoded rows that neighbouring tiles read. ``bytes_per_pixel`` of a model includes it.
+STRIPS_FRACTION = 1 / 6
+#: Most bytes of a tile: what ``MAX_MEMORY`` leaves beside an 8K frame. Other tiles give other pixels, so this does not
+#: depend on the memory that the user allows.
 TILE_MEMORY = 1720 << 20
+#: Memory is estimated from the tiles of this many LRHS pixels on a side. Larger frames have no larger tiles, and a
+#: damaged header may claim millions of them.
+_LARGEST_SIDE = 16384
 #: Bands of rows that :func:`sample_bands` spreads over a frame.
 SAMPLE_BANDS = 8
 
@@ -40,6 +44,11 @@ class Tile:
     """The pixels that the network reads: the core plus the overlap, cut at the borders of the grid."""
 
 
+def network_grid(alignment: Alignment, contract: Contract) -> Window:
+    """Return the LRHS pixels that a network reads: those of the frame, extended to a size that the network takes."""
+    return aligned_grid(alignment.grid, contract.alignment)
+
+
 def aligned_grid(grid: Window, alignment: int) -> Window:
     """Extend ``grid`` to the right and to the bottom until its sides are multiples of ``alignment``."""
     width, height = (-(-side // alignment) * alignment for side in (grid.width, grid.height))
@@ -49,18 +58,18 @@ def aligned_grid(grid: Window, alignment: int) -> Window:
 def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> list[Tile]:
     """Cover ``grid`` by tiles of at most ``TILE_MEMORY``, row by row, so that the network computes the fewest pixels.
 
-    There is no overlap at the borders of the grid: the network sees the end of the picture there, as in training.
-    The offsets of all tiles are multiples of the contract's alignment, so that a network that works on blocks of
-    pixels divides a tile as it divides the frame.
+    No tile reaches beyond the grid: the network sees the end of the picture there, as in training. The offsets of all
+    tiles are multiples of the contract's alignment, so that a network that works on blocks of pixels divides a tile as
+    it divides the frame.
 
     Args:
-        part: the part of the grid that is to be covered, which the tiles may exceed; None for all of it.
+        part: cover only this part of the grid, which the tiles may exceed; None for all of it.
     """
     alignment = contract.alignment
     overlap = -(-contract.overlap // alignment) * alignment
     largest = TILE_MEMORY // (contract.bytes_per_pixel * contract.scale**2)
     part = grid if part is None else _aligned_part(part, grid, alignment)
-    # The fewest pixels that are computed, in the fewest tiles; where even the smallest tile is too large, that one.
+    # The smallest tile is taken if it exceeds the memory, too. Then the fewest pixels count, then the fewest tiles.
     columns, rows = min(
         itertools.product(
             _splits((part.x0, part.x1), (grid.x0, grid.x1), overlap, alignment),
@@ -80,8 +89,7 @@ def plan_tiles(grid: Window, contract: Contract, part: Window | None = None) -> 
 
 
 def _aligned_part(part: Window, grid: Window, alignment: int) -> Window:
-    """Extend a part of a grid until its offset in the grid and its size are multiples of ``alignment``, or it ends with
-    the grid."""
+    """Extend a part of a grid to multiples of ``alignment``, or to the end of the grid."""
     x0, y0 = (
         (start - first) // alignment * alignment + first for start, first in ((part.x0, grid.x0), (part.y0, grid.y0))
     )
@@ -90,7 +98,7 @@ def _aligned_part(part: Window, grid: Window, alignment: int) -> Window:
 
 
 def sample_bands(grid: Window, scale: int) -> list[Window]:
-    """Bands of rows, evenly spread over ``grid``, from which the whole frame is judged before its tiles are read.
+    """Return bands of rows, evenly spread over ``grid``, from which a frame is judged before its tiles are read.
 
     They are as wide as the grid, because EXR files store whole rows, often in blocks of 16.
     """
@@ -100,23 +108,43 @@ def sample_bands(grid: Window, scale: int) -> list[Window]:
     return [Window(grid.x0, top, grid.x1, top + rows) for top in tops]
 
 
-def memory_for_tiles(contract: Contract, tiles: Sequence[Tile], frame_bytes: int) -> int:
-    """Memory of a process that fuses a frame in these tiles.
+def tile_count(alignment: Alignment, contract: Contract) -> int:
+    """Return the number of tiles of a frame."""
+    return len(plan_tiles(network_grid(alignment, contract), contract))
 
-    Args:
-        frame_bytes: memory for the whole frame: the result, the LRHS, and what the caller holds.
-    """
-    pixels = max(tile.area.width * tile.area.height for tile in tiles) * contract.scale**2
-    return FIXED_MEMORY + frame_bytes + pixels * contract.bytes_per_pixel
+
+def tile_bytes(alignment: Alignment, contract: Contract) -> int:
+    """Return the bytes of the largest tile of a frame, with the network's intermediate results."""
+    grid = network_grid(alignment, contract)
+    corner = grid.intersect(Window(grid.x0, grid.y0, grid.x0 + _LARGEST_SIDE, grid.y0 + _LARGEST_SIDE))
+    pixels = max(tile.area.width * tile.area.height for tile in plan_tiles(corner, contract))
+    return pixels * contract.scale**2 * contract.bytes_per_pixel
+
+
+def lrhs_bytes(alignment: Alignment, contract: Contract) -> int:
+    """Return the bytes of the LRHS in memory, with all features that the model may read."""
+    grid = network_grid(alignment, contract)
+    return grid.width * grid.height * (3 * len(contract.lrhs) + 1) * 4  # alpha has 1 channel, other features have 3
+
+
+def result_bytes(alignment: Alignment, *, error: bool) -> int:
+    """Return the bytes of a fused frame in float32: colour, alpha (even if there is none), perhaps the error."""
+    return alignment.hr_data_window.width * alignment.hr_data_window.height * (5 if error else 4) * 4
+
+
+def memory_to_fuse(alignment: Alignment, contract: Contract, *, error: bool) -> int:
+    """Return the smallest ``max_memory`` with which a frame can be fused, from its headers."""
+    frame = result_bytes(alignment, error=error) + lrhs_bytes(alignment, contract)
+    return FIXED_MEMORY + frame + tile_bytes(alignment, contract)
 
 
 def strips_memory(max_memory: int, held: int) -> int:
-    """Bytes for decoded rows that neighbouring tiles or bands read, beside ``held`` bytes."""
-    return max(0, int((max_memory - held) * STRIPS_SHARE))
+    """Return the bytes for decoded rows that neighbouring tiles or bands read, beside ``held`` bytes."""
+    return max(0, int((max_memory - held) * STRIPS_FRACTION))
 
 
 def require_memory(needed: int, contract: Contract, max_memory: int, hint: str = "") -> None:
-    """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else would help."""
+    """Raise InputError if a frame needs more than ``max_memory``; ``hint`` says what else helps."""
     if needed > max_memory:
         raise InputError(
             f"--max-memory: this frame needs more with model {contract.name}; allow at least "
@@ -136,11 +164,13 @@ class _Split:
 
 
 def _splits(side: tuple[int, int], grid: tuple[int, int], overlap: int, alignment: int) -> Iterator[_Split]:
-    """All ways to cut a side, from start to end, into equal steps that are multiples of ``alignment``; the last one may
-    be shorter. ``grid``: start and end of the grid's side."""
+    """Yield all ways to cut a side (start, end) of the ``grid`` into equal multiples of ``alignment``.
+
+    The last range may be shorter.
+    """
     start, end = side
     units = -(-(end - start) // alignment)
-    for step in sorted({-(-units // count) * alignment for count in range(1, units + 1)}):
-        cores = [(a, min(a + step, end)) for a in range(start, end, step)]
+    for length in sorted({-(-units // count) * alignment for count in range(1, units + 1)}):
+        cores = [(a, min(a + length, end)) for a in range(start, end, length)]
         lengths = [min(b + overlap, grid[1]) - max(a - overlap, grid[0]) for a, b in cores]
         yield _Split(cores, max(lengths), sum(lengths))

@@ -12,8 +12,9 @@ import OpenImageIO as oiio
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.compare import error_map
 from oiio_msspl.exr.preview import write_png
-from oiio_msspl.image.arrays import Array, box_downsample
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import find_exposure
 from research.benchmarks.results import Row
 from research.benchmarks.stability.cases import Case

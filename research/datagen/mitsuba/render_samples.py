@@ -23,7 +23,7 @@ from pathlib import Path
 
 import numpy as np
 
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from research.datagen import command_line, quality, samples, views
 from research.datagen.mitsuba.start import VARIANT, start
 

@@ -10,8 +10,8 @@ from oiio_msspl.fusion.checks.pair import HrlsAverages, check_renders
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
-from oiio_msspl.image.arrays import interpolate
 from oiio_msspl.image.colour import ACES2065, ACESCG, REC709, conversion, luminance
+from oiio_msspl.image.filters import interpolate
 from tests.conftest import downsample, noisy
 
 #: Height and width of the LRHS.

@@ -7,7 +7,7 @@ import pytest
 from oiio_msspl import Render
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from tests.conftest import noisy, picture, spread
 
 

@@ -11,7 +11,7 @@ from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.neighbours import bands
 from oiio_msspl.fusion.neighbours.average import average_renders as average
 from oiio_msspl.fusion.neighbours.renders import RenderPair, shared_noise
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.parallel import limit_threads
 from tests.conftest import rgb, write_exr
 from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, hop, moved, rms, still, texture

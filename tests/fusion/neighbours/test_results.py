@@ -14,8 +14,8 @@ from oiio_msspl.fusion.neighbours import bands
 from oiio_msspl.fusion.neighbours.average import average_results
 from oiio_msspl.fusion.neighbours.trust import relative_difference
 from oiio_msspl.fusion.tiles.alignment import align
-from oiio_msspl.image.arrays import box_downsample
 from oiio_msspl.image.colour import luminance
+from oiio_msspl.image.filters import box_downsample
 from tests.fusion.motion.moving_texture import HEIGHT, SCALE, WIDTH, hop, moved, rms, still, texture
 
 #: Deviation of the error of a fused frame, as a share of its light, and of a sample's noise.

@@ -11,12 +11,14 @@ from numpy.lib.stride_tricks import sliding_window_view
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import ExrFile, open_exr
-from oiio_msspl.fusion.fuse import _Pair, fuse, layer_fuser
+from oiio_msspl.fusion.fuse import fuse
 from oiio_msspl.fusion.passes import fuse as passes
 from oiio_msspl.fusion.passes.fuse import _make_sum, fuse_passes, pass_steps
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.fusion.tiles.alignment import align
+from oiio_msspl.fusion.tiles.network import layer_fuser
+from oiio_msspl.fusion.tiles.prepare import FramePair
 from oiio_msspl.jobs import settings
 from oiio_msspl.model.catalogue import load_model
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
@@ -297,7 +299,7 @@ def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_
     )
     for whole in (False, True):
         if whole:
-            monkeypatch.setattr(_Pair, "_lit_part", lambda *_: None)
+            monkeypatch.setattr(FramePair, "_lit_part", lambda *_: None)
         fuser = layer_fuser(session, beauty)
         result = fuse_passes(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, fuse_layers=fuser)
         channels = result.sets[0].layers[1].channels
@@ -660,8 +662,8 @@ def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeyp
     monkeypatch.setattr("oiio_msspl.fusion.passes.fuse.BAND_ROWS", 16)
     decode, decoded, results = ExrFile._decode, [], []
     monkeypatch.setattr(ExrFile, "_decode", lambda *given: decoded.append(given) or decode(*given))
-    for share in (tiling.STRIPS_SHARE, 0):
-        monkeypatch.setattr(tiling, "STRIPS_SHARE", share)
+    for share in (tiling.STRIPS_FRACTION, 0):
+        monkeypatch.setattr(tiling, "STRIPS_FRACTION", share)
         fuse_files(*pair, tmp_path / "out.exr", model=str(bilinear_models[4]), overwrite=True)
         results.append((read_bits(tmp_path / "out.exr"), len(decoded)))
         decoded.clear()

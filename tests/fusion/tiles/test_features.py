@@ -7,7 +7,7 @@ from oiio_msspl.exr.render import Render, Window
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.features import mirrored, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile, aligned_grid
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.encoding import encode_radiance
 from oiio_msspl.model.session import Session
 from tests.conftest import downsample, noisy, picture

@@ -6,7 +6,7 @@ import pytest
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.tiles.features import TilePair
+from oiio_msspl.fusion.tiles.features import TileFeatures
 from oiio_msspl.fusion.tiles.guards import FIREFLY_FACTOR, EmptyRegions, _rare_light, dim_fireflies
 
 
@@ -18,7 +18,7 @@ def tile(lrhs, hrls, scale=2):
         Window(0, 0, scale * size, scale * size),
         (slice(0, size), slice(0, size)),
     )
-    return TilePair({RGB: lrhs}, hrls, scale, area, whole, whole, pixels, pixels)
+    return TileFeatures({RGB: lrhs}, hrls, scale, area, whole, whole, pixels, pixels)
 
 
 @pytest.mark.parametrize("feature", RADIANCE_FEATURES)
@@ -68,7 +68,7 @@ def test_a_layer_with_rare_light_has_no_holes():
     low, high = np.zeros((64, 64, 3), np.float32), np.zeros((128, 128, 3), np.float32)
     low[::8, :32:8], high[::16, :64:16] = 1.0, 1.0
     pair, whole = tile(low, {RGB: high, NORMAL: np.zeros_like(high)}), (slice(0, 64), slice(0, 64))
-    beauty, layer = (EmptyRegions(low, 7, of_layer=of_layer).mask(pair, whole) for of_layer in (False, True))
+    beauty, layer = (EmptyRegions(low, 7, of_pass=of_pass).mask(pair, whole) for of_pass in (False, True))
     assert beauty[:, :48].mean() > 0.5 and not layer[:, :48].any()
     assert layer[:, 112:].all()
 

@@ -7,7 +7,15 @@ import pytest
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles import tiling
-from oiio_msspl.fusion.tiles.tiling import aligned_grid, memory_for_tiles, plan_tiles, require_memory, sample_bands
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.tiling import (
+    FIXED_MEMORY,
+    aligned_grid,
+    plan_tiles,
+    require_memory,
+    sample_bands,
+    tile_bytes,
+)
 from oiio_msspl.model.catalogue import shipped_models
 from oiio_msspl.model.contract import Contract
 
@@ -16,6 +24,12 @@ GRIDS = [Window(0, 0, 480, 270), Window(-7, 3, 90, 400), Window(0, 0, 1, 1)]
 
 def contract_of(alignment, overlap):
     return Contract(name="test", scale=2, alignment=alignment, overlap=overlap, bytes_per_pixel=100)
+
+
+def whole_frame(contract, width, height):
+    """The alignment of a pair whose LRHS has this size."""
+    low, scale = Window(0, 0, width, height), contract.scale
+    return Alignment(scale, low, low, Window(0, 0, width * scale, height * scale))
 
 
 @pytest.mark.parametrize("grid", GRIDS)
@@ -76,13 +90,12 @@ def test_overlaps_cost_little_and_the_default_memory_suffices(name, size, cost):
     tiles = plan_tiles(aligned_grid(Window(0, 0, width, height), contract.alignment), contract)
     assert sum(tile.area.width * tile.area.height for tile in tiles) <= cost * width * height
     frame_bytes = 4 * (4 * size[0] * size[1] + 9 * width * height)  # result, and LRHS with albedo and normal
-    assert memory_for_tiles(contract, tiles, frame_bytes) <= tiling.MAX_MEMORY
+    assert FIXED_MEMORY + frame_bytes + tile_bytes(whole_frame(contract, width, height), contract) <= tiling.MAX_MEMORY
 
 
 def test_too_little_memory_is_said_with_what_suffices():
     contract = contract_of(1, 8)
-    tiles = plan_tiles(Window(0, 0, 1000, 500), contract)
-    needed = memory_for_tiles(contract, tiles, 500 << 20)
+    needed = FIXED_MEMORY + (500 << 20) + tile_bytes(whole_frame(contract, 1000, 500), contract)
     with pytest.raises(InputError, match=r"this frame needs more with model test; allow at least 1\.1G"):
         require_memory(needed, contract, 1 << 30)
     require_memory(needed, contract, int(1.1 * 2**30))

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.runtime import load_network

@@ -6,7 +6,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from oiio_msspl.image.arrays import box_downsample
+from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.model.catalogue import find_model
 from oiio_msspl.model.contract import NO_DENOISER, SCALES, Contract
 from oiio_msspl.model.encoding import MAX_RADIANCE, encode_radiance

@@ -1,0 +1,193 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Runs the network on the tiles of a frame, of its beauty or of its passes, and writes them into the result."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.features import ALBEDO, RGB
+from oiio_msspl.exr.render import Render
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.alpha import fuse_alpha
+from oiio_msspl.fusion.tiles.guards import LAYER_REACH, check_finite
+from oiio_msspl.fusion.tiles.prepare import FramePair, FrameShares, PreparedTile
+from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
+from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
+from oiio_msspl.model.encoding import decode_radiance, encode_radiance
+from oiio_msspl.model.render_mean import Images, Shares
+from oiio_msspl.model.session import Session
+
+
+@dataclass
+class FusedPixels:
+    """The fused pixels of a frame, over the HRLS's data window."""
+
+    rgb: Array
+    """(height, width, 3), scene linear, finite and >= 0: float32, or half if that was asked for."""
+    alpha: Array | None
+    """(height, width, 1) in [0, 1]; None if the HRLS has none."""
+    error: Array | None
+    """(height, width, 1): expected absolute error of ``rgb`` in scene-linear units, mean of the channels; None unless
+    asked for."""
+    alignment: Alignment
+    exposure: float
+    """Factor that the scene was multiplied by for the network."""
+    clipped: int = field(default=0, kw_only=True)
+    """Number of values of ``rgb`` that were too bright for half; 0 for float32."""
+    clean_aovs: dict[str, NDArray[np.float16]] = field(default_factory=dict, kw_only=True)
+    """Albedo and normal of the HRLS without noise, (height, width, 3): those that it has, that the model denoises and
+    that were asked for. Albedos above 1 are as rendered."""
+
+
+@dataclass(frozen=True)
+class TileTask:
+    """A tile that is ready for the network, and the result into which it is written."""
+
+    tile: PreparedTile
+    shares: FrameShares
+    result: FusedPixels
+    number: int
+    """Tiles of the result up to this one."""
+    count: int
+    """Tiles of the result."""
+
+
+def tile_tasks(
+    pair: FramePair, result: FusedPixels, threads: Callable[[], AbstractContextManager[object]] = nullcontext
+) -> Iterator[TileTask]:
+    """Prepare the tiles of a frame, one after the other, each inside of ``threads()``."""
+    tiles = pair.tiles()
+    with threads():
+        shares = pair.sample_shares()
+    for number, tile in enumerate(tiles, start=1):
+        with threads():
+            prepared = pair.prepare(tile)
+        yield TileTask(prepared, shares, result, number, len(tiles))
+
+
+def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[tuple[FusedPixels, int, int]]:
+    """Run the network on each tile and write it into its result. The next tile is prepared meanwhile.
+
+    Yields:
+        After each tile: its result, the number of the tile, and the number of tiles of this result.
+    """
+    for task in one_ahead(tasks):
+        _fuse_tile(task.tile, session, task.result, task.shares)
+        yield task.result, task.number, task.count
+
+
+def _fuse_tile(tile: PreparedTile, session: Session, result: FusedPixels, shares: FrameShares) -> None:
+    """Run the network on a tile and write its core into the result."""
+    features, empty = tile.features, tile.empty
+    target = features.hrls_target.slices(result.alignment.hr_data_window)
+    core = features.hrls_target.slices(features.hrls_area)
+    if tile.hrls is not None:
+        images = _run_network(tile, session, result.exposure, shares.rgb, error=result.error is not None)
+        for name in tile.aovs:
+            if name not in result.clean_aovs:
+                result.clean_aovs[name] = blank(result.rgb.shape, np.float16)
+            result.clean_aovs[name][target] = images[name][core].clip(-HALF_MAX, HALF_MAX)
+        rgb = images["fused"][core]
+        if tile.lights is not None:
+            lights = tile.lights[core]
+            rgb = np.where(np.any(lights > 0, axis=-1, keepdims=True), lights, rgb)
+        if empty is not None:
+            rgb = rgb * ~empty[core]
+        if result.rgb.dtype == np.float16:
+            result.clipped += int(np.count_nonzero(rgb > HALF_MAX))
+            rgb = np.minimum(rgb, np.float32(HALF_MAX))
+        result.rgb[target] = rgb
+        if result.error is not None:
+            error = _scene_linear_error(images["fused"], images["error"], result.exposure)
+            if empty is not None:
+                error *= ~empty
+            result.error[target] = error[core]
+    if "alpha" in features.hrls:
+        if result.alpha is None:
+            result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
+        result.alpha[target] = fuse_alpha(features, session, shares.alpha)[core]
+
+
+def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:
+    """Return the images of :meth:`Session.run` for a tile; the HRLS itself if the tile has no noise."""
+    assert tile.lrhs is not None and tile.hrls is not None
+    if tile.noise_free:
+        errors = {"error": np.zeros_like(tile.hrls[RGB][..., :1])} if error else {}
+        return {"fused": tile.hrls[RGB], **errors, **{name: tile.features.hrls[name] for name in tile.aovs}}
+    images = session.run(tile.lrhs, tile.hrls, exposure, shares, error=error, aovs=tile.aovs)
+    check_finite(session, *images.values())
+    if ALBEDO in images:
+        # The albedo of an emitter may be its light. The network only knows albedos up to 1.
+        albedo = tile.features.hrls[ALBEDO]
+        images[ALBEDO] = np.where((albedo > 1).any(axis=-1, keepdims=True), albedo, images[ALBEDO])
+    return images
+
+
+def _scene_linear_error(rgb: Array, error: Array, exposure: float) -> Array:
+    """Return an error (h, w, 1) of log-encoded colours in the scene-linear units of ``rgb`` (h, w, 3)."""
+    grey = encode_radiance(rgb, exposure).mean(axis=-1, keepdims=True)
+    return decode_radiance(grey + error, exposure) - decode_radiance(grey, exposure)
+
+
+def fuse_layers(
+    renders: Iterable[tuple[Render, Render]], session: Session, alignment: Alignment, exposure: float, reach: int
+) -> Iterator[Array]:
+    """Fuse passes of a frame, such as the light of each lamp.
+
+    The caller limits the threads of NumPy, see :func:`oiio_msspl.image.parallel.limit_threads`.
+
+    Args:
+        renders: LRHS and HRLS with a pass in place of the beauty, for each pass. The next two are taken in the
+            background while the network works.
+        session: a model for the scale of the renders.
+        alignment: of the renders.
+        exposure: that of the beauty, because networks tell light from noise by its brightness.
+        reach: see :class:`oiio_msspl.fusion.tiles.guards.EmptyRegions`.
+
+    Yields:
+        The fused passes, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files if they
+        have many pixels.
+
+    Raises:
+        InputError: pixels can't be decoded.
+        MssplError: the network failed, or returned NaN or infinite values.
+    """
+    size = alignment.hr_data_window.height, alignment.hr_data_window.width
+
+    def tasks() -> Iterator[TileTask]:
+        for lr, hr in renders:
+            # The network works at the same time, and has threads on all cores.
+            with half_of_the_threads():
+                pair = FramePair(lr, hr, alignment, session.contract, of_pass=(exposure, reach))
+            result = FusedPixels(blank((*size, 3)), None, None, alignment, exposure)
+            for task in tile_tasks(pair, result, half_of_the_threads):
+                for render in (lr, hr):
+                    render.unload()
+                yield task
+
+    for result, number, count in fuse_tiles(tasks(), session):
+        unload(result.rgb)
+        if number == count:
+            yield result.rgb
+
+
+def layer_fuser(
+    session: Session, beauty: FusedPixels
+) -> Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]] | None:
+    """Return a function that fuses passes of a frame whose beauty ``session`` has fused; None if no network does."""
+    if session.layers is None:
+        return None
+
+    def fuse_passes(renders: Iterable[tuple[Render, Render]], alignment: Alignment) -> Iterator[Array]:
+        whole = alignment.scale == beauty.alignment.scale
+        layer_session = session.layer_session if whole else session.half_layer_session
+        assert layer_session is not None
+        reach = max(LAYER_REACH // beauty.alignment.scale - 1, 1)
+        return fuse_layers(renders, layer_session, alignment, beauty.exposure, reach)
+
+    return fuse_passes

@@ -1,0 +1,148 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Prepares the tiles of a frame for the network: reads them and applies the guards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.alpha import alpha_as_colour
+from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.guards import FAR, EmptyRegions, bright_lights, dim_fireflies, is_noise_free, lit_window
+from oiio_msspl.fusion.tiles.tiling import Tile, network_grid, plan_tiles, sample_bands
+from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.model.contract import Contract
+from oiio_msspl.model.encoding import find_exposure
+from oiio_msspl.model.render_mean import Images, Shares, find_shares
+
+
+@dataclass(frozen=True)
+class FrameShares:
+    """The LRHS's shares in the mean of both renders, which many models denoise."""
+
+    rgb: Shares = field(default_factory=dict)
+    alpha: Shares = field(default_factory=dict)
+
+
+@dataclass
+class PreparedTile:
+    """A tile that is ready for the network."""
+
+    features: TileFeatures
+    """As read, with alpha, albedo and normal of the HRLS only."""
+    empty: Mask | None
+    """Pixels that stay black, see :meth:`oiio_msspl.fusion.tiles.guards.EmptyRegions.mask`."""
+    lrhs: Images | None = None
+    """Inputs of the model; None for a tile that is empty everywhere."""
+    hrls: Images | None = None
+    lights: Array | None = None
+    """Pixels that keep the colour of the HRLS, see :func:`oiio_msspl.fusion.tiles.guards.bright_lights`."""
+    noise_free: bool = False
+    """The renders agree, so the HRLS is the result."""
+    aovs: tuple[str, ...] = ()
+    """AOVs of the HRLS whose denoised pixels are kept."""
+
+
+class FramePair:
+    """Both renders of a frame: the LRHS in memory, and the HRLS that is read tile by tile.
+
+    Args:
+        lr, hr: the renders.
+        alignment: how their pixels lie over each other.
+        contract: of the model.
+        aovs: AOVs of the HRLS whose denoised pixels are kept.
+        of_pass: exposure of the beauty, and reach of :class:`oiio_msspl.fusion.tiles.guards.EmptyRegions`, if the
+            renders show a pass in place of the beauty.
+        on_read: called with the features of each tile.
+    """
+
+    def __init__(
+        self,
+        lr: ReadableRender,
+        hr: ReadableRender,
+        alignment: Alignment,
+        contract: Contract,
+        aovs: Sequence[str] = (),
+        *,
+        of_pass: tuple[float, int] | None = None,
+        on_read: Callable[[TileFeatures], object] | None = None,
+    ) -> None:
+        self._lr, self._hr, self._alignment, self._contract = lr, hr, alignment, contract
+        self._aovs, self._on_read = aovs, on_read
+        self.grid = network_grid(alignment, contract)
+        self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
+        self._lrhs = read_lrhs(lr, alignment, self.grid, [*contract.lrhs, "alpha"], self._lrhs_counts)
+        self.lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
+        """Colour of the LRHS (h, w, 3) over the grid of the alignment."""
+        self.exposure, reach = of_pass or (find_exposure(self.lrhs_rgb), FAR)
+        self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_pass=of_pass is not None)
+        self._part = self._lit_part(reach) if of_pass else None
+
+    @property
+    def lrhs_has_alpha(self) -> bool:
+        return "alpha" in self._lrhs
+
+    def counts(self, kind: str) -> dict[str, int]:
+        """Return the numbers of values that were ``repaired`` or ``negative``, by render and feature (``lrhs.rgb``)."""
+        renders = (("lrhs", self._lrhs_counts), ("hrls", self._hrls_counts))
+        return {f"{which}.{name}": n for which, counts in renders for name, n in getattr(counts, kind).items()}
+
+    def tiles(self) -> list[Tile]:
+        """Return the tiles in which the pair is fused. A pass is black where none of them is."""
+        return plan_tiles(self.grid, self._contract, self._part)
+
+    def prepare(self, tile: Tile) -> PreparedTile:
+        """Read a tile and apply the guards."""
+        features = self._read(tile, [*self._contract.hrls, "alpha"], self._hrls_counts)
+        if self._on_read is not None:
+            self._on_read(features)
+        empty = self._empty_regions.mask(features, tile.area.slices(self.grid))
+        guides = {name: values for name, values in features.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
+        aovs = tuple(name for name in self._aovs if name in features.hrls)
+        prepared = PreparedTile(replace(features, hrls=guides), empty, aovs=aovs)
+        # An empty tile may still show surfaces.
+        if empty is None or not empty.all() or self._aovs:
+            lrhs_rgb, prepared.hrls = dim_fireflies(features)
+            prepared.lrhs = features.lrhs | {RGB: lrhs_rgb}
+            prepared.lights = bright_lights(lrhs_rgb, prepared.hrls[RGB], self.exposure)
+            prepared.noise_free = is_noise_free(features, lrhs_rgb, prepared.hrls[RGB], self.exposure)
+        return prepared
+
+    def sample_shares(self) -> FrameShares:
+        """Decide how both renders are averaged, from bands of the frame, so that neighbouring tiles agree."""
+        if not self._contract.denoiser:
+            return FrameShares()
+        colours, alphas = [], []
+        for band in sample_bands(self._alignment.grid, self._contract.scale):
+            features = self._read(Tile(band, band), [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts())
+            lrhs_rgb, hrls = dim_fireflies(features)
+            colours.append((features.lrhs | {RGB: lrhs_rgb}, hrls))
+            if "alpha" in features.lrhs and "alpha" in features.hrls:
+                alphas.append(alpha_as_colour(features))
+        return FrameShares(find_shares(colours, self.exposure), find_shares(alphas, 1.0) if alphas else {})
+
+    def exact_lrhs_rgb(self) -> Array:
+        """Return the colour of the LRHS at the places of its HRLS pixels, (h, w, 3) over the grid of the alignment.
+
+        Networks read the nearest pixels instead, which lie beside these places if an odd size was rounded.
+        """
+        if self._alignment.stretch == (1.0, 1.0):
+            return self.lrhs_rgb
+        return read_lrhs(self._lr, self._alignment, self._alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
+
+    def _read(self, tile: Tile, features: Sequence[str], counts: RepairCounts) -> TileFeatures:
+        return read_tile(tile, self._lrhs, self.grid, self._hr, self._alignment, features, counts)
+
+    def _lit_part(self, reach: int) -> Window | None:
+        """Return the part of the grid within ``reach`` of light; None for all of it, if a render is black."""
+        scale, data = self._alignment.scale, self._alignment.hr_data_window
+        low = lit_window(self._lrhs[RGB], self.grid, reach)
+        high = lit_window(self._hr.read(self._hr.data_window, [RGB])[RGB], data, 0)
+        if low is None or high is None:
+            return None
+        whole = Window(high.x0 // scale, high.y0 // scale, -(-high.x1 // scale), -(-high.y1 // scale))
+        sides = min(low.x0, whole.x0), min(low.y0, whole.y0), max(low.x1, whole.x1), max(low.y1, whole.y1)
+        return Window(*sides).intersect(self.grid)

@@ -10,15 +10,12 @@ from __future__ import annotations
 import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from oiio_msspl.aovs.features import DEFAULTS, FEATURES, HRLS_FEATURES, RGB
 from oiio_msspl.errors import InputError
 from oiio_msspl.model.encoding import KEY, MAX_ALBEDO, MAX_RADIANCE, MU
-from oiio_msspl.model.runtime import load_network
-
-if TYPE_CHECKING:
-    import onnxruntime
+from oiio_msspl.model.runtime import Network, load_network
 
 #: Upsampling factors from the LRHS to the HRLS.
 SCALES = (2, 4, 8)
@@ -143,7 +140,7 @@ class Contract:
         return cls.of_network(load_network(path, optimise=False), path)
 
     @classmethod
-    def of_network(cls, network: onnxruntime.InferenceSession, path: str | Path) -> Contract:
+    def of_network(cls, network: Network, path: str | Path) -> Contract:
         """Read the contract of a loaded network.
 
         Args:

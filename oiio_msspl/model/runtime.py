@@ -11,13 +11,10 @@ import logging
 import os
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 
 from oiio_msspl.errors import InputError
 from oiio_msspl.image.arrays import Array
-
-if TYPE_CHECKING:
-    import onnxruntime
 
 log = logging.getLogger(__name__)
 
@@ -25,6 +22,8 @@ log = logging.getLogger(__name__)
 os.environ.setdefault("ORT_DISABLE_TELEMETRY", "1")
 
 CPU = "CPUExecutionProvider"
+#: A loaded network: ``onnxruntime.InferenceSession``, which has no types.
+Network = Any
 #: An execution provider and its settings.
 Provider = tuple[str, dict[str, str]]
 
@@ -45,7 +44,7 @@ def runtime_version() -> str:
 
 def load_network(
     path: str | Path, threads: int = 0, providers: Sequence[Provider] = ((CPU, {}),), *, optimise: bool = True
-) -> onnxruntime.InferenceSession:
+) -> Network:
     """Load a network.
 
     Args:
@@ -95,7 +94,7 @@ def _share_memory() -> None:
     onnxruntime.create_and_register_allocator(place, arena)
 
 
-def release_memory(network: onnxruntime.InferenceSession, feed: Mapping[str, Array]) -> None:
+def release_memory(network: Network, feed: Mapping[str, Array]) -> None:
     """Run a network on the CPU once more, and give the memory of all networks back to the system.
 
     Args:
@@ -119,7 +118,7 @@ def _load_cuda() -> None:
         log.debug("preload_dlls: %s", printed.getvalue())
 
 
-def convolutions(network: onnxruntime.InferenceSession) -> dict[str, int]:
+def convolutions(network: Network) -> dict[str, int]:
     """Return the number of convolutions on each execution provider; empty if the onnxruntime is too old to say."""
     if not hasattr(network, "get_provider_graph_assignment_info"):
         return {}

@@ -9,7 +9,7 @@ import pytest
 from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files, fuse_shot
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.inspection import inspect_file
-from oiio_msspl.jobs import views
+from oiio_msspl.jobs import run
 from oiio_msspl.jobs.inputs import map_pair
 from oiio_msspl.jobs.pair_check import check_files
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
@@ -323,9 +323,8 @@ def test_memory_holds_one_view_at_a_time(tmp_path, bilinear_models, monkeypatch)
         alive.append(weakref.ref(frame.rgb))
         return frame
 
-    original = views.fuse
-    monkeypatch.setattr(views, "fuse", fuse)
-    monkeypatch.setattr("oiio_msspl.jobs.run.fuse", fuse)
+    original = run.fuse
+    monkeypatch.setattr(run, "fuse", fuse)
     fused(pair, tmp_path / "out.exr", bilinear_models)
     assert len(alive) == 2
 

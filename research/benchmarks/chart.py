@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy against time, from the tables of `research.benchmarks.quality`, `research.benchmarks.runtime` and
+"""Accuracy against time, from the tables of `research.benchmarks.accuracy`, `research.benchmarks.runtime` and
 `research.benchmarks.render_time`.
 
     python -m research.benchmarks.chart -o docs/chart.html              # every scene; needs only a browser

@@ -26,7 +26,7 @@ from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
 from oiio_msspl.model.session import Session
 from research.benchmarks import results, scenes
-from research.benchmarks.quality import AVERAGES
+from research.benchmarks.accuracy import AVERAGES
 from research.benchmarks.results import Row
 
 #: In the column `bin`: all pixels. Bins have the numbers 1 to `BINS`.

@@ -3,7 +3,7 @@
 
     python -m research.benchmarks.paper
 
-Everything is read from `research/benchmarks/results`. The tables there come from `research.benchmarks.quality`,
+Everything is read from `research/benchmarks/results`. The tables there come from `research.benchmarks.accuracy`,
 `research.benchmarks.runtime`, `research.benchmarks.spp_grid` and `research.benchmarks.ablations`.
 """
 

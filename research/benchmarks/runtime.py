@@ -38,7 +38,7 @@ OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
 OIDN_BASE_GUIDES = "OIDN prefiltered with base guides"
 #: See :func:`research.benchmarks.peers.oidn_split`.
 OIDN_SPLIT = "OIDN prefiltered, on every second pixel"
-#: As :mod:`research.benchmarks.quality` calls them -> as they are called here, where it does not matter which render
+#: As :mod:`research.benchmarks.accuracy` calls them -> as they are called here, where it does not matter which render
 #: they get.
 SAME_WORK = {
     "OIDN on the HRLS": OIDN,

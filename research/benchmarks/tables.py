@@ -55,7 +55,7 @@ ROOT = Path(__file__).parents[2]
 FAMILIES = ("paper", "joint-small", "joint", "joint-large")
 #: OIDN on both renders at its best: see :func:`research.benchmarks.peers.match_local_means`.
 JOINED = "OIDN prefiltered on both x2, together"
-#: Methods of :mod:`research.benchmarks.quality` that most tables compare the models with.
+#: Methods of :mod:`research.benchmarks.accuracy` that most tables compare the models with.
 PEERS = (
     "OIDN on the HRLS",
     "OIDN prefiltered on the HRLS",
@@ -144,12 +144,12 @@ def models(scales: Sequence[int] = SCALES, families: Sequence[str] = FAMILIES) -
 
 
 def means_of(rows: Iterable[Row]) -> Found:
-    """The mean rows of :mod:`research.benchmarks.quality` by (spp, method)."""
+    """The mean rows of :mod:`research.benchmarks.accuracy` by (spp, method)."""
     return results.index((row for row in rows if row["scene"] == MEAN), "spp", "method")
 
 
 def share_of_oidn(times: Found, method: str) -> str:
-    """Time of a method of :mod:`research.benchmarks.quality` as a share of OIDN's; empty if it was not measured.
+    """Time of a method of :mod:`research.benchmarks.accuracy` as a share of OIDN's; empty if it was not measured.
 
     Args:
         times: rows of :mod:`research.benchmarks.runtime` by method.

@@ -5,7 +5,7 @@
 
 Of every ``NAME/scene.xml``, a crop of 376 x 232 pixels in the middle is rendered by Mitsuba's own film into
 ``OUT/box/NAME`` and ``OUT/gaussian/NAME``: HRLS of 1 to 8 spp, LRHS, and a reference with the same filter.
-`research.benchmarks.quality` reads both folders. Files that exist are kept.
+`research.benchmarks.accuracy` reads both folders. Files that exist are kept.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
+"""Measure accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m research.benchmarks.passes PASSES --table research/benchmarks/results/passes.csv
     python -m research.benchmarks.passes PASSES --spread --table research/benchmarks/results/passes_spread.csv
@@ -36,17 +36,15 @@ part of the sum, but is not scored: every method has a high PSNR there.
 
 "Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
 "Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
-beauty, as a multiple of OIDN's plain call on the beauty. The gain is the PSNR of a method minus that of one of `GAINS`,
-with a 95 % interval by :mod:`research.benchmarks.versus`; a win is a layer with more PSNR than that of `PEER`.
+beauty, as a multiple of OIDN's plain call on the beauty.
 """
 
 from __future__ import annotations
 
-import argparse
-import re
-import time
+import itertools
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -69,11 +67,10 @@ from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
-from research.benchmarks import results
+from research.benchmarks import results, timer
 from research.benchmarks.every_second_pixel import places, without_grid
 from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
 from research.benchmarks.results import MEAN, Row
-from research.benchmarks.versus import cell, with_interval
 
 SCALES, SPP = (2, 4), (1, 2)
 KEYS = ("scene", "set", "spp", "method")
@@ -93,8 +90,6 @@ SPLIT_PEER = "OIDN, every second pixel, rescaled"
 STORED_PEER = "OIDN, prefiltered, stored"
 #: The set whose layers are products of light and colour in some renderers.
 COMPONENTS = "components"
-#: Column of the gain -> over which method.
-GAINS = {"gain": PEER, "gain_split": SPLIT_PEER, "gain_stored": STORED_PEER}
 #: How many light groups are fused, and what ``--half`` compares.
 AT_HALF = "msspl, best, at half size"
 BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
@@ -254,11 +249,11 @@ def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
     return [{"layer": ALL, **means, **regrade, "worst_psnr": float(-10 * np.log10(worst))}, *rows]
 
 
-def timed(function: Callable[[], Array]) -> tuple[Array, float]:
-    """The result and the time of a call."""
-    start = time.perf_counter()
-    result = function()
-    return result, time.perf_counter() - start
+def model_used(method: str, scale: int, noise: str = "") -> Row:
+    """Return the column ``model`` of a method: the model of its beauty, to which all but two methods are rescaled."""
+    if method.startswith("msspl"):
+        return {"model": f"{BEST if 'best' in method else BALANCED}{noise}-x{scale}"}
+    return {"model": f"{BEST}{noise}-x{scale}"} if any(w in method for w in ("rescaled", "stored", "ratio")) else {}
 
 
 def measure(
@@ -276,10 +271,11 @@ def measure(
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     other = folder / f"hr_{2 * spp}spp.exr"
     ordinary = map_render(open_exr(other)) if other.exists() else None
-    fused = fused_frames(lr, hr, scale, SPREAD if spread else "")
+    noise = SPREAD if spread else ""
+    fused = fused_frames(lr, hr, scale, noise)
     pixels = hr.load().layers
-    plain = [timed(lambda: denoise(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]))[1] for _ in range(WARM_UP + 1)]
-    oidn_seconds = plain[-1]
+    plain = partial(denoise, pixels["rgb"], pixels[ALBEDO], pixels[NORMAL])
+    oidn_seconds = timer.seconds_of(plain, 1, WARM_UP)[0]
     rows = []
     for layers in hr.additive_sets:
         if half and layers.name != LIGHT_GROUPS:
@@ -292,113 +288,66 @@ def measure(
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
                 continue
-            result, seconds = timed(function)
-            total, *each = scores(result, clean, [layer.name for layer in layers.layers])
-            seconds = 0.0 if name == "HRLS" else seconds / oidn_seconds
-            rows += [key | total | {"time": seconds}, *(key | row for row in each)]
+            made: list[Array] = []
+            seconds = timer.seconds_of(lambda function=function, made=made: made.append(function()), 1, 0)[0]
+            total, *each = scores(made[0], clean, [layer.name for layer in layers.layers])
+            key |= model_used(name, scale, noise)
+            rows += [key | total | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds}]
+            rows += [key | row for row in each]
     return rows
 
 
 def means(rows: list[Row]) -> list[Row]:
-    """Means over the scenes, of the methods that were measured on each, and the gain over `PEER`."""
-    found = []
-    totals = [row for row in rows if row["layer"] == ALL]
-    for key in dict.fromkeys(tuple(row[k] for k in KEYS[1:]) for row in totals):
-        same = [row for row in totals if tuple(row[k] for k in KEYS[1:]) == key]
-        if len(same) < sum((row["set"], row["spp"], row["method"]) == (*key[:2], PEER) for row in totals):
+    """Return means over the scenes, of the methods that were measured on each. A mean has the oldest stamp."""
+    made = []
+    totals = results.where(rows, layer=ALL)
+    scenes = {(row["set"], row["spp"], row["scene"]) for row in totals if row["method"] == PEER}
+    for name, spp, method in dict.fromkeys(tuple(row[key] for key in KEYS[1:]) for row in totals):
+        members = results.where(totals, set=name, spp=spp, method=method)
+        if len(members) < sum((name, spp) == key[:2] for key in scenes):
             continue
-        numbers = {k: float(np.mean([row[k] for row in same])) for k, v in same[0].items() if isinstance(v, float)}
-        mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
-        for column, peer in GAINS.items():
-            peers = {r["scene"]: r for r in totals if (r["set"], r["spp"], r["method"]) == (*key[:2], peer)}
-            if peers.keys() == {row["scene"] for row in same}:
-                gains = np.array([row["psnr"] - peers[row["scene"]]["psnr"] for row in same])
-                mean |= dict(zip((column, f"{column}_low", f"{column}_high"), with_interval(gains), strict=True))
-        ours, theirs = (_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER))
-        won = [row["psnr"] > theirs[layer]["psnr"] for layer, row in ours.items()]
-        found.append(mean | {"wins": sum(won), "layers": len(won)})
-    return found
-
-
-def _single_layers(rows: list[Row], key: tuple[object, ...]) -> dict[tuple[str, str], Row]:
-    """The rows of single layers of a set, spp and method, by scene and layer."""
-    same = (row for row in rows if tuple(row[k] for k in KEYS[1:]) == key and row["layer"] != ALL)
-    return {(row["scene"], row["layer"]): row for row in same}
+        numbers = {k: float(np.mean([row[k] for row in members])) for k, v in members[0].items() if isinstance(v, float)}
+        key: Row = {"scene": MEAN, "set": name, "spp": spp, "method": method, "layer": ALL}
+        model = {"model": members[0]["model"]} if "model" in members[0] else {}
+        made.append(key | numbers | model | results.oldest_stamp(members))
+    return made
 
 
 def layout(rows: list[Row]) -> str:
-    """The means, as a table with the columns that were measured."""
-    titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
-    titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
-    formats = {key: "{:.4f}" if "relmse" in key else "{:.2f}" for key in titles}
-    shown = [row for row in rows if row["scene"] == MEAN]
-    body = [
-        [row["set"], str(row["spp"]), row["method"], *(formats[key].format(row[key]) for key in titles)]
-        for row in shown
-    ]
-    head = ["set", "spp", "method", *titles.values()]
-    for column, peer in GAINS.items():
-        if not any(column in row for row in shown):
-            continue
-        head.append(f"gain over {peer}, dB")
-        for line, row in zip(body, shown, strict=True):
-            gain = tuple(row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
-            line.append("" if gain[0] is None else cell(gain, "+.2f"))
-    head.append("better on")
-    for line, row in zip(body, shown, strict=True):
-        line.append(f"{row['wins']:.0f} of {row['layers']:.0f}")
-    return results.markdown(head, body)
-
-
-def layout_of_layers(rows: list[Row]) -> str:
-    """PSNR and RelMSE of single layers, means over the scenes that have them. Lamps in groups count as one layer."""
-    single = [row for row in rows if row["scene"] != MEAN and row["layer"] != ALL]
-    kinds = {row["layer"]: re.sub(r"_\d+$", "", row["layer"]) for row in single}
-    body = []
-    for name, spp, kind in dict.fromkeys((row["set"], row["spp"], kinds[row["layer"]]) for row in single):
-        same = [row for row in single if (row["set"], row["spp"], kinds[row["layer"]]) == (name, spp, kind)]
-        cells = []
-        for method in IN_LAYERS:
-            scores = [(row["psnr"], row["relmse"]) for row in same if row["method"] == method]
-            cells.append("{:.2f}, {:.4f}".format(*np.mean(scores, axis=0)))
-        count = sum(row["method"] == PEER for row in same)
-        body.append([name, str(spp), kind, str(count), *cells])
-    return results.markdown(["set", "spp", "layer", "number", *IN_LAYERS], sorted(body))
+    """Lay out the means."""
+    names = ("psnr", "relmse", "regraded_psnr", "regraded_relmse", "worst_psnr", "time")
+    body = [[str(row[key]) for key in KEYS[1:]] + [f"{row[name]:.4g}" for name in names] for row in rows]
+    return results.markdown([*KEYS[1:], *names], body)
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure scenes, or draw one."""
+    parser = results.parser(__doc__)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
-    parser.add_argument(
-        "--half", action="store_true", help="compare light groups at full and at half of the resolution"
-    )
+    parser.add_argument("--half", action="store_true", help="compare light groups at full and at half resolution")
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
-    results.add_option(parser)
     args = parser.parse_args()
     scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
     if args.picture:
         picture(args.passes / scenes[0], args.picture)
         return
     rows: list[Row] = []
-    for scene in scenes:
-        for spp in SPP:
-            for scale in SCALES:
-                known = {tuple(row[k] for k in KEYS) for row in rows}
-                # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
-                print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
-        if args.table:
-            add(args.table, rows)
+    for scene, spp, scale in itertools.product(scenes, SPP, SCALES):
+        known = {tuple(row[key] for key in KEYS) for row in rows}
+        # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
+        rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
+        print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
     print(layout(means(rows)))
+    if args.table:
+        add(args.table, rows)
 
 
 def add(table: Path, rows: list[Row]) -> None:
     """Put rows of scenes into a table, whose means are computed anew."""
-    old = [row for row in results.read(table) if row["scene"] != MEAN] if table.exists() else []
-    keys = (*KEYS, "layer")
-    together = list((results.index(old, *keys) | results.index(rows, *keys)).values())
+    results.write(table, rows, (*KEYS, "layer"))
+    together = [row for row in results.read(table) if row["scene"] != MEAN]
     results.write(table, together + means(together))
 
 

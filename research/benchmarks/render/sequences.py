@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders short sequences for `research.benchmarks.temporal`, with Mitsuba 3.
+"""Renders short sequences for `research.benchmarks.shots`, with Mitsuba 3.
 
     python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m research.benchmarks.render.sequences SPREAD --scenes SCENES --spread

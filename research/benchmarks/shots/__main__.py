@@ -3,8 +3,8 @@
 
     python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m research.datagen.cycles.sequence SEQUENCES
-    python -m research.benchmarks.temporal SEQUENCES --table research/benchmarks/results/temporal.csv
-    python -m research.benchmarks.temporal SPREAD --spread --table research/benchmarks/results/temporal_spread.csv
+    python -m research.benchmarks.shots SEQUENCES --table research/benchmarks/results/temporal.csv
+    python -m research.benchmarks.shots SPREAD --spread --table research/benchmarks/results/temporal_spread.csv
 
 The things in ``cycles/slide`` move to the side alone, so its pixels don't tell which way y points. If the benchmark
 says so, give that sequence Blender's format, in one line::
@@ -12,7 +12,7 @@ says so, give that sequence Blender's format, in one line::
     --motion-format layer=Vector,channels=XY,to=previous,x=right,y=up,unit=pixels
                    +layer=Vector,channels=ZW,to=next,x=left,y=down,unit=pixels
 
-:mod:`research.benchmarks.temporal.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
+:mod:`research.benchmarks.shots.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
 """
 
 from __future__ import annotations
@@ -33,10 +33,10 @@ from oiio_msspl.jobs.temporal import AUTO, TemporalOptions
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.scenes import beauty
-from research.benchmarks.temporal.measures import flicker, jod, psnr, relmse, warp_error
-from research.benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
-from research.benchmarks.temporal.report import REFERENCE, details, film, layout, strip, summary
-from research.benchmarks.temporal.sequence import Sequence, load, without_vectors
+from research.benchmarks.shots.measures import flicker, jod, psnr, relmse, warp_error
+from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
+from research.benchmarks.shots.report import REFERENCE, details, film, layout, strip, summary
+from research.benchmarks.shots.sequence import Sequence, load, without_vectors
 
 KEYS = ("sequence", "scale", "method")
 #: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.

@@ -23,7 +23,7 @@ from oiio_msspl.jobs.shot_checks import model_of_shot
 from oiio_msspl.jobs.stages import LoadedFrame, Stages
 from oiio_msspl.jobs.temporal import Temporal, TemporalOptions, plan_temporal
 from research.benchmarks.peers import oidn, oidn_prefiltered, oidn_split
-from research.benchmarks.temporal.sequence import Sequence
+from research.benchmarks.shots.sequence import Sequence
 
 ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
 OIDN, OIDN_BEST, OIDN_SPLIT = "OIDN", "OIDN prefiltered", "OIDN on every second pixel"

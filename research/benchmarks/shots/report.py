@@ -15,8 +15,8 @@ from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.image.arrays import Array
 from research.benchmarks import results
 from research.benchmarks.results import Row
-from research.benchmarks.temporal.methods import ALONE, NEIGHBOURS, OIDN_BEST, OIDN_NEIGHBOURS, QUALITIES, SCALES
-from research.benchmarks.temporal.sequence import MASKS
+from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, OIDN_NEIGHBOURS, QUALITIES, SCALES
+from research.benchmarks.shots.sequence import MASKS
 from research.benchmarks.versus import cell, with_interval
 
 #: In the column ``method``: the reference itself.

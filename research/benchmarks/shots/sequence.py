@@ -21,7 +21,7 @@ from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
 from research.benchmarks.render.sequences import MOTION, STATIC
 from research.benchmarks.scenes import beauty
-from research.benchmarks.temporal.measures import Mask, blur, warped
+from research.benchmarks.shots.measures import Mask, blur, warped
 
 #: A surface is hidden in a neighbour if the way there and back ends further away than this, in pixels.
 ROUND_TRIP = 1.0

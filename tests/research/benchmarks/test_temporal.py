@@ -1,12 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""`research.benchmarks.temporal` measures the right amount on sequences whose errors are known."""
+"""`research.benchmarks.shots` measures the right amount on sequences whose errors are known."""
 
 import math
 
 import numpy as np
 import pytest
 
-from research.benchmarks.temporal.measures import BLUR, blur, flicker, psnr, relmse, warp_error, warped
+from research.benchmarks.shots.measures import BLUR, blur, flicker, psnr, relmse, warp_error, warped
 from tests.conftest import picture
 
 SIGMA = 0.02

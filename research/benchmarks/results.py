@@ -140,11 +140,12 @@ def stamp_note(rows: Iterable[Row]) -> str:
     """
     rows = list(rows)
     dates, machines = ({row[name] for row in rows if name in row} for name in ("date", "machine"))
+    some = "" if all("machine" in row for row in rows) else "partly "
     by_date = sorted({(row["date"], row["version"]) for row in rows})
     versions = list(dict.fromkeys(version for _, version in by_date))
     when = " to ".join(dict.fromkeys((min(dates), max(dates))))
     note = f"*Measured {when} with version {' to '.join(dict.fromkeys((versions[0], versions[-1])))}"
-    note += f" on {', '.join(sorted(machines))}.*" if machines else ".*"
+    note += f", {some}on {', '.join(sorted(machines))}.*" if machines else ".*"
     older = sorted({row["model"] for row in rows if "model" in row and is_older(row)})
     if older:
         names = ", ".join(f"`{name}`" for name in older)

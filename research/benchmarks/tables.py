@@ -239,13 +239,11 @@ VERDICTS = ("holds", "suffers", "fails")
 #: Wrong pairs on the page, and right ones.
 PAIRS = (
     "right, whole frame",
-    "right, a quarter of the frame",
     "crop 3 % tighter",
     "normals of another scene",
     "albedo of another scene",
     "shift by 1 LRHS pixel",
     "LRHS scaled down: lanczos3",
-    "LRHS in ACEScg",
     "exposure one stop up",
 )
 #: Sequences that were measured with two neighbours on each side.
@@ -329,7 +327,6 @@ SPREAD_NOISE = Table(
     [
         Line([title], {"method": method})
         for method, title in {
-            BALANCED: "`joint-x2`, trained for independent noise",
             f"joint-small{SPREAD}-x2": "`--quality fast`",
             f"joint{SPREAD}-x2": "`--quality balanced`",
             f"joint-large{SPREAD}-x2": "`--quality best`",
@@ -355,7 +352,7 @@ TIME = Table(
     ("seconds for 1024 x 1024 in memory, 2 cores",),
     [
         Line([_label(method)], {"method": method})
-        for method in (FAST, BALANCED, BEST, "joint-x4", "paper-x2")
+        for method in (FAST, BALANCED, BEST, "paper-x2")
     ]
     + [Line([method], {"method": method}) for method in (runtime.OIDN_FAST, runtime.OIDN, runtime.OIDN_PREFILTERED)],
     [
@@ -409,7 +406,7 @@ SHOTS = Table(
     ("frames averaged with neighbours",),
     [
         *_shot_lines("shots", "", (2, 4)),
-        *_shot_lines("shots_without_vectors", ", without vectors", (2,)),
+        *_shot_lines("shots_without_vectors", ", without vectors", (2,))[1:],
         *_shot_lines("shots_spread", ", spread noise", (2,)),
     ],
     [
@@ -496,7 +493,7 @@ PASSES_SUMMARY = Table(
     ("passes",),
     ("scene", "set", "spp", "method", "layer"),
     ("layers at 2 spp",),
-    [Line([method], {"method": method}) for method in ("HRLS", passes.PEER, "msspl-x2", "msspl-x2, best")],
+    [Line([method], {"method": method}) for method in (passes.PEER, "msspl-x2", "msspl-x2, best")],
     [
         Column(f"{name}: {title}", measure, {"set": name, "spp": 2, "scene": MEAN, "layer": passes.ALL})
         for name in ("light groups", "components")

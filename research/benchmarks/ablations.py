@@ -105,7 +105,7 @@ class Pair:
 
 
 def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
-    """A crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
+    """Return a crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
     rows, columns = slice(top, top + patch), slice(left, left + patch)
     colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
     exposure = find_exposure(colour)
@@ -147,7 +147,7 @@ def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tens
 
 
 def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
-    """A network after ``steps`` training steps."""
+    """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(variant.scale, **variant.network, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)

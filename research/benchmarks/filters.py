@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy by pixel filter: the same samples, filtered as renderers filter them.
+"""Measure accuracy by pixel filter: equal samples, filtered as renderers filter them.
 
-    python -m research.benchmarks.pixel_filters VIEWS --table research/benchmarks/results/pixel_filters.csv
+    python -m research.benchmarks.filters VIEWS --table research/benchmarks/results/filters.csv
 
 VIEWS keep their samples (:mod:`research.datagen.samples`). Those that no network was trained on are used: the splits
 ``validation``, whose references Open Image Denoise (OIDN) has cleaned, and ``test``. Each filter gives an HRLS of 1 and
@@ -10,7 +10,6 @@ VIEWS keep their samples (:mod:`research.datagen.samples`). Those that no networ
 
 from __future__ import annotations
 
-import argparse
 import statistics
 from collections.abc import Iterator
 from pathlib import Path
@@ -27,7 +26,6 @@ from oiio_msspl.model.encoding import find_exposure
 from research.benchmarks import results
 from research.benchmarks.peers import oidn_prefiltered
 from research.benchmarks.results import Row
-from research.benchmarks.tables import by_filter
 from research.datagen.samples import decode
 from research.datagen.views import REF_CELLS, Folder, SampleView
 from research.training.data import SampleTensors
@@ -55,7 +53,7 @@ STORED = {RGB: "color", ALBEDO: ALBEDO, NORMAL: NORMAL}
 
 
 def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: int, scale: int) -> dict[str, Array]:
-    """The layers of a render with ``spp`` samples for each HRLS pixel, (h, w, 3) by name."""
+    """Return the layers of a render with ``spp`` samples for each HRLS pixel, (h, w, 3) by name."""
     rows, columns = (slice(0, side) for side in view.size)
     stored = len(view.arrays[f"{prefix}color"])
     samples = torch.arange(min(pixel_filter.samples_for(spp), stored))
@@ -67,7 +65,7 @@ def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: i
 
 
 def pair(view: SampleView, pixel_filter: PixelFilter, spp: int) -> tuple[Render, Render, Array]:
-    """LRHS, HRLS and reference (h, w, 3), exposed."""
+    """Return LRHS, HRLS and reference (h, w, 3), exposed."""
     tensors = SampleTensors.of(view, torch.device("cpu"))
     cells = torch.from_numpy(decode(view.arrays["ref"])).movedim(-1, 0)
     reference = filter_reference(pixel_filter, cells, REF_CELLS).movedim(0, -1).clamp_min(0).numpy()
@@ -81,7 +79,7 @@ def pair(view: SampleView, pixel_filter: PixelFilter, spp: int) -> tuple[Render,
 
 
 def measure(views: list[SampleView], models: list[str]) -> Iterator[Row]:
-    """A row for each filter, spp and method."""
+    """Yield a row for each filter, spp and method."""
     sessions = {name: load_model(SCALE, name) for name in models}
     for pixel_filter in FILTERS:
         way = "" if pixel_filter.splatted else ", importance sampled"
@@ -94,27 +92,20 @@ def measure(views: list[SampleView], models: list[str]) -> Iterator[Row]:
                     image = oidn_prefiltered(hrls) if method == OIDN else fuse(lrhs, hrls, sessions[method]).rgb
                     scores.append((psnr(image, reference), relmse(image, reference)))
                 row = dict(zip(("psnr", "relmse"), map(statistics.fmean, zip(*scores, strict=True)), strict=True))
-                yield {"filter": kind, "spp": 2 * spp, "method": method, **row}
+                yield {"filter": kind, "spp": 2 * spp, "method": method, **results.model_of(method), **row}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m research.benchmarks.pixel_filters",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """Measure the held-out views of a folder."""
+    parser = results.parser(__doc__)
     parser.add_argument("views", type=Path)
     parser.add_argument("--model", nargs="+", default=list(MODELS))
-    results.add_option(parser)
     args = parser.parse_args()
     folder = Folder(args.views)
     views = [view for split in ("validation", "test") for view in folder.sample_views(split)]
     if not views:
         raise SystemExit(f"{args.views}: no views with samples for validation or testing")
-    rows = list(measure(views, args.model))
-    print(f"{len(views)} views\n{by_filter(rows)}")
-    if args.table:
-        results.write(args.table, rows)
+    results.show(results.plain, list(measure(views, args.model)), args.table)
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ the first two with the albedo and the normal:
 - "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
   so that they sum to the beauty that OIDN makes of this render.
 - "OIDN, every second pixel, rescaled": with ``--spread``, the recommended call on every second pixel, see
-  :mod:`research.benchmarks.every_second_pixel`.
+  :func:`research.benchmarks.peers.oidn_split`.
 - "msspl": :mod:`oiio_msspl.fusion.passes.fuse`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
@@ -68,8 +68,8 @@ from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from research.benchmarks import results, timer
-from research.benchmarks.every_second_pixel import places, without_grid
 from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
+from research.benchmarks.peers import places, without_grid
 from research.benchmarks.results import MEAN, Row
 
 SCALES, SPP = (2, 4), (1, 2)
@@ -100,7 +100,7 @@ WITH_SPREAD_NOISE = ("HRLS", PEER, SPLIT_PEER, "msspl-x2", "msspl-x2, best", "ms
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
-    """The layers of a set, (layers, h, w, 3)."""
+    """Return the layers of a set, (layers, h, w, 3)."""
     pixels = with_layers(render, layers).read(render.data_window, layer_keys(layers))
     return np.stack([np.maximum(pixels[name], 0) for name in layer_keys(layers)])
 
@@ -112,7 +112,7 @@ def rescaled(layers: Array, beauty: Array) -> Array:
 
 
 def colours_of(render: MappedRender, layers: AdditiveSet) -> Array:
-    """What the stored light of each layer is multiplied by, (layers, h, w, 3): 1 in a layer that is no product."""
+    """Return the colour by which each layer's light is multiplied, (layers, h, w, 3); 1 if there is none."""
     formulas = {str(i): FeatureFormula((x.factor,)) for i, x in enumerate(layers.layers) if x.factor}
     pixels = replace(render, features=formulas, alpha=None).read(render.data_window, list(formulas))
     ones = np.ones((render.data_window.height, render.data_window.width, 3), np.float32)
@@ -128,7 +128,7 @@ def methods(
     *,
     spread: bool = False,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
-    """The name of each method, and a function that computes the layers.
+    """Yield the name of each method, and a function that computes the layers.
 
     Args:
         fused: the fused frame of each model, and the model.
@@ -193,14 +193,14 @@ def methods(
 
 
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
-    """The set of another file with the same name and layers."""
+    """Return the set of another file with the same name and layers."""
     names = [layer.name for layer in layers.layers]
     found = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
     return next(found)
 
 
 def regraded(layers: Array) -> Array:
-    """The beauty with the first layer switched off, and four times the light of the second one."""
+    """Return the beauty with the first layer switched off, and four times the light of the second one."""
     grades = np.array([0, 4, *[1] * (len(layers) - 2)], np.float32)
     return np.einsum("i,ihwc->hwc", grades, layers)
 
@@ -208,7 +208,7 @@ def regraded(layers: Array) -> Array:
 def fused_frames(
     lr: MappedRender, hr: MappedRender, scale: int, noise: str = ""
 ) -> dict[str, tuple[FusedFrame, Session]]:
-    """The fused frame of each model, and the model. That of single layers is loaded, too.
+    """Return the fused frame of each model, and the model. That of single layers is loaded, too.
 
     Args:
         noise: the ending of the models' names.
@@ -234,7 +234,7 @@ def picture(folder: Path, output: Path) -> None:
 
 
 def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
-    """A row for each layer that is bright enough, and their mean with the regraded picture."""
+    """Return a row for each layer that is bright enough, and their mean with the regraded picture."""
     light = reference.sum(axis=(1, 2, 3))
     rows: list[Row] = [
         {"layer": name, "psnr": psnr(layer, truth), "relmse": relmse(layer, truth)}
@@ -306,18 +306,13 @@ def means(rows: list[Row]) -> list[Row]:
         members = results.where(totals, set=name, spp=spp, method=method)
         if len(members) < sum((name, spp) == key[:2] for key in scenes):
             continue
-        numbers = {k: float(np.mean([row[k] for row in members])) for k, v in members[0].items() if isinstance(v, float)}
+        numbers = {
+            k: float(np.mean([row[k] for row in members])) for k, v in members[0].items() if isinstance(v, float)
+        }
         key: Row = {"scene": MEAN, "set": name, "spp": spp, "method": method, "layer": ALL}
         model = {"model": members[0]["model"]} if "model" in members[0] else {}
         made.append(key | numbers | model | results.oldest_stamp(members))
     return made
-
-
-def layout(rows: list[Row]) -> str:
-    """Lay out the means."""
-    names = ("psnr", "relmse", "regraded_psnr", "regraded_relmse", "worst_psnr", "time")
-    body = [[str(row[key]) for key in KEYS[1:]] + [f"{row[name]:.4g}" for name in names] for row in rows]
-    return results.markdown([*KEYS[1:], *names], body)
 
 
 def main() -> None:
@@ -339,7 +334,7 @@ def main() -> None:
         # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
         rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
         print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
-    print(layout(means(rows)))
+    print(results.plain(means(rows)))
     if args.table:
         add(args.table, rows)
 

@@ -139,6 +139,8 @@ def stamp_note(rows: Iterable[Row]) -> str:
     A row is older if the digest of its model is not that of the model that ships, or is not known.
     """
     rows = list(rows)
+    if not rows:
+        return ""
     dates, machines = ({row[name] for row in rows if name in row} for name in ("date", "machine"))
     some = "" if all("machine" in row for row in rows) else "partly "
     by_date = sorted({(row["date"], row["version"]) for row in rows})
@@ -179,6 +181,12 @@ def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
     """Return a Markdown table."""
     lines = [head, ["---"] * len(head), *rows]
     return "\n".join("| " + " | ".join(cells) + " |" for cells in lines) + "\n"
+
+
+def plain(rows: Sequence[Row]) -> str:
+    """Return a Markdown table of all columns and rows."""
+    columns = list(dict.fromkeys(column for row in rows for column in row))
+    return markdown(columns, [[str(_cell(row.get(column, ""))) for column in columns] for row in rows])
 
 
 def parser(description: str | None) -> argparse.ArgumentParser:

@@ -302,13 +302,6 @@ def time_render(args: argparse.Namespace) -> list[Row]:
     return rows
 
 
-def layout(rows: list[Row]) -> str:
-    """Lay out all columns but the stamps."""
-    columns = list(dict.fromkeys(column for row in rows for column in row))
-    body = [[f"{v:.4g}" if isinstance(v := row.get(c, ""), float) else str(v) for c in columns] for row in rows]
-    return results.markdown(columns, body)
-
-
 #: Question -> how it is measured, the columns that tell its rows apart, and the size of the frame.
 QUESTIONS = {
     "frame": (time_frame, ("method", "machine"), "1024x1024"),
@@ -339,7 +332,7 @@ def main() -> None:
     measure, keys, size = QUESTIONS[args.question]
     args.size = [int(side) for side in (args.size or size).split("x")]
     rows = [{"machine": results.processor(), **row} for row in measure(args)]
-    results.show(layout, rows, args.table, keys)
+    results.show(results.plain, rows, args.table, keys)
 
 
 if __name__ == "__main__":

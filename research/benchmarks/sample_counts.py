@@ -39,20 +39,13 @@ def measure(clean: list[scenes.Scene]) -> list[Row]:
     ]
 
 
-def layout(rows: list[Row]) -> str:
-    """Lay out a line for each spp of the LRHS."""
-    psnr_of = results.index(rows, "lrhs_spp", "hrls_spp")
-    body = [[f"{low} spp", *(f"{psnr_of[low, high]['psnr']:.2f}" for high in HRLS_SPP)] for low in LRHS_SPP]
-    return results.markdown(["LRHS \\ HRLS", *(f"{high} spp" for high in HRLS_SPP)], body)
-
-
 def main() -> None:
     """Measure the scenes of a folder."""
     parser = results.parser(__doc__)
     parser.add_argument("renders", type=Path)
     args = parser.parse_args()
     clean = [scene for scene in scenes.load(args.renders) if scene.name not in scenes.NOISY_REFERENCE]
-    results.show(layout, measure(clean), args.table)
+    results.show(results.plain, measure(clean), args.table)
 
 
 if __name__ == "__main__":

@@ -63,7 +63,7 @@ def load(folder: Path) -> list[Scene]:
 
 
 def beauty(source: ReadableRender) -> Array:
-    """The beauty (h, w, 3) of a whole render, without NaN, Inf and negative values."""
+    """Return the beauty (h, w, 3) of a whole render, without NaN, Inf and negative values."""
     return repair(source.read(source.data_window, ["rgb"])["rgb"])[0]
 
 
@@ -81,7 +81,7 @@ def _render(folder: Path) -> Scene:
 
 
 def of_view(view: View) -> Scene:
-    """A rendered view as a scene."""
+    """Return a rendered view as a scene."""
     reference = as_float32(view.ref)
     exposure = np.float32(find_exposure(reference))
     whole = slice(None)

@@ -53,9 +53,9 @@ class Column:
     """A column of the CSV file; two columns with ``/`` between them."""
     where: Mapping[str, Wanted] = field(default_factory=dict)
     how: str = "mean"
-    """mean, sum, count (of the rows whose measure is what stands behind ``=``), max or quotient (of two measures' sums) of the rows; or a comparison with their peers:
-    difference, interval (that with its 95 % interval), ratio (mean of ratios), ratio interval (ratio of means with its
-    95 % interval), wins."""
+    """mean, sum or max of the rows; count (of those whose measure is what stands behind ``=``); quotient of two
+    measures' sums; or a comparison with their peers: difference, interval (that with its 95 % interval), ratio (mean of
+    ratios), ratio interval (ratio of means with its 95 % interval), wins."""
     form: str = ""
     """Format of a number; by default that of the measure."""
     against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]] = field(default_factory=dict)
@@ -116,9 +116,7 @@ class Table:
         for values in dict.fromkeys(tuple(row.get(name) for name in names) for row in rows) if names else ():
             yield Line([_label(value) for value in values], dict(zip(names, values, strict=True)))
 
-    def _cell(
-        self, column: Column, line: Line, rows: Sequence[Row], peers: Mapping[Any, Row], used: list[Row]
-    ) -> str:
+    def _cell(self, column: Column, line: Line, rows: Sequence[Row], peers: Mapping[Any, Row], used: list[Row]) -> str:
         wanted = {**line.where, **column.where}
         if "method" in wanted and column.renamed:
             wanted["method"] = column.renamed.get(wanted["method"], wanted["method"])
@@ -207,9 +205,22 @@ def _on(instructions: str) -> dict[str, Wanted]:
     return {"machine": lambda name: name is not None and name.endswith(instructions)}
 
 
+def strongest(rows: Sequence[Row], input_name: str) -> str:
+    """Return the call of OIDN on this input with the highest mean PSNR over all average spp."""
+    means = [row for row in rows if row["scene"] == MEAN and row["method"].startswith("OIDN")]
+    psnr: dict[str, list[float]] = {}
+    for row in means:
+        if row["method"].endswith(input_name):
+            psnr.setdefault(row["method"], []).append(row["psnr"])
+    return max(psnr, key=lambda method: float(np.mean(psnr[method])))
+
+
 FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "joint-large-x2"
-ON_HRLS, SAME_SAMPLES = "OIDN prefiltered on the HRLS", "OIDN prefiltered, same samples"
-JOINED = "OIDN prefiltered on both x2, together"
+ON_HRLS, JOINED, SAME_SAMPLES = (
+    strongest(results.read("accuracy"), name) for name in (" on the HRLS", " on both x2, together", ", same samples")
+)
+#: OIDN at its best -> which render it gets.
+PLACES = {ON_HRLS: "on the HRLS", JOINED: "on both renders, joined", SAME_SAMPLES: "at full resolution, same samples"}
 SETS = {
     "Mitsuba": "accuracy",
     "box": "accuracy_box",
@@ -229,8 +240,6 @@ METHODS = {
     "paper-x2": "`--model paper`",
 }
 SCENES = (MEAN, "cornell-box", "lamp", "spaceship", "staircase2", "tire", *NOISY_REFERENCE)
-#: OIDN at its best -> which render it gets.
-PLACES = {ON_HRLS: "on the HRLS", JOINED: "on both renders, joined", SAME_SAMPLES: "at full resolution, same samples"}
 #: Pixel filters, the spread ones first.
 KINDS = tuple(dict.fromkeys(row["filter"] for row in results.read("filters")))
 #: The larger frame of the times on a GPU.
@@ -274,6 +283,7 @@ WHEN_IT_PAYS = Table(
     ],
 )
 
+
 def _accuracy_columns(source: str, spps: Sequence[int] = accuracy.AVERAGES) -> list[Column]:
     """Return columns of mean PSNR and RelMSE for some average spp."""
     where = {"source": source, "scene": MEAN}
@@ -303,6 +313,7 @@ HOW_SURE = Table(
         for title, measure, how in (("PSNR", "psnr", "interval"), ("RelMSE", "relmse", "ratio interval"))
     ],
 )
+
 
 #: Method with the ending of a division of the samples.
 def _divided(more: int, less: int) -> dict[str, str]:
@@ -350,10 +361,7 @@ TIME = Table(
     ("time_frame",),
     ("method", "machine"),
     ("seconds for 1024 x 1024 in memory, 2 cores",),
-    [
-        Line([_label(method)], {"method": method})
-        for method in (FAST, BALANCED, BEST, "paper-x2")
-    ]
+    [Line([_label(method)], {"method": method}) for method in (FAST, BALANCED, BEST, "paper-x2")]
     + [Line([method], {"method": method}) for method in (runtime.OIDN_FAST, runtime.OIDN, runtime.OIDN_PREFILTERED)],
     [
         column
@@ -379,6 +387,7 @@ GPU_TIMES = Table(
         Column("convolutions, at least", "floor_ms", LARGE, form="{:.1f}"),
     ],
 )
+
 
 #: A sequence's rows with neighbours -> those of single frames.
 def _alone(row: Row) -> dict[str, str]:
@@ -549,16 +558,17 @@ PAIR_CHECKS = Table(
 
 CONFIDENCE = Table(
     ("confidence",),
-    ("method", "bin"),
+    ("method",),
     ("model",),
     ("method",),
     [
         Column("predicted error, log-encoded", "predicted", form="{:.4f}"),
         Column("actual error", "actual", form="{:.4f}"),
-        Column("share of the error in the tenth of the pixels with the largest prediction", "worst_tenth", form="{:.0%}"),
+        Column(
+            "share of the error in the tenth of the pixels with the largest prediction", "worst_tenth", form="{:.0%}"
+        ),
         Column("correlation of logarithms, 8 x 8 pixels", "correlation"),
     ],
-    {"bin": 0},
 )
 
 Block = Table | Callable[[], str]

@@ -36,7 +36,14 @@ class Function:
 
     def command(self) -> list[str]:
         """Return the command that runs it."""
-        return [sys.executable, "-m", "research.benchmarks.timer", self.name, str(self.repeats), json.dumps(self.arguments)]
+        return [
+            sys.executable,
+            "-m",
+            "research.benchmarks.timer",
+            self.name,
+            str(self.repeats),
+            json.dumps(self.arguments),
+        ]
 
 
 @dataclass(frozen=True)
@@ -79,7 +86,10 @@ def run(job: Function | Sequence[str]) -> Run:
             file.seek(0)
         if process.returncode:
             raise SystemExit(f"{' '.join(command)}\n{errors.read()}")
-        cpu, peak = usage.ru_utime + usage.ru_stime, usage.ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+        cpu, peak = (
+            usage.ru_utime + usage.ru_stime,
+            usage.ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10),
+        )
         if not isinstance(job, Function):
             return Run((seconds,), cpu, peak)
         measured = json.loads(output.read().splitlines()[-1])

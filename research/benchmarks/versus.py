@@ -21,9 +21,7 @@ def with_interval(values: NDArray[np.float64]) -> tuple[float, float, float]:
     return float(values.mean()), *_ends(values[_draws(len(values))].mean(axis=1))
 
 
-def ratio_with_interval(
-    ours: NDArray[np.float64], theirs: NDArray[np.float64]
-) -> tuple[float, float, float]:
+def ratio_with_interval(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[float, float, float]:
     """Return the ratio of the means of two methods' values, one for each scene, and the ends of its interval."""
     drawn = _draws(len(ours))
     return float(ours.mean() / theirs.mean()), *_ends(ours[drawn].mean(axis=1) / theirs[drawn].mean(axis=1))

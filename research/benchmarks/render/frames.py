@@ -71,13 +71,13 @@ def render(mi: Any, file: Path, out: Path, camera: str) -> None:
 
 
 def _turn(degrees: float) -> Array:
-    """A turn around the camera's upward axis, (4, 4)."""
+    """Return a turn around the camera's upward axis, (4, 4)."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
 
 
 def _move(distance: float) -> Array:
-    """A move along the camera's viewing direction, (4, 4)."""
+    """Return a move along the camera's viewing direction, (4, 4)."""
     matrix = np.eye(4)
     matrix[2, 3] = distance
     return matrix

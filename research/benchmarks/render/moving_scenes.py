@@ -102,7 +102,7 @@ def object_matrix(animation: Animation, at: float) -> np.ndarray:
 
 
 def build_room(animation: Animation, frame: int, at: float) -> Room:
-    """The room at a frame. ``at``: frames from the middle of the sequence."""
+    """Return the room at a frame. ``at``: frames from the middle of the sequence."""
     from research.datagen.mitsuba import materials
     from research.datagen.mitsuba.scenes import Scene
 

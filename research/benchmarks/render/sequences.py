@@ -157,7 +157,7 @@ class _AnimatedRoom:
 
 
 def surfaces(mi: Any, room: Room, camera: Camera) -> Array:
-    """What the centre of each pixel shows, (h, w, 6): `MASK`. A ray that hits nothing has the depth 0."""
+    """Return what the centre of each pixel shows, (h, w, 6): `MASK`. A ray that hits nothing has the depth 0."""
     origins, directions = camera.rays()
     ray = mi.Ray3f(mi.Point3f(*origins.T), mi.Vector3f(*directions.T))
     hit = room.scene.ray_intersect(ray)
@@ -227,7 +227,7 @@ def _shoot(
     seed: int,
     pixel_filter: str,
 ) -> Array:
-    """A frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
+    """Return a frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
     angle = np.degrees(2 * np.arctan(scene.size[0] / 2 / camera.focal))
     lens = {"type": "perspective"}
     if camera.aperture:

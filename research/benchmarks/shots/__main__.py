@@ -3,8 +3,8 @@
 
     python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m research.datagen.cycles.sequence SEQUENCES
-    python -m research.benchmarks.shots SEQUENCES --table research/benchmarks/results/temporal.csv
-    python -m research.benchmarks.shots SPREAD --spread --table research/benchmarks/results/temporal_spread.csv
+    python -m research.benchmarks.shots SEQUENCES --table research/benchmarks/results/shots.csv
+    python -m research.benchmarks.shots SPREAD --spread --table research/benchmarks/results/shots_spread.csv
 
 The things in ``cycles/slide`` move to the side alone, so its pixels don't tell which way y points. If the benchmark
 says so, give that sequence Blender's format, in one line::
@@ -30,26 +30,39 @@ from oiio_msspl.errors import InputError, MssplError
 from oiio_msspl.exr.atomic import check_target
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.jobs.temporal import AUTO, TemporalOptions
+from oiio_msspl.model.catalogue import QUALITIES as MODELS
+from oiio_msspl.model.contract import SPREAD
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.scenes import beauty
 from research.benchmarks.shots.measures import flicker, jod, psnr, relmse, warp_error
-from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, Made, all_methods
-from research.benchmarks.shots.report import REFERENCE, details, film, layout, strip, summary
+from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, QUALITIES, Made, all_methods
+from research.benchmarks.shots.pictures import film, strip
 from research.benchmarks.shots.sequence import Sequence, load, without_vectors
 
 KEYS = ("sequence", "scale", "method")
+#: In the column ``method``: the reference itself.
+REFERENCE = "reference"
 #: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
 DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(104, 216), slice(90, 250)), 160
 
 
-def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> Iterator[Row]:
-    """A row for each method, and one for the reference."""
+def model_of(method: str, scale: int, *, spread: bool) -> Row:
+    """Return the column ``model`` of a method; nothing for OIDN and the reference."""
+    for quality, prefix in reversed(QUALITIES.items()):
+        if method in (prefix + ALONE, prefix + NEIGHBOURS):
+            return {"model": f"{MODELS[quality]}{SPREAD if spread else ''}-x{scale}"}
+    return {}
+
+
+def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False, spread: bool = False) -> Iterator[Row]:
+    """Yield a row for each method, and one for the reference."""
     truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
     for method in made:
         images = srgb(method.images)
-        by_frame = [psnr(image, halves) for image, *halves in zip(images, *truth, strict=True)]
+        by_frame = [psnr(image, (first, second)) for image, first, second in zip(images, *truth, strict=True)]
         row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
+        row |= model_of(method.method, method.scale, spread=spread)
         row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
         row |= {"relmse": relmse(method.images, sequence.truth), **flicker(images, truth)}
         if with_jod:
@@ -63,20 +76,18 @@ def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False) -> 
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure sequences; return the exit code."""
+    parser = results.parser(__doc__)
     parser.add_argument("folder", type=Path, help="the sequences")
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
     parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
-    parser.add_argument(
-        "--without-vectors", action="store_true", help="leave the motion vectors of Mitsuba's sequences out"
-    )
+    parser.add_argument("--without-vectors", action="store_true", help="leave out the motion vectors of Mitsuba's")
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
     parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
     parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated WebP")
-    results.add_option(parser)
     args = parser.parse_args()
     try:
         run(args)
@@ -92,40 +103,32 @@ def run(args: argparse.Namespace) -> None:
     Raises:
         InputError: there are none, one is not complete, or a picture can't be written.
     """
-    for path in (args.picture, args.film):
-        if path:
-            check_target(path, overwrite=True)
-    names = args.sequence or sorted(
-        f"{p.parent.parent.name}/{p.parent.name}" for p in args.folder.glob("*/*/hr.0001.exr")
-    )
+    for path in filter(None, (args.picture, args.film)):
+        check_target(path, overwrite=True)
+    files = args.folder.glob("*/*/hr.0001.exr")
+    names = args.sequence or sorted(f"{path.parent.parent.name}/{path.parent.name}" for path in files)
     if not names:
         raise InputError(
-            f"{args.folder}: holds no sequences; make them with python -m research.benchmarks.render.sequences"
+            f"{args.folder}: holds no sequences; python -m research.benchmarks.render.sequences makes them"
         )
-    rows: list[Row] = []
     for index, name in enumerate(names):
         sequence = load(args.folder / name, args.motion_format)
         options = TemporalOptions(args.temporal, args.motion_format)
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))
-        of_sequence = list(measure(sequence, made, with_jod=args.jod))
-        print(layout(of_sequence) if args.methods == "*" else details(of_sequence), flush=True)
-        rows += of_sequence
-        if args.table:
-            results.merge(args.table, of_sequence, KEYS)
+        rows = list(measure(sequence, made, with_jod=args.jod, spread=args.spread))
+        results.show(results.plain, rows, args.table, KEYS)
         if index == 0 and (args.picture or args.film):
             draw(args, sequence, made)
-    if args.methods == "*":
-        print(summary(rows))
 
 
 def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None:
     """Draw a sequence."""
-    found = {each.method: each.images for each in made if each.scale in (1, DRAWN_SCALE)}
+    by_method = {method.method: method.images for method in made if method.scale in (1, DRAWN_SCALE)}
     hrls = np.stack([beauty(map_render(open_exr(sequence.folder / f"hr.{n:04d}.exr"))) for n in sequence.numbers])
     truth = (sequence.truth[0] + sequence.truth[1]) / 2
-    titles = {"HRLS": hrls, ALONE: found[ALONE], NEIGHBOURS: found[NEIGHBOURS], OIDN_BEST: found[OIDN_BEST]}
+    titles = {"HRLS": hrls, ALONE: by_method[ALONE], NEIGHBOURS: by_method[NEIGHBOURS], OIDN_BEST: by_method[OIDN_BEST]}
     shown = {title: srgb(images) for title, images in (titles | {REFERENCE: truth}).items()}
     if args.picture:
         strip(args.picture, shown, FRAMES, CROP, ROW)

@@ -94,7 +94,7 @@ def warp_error(images: Array, others: Array, vectors: Array, seen: Mask) -> floa
 
 
 def decibels(square: float) -> float:
-    """A mean squared error of values from 0 to 1 as PSNR."""
+    """Return a mean squared error of values from 0 to 1 as PSNR."""
     return math.inf if square == 0 else -10 * math.log10(square)
 
 
@@ -114,7 +114,7 @@ def blur(images: Array, sigma: float = BLUR) -> Array:
 
 
 def warped(image: Array, vectors: Array) -> Array:
-    """What an image (h, w, c) shows at the ends of vectors (h, w, 2): bicubic, within the four nearest pixels."""
+    """Sample an image (h, w, c) at the ends of vectors (h, w, 2): bicubic, within the four nearest pixels."""
     height, width = image.shape[:2]
     y, x = np.mgrid[0:height, 0:width] + np.moveaxis(vectors, -1, 0)[::-1]
     top, left = np.floor(y).astype(int), np.floor(x).astype(int)

@@ -84,7 +84,7 @@ def _by_scale(
         return stages.fuse(loaded, stages.session(loaded), neighbours)
 
     def with_full(frame: Frame) -> LoadedFrame:
-        """A frame whose HRLS has the pixels of the full render, and its own motion vectors."""
+        """Return a frame whose HRLS has the pixels of the full render, and its own motion vectors."""
         full = map_render(open_exr(folder / f"full.{frame.number:04d}.exr"))
         return replace(stages.read(frame), hr_pixels=full.load())
 

@@ -1,15 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What neighbouring frames gain for passes: accuracy and flicker of light groups in a shot.
+"""Measure what neighbouring frames gain for passes: accuracy and flicker of light groups in a shot.
 
-    python -m research.benchmarks.temporal_passes --table research/benchmarks/results/temporal_passes.csv
+    python -m research.benchmarks.shots.passes --table research/benchmarks/results/shots_passes.csv
 
-The shot is that of :mod:`research.benchmarks.runtime_temporal`: a wall past which the camera moves, lit by lamps. Its
+The shot is that of :mod:`research.benchmarks.shots.moving_wall`: a wall past which the camera moves, lit by lamps. Its
 clean light is known. Flicker is the mean absolute difference of the error from one frame to the next, along the motion.
 """
 
 from __future__ import annotations
 
-import argparse
+import itertools
 import tempfile
 from pathlib import Path
 
@@ -21,9 +21,10 @@ from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.jobs.temporal import TemporalOptions
+from oiio_msspl.model.catalogue import find_model
 from research.benchmarks import results
 from research.benchmarks.results import Row
-from research.benchmarks.runtime_temporal import OFF, STEP, clean_frame, write_shot
+from research.benchmarks.shots.moving_wall import STEP, clean_frame, write_shot
 
 SIZE, LAMPS = (320, 180), 4
 #: Frames at either end of the shot have fewer neighbours and are not scored.
@@ -45,7 +46,7 @@ def scores(errors: Array) -> tuple[float, float]:
 
 
 def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> list[Row]:
-    """A row for the beauty, and one for the mean of all passes."""
+    """Return a row for the beauty, and one for the mean of all passes."""
     out = folder / f"{quality} {frames}"
     out.mkdir()
     report = fuse_shot(folder / "lr", folder / "hr", out, model=quality, temporal=TemporalOptions(frames))
@@ -56,42 +57,24 @@ def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> 
         _, lights = clean_frame(number, count, *SIZE, LAMPS)
         fused = images_of(out / f"hr.{number:04d}.exr")
         errors.append([image - clean for image, clean in zip(fused, [sum(lights), *lights], strict=True)])
-    beauty, *passes = (scores(each) for each in np.swapaxes(np.array(errors), 0, 1))
-    found = {"beauty": beauty, "passes": np.mean(passes, axis=0)}
-    key: Row = {"scale": scale, "quality": quality, "temporal": frames}
-    return [
-        key | {"of": name, "psnr": float(psnr), "flicker": float(flicker)} for name, (psnr, flicker) in found.items()
-    ]
-
-
-def layout(rows: list[Row]) -> str:
-    """A line for each quality, with what the neighbours gain."""
-    alone = {(row["scale"], row["quality"], row["of"]): row for row in rows if row["temporal"] == OFF}
-    body = []
-    for row in rows:
-        single = alone[row["scale"], row["quality"], row["of"]]
-        if row is not single:
-            gain, ratio = row["psnr"] - single["psnr"], row["flicker"] / single["flicker"]
-            name = f"`--quality {row['quality']}`"
-            body.append([f"x{row['scale']}", name, row["of"], f"{row['psnr']:.2f}", f"{gain:+.2f}", f"{ratio:.2f}"])
-    return results.markdown(["scale", "", "of", "PSNR", "gained, dB", "flicker, of single frames'"], body)
+    beauty, *passes = (scores(images) for images in np.swapaxes(np.array(errors), 0, 1))
+    scored = {"beauty": beauty, "passes": np.mean(passes, axis=0)}
+    key: Row = {"scale": scale, "quality": quality, "temporal": frames, "model": find_model(scale, quality).stem}
+    return [key | {"of": name, "psnr": float(psnr), "flicker": float(f)} for name, (psnr, f) in scored.items()]
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure both qualities at both scales, frame by frame and with neighbours."""
+    parser = results.parser(__doc__)
     parser.add_argument("--frames", type=int, default=18)
-    results.add_option(parser)
     args = parser.parse_args()
     rows: list[Row] = []
     for scale in (2, 4):
         with tempfile.TemporaryDirectory() as folder:
             write_shot(Path(folder), args.frames, *SIZE, scale, LAMPS)
-            for quality in ("balanced", "best"):
-                for frames in (OFF, "auto"):
-                    rows += measure(Path(folder), args.frames, scale, quality, frames)
-    print(layout(rows))
-    if args.table:
-        results.write(args.table, rows)
+            for quality, frames in itertools.product(("balanced", "best"), ("off", "auto")):
+                rows += measure(Path(folder), args.frames, scale, quality, frames)
+    results.show(results.plain, rows, args.table)
 
 
 if __name__ == "__main__":

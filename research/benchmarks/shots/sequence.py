@@ -92,7 +92,7 @@ def load(folder: Path, motion_format: str | None = None) -> Sequence:
 
 
 def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
-    """The same sequence without its motion vectors: its files are linked into a folder, its HRLS is written there."""
+    """Write a sequence without motion vectors into a folder: link its files, except the HRLS."""
     target = folder / sequence.name
     target.mkdir(parents=True)
     for path in sequence.folder.iterdir():

@@ -64,7 +64,7 @@ class Footprint:
 
 
 def box(scale: int = 1) -> Footprint:
-    """The box filter of a pixel that is ``scale`` HRLS pixels wide."""
+    """Return the box filter of a pixel that is ``scale`` HRLS pixels wide."""
     count = SUB * scale
     return Footprint(np.arange(count), np.full(count, 1 / count))
 
@@ -75,7 +75,7 @@ def point(scale: int) -> Footprint:
 
 
 def blackman_harris(scale: int = 1, width: float = 3.0) -> Footprint:
-    """The Blackman-Harris window over ``width`` pixels, as renderers sample it by importance."""
+    """Return the Blackman-Harris window over ``width`` pixels, as renderers sample it by importance."""
     count = round(width * SUB * scale)
     phase = 2 * np.pi * (np.arange(count) + 0.5) / count
     window = 0.35875 - 0.48829 * np.cos(phase) + 0.14128 * np.cos(2 * phase) - 0.01168 * np.cos(3 * phase)
@@ -83,7 +83,7 @@ def blackman_harris(scale: int = 1, width: float = 3.0) -> Footprint:
 
 
 def reference(scene: Scene, footprint: Footprint | None = None, scale: int = 1) -> Array:
-    """Expected colour of every pixel, (h / scale, w / scale, 3), with a pixel filter (the box if None)."""
+    """Return expected colour of every pixel, (h / scale, w / scale, 3), with a pixel filter (the box if None)."""
     footprint = footprint or box(scale)
     image = _expected(scene.back)
     if scene.front is not None:
@@ -164,7 +164,7 @@ def where(mask: NDArray[np.bool_], yes: Any, no: Any) -> Array:
 
 
 def moved(scene: Scene, x: int, y: int) -> Scene:
-    """A scene shifted by whole pixels to the right and down. Its border values are repeated."""
+    """Return a scene shifted by whole pixels to the right and down. Its border values are repeated."""
     rows, columns = (
         np.clip(np.arange(size) - pixels * SUB, 0, size - 1)
         for size, pixels in zip(scene.back.shape, (y, x), strict=False)
@@ -174,7 +174,7 @@ def moved(scene: Scene, x: int, y: int) -> Scene:
 
 
 def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 1.0) -> Scene:
-    """A checkered wall, a floor of thin tiles, a ball with its soft shadow, a glossy box, a few posts of all widths.
+    """Make a checkered wall, a floor of thin tiles, a ball with its soft shadow, a glossy box, posts of all widths.
 
     ``light`` scales the direct light. The ambient light stays.
     """
@@ -248,16 +248,20 @@ def emitters(size: int) -> Scene:
 
 
 def near_black(size: int, traces: float = 0.0) -> Scene:
-    """A room in which one sample of 200 finds the light. ``traces`` is the share of the glossy light that stays; its
-    tails reach down to the smallest floats."""
+    """Make a room in which one sample of 200 finds the light.
+
+    ``traces`` is the share of the glossy light that stays; its tails reach down to the smallest floats.
+    """
     features = split(room(size).back)
     features |= {"visible": features["visible"] * 0.005, "ambient": np.float32(0), "gloss": features["gloss"] * traces}
     return Scene(surface(features["albedo"].shape[:2], **features))
 
 
 def door_ajar(size: int, seen: float) -> Scene:
-    """A room with a plain white wall, lit through a door that is hardly open: a share ``seen`` of the samples finds the
-    light, which gets weaker to the left. Nothing else is lit."""
+    """Make a room with a plain white wall, lit through a door that is hardly open.
+
+    A share ``seen`` of the samples finds the light, which gets weaker to the left. Nothing else is lit.
+    """
     x, y = grid(size)
     features = split(room(size).back)
     wall = y < 0.66
@@ -269,8 +273,10 @@ def door_ajar(size: int, seen: float) -> Scene:
 
 
 def slit(size: int, radiance: float) -> Scene:
-    """A lamp behind a wall, seen through a vertical slit of a quarter of a pixel and a horizontal one of two pixels.
-    One sample of 50 finds its light in the room."""
+    """Make a lamp behind a wall, seen through a vertical slit of a quarter of a pixel and a horizontal one of two.
+
+    One sample of 50 finds its light in the room.
+    """
     x, y = grid(size)
     upright = (np.abs(x * size - size // 2 - 0.375) < 0.5 / SUB) & (y > 0.2) & (y < 0.6)
     level = (np.abs(y - 0.3) * size < 1) & (np.abs(x - 0.2) < 0.12)
@@ -279,7 +285,7 @@ def slit(size: int, radiance: float) -> Scene:
 
 
 def dark_room(size: int) -> Scene:
-    """A room in which one sample of 10 finds the light, with a trace of ambient light."""
+    """Return a room in which one sample of 10 finds the light, with a trace of ambient light."""
     features = split(room(size).back)
     features |= {"visible": 0.1 * features["visible"], "ambient": 0.01 * features["ambient"]}
     return Scene(surface(features["albedo"].shape[:2], **features))
@@ -302,7 +308,7 @@ def defocused(size: int) -> Scene:
 
 
 def moving(size: int) -> Scene:
-    """A textured bar that moves by 60 pixels while the shutter is open, and a small light that leaves a streak."""
+    """Make a textured bar that moves by 60 pixels in an open shutter, and a small light that leaves a streak."""
     x, y = grid(size)
     travel = 60 / size
 
@@ -346,7 +352,7 @@ def hairy(size: int) -> Scene:
 
 
 def glassy(size: int) -> Scene:
-    """A pane and a lens of albedo 1. Only the specular layer shows what is behind them."""
+    """Return a pane and a lens of albedo 1. Only the specular layer shows what is behind them."""
     x, y = grid(size)
     features = split(room(size).back)
     pane = (np.abs(x - 0.68) < 0.22) & (np.abs(y - 0.5) < 0.35)

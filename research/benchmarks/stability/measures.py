@@ -94,7 +94,7 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
 
 
 def verdict(row: dict[str, Any]) -> tuple[str, str]:
-    """("holds", "suffers" or "fails", a sentence) from the figures of :func:`measure` and the case's ``group``."""
+    """Return "holds", "suffers" or "fails", and a sentence, from the figures of :func:`measure` and the ``group``."""
     if not row["finite"] or not math.isfinite(row["relmse"]):
         return "fails", "NaN or Inf comes out."
     faults = []

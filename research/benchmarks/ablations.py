@@ -46,12 +46,7 @@ BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
 #: Batches that are drawn per scale. Every row trains on them repeatedly.
 POOL = 400
 #: Features by the tables' names; each entry includes those before it.
-LAYERS = {
-    "RGB": [RGB],
-    "and albedo": [ALBEDO],
-    "and normal": [NORMAL],
-    "and diffuse, specular": [DIFFUSE, SPECULAR],
-}
+LAYERS = {"RGB": [RGB], "and albedo": [ALBEDO], "and normal": [NORMAL], "and diffuse, specular": [DIFFUSE, SPECULAR]}
 NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
 #: The paper's upper bound of radiance.
 CLIP = 100.0
@@ -115,8 +110,8 @@ def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int
     low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
     low[..., :3] = colour[low_rows, low_columns]
     high = read_hrls(view, [chosen], rows, columns)[0]
-    encoded = (packed(split_features(passes), exposure) for passes in (low, high))
-    return Pair(*encoded, as_float32(view.ref[rows, columns]), exposure)
+    encoded = [packed(split_features(passes), exposure) for passes in (low, high)]
+    return Pair(encoded[0], encoded[1], as_float32(view.ref[rows, columns]), exposure)
 
 
 def channels_of(name: str) -> Tensor:
@@ -150,7 +145,7 @@ def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bo
     """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(variant.scale, **variant.network, lrhs_channels=HRLS_CHANNELS)
-    network.to(memory_format=torch.channels_last)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
     batches = pool(views, variant.scale)
@@ -176,7 +171,7 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View
         pair = pair_of(view, variant.scale, 0, 0, height, 0)
         lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
         fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
-        reference = pair.target * pair.exposure
+        reference = pair.target * np.float32(pair.exposure)
         bicubic = upsample_bicubic(decode_radiance(pair.lrhs[..., :3], 1.0), width, height)
         images = (decode_radiance(fused.numpy(), 1.0), bicubic)
         found.append([measure(i, reference) for i in images for measure in (psnr, relmse)])

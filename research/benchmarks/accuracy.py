@@ -12,7 +12,6 @@ spp_HRLS.
 Methods that get an LRHS and an HRLS, each with half of the samples as in the paper:
 
 - the models of this project, by name. "joint-x2, 3:1" has three quarters of the samples in the HRLS.
-  "joint-x2, nearest" has the paper's LRHS, which keeps one of s x s pixels; a renderer averages them.
 - "OIDN on both x2": OIDN on the HRLS, with the local means of OIDN on the LRHS.
 - "OIDN on both x2, together": OIDN on the HRLS, with the local means of
   :func:`research.benchmarks.peers.oidn_on_average`. "OIDN prefiltered on both x2, together" has prefiltered OIDN on
@@ -87,12 +86,9 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
             if call == "OIDN":
                 yield f"{call} on both x{scale}", partial(_joined, picture, partial(oidn, lr))
             yield f"{call} on both x{scale}, together", partial(_joined, picture, partial(oidn_on_average, lr, hr))
-        nearest = scene.nearest(scale, spp // 2)
         for session in sessions:
             if session.contract.scale == scale:
                 yield session.name, partial(_fused, session, lr, hr)
-                if nearest is not None:
-                    yield f"{session.name}, nearest", partial(_fused, session, nearest, hr)
     yield from _uneven_methods(scene, sessions, spp)
 
 
@@ -128,7 +124,7 @@ def _joined(picture: Picture, means: Picture) -> Array:
 
 def load_models(names: Sequence[str], pattern: str) -> list[Session]:
     """Load the models for which :func:`methods` has a name that matches the pattern."""
-    endings = ("", ", nearest", *(f", {more}:{less}" for more, less in UNEVEN))
+    endings = ("", *(f", {more}:{less}" for more, less in UNEVEN))
     sessions = [load_model(0, name) for name in names]
     return [s for s in sessions if any(fnmatch.fnmatchcase(s.name + ending, pattern) for ending in endings)]
 

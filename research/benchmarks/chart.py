@@ -62,7 +62,7 @@ def data() -> dict[str, Any]:
     for name in times:
         if "-x" in str(name) and SPREAD not in str(name):
             families.setdefault(str(name).rpartition("-x")[0], []).append(str(name))
-    series = []
+    series: list[dict[str, Any]] = []
     for family, members in families.items():
         even = [point(name, name, spp) for spp in accuracy.AVERAGES for name in members]
         uneven = [

@@ -167,7 +167,7 @@ def main() -> None:
         key = {"size": f"{width} x {height}", "machine": card}
         rows += [key | {"method": name, **time_oidn(name, height, width)} for name in OIDN]
         for name in MODELS:
-            row = key | {"method": name, "model": f"gpu/{name}", **time_model(name, height, width)}
+            row: Row = {**key, "method": name, "model": f"gpu/{name}", **time_model(name, height, width)}
             row["floor_ms"] = 1000 * max(row["gflop"] * 1e9 / operations, row["gbyte"] * 1e9 / transfer)
             rows.append(row)
     results.show(results.plain, rows, args.table)

@@ -42,6 +42,7 @@ beauty, as a multiple of OIDN's plain call on the beauty.
 from __future__ import annotations
 
 import itertools
+import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from functools import partial
@@ -288,12 +289,13 @@ def measure(
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
                 continue
-            made: list[Array] = []
-            seconds = timer.seconds_of(lambda function=function, made=made: made.append(function()), 1, 0)[0]
-            total, *each = scores(made[0], clean, [layer.name for layer in layers.layers])
+            start = time.perf_counter()
+            made = function()
+            seconds = time.perf_counter() - start
+            total, *single = scores(made, clean, [layer.name for layer in layers.layers])
             key |= model_used(name, scale, noise)
             rows += [key | total | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds}]
-            rows += [key | row for row in each]
+            rows += [key | row for row in single]
     return rows
 
 

@@ -263,7 +263,8 @@ def time_passes(args: argparse.Namespace) -> list[Row]:
 
     times: dict[tuple[str, str, str], list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:
-        paths = args.pair or write_pair(Path(folder), *args.size, args.scale, GROUPS)
+        width, height = args.size
+        paths = args.pair or write_pair(Path(folder), width, height, args.scale, GROUPS)
         low, high = (map_render(open_exr(path)) for path in paths)
         scale, window = align(low, high).scale, high.data_window
         calls = pass_calls(low, high, args.quality, scale)
@@ -276,6 +277,10 @@ def time_passes(args: argparse.Namespace) -> list[Row]:
         | {"seconds": statistics.median(seconds[1:])}
         for (name, method, model), seconds in times.items()
     ]
+
+
+def _render(mi: Any, scene: Any, integrator: Any, spp: int) -> Any:
+    return mi.render(scene, integrator=integrator, spp=spp).numpy()
 
 
 def time_render(args: argparse.Namespace) -> list[Row]:
@@ -295,8 +300,8 @@ def time_render(args: argparse.Namespace) -> list[Row]:
         for name, scale in (("hrls_s", 1), ("lrhs_s", RENDER_SCALE)):
             size, crop, spp = full // scale, np.array(CROP) // scale, RENDER_SPP * scale**2
             set_crop(mi, parameters, size, crop, (size - crop) // 2)
-            render = partial(mi.render, scene, integrator=integrator, spp=spp)
-            seconds = statistics.median(timer.seconds_of(lambda render=render: render().numpy(), args.rounds))
+            render = partial(_render, mi, scene, integrator, spp)
+            seconds = statistics.median(timer.seconds_of(render, args.rounds))
             row[name] = seconds * MEGAPIXEL / float(crop[0] * crop[1] * spp)
         rows.append(row)
     return rows

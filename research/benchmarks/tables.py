@@ -135,7 +135,7 @@ class Table:
         return _comparison(column, compared)
 
     def _peer_key(self, row: Row, against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]]) -> tuple[Any, ...]:
-        peer = row | (against(row) if callable(against) else against)
+        peer = {**row, **(against(row) if callable(against) else against)}
         return tuple(peer.get(name) for name in ("source", *self.keys))
 
 
@@ -154,7 +154,8 @@ def _summary(column: Column, rows: Sequence[Row]) -> str:
         return str(sum(not wanted or value == wanted for value in columns[0]))
     if column.how == "quotient":
         return column.form.format(sum(columns[0]) / sum(columns[1]))
-    reduced = {"mean": np.mean, "sum": np.sum, "max": np.max}[column.how]
+    functions: dict[str, Callable[[list[float]], Any]] = {"mean": np.mean, "sum": np.sum, "max": np.max}
+    reduced = functions[column.how]
     values = [float(reduced(values)) for values in columns]
     return " / ".join(_format(column, name, value) for name, value in zip(_measures(column), values, strict=True))
 
@@ -423,6 +424,8 @@ SHOTS = Table(
         Column("PSNR over single frames, dB", "psnr", how="interval", against=_alone),
         Column("over OIDN at its best, dB", "psnr", how="interval", against=_oidn),
         Column("over that with neighbours, dB", "psnr", how="interval", against=_averaged_oidn),
+        Column("in uncovered surfaces", "disocclusion", how="difference", against=_alone),
+        Column("where light changes", "light", how="difference", against=_alone),
         Column("flicker, of single frames'", "flicker", how="ratio", against=_alone),
         Column("of OIDN's", "flicker", how="ratio", against=_oidn),
         Column("of that with neighbours", "flicker", how="ratio", against=_averaged_oidn),

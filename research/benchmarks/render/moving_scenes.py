@@ -131,7 +131,8 @@ def build_room(animation: Animation, frame: int, at: float) -> Room:
     if animation.lamp_on:
         second = meshes.rectangle(0.4, 0.4).rotated(meshes.rotation((1, 0, 0), np.pi)).moved(-1.6, 1.2, height - 0.02)
         scene.light(second, np.array([130.0, 85.0, 45.0]) if frame >= LAMP_ON else np.full(3, 1e-6))
-    moved, reflecting = [], []
+    moved: list[str] = []
+    reflecting: list[str] = []
 
     def marked(names: list[str], mesh: Mesh, bsdf: Any) -> None:
         names.append(f"mesh{len(scene._parts)}")

@@ -35,28 +35,26 @@ from oiio_msspl.model.contract import SPREAD
 from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.scenes import beauty
-from research.benchmarks.shots.measures import flicker, jod, psnr, relmse, warp_error
+from research.benchmarks.shots.measures import flicker, psnr, relmse
 from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, QUALITIES, Made, all_methods
 from research.benchmarks.shots.pictures import film, strip
 from research.benchmarks.shots.sequence import Sequence, load, without_vectors
 
 KEYS = ("sequence", "scale", "method")
-#: In the column ``method``: the reference itself.
-REFERENCE = "reference"
 #: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
 DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(104, 216), slice(90, 250)), 160
 
 
 def model_of(method: str, scale: int, *, spread: bool) -> Row:
-    """Return the column ``model`` of a method; nothing for OIDN and the reference."""
+    """Return the column ``model`` of a method; nothing for OIDN."""
     for quality, prefix in reversed(QUALITIES.items()):
         if method in (prefix + ALONE, prefix + NEIGHBOURS):
             return {"model": f"{MODELS[quality]}{SPREAD if spread else ''}-x{scale}"}
     return {}
 
 
-def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False, spread: bool = False) -> Iterator[Row]:
-    """Yield a row for each method, and one for the reference."""
+def measure(sequence: Sequence, made: list[Made], *, spread: bool = False) -> Iterator[Row]:
+    """Yield a row for each method."""
     truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
     for method in made:
         images = srgb(method.images)
@@ -64,15 +62,9 @@ def measure(sequence: Sequence, made: list[Made], *, with_jod: bool = False, spr
         row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
         row |= model_of(method.method, method.scale, spread=spread)
         row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
-        row |= {"relmse": relmse(method.images, sequence.truth), **flicker(images, truth)}
-        if with_jod:
-            row["jod"] = jod(images, truth)
-        row["ewarp"] = warp_error(images, images, sequence.vectors, sequence.seen)
+        row |= {"relmse": relmse(method.images, sequence.truth), "flicker": flicker(images, truth)}
         row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
         yield row | {"motion": method.motion}
-    shares = {f"{name}_share": float(mask.mean()) for name, mask in sequence.masks.items()}
-    error = warp_error(*truth, sequence.vectors, sequence.seen)
-    yield {"sequence": sequence.name, "scale": 1, "method": REFERENCE, "ewarp": error} | shares
 
 
 def main() -> int:
@@ -85,7 +77,6 @@ def main() -> int:
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
     parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
     parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
-    parser.add_argument("--jod", action="store_true", help="also measure JOD; needs pip install pyfvvdp")
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated WebP")
     args = parser.parse_args()
@@ -117,7 +108,7 @@ def run(args: argparse.Namespace) -> None:
         with tempfile.TemporaryDirectory() as folder:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))
-        rows = list(measure(sequence, made, with_jod=args.jod, spread=args.spread))
+        rows = list(measure(sequence, made, spread=args.spread))
         results.show(results.plain, rows, args.table, KEYS)
         if index == 0 and (args.picture or args.film):
             draw(args, sequence, made)
@@ -127,9 +118,9 @@ def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None
     """Draw a sequence."""
     by_method = {method.method: method.images for method in made if method.scale in (1, DRAWN_SCALE)}
     hrls = np.stack([beauty(map_render(open_exr(sequence.folder / f"hr.{n:04d}.exr"))) for n in sequence.numbers])
-    truth = (sequence.truth[0] + sequence.truth[1]) / 2
+    truth = (sequence.truth[0] + sequence.truth[1]) / np.float32(2)
     titles = {"HRLS": hrls, ALONE: by_method[ALONE], NEIGHBOURS: by_method[NEIGHBOURS], OIDN_BEST: by_method[OIDN_BEST]}
-    shown = {title: srgb(images) for title, images in (titles | {REFERENCE: truth}).items()}
+    shown = {title: srgb(images) for title, images in (titles | {"reference": truth}).items()}
     if args.picture:
         strip(args.picture, shown, FRAMES, CROP, ROW)
     if args.film:

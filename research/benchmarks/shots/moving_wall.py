@@ -33,8 +33,8 @@ def clean_frame(number: int, count: int, width: int, height: int, lamps: int) ->
     if lamps:
         lights = np.random.default_rng(1).random((lamps, -(-height // LIT), -(-wide // LIT), 1), np.float32)
         parts = np.stack([enlarged(light, LIT) for light in lights / lights.sum(axis=0)])
-    colour, *parts = (image[:height, STEP * number :][:, :width] for image in (wall, *parts))
-    return colour, [np.float32(0.5) * colour * part for part in parts]
+    colour, *shares = (image[:height, STEP * number :][:, :width] for image in (wall, *parts))
+    return colour, [np.float32(0.5) * colour * share for share in shares]
 
 
 def write_shot(folder: Path, count: int, width: int, height: int, scale: int, lamps: int = 0) -> None:

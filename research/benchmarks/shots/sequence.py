@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reads the references of a sequence, and finds where averaging over time is hard.
+"""Read the references of a sequence, and find where averaging over time is hard.
 
 :mod:`research.benchmarks.render.sequences` and :mod:`research.datagen.cycles.sequence` render the files.
 """
@@ -9,6 +9,7 @@ from __future__ import annotations
 import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import OpenEXR
@@ -41,10 +42,6 @@ class Sequence:
     """The frames."""
     truth: tuple[Array, Array]
     """Two references with independent noise, linear (frames, h, w, 3)."""
-    vectors: Array
-    """(frames - 1, h, w, 2): from each frame to the next one."""
-    seen: Mask
-    """(frames - 1, h, w): pixels whose surface the next frame shows, too."""
     masks: dict[str, Mask]
     """Name -> (frames, h, w), of the masks that are not empty: surfaces that a neighbouring frame hides, objects that
     move, light that changes, mirrors and glass."""
@@ -82,13 +79,9 @@ def load(folder: Path, motion_format: str | None = None) -> Sequence:
     for t in range(len(numbers) - 1):
         light[t] |= seen[t] & _differs(pictures, t, t + 1, forth[t])
         light[t + 1] |= seen_before[t] & _differs(pictures, t + 1, t, back[t + 1])
-    masks = dict(zip(MASKS, (
-        hidden, np.stack([each["moves.Y"] > 0 for each in marked]), light,
-        np.stack([each["reflects.Y"] > 0 for each in marked])), strict=True))  # fmt: skip
-    return Sequence(
-        folder, numbers, (truth[0], truth[1]), np.stack(forth[:-1]), np.stack(seen),
-        {name: mask for name, mask in masks.items() if mask.any()},
-    )  # fmt: skip
+    moves, reflects = (np.stack([mark[name] > 0 for mark in marked]) for name in ("moves.Y", "reflects.Y"))
+    masks = dict(zip(MASKS, (hidden, moves, light, reflects), strict=True))
+    return Sequence(folder, numbers, (truth[0], truth[1]), {name: mask for name, mask in masks.items() if mask.any()})
 
 
 def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
@@ -107,15 +100,15 @@ def without_vectors(sequence: Sequence, folder: Path) -> Sequence:
 
 
 def _channels(path: Path) -> dict[str, Array]:
-    """All channels (h, w) of a file, by name."""
-    image = oiio.ImageBuf(str(path))
+    """Return all channels (h, w) of a file, by name."""
+    image: Any = oiio.ImageBuf(str(path))
     return dict(zip(image.spec().channelnames, np.moveaxis(image.get_pixels(oiio.FLOAT), -1, 0), strict=True))
 
 
 def _motion(
     folder: Path, numbers: list[int], marked: list[dict[str, Array]], motion_format: str | None
 ) -> tuple[list[Array], list[Array]]:
-    """Vectors (h, w, 2) from each frame to the previous and the next one: exact ones, or the renderer's."""
+    """Return vectors (h, w, 2) from each frame to the previous and the next one: exact ones, or the renderer's."""
     if MOTION[0] in marked[0]:
         stored = [np.stack([each[name] for name in MOTION], axis=-1) for each in marked]
         return [each[..., :2] for each in stored], [each[..., 2:] for each in stored]
@@ -127,7 +120,7 @@ def _motion(
 
 
 def _returns(vectors: Array, back: Array) -> Mask:
-    """Where a vector leads into the picture, and the other frame's vector leads back."""
+    """Return where a vector leads into the picture, and the other frame's vector leads back."""
     height, width = vectors.shape[:2]
     y, x = np.mgrid[0:height, 0:width] + np.moveaxis(vectors, -1, 0)[::-1]
     row, column = np.rint(y).astype(int), np.rint(x).astype(int)
@@ -137,6 +130,6 @@ def _returns(vectors: Array, back: Array) -> Mask:
 
 
 def _differs(pictures: tuple[Array, Array], t: int, other: int, vectors: Array) -> Mask:
-    """Where a frame of the reference differs from another one that is brought to its place."""
+    """Return where a frame of the reference differs from another one that is brought to its place."""
     first, second = (half[t] - warped(half[other], vectors) for half in pictures)
     return blur((first * second).mean(axis=-1)[None, ..., None], CHANGED_BLUR)[0, ..., 0] > CHANGED**2

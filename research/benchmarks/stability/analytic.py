@@ -9,6 +9,7 @@ expectation of this, computed without sampling. The mean of many renders converg
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -86,15 +87,13 @@ def reference(scene: Scene, footprint: Footprint | None = None, scale: int = 1) 
     """Return expected colour of every pixel, (h / scale, w / scale, 3), with a pixel filter (the box if None)."""
     footprint = footprint or box(scale)
     image = _expected(scene.back)
-    if scene.front is not None:
+    if scene.front is not None and scene.coverage is not None:
         image += scene.coverage * (_expected(scene.front) - image)
     for axis in (0, 1):
         first = np.arange(0, image.shape[axis], SUB * scale)
         last = image.shape[axis] - 1
-        image = sum(
-            weight * image.take(np.clip(first + offset, 0, last), axis)
-            for offset, weight in zip(footprint.offsets, footprint.weights, strict=True)
-        )
+        shifted = (image.take(np.clip(first + offset, 0, last), axis) for offset in footprint.offsets)
+        image = functools.reduce(np.add, (w * part for w, part in zip(footprint.weights, shifted, strict=True)))
     return image.astype(np.float32)
 
 
@@ -133,7 +132,7 @@ def _sample(
         for corner, size in zip(corners, scene.back.shape[:2], strict=True)
     )
     points = scene.back[rows, columns]
-    if scene.front is not None:
+    if scene.front is not None and scene.coverage is not None:
         hit = rng.random((*shape, 1)) < scene.coverage[rows, columns]
         points = np.where(hit, scene.front[rows, columns], points)
     f = split(points)
@@ -141,11 +140,9 @@ def _sample(
     diffuse = f["albedo"] * (f["direct"] * seen + f["ambient"] * rng.exponential(size=(*shape, 1)))
     rare = (rng.random((*shape, 1)) < GLOSS_SEEN) / GLOSS_SEEN
     specular = f["gloss"] * rare * rng.exponential(size=(*shape, 1))
-    layers = {"albedo": f["albedo"], "normal": f["normal"], "diffuse": diffuse, "specular": specular}
-    return {
-        name: values.astype(np.float32)
-        for name, values in {**layers, "rgb": diffuse + specular + f["emission"]}.items()
-    }
+    layers: dict[str, NDArray[Any]] = {"albedo": f["albedo"], "normal": f["normal"], "diffuse": diffuse}
+    layers |= {"specular": specular, "rgb": diffuse + specular + f["emission"]}
+    return {name: values.astype(np.float32) for name, values in layers.items()}
 
 
 # Scenes. Lengths are shares of the frame. Those named ``pixels`` are in pixels: a hair is thin at any frame size.
@@ -170,7 +167,9 @@ def moved(scene: Scene, x: int, y: int) -> Scene:
         for size, pixels in zip(scene.back.shape, (y, x), strict=False)
     )
     parts = (scene.back, scene.front, scene.coverage)
-    return Scene(*(None if part is None else part[rows][:, columns] for part in parts))
+    back, front, coverage = (None if part is None else part[rows][:, columns] for part in parts)
+    assert back is not None
+    return Scene(back, front, coverage)
 
 
 def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 1.0) -> Scene:
@@ -253,7 +252,11 @@ def near_black(size: int, traces: float = 0.0) -> Scene:
     ``traces`` is the share of the glossy light that stays; its tails reach down to the smallest floats.
     """
     features = split(room(size).back)
-    features |= {"visible": features["visible"] * 0.005, "ambient": np.float32(0), "gloss": features["gloss"] * traces}
+    features |= {
+        "visible": features["visible"] * 0.005,
+        "ambient": np.zeros(1, np.float32),
+        "gloss": features["gloss"] * traces,
+    }
     return Scene(surface(features["albedo"].shape[:2], **features))
 
 

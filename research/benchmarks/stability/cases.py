@@ -262,9 +262,10 @@ def disagreement(size: int, scale: int) -> Iterator[Case]:
     """Yield pairs whose HRLS is right and whose LRHS shows something else."""
     base = room(size)
     clean = base.pair(scale)
-    other = analytic.hairy(size)
-    other = analytic.Scene(other.back[::-1, ::-1], other.front[::-1, ::-1], other.coverage[::-1, ::-1])
-    yield Case("another scene", base.make(scale, lr_scene=other), clean)
+    hairs = analytic.hairy(size)
+    assert hairs.front is not None and hairs.coverage is not None
+    stranger = analytic.Scene(*(part[::-1, ::-1] for part in (hairs.back, hairs.front, hairs.coverage)))
+    yield Case("another scene", base.make(scale, lr_scene=stranger), clean)
     ball = analytic.room(size, ball=(0.41, 0.5))
     yield Case("another frame: the ball 6 % further", base.make(scale, lr_scene=ball), clean)
     for factor in (0.25, 0.67, 1.5, 4.0):

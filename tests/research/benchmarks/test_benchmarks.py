@@ -42,12 +42,6 @@ def test_views_for_testing_are_scenes(tmp_path):
         low = scene.lrhs(8, spp)
         assert low.data_window.width == 8
         np.testing.assert_allclose(scenes.beauty(low), value * scale, rtol=2e-3)
-    # 4 spp are those of the fourth pass, 16 those of all five; more there are not
-    for factor, spp, value in ((2, 1, 4), (2, 4, (1 + 2 + 2 * 3 + 4 * 4 + 8 * 5) / 16)):
-        low = scene.nearest(factor, spp)
-        assert low.data_window.width == 32
-        np.testing.assert_allclose(scenes.beauty(low), value * scale, rtol=2e-3)
-    assert scene.nearest(4, 2) is None
 
 
 def test_folders_of_renders_are_scenes(tmp_path):

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from research.benchmarks.shots.measures import BLUR, blur, flicker, psnr, relmse, warp_error, warped
+from research.benchmarks.shots.measures import blur, flicker, psnr, relmse, warped
 from tests.conftest import picture
 
 SIGMA = 0.02
@@ -26,47 +26,29 @@ def panned(frames=6, step=3):
 
 
 def test_identical_frames_do_not_flicker_however_wrong_they_are():
-    measured = flicker(still() * 0.5, (still(), still()))
-    assert measured.pop("tpsnr") == math.inf
-    assert set(measured.values()) == {0.0}
+    assert flicker(still() * 0.5, (still(), still())) == 0
 
 
 def test_motion_that_the_reference_shares_is_no_flicker():
     moving = panned()
-    measured = flicker(moving + 0.1, (moving, moving))
-    assert max(measured[name] for name in ("flicker", "blotches", "grain")) < 1e-6
-    assert measured["tpsnr"] > 120
-    assert flicker(moving, (still(), still()))["flicker"] > 0.01
+    assert flicker(moving + 0.1, (moving, moving)) < 1e-6
+    assert flicker(moving, (still(), still())) > 0.01
 
 
 def test_independent_noise_flickers_by_the_root_of_two_of_its_deviation():
     truth = still()
-    measured = flicker(truth + noise(truth.shape), (truth, truth))
-    assert measured["flicker"] == pytest.approx(math.sqrt(2) * SIGMA, rel=0.01)
-    assert measured["tpsnr"] == pytest.approx(-20 * math.log10(math.sqrt(2) * SIGMA), abs=0.1)
-    # A Gaussian of deviation b leaves 1 / (2 sqrt(pi) b) of white noise, and somewhat more along the border.
-    assert measured["blotches"] == pytest.approx(math.sqrt(2) * SIGMA / (2 * math.sqrt(math.pi) * BLUR), rel=0.35)
-    assert measured["grain"] == pytest.approx(measured["flicker"], rel=0.01)
-
-
-def test_a_frame_that_changes_as_a_whole_flickers_in_the_low_frequencies_alone():
-    truth = still()
-    brightness = np.array([0, 0.01] * 3, np.float32)[:, None, None, None]
-    measured = flicker(truth + brightness, (truth, truth))
-    assert measured["blotches"] == pytest.approx(0.01, rel=1e-3)
-    assert measured["grain"] < 1e-5
+    assert flicker(truth + noise(truth.shape), (truth, truth)) == pytest.approx(math.sqrt(2) * SIGMA, rel=0.01)
 
 
 def test_noise_of_the_reference_halves_cancels_out():
     truth = still()
     halves = tuple(truth + noise(truth.shape, seed) for seed in (1, 2))
-    measured = flicker(truth + noise(truth.shape, 3), halves)
-    assert measured["flicker"] == pytest.approx(math.sqrt(2) * SIGMA, rel=0.02)
+    assert flicker(truth + noise(truth.shape, 3), halves) == pytest.approx(math.sqrt(2) * SIGMA, rel=0.02)
     assert psnr((truth + 0.1)[0], tuple(h[0] for h in halves)) == pytest.approx(20, abs=0.1)
 
 
 def test_blur_keeps_a_constant_picture_up_to_its_border():
-    assert blur(np.full((2, 40, 50, 3), 0.7, np.float32)) == pytest.approx(0.7, abs=1e-5)
+    assert blur(np.full((2, 40, 50, 3), 0.7, np.float32), 8) == pytest.approx(0.7, abs=1e-5)
 
 
 def test_psnr_in_a_mask_counts_that_alone():
@@ -91,16 +73,3 @@ def test_warping_brings_the_next_frame_of_a_pan_to_its_place():
     moving = panned(step=3)
     vectors = np.broadcast_to(np.float32((-3, 0)), (96, 128, 2))
     assert warped(moving[1], vectors)[:, 3:] == pytest.approx(moving[0][:, 3:], abs=1e-6)
-
-
-def test_warp_error_is_that_of_the_noise_and_ignores_what_the_next_frame_hides():
-    moving = panned(step=3)
-    vectors = np.broadcast_to(np.float32((-3, 0)), (5, 96, 128, 2))
-    seen = np.zeros((5, 96, 128), bool)
-    seen[..., 3:] = True
-    assert warp_error(moving, moving, vectors, seen) < 1e-10
-    noisy = moving + noise(moving.shape)
-    assert warp_error(noisy, noisy, vectors, seen) == pytest.approx(2 * SIGMA**2, rel=0.05)
-    halves = (moving + noise(moving.shape, seed) for seed in (1, 2))
-    assert warp_error(*halves, vectors, seen) < 0.1 * SIGMA**2
-    assert warp_error(moving, moving, vectors, ~seen) > 1e-6

@@ -157,6 +157,9 @@ def test_prefiltered_oidn_gets_clean_guides_and_is_told_so(monkeypatch):
     assert [options.get("quality") for _, options in calls[:2]] == ["high", "high"]
     assert calls[2][1] == {"hdr": True, "cleanAux": True}
     assert calls[2][0]["albedo"] == "clean albedo" and calls[2][0]["normal"] == "clean normal"
+    calls.clear()
+    oidn.denoise_prefiltered(GREY, GREY)
+    assert [options for _, options in calls] == [{"quality": "high"}, {"hdr": True, "cleanAux": True}]
 
 
 def row(scene, method, psnr, relmse=0.01, spp=2):
@@ -192,8 +195,18 @@ def test_a_ratio_is_that_of_the_means():
 def cell(monkeypatch):
     """Return the only cell of a table about "ours", whose peer is "theirs"."""
     noisy = next(iter(scenes.NOISY_REFERENCE))
-    ours = [row("a", "ours", 32.0, 0.01), row("b", "ours", 31.0, 0.03), row("c", "ours", 30.0, 0.02)]
-    theirs = [row("a", "theirs", 30.0, 0.02), row("b", "theirs", 31.0, 0.02), row("c", "theirs", 30.5, 0.02)]
+    ours = [
+        row("a", "ours", 32.0, 0.01),
+        row("b", "ours", 31.0, 0.03),
+        row("c", "ours", 30.0, 0.02),
+        row("d", "ours", 33.0, 0.08),
+    ]
+    theirs = [
+        row("a", "theirs", 30.0, 0.02),
+        row("b", "theirs", 31.0, 0.02),
+        row("c", "theirs", 30.5, 0.02),
+        row("d", "theirs", 30.5, 0.04),
+    ]
     others = [
         row(noisy, "ours", 99.0),
         row(noisy, "theirs", 0.0),
@@ -214,27 +227,28 @@ def cell(monkeypatch):
 
 def test_cells_compare_a_method_with_its_peer_by_scene(cell):
     """More is better for PSNR, so a positive difference is a lead; a draw is no win; noisy references don't count."""
-    assert cell("difference") == "+0.50"
-    assert cell("wins") == "1 of 3"
-    assert cell("mean") == "31.00"
-    assert cell("interval").startswith("+0.50 (-0.50 to +")
-    assert cell("ratio interval", "relmse") == "1.00 (0.50 to 1.50)"
-    assert cell("ratio", "relmse") == "1.00"
-    assert cell("max") == "32.00" and cell("count") == "3"
-    assert cell("quotient", "psnr/relmse", form="{:.0f}") == f"{93 / 0.06:.0f}"
+    assert cell("difference") == "+1.00"
+    assert cell("wins") == "2 of 4"
+    assert cell("mean") == "31.50"
+    assert cell("interval").startswith("+1.00 (-0.2")
+    assert cell("ratio interval", "relmse").startswith("1.40 (")
+    assert cell("ratio", "relmse") == "1.25"
+    assert cell("max") == "33.00" and cell("count") == "4"
+    assert cell("quotient", "psnr/relmse", form="{:.0f}") == f"{126 / 0.14:.0f}"
     assert cell("count", "psnr=30.0") == "0"  # names of verdicts are text
-    assert cell("mean", "psnr/relmse") == "31.00 / 0.0200"
+    assert cell("mean", "psnr/relmse") == "31.50 / 0.0350"
 
 
 def test_a_cell_is_empty_if_its_peer_was_not_measured_on_every_scene(cell, monkeypatch):
     rows = [r for r in results.read("t") if (r["scene"], r["method"]) != ("b", "theirs")]
     monkeypatch.setattr(results, "read", lambda name: rows)
-    assert cell("mean") == "31.00"
+    assert cell("mean") == "31.50"
     assert (cell("difference"), cell("wins")) == ("", "")
 
 
 def test_the_strongest_peer_is_the_one_with_the_highest_mean():
-    rows = [row("mean", f"OIDN{kind}, same samples", psnr) for kind, psnr in (("", 30.0), (" b", 32.0), (" c", 31.0))]
+    psnr = {"": (40.0, 20.0), " b": (29.0, 36.0), " c": (31.0, 31.0)}
+    rows = [row("mean", f"OIDN{kind}, same samples", value) for kind, values in psnr.items() for value in values]
     rows += [row("a", "OIDN, same samples", 99.0), row("mean", "OIDN on the HRLS", 50.0), row("mean", "joint-x2", 60.0)]
     assert tables.strongest(rows, ", same samples") == "OIDN b, same samples"
     assert tables.PLACES.keys() == {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
+"""Repeat the paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
 
     python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/ablations.csv
 
@@ -8,20 +8,13 @@ that is not varied reads colour only. For every row a reduced network of the pap
 scratch, for the same few steps on the same batches, and scored on the validation views. Rows can be compared with each
 other, not with the shipped models. The LRHS's AOVs come from the ``hr`` passes that are not in the HRLS. Rows that the
 table already has are kept.
-
-    python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/growth.csv --only "growth rate*"
-    --steps 300
-
-trains the whole network with either growth rate that the paper may mean.
 """
 
 from __future__ import annotations
 
-import argparse
-import fnmatch
 import functools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -61,8 +54,6 @@ class Variant:
     lrhs: str = RGB
     hrls: str = RGB
     loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
-    network: Mapping[str, int] = field(default_factory=lambda: REDUCED)
-    """Sizes of the network that are not the whole one's."""
 
 
 def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
@@ -82,8 +73,6 @@ VARIANTS = [
     Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
     *(Variant(f"x{scale}, HRLS: {name}", scale, hrls=name) for scale in (2, 8) for name in (NONE, ALL)),
 ]
-#: The whole network, which reads what the models that ship do.
-GROWTH_RATES = [Variant(f"growth rate {rate}", hrls=ALL, network={"growth": rate}) for rate in (32, 64)]
 
 
 @dataclass(frozen=True)
@@ -115,7 +104,7 @@ def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int
 
 
 def channels_of(name: str) -> Tensor:
-    """Mask (1, 16, 1, 1) of the channels that a branch reads."""
+    """Return the mask (1, 16, 1, 1) of the channels that a branch reads."""
     names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
     read = {feature for layers in names for feature in LAYERS[layers]}
     return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
@@ -123,7 +112,7 @@ def channels_of(name: str) -> Tensor:
 
 @functools.lru_cache(maxsize=1)  # some GB; VARIANTS are sorted by scale
 def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Batches of LRHS, HRLS and target, encoded."""
+    """Return batches of LRHS, HRLS and target, encoded."""
     rng = np.random.default_rng(0)
     batches = []
     for _ in range(POOL):
@@ -144,7 +133,7 @@ def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tens
 def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
     """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
-    network = MultiResolutionFusion(variant.scale, **variant.network, lrhs_channels=HRLS_CHANNELS)
+    network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
@@ -164,7 +153,7 @@ def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bo
 
 @torch.inference_mode()
 def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
-    """Mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
+    """Return mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
     found = []
     for view in views:
         height, width = view.ref.shape[:2]
@@ -179,29 +168,23 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Train and score the rows that the table does not have."""
+    parser = results.parser(__doc__)
     parser.add_argument("views", type=Path, help="folder of views")
-    parser.add_argument("--table", type=Path, required=True, help="table to write or complete")
     parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
-    parser.add_argument("--only", metavar="PATTERN", help="rows whose name matches, the growth rates' included")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16", help="(default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    rows = results.read(args.table) if args.table.exists() else []
     folder = Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
     effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
-    done = {row["name"] for row in rows}
-    every = [*VARIANTS, *GROWTH_RATES]
-    chosen = [each for each in every if fnmatch.fnmatch(each.name, args.only)] if args.only else VARIANTS
-    for variant in chosen:
+    done = {row["name"] for row in results.read(args.table)} if args.table and args.table.exists() else set()
+    for variant in VARIANTS:
         if variant.name not in done:
             network = train(variant, views, args.steps, bfloat16=args.precision == "bf16")
             row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
-            print(row, flush=True)
-            rows.append(row)
-            results.write(args.table, rows)
+            results.show(results.plain, [row], args.table, ("name",))
 
 
 if __name__ == "__main__":

@@ -107,7 +107,7 @@ def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
 
 
 def rescaled(layers: Array, beauty: Array) -> Array:
-    """Layers that sum to the beauty, in the ratio of these."""
+    """Return layers that sum to the beauty, in the ratio of these."""
     total = layers.sum(axis=0)
     return layers * np.where(total > 0, beauty / np.where(total > 0, total, 1), 0)
 
@@ -266,8 +266,10 @@ def measure(
     spread: bool = False,
     half: bool = False,
 ) -> list[Row]:
-    """One scene: rows for each set and method, without those whose `KEYS` are known; with ``half``, for `BESIDE_HALF`
-    of light groups alone, else for all but `AT_HALF`."""
+    """Measure one scene: rows for each set and method, without those whose `KEYS` are known.
+
+    With ``half``, only light groups by the methods `BESIDE_HALF`; else by all but `AT_HALF`.
+    """
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     other = folder / f"hr_{2 * spp}spp.exr"

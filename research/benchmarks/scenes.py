@@ -46,7 +46,7 @@ class Scene:
 
 
 def load(folder: Path) -> list[Scene]:
-    """All scenes of a folder.
+    """Return all scenes of a folder.
 
     Raises:
         SystemExit: there are none.

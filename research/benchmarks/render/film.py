@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the renders of benchmarks share: which part of a frame is rendered, and how it is stored."""
+"""Set which part of a frame is rendered, and store it: what the renders of benchmarks share."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ LONGER, CROP = 1280, (384, 256)
 
 
 def frame_size(sensor: Any, longer: int = LONGER) -> np.ndarray:
-    """Width and height of a Mitsuba sensor's frame, scaled to a longer side; both are multiples of 8."""
+    """Return width and height of a Mitsuba sensor's frame, scaled to a longer side; both are multiples of 8."""
     original = np.array(sensor.film().size())
     return np.asarray(np.round(original * longer / original.max() / 8).astype(int) * 8)
 

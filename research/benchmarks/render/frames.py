@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders whole frames of scenes for `research.benchmarks.pair_checks`, with Mitsuba 3.
+"""Render whole frames of scenes for `research.benchmarks.pair_checks`, with Mitsuba 3.
 
     python -m research.benchmarks.render.frames SCENES OUT
 

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A room in which one thing changes, for `research.benchmarks.render.sequences`: an object, the light or the camera.
+"""Build a room for `research.benchmarks.render.sequences` in which an object, the light or the camera changes.
 
 Lengths are metres, z is up. The random parts have fixed seeds, so a frame always shows the same room.
 """
@@ -77,7 +77,7 @@ class Room:
 
 
 def camera_matrix(animation: Animation, at: float) -> np.ndarray:
-    """Camera to world, (4, 4); the camera has x to the left, as Mitsuba's. ``at``: frames from the middle."""
+    """Return the matrix from camera (x to the left) to world, (4, 4). ``at``: frames from the middle."""
     forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
     left = np.cross([0, 0, 1], forward)
     left /= np.linalg.norm(left)
@@ -88,13 +88,13 @@ def camera_matrix(animation: Animation, at: float) -> np.ndarray:
 
 
 def focus_distance() -> float:
-    """Metres from the camera to the block in the middle, along the camera's axis."""
+    """Return the metres from the camera to the block in the middle, along the camera's axis."""
     forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
     return float((BLOCK + np.array([0, 0, 0.3]) - CAMERA) @ forward)
 
 
 def object_matrix(animation: Animation, at: float) -> np.ndarray:
-    """Where the moving object is, (4, 4)."""
+    """Return where the moving object is, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3, :3] = meshes.rotation((0, 0, 1), at * animation.turn)
     matrix[:3, 3] = BLOCK + at * np.array([animation.slide, 0, -animation.flakes])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders short sequences for `research.benchmarks.shots`, with Mitsuba 3.
+"""Render short sequences for `research.benchmarks.shots`, with Mitsuba 3.
 
     python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m research.benchmarks.render.sequences SPREAD --scenes SCENES --spread
@@ -88,13 +88,13 @@ class Camera:
     focus: float = 1.0
 
     def project(self, positions: NDArray[Any]) -> NDArray[Any]:
-        """World positions (..., 3) to pixels (..., 2), y downwards."""
+        """Project world positions (..., 3) to pixels (..., 2), y downwards."""
         inverse = np.linalg.inv(self.to_world)
         seen = positions @ inverse[:3, :3].T + inverse[:3, 3]
         return np.asarray(self.centre) - self.focal * seen[..., :2] / seen[..., 2:]
 
     def rays(self) -> tuple[NDArray[Any], NDArray[Any]]:
-        """Origins and directions through the centres of the pixels, (pixels, 3) each."""
+        """Return origins and directions through the centres of the pixels, (pixels, 3) each."""
         y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
         seen = [(self.centre[0] - x) / self.focal, (self.centre[1] - y) / self.focal, np.ones_like(x)]
         directions = np.stack(seen, axis=-1).reshape(-1, 3) @ self.to_world[:3, :3].T
@@ -154,7 +154,7 @@ class _AnimatedRoom:
         return build_room(self._animation, frame, at)
 
     def object_moves(self, at: float, other: float) -> NDArray[Any]:
-        """From the moving object's place at one time to that at another, (4, 4)."""
+        """Return the matrix from the moving object's place at one time to that at another, (4, 4)."""
         return np.asarray(object_matrix(self._animation, other) @ np.linalg.inv(object_matrix(self._animation, at)))
 
 
@@ -179,7 +179,7 @@ def surfaces(mi: Any, room: Room, camera: Camera) -> NDArray[Any]:
 
 
 def motion(shown: NDArray[Any], scene: Any, at: float, other: float) -> NDArray[Any]:
-    """Where the surfaces (h, w, 6) of one time are at another, in pixels from their place, (h, w, 2)."""
+    """Return where the surfaces (h, w, 6) of one time are at another, in pixels from their place, (h, w, 2)."""
     positions = shown[..., :3]
     matrix = scene.object_moves(at, other)
     moved = positions @ matrix[:3, :3].T + matrix[:3, 3]

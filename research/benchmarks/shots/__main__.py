@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Sequences that are fused frame by frame and with their neighbours, beside OIDN's.
+"""Measure sequences that are fused frame by frame and with their neighbours, beside OIDN's.
 
     python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m research.datagen.cycles.sequence SEQUENCES

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The frames of a sequence by each method, through the code that fuses shots."""
+"""Make the frames of a sequence by each method, through the code that fuses shots."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ class Made:
     images: Array
     """Linear (frames, h, w, 3)."""
     motion: str = ""
-    """How the motion is known; empty for single frames."""
+    """Say how the motion is known; empty for single frames."""
 
 
 def all_methods(
     sequence: Sequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*", *, spread: bool = False
 ) -> Iterator[Made]:
-    """Each method on a sequence whose name matches the pattern.
+    """Yield each method on a sequence whose name matches the pattern.
 
     OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
     are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``options`` say which
@@ -69,7 +69,7 @@ def all_methods(
 def _by_scale(
     sequence: Sequence, scale: int, options: TemporalOptions, spread: bool
 ) -> Iterator[tuple[str, Temporal, Callable[[], Array]]]:
-    """Our frames alone and with neighbours, and OIDN's with neighbours: the method, and how to compute its frames."""
+    """Yield the methods that read an LRHS: the name, the neighbours, and how to compute its frames."""
     folder = sequence.folder
     shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
     # More threads only wait for each other: the pictures are small.
@@ -115,7 +115,7 @@ def _frames(
     frames: list[Frame],
     fuse: Callable[[LoadedFrame, Neighbours], FusedAlone],
 ) -> Array:
-    """Images of all frames.
+    """Return the images of all frames.
 
     Raises:
         MssplError: a frame can't be fused.

@@ -32,7 +32,7 @@ ENDS = 6
 
 
 def images_of(path: Path) -> list[Array]:
-    """Beauty and light groups of a frame, (h, w, 3) each."""
+    """Return beauty and light groups of a frame, (h, w, 3) each."""
     render = map_render(open_exr(path))
     (lamps,) = render.additive_sets
     pixels = with_layers(render, lamps).read(render.data_window, ["rgb", *layer_keys(lamps)])
@@ -40,7 +40,7 @@ def images_of(path: Path) -> list[Array]:
 
 
 def scores(errors: Array) -> tuple[float, float]:
-    """PSNR in dB, and flicker, of errors (frames, h, w, 3)."""
+    """Return PSNR in dB, and flicker, of errors (frames, h, w, 3)."""
     moved = errors[1:, :, :-STEP] - errors[:-1, :, STEP:]
     return float(-10 * np.log10(np.mean(errors**2))), float(np.abs(moved).mean())
 

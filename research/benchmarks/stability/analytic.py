@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Analytic scenes with exact references, and renders of them with the noise of one-sample Monte Carlo.
+"""Define scenes with exact references, and render them with the noise of one-sample Monte Carlo.
 
 A scene is defined at ``SUB`` x ``SUB`` points in each pixel. A sample picks one of the points under its pixel filter.
 Then it picks the front, with the probability of its coverage, or the back; whether it sees the light (Bernoulli); and
@@ -29,7 +29,7 @@ CHANNELS = {"albedo": 3, "normal": 3, "direct": 1, "visible": 1, "ambient": 1, "
 
 
 def surface(shape: tuple[int, int], **features: NDArray | float | tuple[float, ...]) -> Array:
-    """Features at every point, (h * SUB, w * SUB, 15). Missing ones are 0, and the normal faces the camera.
+    """Return features at every point, (h * SUB, w * SUB, 15). Missing ones are 0, and the normal faces the camera.
 
     Radiance is ``albedo * (direct * visible + ambient) + gloss + emission``; ``visible`` is a probability.
     """
@@ -39,7 +39,7 @@ def surface(shape: tuple[int, int], **features: NDArray | float | tuple[float, .
 
 
 def split(points: Array) -> dict[str, Array]:
-    """Stacked features (..., 15) by name."""
+    """Return stacked features (..., 15) by name."""
     ends = np.cumsum(list(CHANNELS.values()))
     return dict(zip(CHANNELS, np.split(points, ends[:-1], axis=-1), strict=True))
 
@@ -71,7 +71,7 @@ def box(scale: int = 1) -> Footprint:
 
 
 def point(scale: int) -> Footprint:
-    """Only one of the HRLS pixels that an LRHS pixel covers, as in the paper's nearest-neighbour LRHS."""
+    """Return the filter of one of the HRLS pixels that an LRHS pixel covers, as in the paper's LRHS."""
     return Footprint(scale // 2 * SUB + np.arange(SUB), np.full(SUB, 1 / SUB))
 
 
@@ -100,7 +100,7 @@ def reference(scene: Scene, footprint: Footprint | None = None, scale: int = 1) 
 def render(
     scene: Scene, spp: int, rng: np.random.Generator, *, footprint: Footprint | None = None, scale: int = 1
 ) -> Render:
-    """All layers at 1 / ``scale`` of the scene's resolution. The variance needs at least 2 spp."""
+    """Render all layers at 1 / ``scale`` of the scene's resolution. The variance needs at least 2 spp."""
     footprint = footprint or box(scale)
     height, width = (n // (SUB * scale) for n in scene.back.shape[:2])
     corners = np.mgrid[0:height, 0:width] * (SUB * scale)
@@ -114,7 +114,8 @@ def render(
     if spp > 1:
         variance = squares - np.square(luminance(total["rgb"].astype(np.float32)))[..., None]
         total["variance"] = np.maximum(variance, 0) / (spp - 1)
-    return Render.from_arrays("HRLS" if scale == 1 else "LRHS", **total)
+    layers = {name: values.astype(np.float32) for name, values in total.items()}
+    return Render.from_arrays("HRLS" if scale == 1 else "LRHS", **layers)
 
 
 def _expected(points: Array) -> Array:
@@ -149,14 +150,14 @@ def _sample(
 
 
 def grid(size: int) -> tuple[Array, Array]:
-    """(x, y) of all points of a square frame, in [0, 1]."""
+    """Return (x, y) of all points of a square frame, in [0, 1]."""
     along = (np.arange(size * SUB, dtype=np.float32) + 0.5) / np.float32(size * SUB)
     x, y = np.meshgrid(along, along)
     return x[..., None], y[..., None]
 
 
 def where(mask: NDArray[np.bool_], yes: Any, no: Any) -> Array:
-    """np.where in single precision, to save memory."""
+    """Call np.where in single precision, to save memory."""
     return np.where(mask, np.asarray(yes, np.float32), np.asarray(no, np.float32))
 
 
@@ -213,7 +214,7 @@ def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 
 
 
 def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
-    """Emitters in front of a scene whose own light is dimmed. They have no albedo, as in renderers."""
+    """Put emitters in front of a scene whose own light is dimmed. They have no albedo, as in renderers."""
     features = split(scene.back)
     lit = emission.max(axis=-1, keepdims=True) > 0
     features["emission"] = where(lit, emission, 0)
@@ -224,7 +225,7 @@ def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
 
 
 def small_lights(size: int, radiance: float) -> Scene:
-    """Lamps with a radius of 0.3 to 3 pixels in front of a dim room, from ``radiance`` / 1000 to ``radiance``."""
+    """Make lamps with a radius of 0.3 to 3 pixels in front of a dim room, from ``radiance`` / 1000 to ``radiance``."""
     x, y = grid(size)
     rng = np.random.default_rng(5)
     emission = np.zeros((*x.shape[:2], 3), np.float32)
@@ -237,7 +238,7 @@ def small_lights(size: int, radiance: float) -> Scene:
 
 
 def emitters(size: int) -> Scene:
-    """Bright panels with hard edges, one seen through a grille."""
+    """Make bright panels with hard edges, one seen through a grille."""
     x, y = grid(size)
     panel = (np.abs(x - 0.3) < 0.18) & (np.abs(y - 0.22) < 0.1)
     window = (np.abs(x - 0.72) < 0.17) & (np.abs(y - 0.5) < 0.3)
@@ -295,7 +296,7 @@ def dark_room(size: int) -> Scene:
 
 
 def defocused(size: int) -> Scene:
-    """Out-of-focus discs in front of the room. At their rims each sample hits the front or the back."""
+    """Make out-of-focus discs in front of the room. At their rims each sample hits the front or the back."""
     x, y = grid(size)
     coverage = np.zeros_like(x)
     albedo = np.zeros((*x.shape[:2], 3), np.float32)
@@ -316,7 +317,7 @@ def moving(size: int) -> Scene:
     travel = 60 / size
 
     def time_over(left: float, right: float) -> NDArray:
-        """Share of the time that something between left and right, moving to the right, is at x."""
+        """Return the share of the time that something between left and right, moving to the right, is at x."""
         return np.clip((np.minimum(x - left, travel) - np.maximum(x - right, 0)) / travel, 0, 1)
 
     bar = time_over(0.2, 0.4) * ((y > 0.3) & (y < 0.5))
@@ -336,7 +337,7 @@ def moving(size: int) -> Scene:
 
 
 def hairy(size: int) -> Scene:
-    """Curved hairs with a width of 0.1 to 0.8 pixels, lighter than their background."""
+    """Make curved hairs with a width of 0.1 to 0.8 pixels, lighter than their background."""
     x, y = grid(size)
     cell = 1 / SUB
     coverage = np.zeros_like(x)

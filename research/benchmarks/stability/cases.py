@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cases: what can go wrong with a pair. There is one function for each group."""
+"""Make the cases: what can go wrong with a pair. There is one function for each group."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ def exposure(base: Base, scale: int) -> Iterator[Case]:
 
 
 def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
-    """One bright pixel. In ``clean`` it is one pixel further left."""
+    """Yield pairs with one bright pixel. In ``clean`` it is one pixel further left."""
     clean = base.pair(scale)
     value = 1e4 * mean_light(clean)
 
@@ -179,7 +179,7 @@ def footprints(base: Base, scale: int) -> Iterator[Case]:
 
 
 def overflow(base: Base, scale: int) -> Iterator[Case]:
-    """Light beyond 65504, the largest half float."""
+    """Yield light beyond 65504, the largest half float."""
     clean = base.pair(scale)
     bright = scaled(clean, 4 * MAX_RADIANCE / float(np.quantile(clean.reference, 0.999)))
     with np.errstate(over="ignore"):

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures a result, and words a verdict from the figures."""
+"""Measure a result, and word a verdict from the figures."""
 
 from __future__ import annotations
 
@@ -190,7 +190,7 @@ def window(
 
 
 def input_range(pair: Pair) -> tuple[Array, Array]:
-    """Smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
+    """Return the smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
     low, high = repaired(pair.lr.layers[RGB]), repaired(pair.hr.layers[RGB])
     s = pair.scale
     result = []

@@ -271,7 +271,11 @@ def time_passes(args: argparse.Namespace) -> list[Row]:
         for _ in range(args.rounds + 1):
             for key, call in calls.items():
                 times.setdefault(key, []).extend(timer.seconds_of(call, 1, 0))
-    size = {"size": f"{window.width}x{window.height}", "scale": scale, "kind": "rendered" if args.pair else "light"}
+    size = {
+        "size": f"{window.width}x{window.height}",
+        "scale": scale,
+        "kind": "rendered" if args.pair else "light everywhere",
+    }
     return [
         {"set": name, "method": method, **size, "cores": os.cpu_count(), **({"model": model} if model else {})}
         | {"seconds": statistics.median(seconds[1:])}

@@ -52,6 +52,7 @@ class Run:
 
     seconds: tuple[float, ...]
     cpu_seconds: float
+    """Of the whole process, preparation included."""
     peak_mb: float
 
 

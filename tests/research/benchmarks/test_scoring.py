@@ -12,7 +12,7 @@ pytest.importorskip("torch")
 from oiio_msspl import Render
 from oiio_msspl.image.colour import srgb
 from research.benchmarks import accuracy, oidn, passes, peers, results, scenes, tables, versus
-from research.benchmarks.tables import Column, Line, Table
+from research.benchmarks.layout import Column, Line, Table, clean
 from tests.conftest import downsample, picture
 
 GREY = np.full((16, 16, 3), 0.25, np.float32)
@@ -217,7 +217,7 @@ def cell(monkeypatch):
     monkeypatch.setattr(results, "read", lambda name: rows)
 
     def cell_of(how, measure="psnr", **options):
-        line = Line(["x"], {"method": "ours", "spp": 2, "scene": tables.clean}, {"method": "theirs"})
+        line = Line(["x"], {"method": "ours", "spp": 2, "scene": clean}, {"method": "theirs"})
         columns = [Column("c", measure, how=how, **options), Column("d", "psnr")]
         text = Table(("t",), tables.BY_SCENE, ("h",), [line], columns).text()
         return text.splitlines()[2].split("|")[2].strip()

@@ -154,7 +154,7 @@ def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bo
 @torch.inference_mode()
 def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
     """Return mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
-    found = []
+    scored = []
     for view in views:
         height, width = view.ref.shape[:2]
         pair = pair_of(view, variant.scale, 0, 0, height, 0)
@@ -163,8 +163,10 @@ def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View
         reference = pair.target * np.float32(pair.exposure)
         bicubic = upsample_bicubic(decode_radiance(pair.lrhs[..., :3], 1.0), width, height)
         images = (decode_radiance(fused.numpy(), 1.0), bicubic)
-        found.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
-    return dict(zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(found, axis=0).tolist(), strict=True))
+        scored.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
+    return dict(
+        zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(scored, axis=0).tolist(), strict=True)
+    )
 
 
 def main() -> None:

@@ -216,8 +216,8 @@ def main() -> None:
     args = parser.parse_args()
     pattern = args.methods or "*"
     sessions = load_models(args.model or list(shipped_models()), pattern)
-    found = scenes.load(args.folder)
-    rows = [row for scene in found for row in measure(scene, sessions, flip=args.flip, pattern=pattern)]
+    loaded = scenes.load(args.folder)
+    rows = [row for scene in loaded for row in measure(scene, sessions, flip=args.flip, pattern=pattern)]
     if not rows:
         parser.error(f"no method matches {args.methods}")
     results.show(layout, with_means(rows), args.table, KEYS if args.methods else ())

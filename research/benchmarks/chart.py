@@ -33,7 +33,7 @@ PEERS = (
     "OIDN prefiltered on the HRLS",
     "OIDN fast on the HRLS",
 )
-#: How a series of models ends if most samples are in the HRLS, as far as that was measured.
+#: How a series of models ends if most samples are in the HRLS.
 UNEVEN = ", most samples in the HRLS"
 
 
@@ -47,14 +47,14 @@ def data() -> dict[str, Any]:
         pixels, and for each scene its ``values`` in the order of the measures.
     """
     rows = results.read("accuracy")
-    found = results.index(rows, *accuracy.KEYS)
+    by_key = results.index(rows, *accuracy.KEYS)
     times = results.index((row for row in results.read("time_frame") if row["machine"].endswith(MACHINE)), "method")
     cost = {row["scene"]: row["hrls_s"] for row in results.read("time_render") if row["machine"].endswith(MACHINE)}
     cost[MEAN] = round(statistics.fmean(value for name, value in cost.items() if name not in NOISY_REFERENCE), 4)
     names = [MEAN, *(name for name in dict.fromkeys(row["scene"] for row in rows) if name in cost and name != MEAN)]
 
     def point(timed: str, method: str, spp: int) -> dict[str, Any]:
-        measured = {name: found[name, spp, method] for name in names if (name, spp, method) in found}
+        measured = {name: by_key[name, spp, method] for name in names if (name, spp, method) in by_key}
         values = {name: [row[measure] for measure in MEASURES] for name, row in measured.items()}
         return {"method": method, "spp": spp, "seconds": times[timed]["seconds"], "values": values}
 
@@ -68,7 +68,7 @@ def data() -> dict[str, Any]:
         uneven = [
             point(name, f"{name}, {division}", spp)
             for spp in accuracy.AVERAGES
-            if (division := _largest_share(found, members, spp))
+            if (division := _largest_share(by_key, members, spp))
             for name in members
         ]
         series += [{"name": family, "points": even}, {"name": family + UNEVEN, "points": uneven}]

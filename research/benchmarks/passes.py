@@ -85,9 +85,9 @@ FAINT = 0.01
 BALANCED, BEST = "joint", "joint-large"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
-#: The same for noise that a pixel filter has spread.
+#: The peer for noise that a pixel filter has spread.
 SPLIT_PEER = "OIDN, every second pixel, rescaled"
-#: The same as a file can hold it.
+#: The peer as a file can hold it.
 STORED_PEER = "OIDN, prefiltered, stored"
 #: The set whose layers are products of light and colour in some renderers.
 COMPONENTS = "components"
@@ -196,8 +196,8 @@ def methods(
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
     """Return the set of another file with the same name and layers."""
     names = [layer.name for layer in layers.layers]
-    found = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
-    return next(found)
+    sets = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
+    return next(sets)
 
 
 def regraded(layers: Array) -> Array:
@@ -272,8 +272,8 @@ def measure(
     """
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
-    other = folder / f"hr_{2 * spp}spp.exr"
-    ordinary = map_render(open_exr(other)) if other.exists() else None
+    full = folder / f"hr_{2 * spp}spp.exr"
+    ordinary = map_render(open_exr(full)) if full.exists() else None
     noise = SPREAD if spread else ""
     fused = fused_frames(lr, hr, scale, noise)
     pixels = hr.load().layers
@@ -334,9 +334,9 @@ def main() -> None:
         return
     rows: list[Row] = []
     for scene, spp, scale in itertools.product(scenes, SPP, SCALES):
-        known = {tuple(row[key] for key in KEYS) for row in rows}
+        measured = {tuple(row[key] for key in KEYS) for row in rows}
         # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-        rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
+        rows += measure(args.passes / scene, scale, spp, measured, spread=args.spread, half=args.half)
         print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
     print(results.plain(means(rows)))
     if args.table:

@@ -320,12 +320,14 @@ def _time_of_shots(lamps: int) -> Table:
 
 def _passes(source: str, gains: Sequence[str], methods: Wanted = lambda name: True) -> Table:
     """Return a table of means over scenes of a table of :mod:`research.benchmarks.passes`."""
-    mean, each = {"scene": MEAN, "layer": passes.ALL}, {"scene": clean, "layer": passes.ALL}
+    mean, by_scene = {"scene": MEAN, "layer": passes.ALL}, {"scene": clean, "layer": passes.ALL}
     titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
     titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
     form = {name: "{:.4f}" if "relmse" in name else "{:.2f}" for name in titles}
     columns = [Column(title, name, mean, form=form[name]) for name, title in titles.items()]
-    columns += [Column(f"gain over {peer}, dB", "psnr", each, "interval", against={"method": peer}) for peer in gains]
+    columns += [
+        Column(f"gain over {peer}, dB", "psnr", by_scene, "interval", against={"method": peer}) for peer in gains
+    ]
     single = {"scene": clean, "layer": lambda name: name != passes.ALL}
     columns.append(Column("better on", "psnr", single, "wins", against={"method": passes.PEER}))
     by = ("set", "spp", "method")

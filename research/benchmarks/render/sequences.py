@@ -167,10 +167,10 @@ def surfaces(mi: Any, room: Room, camera: Camera) -> NDArray[Any]:
     depth = np.where(valid, np.array(hit.t), 0)
 
     def any_of(shapes: list[Any]) -> NDArray[Any]:
-        found = np.zeros(len(depth), bool)
+        hits = np.zeros(len(depth), bool)
         for shape in shapes:
-            found |= np.array(hit.shape == mi.ShapePtr(shape))
-        return found
+            hits |= np.array(hit.shape == mi.ShapePtr(shape))
+        return hits
 
     far = np.where(valid, depth, 1e5)[:, None]
     columns = [origins + far * directions, depth[:, None]]

@@ -95,9 +95,13 @@ def _by_scale(
         return FusedAlone(loaded, stages.session(loaded), fused, 0.0)
 
     for quality, prefix in QUALITIES.items():
-        own = by_quality[quality]
-        for name, temporal in ((ALONE, Temporal()), (NEIGHBOURS, own.temporal)):
-            yield prefix + name, temporal, partial(_frames, own.read, temporal, shot.frames, partial(ours, own))
+        by_model = by_quality[quality]
+        for name, temporal in ((ALONE, Temporal()), (NEIGHBOURS, by_model.temporal)):
+            yield (
+                prefix + name,
+                temporal,
+                partial(_frames, by_model.read, temporal, shot.frames, partial(ours, by_model)),
+            )
     peers = {OIDN_NEIGHBOURS: oidn_prefiltered} | ({OIDN_SPLIT_NEIGHBOURS: oidn_split} if spread else {})
     for name, denoised in peers.items():
         fused = partial(theirs, denoised)

@@ -110,8 +110,8 @@ def _motion(
 ) -> tuple[list[Array], list[Array]]:
     """Return vectors (h, w, 2) from each frame to the previous and the next one: exact ones, or the renderer's."""
     if MOTION[0] in marked[0]:
-        stored = [np.stack([each[name] for name in MOTION], axis=-1) for each in marked]
-        return [each[..., :2] for each in stored], [each[..., 2:] for each in stored]
+        stored = [np.stack([mark[name] for name in MOTION], axis=-1) for mark in marked]
+        return [vectors[..., :2] for vectors in stored], [vectors[..., 2:] for vectors in stored]
     frames = [MotionFrame(map_render(open_exr(folder / f"hr.{n:04d}.exr"))) for n in numbers]
     source = find_motion(frames[0].hr, frames[1].hr, motion_format, required=True)
     back = [source.read(here, there, -1)[0] for there, here in itertools.pairwise(frames)]

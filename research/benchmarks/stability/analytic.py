@@ -51,7 +51,7 @@ class Scene:
     back: Array
     """See :func:`surface`."""
     front: Array | None = None
-    """The same for what covers the back."""
+    """Features of what covers the back."""
     coverage: Array | None = None
     """Probability that a sample at a point hits the front, (h * SUB, w * SUB, 1), as with lens or motion blur."""
 

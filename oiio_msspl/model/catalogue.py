@@ -4,6 +4,8 @@
 from __future__ import annotations
 
 import csv
+import hashlib
+import re
 from pathlib import Path
 
 from oiio_msspl.errors import InputError
@@ -25,6 +27,22 @@ AUTO, DEFAULT_QUALITY = "auto", "balanced"
 def shipped_models() -> dict[str, Path]:
     """Return the ONNX files of all models for pairs inside the package, by name (``paper-x4``)."""
     return {path.stem: path for path in sorted(WEIGHTS.glob("*.onnx")) if not path.stem.endswith("-x1")}
+
+
+def digest(path: Path) -> str:
+    """Return 12 hexadecimal digits that identify a model: SHA-256 over its ONNX file and the weights files it names.
+
+    Args:
+        path: the ONNX file. Its weights files, ``*.weights``, lie beside it and are read in the order of their names.
+
+    Raises:
+        FileNotFoundError: the ONNX file or one of its weights files is missing.
+    """
+    content = path.read_bytes()
+    made = hashlib.sha256(content)
+    for name in sorted(set(re.findall(rb"[\w.-]+\.weights", content))):
+        made.update((path.parent / name.decode()).read_bytes())
+    return made.hexdigest()[:12]
 
 
 def measured() -> dict[str, dict[str, float]]:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
+"""Repeat the paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
 
     python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/ablations.csv
 
@@ -8,20 +8,13 @@ that is not varied reads colour only. For every row a reduced network of the pap
 scratch, for the same few steps on the same batches, and scored on the validation views. Rows can be compared with each
 other, not with the shipped models. The LRHS's AOVs come from the ``hr`` passes that are not in the HRLS. Rows that the
 table already has are kept.
-
-    python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/growth.csv --only "growth rate*"
-    --steps 300
-
-trains the whole network with either growth rate that the paper may mean.
 """
 
 from __future__ import annotations
 
-import argparse
-import fnmatch
 import functools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -46,12 +39,7 @@ BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
 #: Batches that are drawn per scale. Every row trains on them repeatedly.
 POOL = 400
 #: Features by the tables' names; each entry includes those before it.
-LAYERS = {
-    "RGB": [RGB],
-    "and albedo": [ALBEDO],
-    "and normal": [NORMAL],
-    "and diffuse, specular": [DIFFUSE, SPECULAR],
-}
+LAYERS = {"RGB": [RGB], "and albedo": [ALBEDO], "and normal": [NORMAL], "and diffuse, specular": [DIFFUSE, SPECULAR]}
 NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
 #: The paper's upper bound of radiance.
 CLIP = 100.0
@@ -66,8 +54,6 @@ class Variant:
     lrhs: str = RGB
     hrls: str = RGB
     loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
-    network: Mapping[str, int] = field(default_factory=lambda: REDUCED)
-    """Sizes of the network that are not the whole one's."""
 
 
 def _in_linear(loss: Callable[[Tensor, Tensor], Tensor]) -> Callable[[Tensor, Tensor], Tensor]:
@@ -87,8 +73,6 @@ VARIANTS = [
     Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
     *(Variant(f"x{scale}, HRLS: {name}", scale, hrls=name) for scale in (2, 8) for name in (NONE, ALL)),
 ]
-#: The whole network, which reads what the models that ship do.
-GROWTH_RATES = [Variant(f"growth rate {rate}", hrls=ALL, network={"growth": rate}) for rate in (32, 64)]
 
 
 @dataclass(frozen=True)
@@ -105,7 +89,7 @@ class Pair:
 
 
 def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
-    """A crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
+    """Return a crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
     rows, columns = slice(top, top + patch), slice(left, left + patch)
     colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
     exposure = find_exposure(colour)
@@ -115,12 +99,12 @@ def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int
     low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
     low[..., :3] = colour[low_rows, low_columns]
     high = read_hrls(view, [chosen], rows, columns)[0]
-    encoded = (packed(split_features(passes), exposure) for passes in (low, high))
-    return Pair(*encoded, as_float32(view.ref[rows, columns]), exposure)
+    encoded = [packed(split_features(passes), exposure) for passes in (low, high)]
+    return Pair(encoded[0], encoded[1], as_float32(view.ref[rows, columns]), exposure)
 
 
 def channels_of(name: str) -> Tensor:
-    """Mask (1, 16, 1, 1) of the channels that a branch reads."""
+    """Return the mask (1, 16, 1, 1) of the channels that a branch reads."""
     names = list(LAYERS)[: list(LAYERS).index(name) + 1] if name in LAYERS else []
     read = {feature for layers in names for feature in LAYERS[layers]}
     return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
@@ -128,7 +112,7 @@ def channels_of(name: str) -> Tensor:
 
 @functools.lru_cache(maxsize=1)  # some GB; VARIANTS are sorted by scale
 def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
-    """Batches of LRHS, HRLS and target, encoded."""
+    """Return batches of LRHS, HRLS and target, encoded."""
     rng = np.random.default_rng(0)
     batches = []
     for _ in range(POOL):
@@ -147,10 +131,10 @@ def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tens
 
 
 def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
-    """A network after ``steps`` training steps."""
+    """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
-    network = MultiResolutionFusion(variant.scale, **variant.network, lrhs_channels=HRLS_CHANNELS)
-    network.to(memory_format=torch.channels_last)
+    network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
+    network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
     batches = pool(views, variant.scale)
@@ -169,44 +153,40 @@ def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bo
 
 @torch.inference_mode()
 def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
-    """Mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
-    found = []
+    """Return mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
+    scored = []
     for view in views:
         height, width = view.ref.shape[:2]
         pair = pair_of(view, variant.scale, 0, 0, height, 0)
         lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
         fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
-        reference = pair.target * pair.exposure
+        reference = pair.target * np.float32(pair.exposure)
         bicubic = upsample_bicubic(decode_radiance(pair.lrhs[..., :3], 1.0), width, height)
         images = (decode_radiance(fused.numpy(), 1.0), bicubic)
-        found.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
-    return dict(zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(found, axis=0).tolist(), strict=True))
+        scored.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
+    return dict(
+        zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(scored, axis=0).tolist(), strict=True)
+    )
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Train and score the rows that the table does not have."""
+    parser = results.parser(__doc__)
     parser.add_argument("views", type=Path, help="folder of views")
-    parser.add_argument("--table", type=Path, required=True, help="table to write or complete")
     parser.add_argument("--steps", type=int, default=1500, help="per row (default: %(default)s)")
-    parser.add_argument("--only", metavar="PATTERN", help="rows whose name matches, the growth rates' included")
     parser.add_argument("--precision", choices=("bf16", "fp32"), default="bf16", help="(default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    rows = results.read(args.table) if args.table.exists() else []
     folder = Folder(args.views)
     views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
     effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
-    done = {row["name"] for row in rows}
-    every = [*VARIANTS, *GROWTH_RATES]
-    chosen = [each for each in every if fnmatch.fnmatch(each.name, args.only)] if args.only else VARIANTS
-    for variant in chosen:
+    done = {row["name"] for row in results.read(args.table)} if args.table and args.table.exists() else set()
+    for variant in VARIANTS:
         if variant.name not in done:
             network = train(variant, views, args.steps, bfloat16=args.precision == "bf16")
             row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
-            print(row, flush=True)
-            rows.append(row)
-            results.write(args.table, rows)
+            results.show(results.plain, [row], args.table, ("name",))
 
 
 if __name__ == "__main__":

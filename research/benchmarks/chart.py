@@ -1,6 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy against time, from the tables of `research.benchmarks.quality`, `research.benchmarks.runtime` and
-`research.benchmarks.render_time`.
+"""Draw accuracy against time, from the tables of `research.benchmarks.accuracy`, `research.benchmarks.runtime`.
 
     python -m research.benchmarks.chart -o docs/chart.html              # every scene; needs only a browser
     python -m research.benchmarks.chart -o docs/images/chart.png        # the mean of the scenes
@@ -18,12 +17,14 @@ from pathlib import Path
 from typing import Any
 
 from oiio_msspl.model.contract import SPREAD
-from research.benchmarks import quality, results
+from research.benchmarks import accuracy, results
 from research.benchmarks.results import MEAN
 from research.benchmarks.runtime import SAME_WORK
 from research.benchmarks.scenes import NOISY_REFERENCE
 
 TEMPLATE = Path(__file__).parent / "chart_template.html"
+#: How the name of the machine ends whose times are drawn.
+MACHINE = "with VNNI"
 MEASURES = ("psnr", "relmse", "flip")
 PEERS = (
     "OIDN, same samples",
@@ -32,12 +33,12 @@ PEERS = (
     "OIDN prefiltered on the HRLS",
     "OIDN fast on the HRLS",
 )
-#: How a series of models ends if most samples are in the HRLS, as far as that was measured.
+#: How a series of models ends if most samples are in the HRLS.
 UNEVEN = ", most samples in the HRLS"
 
 
 def data() -> dict[str, Any]:
-    """What is drawn.
+    """Return what is drawn.
 
     Returns:
         ``measures``, column -> title. ``machine``, the processor. ``scenes``, name -> title. ``spp``, the averages.
@@ -45,15 +46,15 @@ def data() -> dict[str, Any]:
         whether it is a ``peer``, and its ``points``, each with ``method``, ``spp``, ``seconds`` for 1024 x 1024
         pixels, and for each scene its ``values`` in the order of the measures.
     """
-    rows = results.read("quality")
-    found = results.index(rows, *quality.KEYS)
-    times = results.index(results.read("runtime_vnni"), "method")
-    cost = {row["scene"]: row["hrls_s"] for row in results.read("render_time_vnni")}
+    rows = results.read("accuracy")
+    by_key = results.index(rows, *accuracy.KEYS)
+    times = results.index((row for row in results.read("time_frame") if row["machine"].endswith(MACHINE)), "method")
+    cost = {row["scene"]: row["hrls_s"] for row in results.read("time_render") if row["machine"].endswith(MACHINE)}
     cost[MEAN] = round(statistics.fmean(value for name, value in cost.items() if name not in NOISY_REFERENCE), 4)
     names = [MEAN, *(name for name in dict.fromkeys(row["scene"] for row in rows) if name in cost and name != MEAN)]
 
     def point(timed: str, method: str, spp: int) -> dict[str, Any]:
-        measured = {name: found[name, spp, method] for name in names if (name, spp, method) in found}
+        measured = {name: by_key[name, spp, method] for name in names if (name, spp, method) in by_key}
         values = {name: [row[measure] for measure in MEASURES] for name, row in measured.items()}
         return {"method": method, "spp": spp, "seconds": times[timed]["seconds"], "values": values}
 
@@ -61,33 +62,33 @@ def data() -> dict[str, Any]:
     for name in times:
         if "-x" in str(name) and SPREAD not in str(name):
             families.setdefault(str(name).rpartition("-x")[0], []).append(str(name))
-    series = []
+    series: list[dict[str, Any]] = []
     for family, members in families.items():
-        even = [point(name, name, spp) for spp in quality.AVERAGES for name in members]
+        even = [point(name, name, spp) for spp in accuracy.AVERAGES for name in members]
         uneven = [
             point(name, f"{name}, {division}", spp)
-            for spp in quality.AVERAGES
-            if (division := _largest_share(found, members, spp))
+            for spp in accuracy.AVERAGES
+            if (division := _largest_share(by_key, members, spp))
             for name in members
         ]
         series += [{"name": family, "points": even}, {"name": family + UNEVEN, "points": uneven}]
     for peer in PEERS:
         if SAME_WORK[peer] in times:
-            points = [point(SAME_WORK[peer], peer, spp) for spp in quality.AVERAGES]
+            points = [point(SAME_WORK[peer], peer, spp) for spp in accuracy.AVERAGES]
             series.append({"name": peer, "peer": True, "points": points})
     return {
-        "measures": {measure: quality.MEASURES[measure][0] for measure in MEASURES},
+        "measures": {measure: accuracy.MEASURES[measure][0] for measure in MEASURES},
         "machine": next(iter(times.values()))["machine"],
         "scenes": {name: _scene_title(name, names) for name in names},
-        "spp": quality.AVERAGES,
+        "spp": accuracy.AVERAGES,
         "cost": cost,
         "series": [one for one in series if one["points"]],
     }
 
 
 def _largest_share(found: dict[Any, Any], members: list[str], spp: int) -> str | None:
-    """The division with the most samples in the HRLS that was measured for all of these models."""
-    divisions = [f"{more}:{less}" for more, less in reversed(quality.UNEVEN)]
+    """Return the division with the most samples in the HRLS that was measured for all of these models."""
+    divisions = [f"{more}:{less}" for more, less in reversed(accuracy.UNEVEN)]
     return next((d for d in divisions if all((MEAN, spp, f"{name}, {d}") in found for name in members)), None)
 
 
@@ -98,12 +99,12 @@ def _scene_title(name: str, names: list[str]) -> str:
 
 
 def page(shown: dict[str, Any]) -> str:
-    """An HTML page that holds the data and draws it."""
+    """Return an HTML page that holds the data and draws it."""
     return TEMPLATE.read_text().replace("DATA", json.dumps(shown, separators=(",", ":")))
 
 
 def draw(shown: dict[str, Any], path: Path) -> None:
-    """A picture of the mean: a row for each measure, a column for each average spp, against the method's own time."""
+    """Draw the mean against the method's own time: a row for each measure, a column for each average spp."""
     import matplotlib
 
     matplotlib.use("Agg")

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Milliseconds a frame on an NVIDIA GPU: our models, and Open Image Denoise (OIDN) on its CUDA device.
+"""Measure milliseconds a frame on an NVIDIA GPU: our models, and Open Image Denoise (OIDN) on its CUDA device.
 
     python -m research.benchmarks.gpu --table research/benchmarks/results/gpu.csv
 
@@ -12,14 +12,15 @@ here.
 
 from __future__ import annotations
 
-import argparse
 import statistics
-import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+
+from research.benchmarks import results, timer
+from research.benchmarks.results import Row
 
 #: Height and width of the frames. The second is 1080p, padded to what the models take.
 SIZES = ((1024, 1024), (1088, 1920))
@@ -29,20 +30,12 @@ REPEATS = 20
 
 
 def median_ms(call: Callable[[], Any], wait: Callable[[], Any]) -> float:
-    """Median time of a call after three others."""
-    times = []
-    for repeat in range(REPEATS + 3):
-        wait()
-        before = time.perf_counter()
-        call()
-        wait()
-        if repeat >= 3:
-            times.append(time.perf_counter() - before)
-    return 1000 * statistics.median(times)
+    """Return the median time of a call, after three others."""
+    return 1000 * statistics.median(timer.seconds_of(call, REPEATS, 3, wait))
 
 
 def ceilings() -> tuple[float, float]:
-    """Operations and bytes a second of the GPU: of a product of half-float matrices, and of a copy."""
+    """Return operations and bytes a second of the GPU: of a product of half-float matrices, and of a copy."""
     import torch
 
     a, b = (torch.randn(8192, 8192, device="cuda", dtype=torch.float16) for _ in range(2))
@@ -54,7 +47,7 @@ def ceilings() -> tuple[float, float]:
 
 
 def convolution_work(path: Path, sizes: dict[str, int]) -> tuple[float, float]:
-    """Operations of a model's convolutions, and the bytes that they read and write in half floats, for a frame.
+    """Count the operations of a model's convolutions for a frame, and the bytes that they move in half floats.
 
     Args:
         sizes: values of the graph's symbolic dimensions.
@@ -81,7 +74,7 @@ def convolution_work(path: Path, sizes: dict[str, int]) -> tuple[float, float]:
 
 
 def time_model(name: str, height: int, width: int) -> dict[str, float]:
-    """Times of one of our models for a frame, and the work of its convolutions."""
+    """Time one of our models for a frame, and the work of its convolutions."""
     import onnxruntime as ort
     import torch
 
@@ -114,7 +107,7 @@ def time_model(name: str, height: int, width: int) -> dict[str, float]:
 
 
 def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
-    """Time of OIDN's filters for a frame."""
+    """Time OIDN's filters for a frame."""
     import pyoidn
 
     device = pyoidn.Device(pyoidn.OIDN_DEVICE_TYPE_CUDA)
@@ -123,7 +116,7 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
     buffers = {}
 
     def image(key: str) -> Any:
-        """A picture in the GPU's memory."""
+        """Return a picture in the GPU's memory."""
         if key not in buffers:
             pixels = rng.random((height, width, 3), np.float32)
             buffers[key] = pyoidn.Buffer(device, pixels.nbytes, storage=pyoidn.OIDN_STORAGE_DEVICE)
@@ -131,7 +124,7 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
         return buffers[key]
 
     def built(inputs: dict[str, str], output: str, **flags: bool) -> Any:
-        """A filter that reads and writes the named pictures."""
+        """Return a filter that reads and writes the named pictures."""
         oidn_filter = pyoidn.Filter(device, pyoidn.OIDN_FILTER_TYPE_RT)
         oidn_filter.set_quality(getattr(pyoidn, f"OIDN_QUALITY_{OIDN[name].upper()}"))
         for role, key in {**inputs, "output": output}.items():
@@ -152,8 +145,8 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
     filters.append(built({"color": "color", **inputs}, "result", hdr=True, cleanAux=bool(filters)))
 
     def run() -> None:
-        for each in filters:
-            each.execute_async()
+        for oidn_filter in filters:
+            oidn_filter.execute_async()
 
     elapsed = median_ms(run, device.wait)
     if error := device.get_error():
@@ -162,33 +155,22 @@ def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m research.benchmarks.gpu",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--table", type=Path, help="CSV file to write")
-    args = parser.parse_args()
+    """Measure both sizes."""
+    args = results.parser(__doc__).parse_args()
     import torch
 
     operations, transfer = ceilings()
     card = torch.cuda.get_device_name()
     print(f"{card}: {operations / 1e12:.0f} TFLOP/s, {transfer / 1e12:.2f} TB/s")
-    lines = ["card,size,method,ms,with_copies_ms,of_oidn,gflop,gbyte,floor_ms"]
+    rows: list[Row] = []
     for height, width in SIZES:
-        rows = {name: time_oidn(name, height, width) for name in OIDN}
-        rows |= {name: time_model(name, height, width) for name in MODELS}
-        for name, row in rows.items():
-            floor = 1000 * max(row["gflop"] * 1e9 / operations, row["gbyte"] * 1e9 / transfer) if "gflop" in row else 0
-            figures = [
-                row["ms"], row.get("with_copies_ms"), row["ms"] / rows["OIDN"]["ms"], row.get("gflop"),
-                row.get("gbyte"), floor or None,
-            ]  # fmt: skip
-            cells = ["" if figure is None else f"{figure:.4g}" for figure in figures]
-            lines.append(",".join([card, f"{width} x {height}", name, *cells]))
-            print(lines[-1], flush=True)
-    if args.table:
-        args.table.write_text("\n".join(lines) + "\n")
+        key = {"size": f"{width} x {height}", "machine": card}
+        rows += [key | {"method": name, **time_oidn(name, height, width)} for name in OIDN]
+        for name in MODELS:
+            row: Row = {**key, "method": name, "model": f"gpu/{name}", **time_model(name, height, width)}
+            row["floor_ms"] = 1000 * max(row["gflop"] * 1e9 / operations, row["gbyte"] * 1e9 / transfer)
+            rows.append(row)
+    results.show(results.plain, rows, args.table)
 
 
 if __name__ == "__main__":

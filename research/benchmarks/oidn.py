@@ -1,13 +1,18 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Open Image Denoise (OIDN) on arrays: its plain call, and the one that its documentation recommends.
+"""Denoise arrays with Open Image Denoise (OIDN): by its plain call, and by the one that its documentation recommends.
 
-Images are (h, w, 3) and linear. Both functions need pyoidn: ``pip install '.[benchmark]'``.
+Images are (h, w, 3) and linear. All functions need pyoidn: ``pip install '.[benchmark]'``.
+
+    python -m research.benchmarks.oidn FRAME.exr DENOISED.exr
+
+denoises a file as the documentation recommends. The file has the layers RGB, ``albedo`` and ``N``.
 """
 
 from __future__ import annotations
 
 import functools
 import math
+import sys
 from collections.abc import Mapping
 from typing import Any
 
@@ -18,7 +23,7 @@ Array = NDArray[np.float32]
 
 
 def denoise(color: Array, albedo: Array | None = None, normal: Array | None = None, quality: str = "high") -> Array:
-    """The plain call: one filter that gets the beauty and the noisy albedo and normal."""
+    """Denoise by the plain call: one filter that gets the beauty and the noisy albedo and normal."""
     import pyoidn
 
     return np.asarray(pyoidn.denoise(color, albedo, normal, hdr=True, quality=quality))
@@ -27,7 +32,7 @@ def denoise(color: Array, albedo: Array | None = None, normal: Array | None = No
 def denoise_prefiltered(
     color: Array, albedo: Array | None = None, normal: Array | None = None, guides: str = "high"
 ) -> Array:
-    """The recommended call: the albedo and the normal are first denoised, each by a filter of its own.
+    """Denoise by the recommended call: the albedo and the normal are first denoised, each by a filter of its own.
 
     The filter of the beauty gets the results and is told by ``cleanAux`` that they have no noise. It has the quality
     "high", and those of albedo and normal the quality ``guides``. See https://github.com/RenderKit/oidn,
@@ -38,19 +43,19 @@ def denoise_prefiltered(
 
 
 def prefiltered(auxiliary: Mapping[str, Array], quality: str = "high") -> dict[str, Array]:
-    """Albedo and normal without noise, each by a filter of its own."""
+    """Return albedo and normal without noise, each by a filter of its own."""
     return {name: run_filter({name: image}, quality=quality) for name, image in auxiliary.items()}
 
 
 def denoise_with_clean(color: Array, clean: Mapping[str, Array]) -> Array:
-    """A colour, denoised with an albedo and a normal of :func:`prefiltered`."""
+    """Denoise a colour with an albedo and a normal of :func:`prefiltered`."""
     return run_filter({"color": color, **clean}, hdr=True, cleanAux=bool(clean))
 
 
 def run_filter(
     images: dict[str, Array], *, input_scale: float = math.nan, quality: str = "high", **flags: bool
 ) -> Array:
-    """The output of one OIDN filter. It denoises the color, or the only image that it gets.
+    """Return the output of one OIDN filter. It denoises the color, or the only image that it gets.
 
     Args:
         input_scale: brings the color to OIDN's range; OIDN finds it if it is not a number.
@@ -74,7 +79,7 @@ def run_filter(
 
 @functools.cache
 def _filter(inputs: tuple[str, ...], quality: str, **flags: bool) -> Any:
-    """A filter for these inputs. It is used again for the next picture, as in pyoidn's plain call."""
+    """Return a filter for these inputs. The next picture uses it again, as in pyoidn's plain call."""
     import pyoidn
 
     oidn_filter = pyoidn.Filter(_device(), pyoidn.OIDN_FILTER_TYPE_RT)
@@ -86,9 +91,25 @@ def _filter(inputs: tuple[str, ...], quality: str, **flags: bool) -> Any:
 
 @functools.cache
 def _device() -> Any:
-    """One device for all filters of the process."""
+    """Return one device for all filters of the process."""
     import pyoidn
 
     device = pyoidn.Device()
     device.commit()
     return device
+
+
+def denoise_file(source: str, target: str) -> None:
+    """Denoise an EXR file by the recommended call; write the beauty as half floats."""
+    import OpenEXR
+
+    with OpenEXR.File(source) as file:
+        layers = {name: np.asarray(channel.pixels, np.float32) for name, channel in file.channels().items()}
+    beauty = denoise_prefiltered(layers["RGB"], layers["albedo"], layers["N"])
+    header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+    with OpenEXR.File(header, {"RGB": np.maximum(beauty, 0).astype(np.float16)}) as file:
+        file.write(target)
+
+
+if __name__ == "__main__":
+    denoise_file(*sys.argv[1:])

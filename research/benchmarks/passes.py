@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
+"""Measure accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m research.benchmarks.passes PASSES --table research/benchmarks/results/passes.csv
     python -m research.benchmarks.passes PASSES --spread --table research/benchmarks/results/passes_spread.csv
@@ -19,7 +19,7 @@ the first two with the albedo and the normal:
 - "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
   so that they sum to the beauty that OIDN makes of this render.
 - "OIDN, every second pixel, rescaled": with ``--spread``, the recommended call on every second pixel, see
-  :mod:`research.benchmarks.every_second_pixel`.
+  :func:`research.benchmarks.peers.oidn_split`.
 - "msspl": :mod:`oiio_msspl.fusion.passes.fuse`.
 - "msspl, HRLS alone": the same without the layers of the LRHS.
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
@@ -36,17 +36,16 @@ part of the sum, but is not scored: every method has a high PSNR there.
 
 "Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
 "Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
-beauty, as a multiple of OIDN's plain call on the beauty. The gain is the PSNR of a method minus that of one of `GAINS`,
-with a 95 % interval by :mod:`research.benchmarks.versus`; a win is a layer with more PSNR than that of `PEER`.
+beauty, as a multiple of OIDN's plain call on the beauty.
 """
 
 from __future__ import annotations
 
-import argparse
-import re
+import itertools
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from unittest.mock import patch
 
@@ -69,11 +68,10 @@ from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import load_model
 from oiio_msspl.model.contract import SPREAD
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
-from research.benchmarks import results
-from research.benchmarks.every_second_pixel import places, without_grid
+from research.benchmarks import results, timer
 from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
+from research.benchmarks.peers import places, without_grid
 from research.benchmarks.results import MEAN, Row
-from research.benchmarks.versus import cell, with_interval
 
 SCALES, SPP = (2, 4), (1, 2)
 KEYS = ("scene", "set", "spp", "method")
@@ -87,14 +85,12 @@ FAINT = 0.01
 BALANCED, BEST = "joint", "joint-large"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
-#: The same for noise that a pixel filter has spread.
+#: The peer for noise that a pixel filter has spread.
 SPLIT_PEER = "OIDN, every second pixel, rescaled"
-#: The same as a file can hold it.
+#: The peer as a file can hold it.
 STORED_PEER = "OIDN, prefiltered, stored"
 #: The set whose layers are products of light and colour in some renderers.
 COMPONENTS = "components"
-#: Column of the gain -> over which method.
-GAINS = {"gain": PEER, "gain_split": SPLIT_PEER, "gain_stored": STORED_PEER}
 #: How many light groups are fused, and what ``--half`` compares.
 AT_HALF = "msspl, best, at half size"
 BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
@@ -105,19 +101,19 @@ WITH_SPREAD_NOISE = ("HRLS", PEER, SPLIT_PEER, "msspl-x2", "msspl-x2, best", "ms
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
-    """The layers of a set, (layers, h, w, 3)."""
+    """Return the layers of a set, (layers, h, w, 3)."""
     pixels = with_layers(render, layers).read(render.data_window, layer_keys(layers))
     return np.stack([np.maximum(pixels[name], 0) for name in layer_keys(layers)])
 
 
 def rescaled(layers: Array, beauty: Array) -> Array:
-    """Layers that sum to the beauty, in the ratio of these."""
+    """Return layers that sum to the beauty, in the ratio of these."""
     total = layers.sum(axis=0)
     return layers * np.where(total > 0, beauty / np.where(total > 0, total, 1), 0)
 
 
 def colours_of(render: MappedRender, layers: AdditiveSet) -> Array:
-    """What the stored light of each layer is multiplied by, (layers, h, w, 3): 1 in a layer that is no product."""
+    """Return the colour by which each layer's light is multiplied, (layers, h, w, 3); 1 if there is none."""
     formulas = {str(i): FeatureFormula((x.factor,)) for i, x in enumerate(layers.layers) if x.factor}
     pixels = replace(render, features=formulas, alpha=None).read(render.data_window, list(formulas))
     ones = np.ones((render.data_window.height, render.data_window.width, 3), np.float32)
@@ -133,7 +129,7 @@ def methods(
     *,
     spread: bool = False,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
-    """The name of each method, and a function that computes the layers.
+    """Yield the name of each method, and a function that computes the layers.
 
     Args:
         fused: the fused frame of each model, and the model.
@@ -198,14 +194,14 @@ def methods(
 
 
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
-    """The set of another file with the same name and layers."""
+    """Return the set of another file with the same name and layers."""
     names = [layer.name for layer in layers.layers]
-    found = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
-    return next(found)
+    sets = (x for x in render.additive_sets if x.name == layers.name and [y.name for y in x.layers] == names)
+    return next(sets)
 
 
 def regraded(layers: Array) -> Array:
-    """The beauty with the first layer switched off, and four times the light of the second one."""
+    """Return the beauty with the first layer switched off, and four times the light of the second one."""
     grades = np.array([0, 4, *[1] * (len(layers) - 2)], np.float32)
     return np.einsum("i,ihwc->hwc", grades, layers)
 
@@ -213,7 +209,7 @@ def regraded(layers: Array) -> Array:
 def fused_frames(
     lr: MappedRender, hr: MappedRender, scale: int, noise: str = ""
 ) -> dict[str, tuple[FusedFrame, Session]]:
-    """The fused frame of each model, and the model. That of single layers is loaded, too.
+    """Return the fused frame of each model, and the model. That of single layers is loaded, too.
 
     Args:
         noise: the ending of the models' names.
@@ -239,7 +235,7 @@ def picture(folder: Path, output: Path) -> None:
 
 
 def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
-    """A row for each layer that is bright enough, and their mean with the regraded picture."""
+    """Return a row for each layer that is bright enough, and their mean with the regraded picture."""
     light = reference.sum(axis=(1, 2, 3))
     rows: list[Row] = [
         {"layer": name, "psnr": psnr(layer, truth), "relmse": relmse(layer, truth)}
@@ -254,11 +250,11 @@ def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
     return [{"layer": ALL, **means, **regrade, "worst_psnr": float(-10 * np.log10(worst))}, *rows]
 
 
-def timed(function: Callable[[], Array]) -> tuple[Array, float]:
-    """The result and the time of a call."""
-    start = time.perf_counter()
-    result = function()
-    return result, time.perf_counter() - start
+def model_used(method: str, scale: int, noise: str = "") -> Row:
+    """Return the column ``model`` of a method: the model of its beauty, to which all but two methods are rescaled."""
+    if method.startswith("msspl"):
+        return {"model": f"{BEST if 'best' in method else BALANCED}{noise}-x{scale}"}
+    return {"model": f"{BEST}{noise}-x{scale}"} if any(w in method for w in ("rescaled", "stored", "ratio")) else {}
 
 
 def measure(
@@ -270,16 +266,19 @@ def measure(
     spread: bool = False,
     half: bool = False,
 ) -> list[Row]:
-    """One scene: rows for each set and method, without those whose `KEYS` are known; with ``half``, for `BESIDE_HALF`
-    of light groups alone, else for all but `AT_HALF`."""
+    """Measure one scene: rows for each set and method, without those whose `KEYS` are known.
+
+    With ``half``, only light groups by the methods `BESIDE_HALF`; else by all but `AT_HALF`.
+    """
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
-    other = folder / f"hr_{2 * spp}spp.exr"
-    ordinary = map_render(open_exr(other)) if other.exists() else None
-    fused = fused_frames(lr, hr, scale, SPREAD if spread else "")
+    full = folder / f"hr_{2 * spp}spp.exr"
+    ordinary = map_render(open_exr(full)) if full.exists() else None
+    noise = SPREAD if spread else ""
+    fused = fused_frames(lr, hr, scale, noise)
     pixels = hr.load().layers
-    plain = [timed(lambda: denoise(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]))[1] for _ in range(WARM_UP + 1)]
-    oidn_seconds = plain[-1]
+    plain = partial(denoise, pixels["rgb"], pixels[ALBEDO], pixels[NORMAL])
+    oidn_seconds = timer.seconds_of(plain, 1, WARM_UP)[0]
     rows = []
     for layers in hr.additive_sets:
         if half and layers.name != LIGHT_GROUPS:
@@ -292,113 +291,62 @@ def measure(
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
                 continue
-            result, seconds = timed(function)
-            total, *each = scores(result, clean, [layer.name for layer in layers.layers])
-            seconds = 0.0 if name == "HRLS" else seconds / oidn_seconds
-            rows += [key | total | {"time": seconds}, *(key | row for row in each)]
+            start = time.perf_counter()
+            made = function()
+            seconds = time.perf_counter() - start
+            total, *single = scores(made, clean, [layer.name for layer in layers.layers])
+            key |= model_used(name, scale, noise)
+            rows += [key | total | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds}]
+            rows += [key | row for row in single]
     return rows
 
 
 def means(rows: list[Row]) -> list[Row]:
-    """Means over the scenes, of the methods that were measured on each, and the gain over `PEER`."""
-    found = []
-    totals = [row for row in rows if row["layer"] == ALL]
-    for key in dict.fromkeys(tuple(row[k] for k in KEYS[1:]) for row in totals):
-        same = [row for row in totals if tuple(row[k] for k in KEYS[1:]) == key]
-        if len(same) < sum((row["set"], row["spp"], row["method"]) == (*key[:2], PEER) for row in totals):
+    """Return means over the scenes, of the methods that were measured on each. A mean has the oldest stamp."""
+    made = []
+    totals = results.where(rows, layer=ALL)
+    scenes = {(row["set"], row["spp"], row["scene"]) for row in totals if row["method"] == PEER}
+    for name, spp, method in dict.fromkeys(tuple(row[key] for key in KEYS[1:]) for row in totals):
+        members = results.where(totals, set=name, spp=spp, method=method)
+        if len(members) < sum((name, spp) == key[:2] for key in scenes):
             continue
-        numbers = {k: float(np.mean([row[k] for row in same])) for k, v in same[0].items() if isinstance(v, float)}
-        mean: Row = {"scene": MEAN, **dict(zip(KEYS[1:], key, strict=True)), "layer": ALL, **numbers}
-        for column, peer in GAINS.items():
-            peers = {r["scene"]: r for r in totals if (r["set"], r["spp"], r["method"]) == (*key[:2], peer)}
-            if peers.keys() == {row["scene"] for row in same}:
-                gains = np.array([row["psnr"] - peers[row["scene"]]["psnr"] for row in same])
-                mean |= dict(zip((column, f"{column}_low", f"{column}_high"), with_interval(gains), strict=True))
-        ours, theirs = (_single_layers(rows, (*key[:2], method)) for method in (key[2], PEER))
-        won = [row["psnr"] > theirs[layer]["psnr"] for layer, row in ours.items()]
-        found.append(mean | {"wins": sum(won), "layers": len(won)})
-    return found
-
-
-def _single_layers(rows: list[Row], key: tuple[object, ...]) -> dict[tuple[str, str], Row]:
-    """The rows of single layers of a set, spp and method, by scene and layer."""
-    same = (row for row in rows if tuple(row[k] for k in KEYS[1:]) == key and row["layer"] != ALL)
-    return {(row["scene"], row["layer"]): row for row in same}
-
-
-def layout(rows: list[Row]) -> str:
-    """The means, as a table with the columns that were measured."""
-    titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
-    titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
-    formats = {key: "{:.4f}" if "relmse" in key else "{:.2f}" for key in titles}
-    shown = [row for row in rows if row["scene"] == MEAN]
-    body = [
-        [row["set"], str(row["spp"]), row["method"], *(formats[key].format(row[key]) for key in titles)]
-        for row in shown
-    ]
-    head = ["set", "spp", "method", *titles.values()]
-    for column, peer in GAINS.items():
-        if not any(column in row for row in shown):
-            continue
-        head.append(f"gain over {peer}, dB")
-        for line, row in zip(body, shown, strict=True):
-            gain = tuple(row.get(key) for key in (column, f"{column}_low", f"{column}_high"))
-            line.append("" if gain[0] is None else cell(gain, "+.2f"))
-    head.append("better on")
-    for line, row in zip(body, shown, strict=True):
-        line.append(f"{row['wins']:.0f} of {row['layers']:.0f}")
-    return results.markdown(head, body)
-
-
-def layout_of_layers(rows: list[Row]) -> str:
-    """PSNR and RelMSE of single layers, means over the scenes that have them. Lamps in groups count as one layer."""
-    single = [row for row in rows if row["scene"] != MEAN and row["layer"] != ALL]
-    kinds = {row["layer"]: re.sub(r"_\d+$", "", row["layer"]) for row in single}
-    body = []
-    for name, spp, kind in dict.fromkeys((row["set"], row["spp"], kinds[row["layer"]]) for row in single):
-        same = [row for row in single if (row["set"], row["spp"], kinds[row["layer"]]) == (name, spp, kind)]
-        cells = []
-        for method in IN_LAYERS:
-            scores = [(row["psnr"], row["relmse"]) for row in same if row["method"] == method]
-            cells.append("{:.2f}, {:.4f}".format(*np.mean(scores, axis=0)))
-        count = sum(row["method"] == PEER for row in same)
-        body.append([name, str(spp), kind, str(count), *cells])
-    return results.markdown(["set", "spp", "layer", "number", *IN_LAYERS], sorted(body))
+        numbers = {
+            k: float(np.mean([row[k] for row in members])) for k, v in members[0].items() if isinstance(v, float)
+        }
+        key: Row = {"scene": MEAN, "set": name, "spp": spp, "method": method, "layer": ALL}
+        model = {"model": members[0]["model"]} if "model" in members[0] else {}
+        made.append(key | numbers | model | results.oldest_stamp(members))
+    return made
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    """Measure scenes, or draw one."""
+    parser = results.parser(__doc__)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
     parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
-    parser.add_argument(
-        "--half", action="store_true", help="compare light groups at full and at half of the resolution"
-    )
+    parser.add_argument("--half", action="store_true", help="compare light groups at full and at half resolution")
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
-    results.add_option(parser)
     args = parser.parse_args()
     scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
     if args.picture:
         picture(args.passes / scenes[0], args.picture)
         return
     rows: list[Row] = []
-    for scene in scenes:
-        for spp in SPP:
-            for scale in SCALES:
-                known = {tuple(row[k] for k in KEYS) for row in rows}
-                # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-                rows += measure(args.passes / scene, scale, spp, known, spread=args.spread, half=args.half)
-                print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
-        if args.table:
-            add(args.table, rows)
-    print(layout(means(rows)))
+    for scene, spp, scale in itertools.product(scenes, SPP, SCALES):
+        measured = {tuple(row[key] for key in KEYS) for row in rows}
+        # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
+        rows += measure(args.passes / scene, scale, spp, measured, spread=args.spread, half=args.half)
+        print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
+    print(results.plain(means(rows)))
+    if args.table:
+        add(args.table, rows)
 
 
 def add(table: Path, rows: list[Row]) -> None:
     """Put rows of scenes into a table, whose means are computed anew."""
-    old = [row for row in results.read(table) if row["scene"] != MEAN] if table.exists() else []
-    keys = (*KEYS, "layer")
-    together = list((results.index(old, *keys) | results.index(rows, *keys)).values())
+    results.write(table, rows, (*KEYS, "layer"))
+    together = [row for row in results.read(table) if row["scene"] != MEAN]
     results.write(table, together + means(together))
 
 

@@ -1,45 +1,51 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Time and peak memory of each method for one frame of 1024 x 1024 pixels, as in the paper's table of runtimes.
+"""Measure how long every method takes: a frame in memory, whole commands, shots, passes, and rendering itself.
 
-    python -m research.benchmarks.runtime --table research/benchmarks/results/runtime.csv
+    python -m research.benchmarks.runtime command --table research/benchmarks/results/time_command.csv
+    python -m research.benchmarks.runtime command --size 8192x4320 --scale 4 --quality balanced
+    python -m research.benchmarks.runtime frame --table research/benchmarks/results/time_frame.csv
+    python -m research.benchmarks.runtime shots --lamps 4 --frames 8 --table research/benchmarks/results/time_shots.csv
+    python -m research.benchmarks.runtime passes --pair LR.exr HR.exr
+    python -m research.benchmarks.runtime render SCENES --table research/benchmarks/results/time_render.csv
 
-Each measurement runs in its own process. A first call warms up and is not counted. The methods take turns for several
-rounds, so that a machine whose speed drifts favours none of them. Peak memory is the largest resident set of the
-process, with its libraries and weights. :mod:`research.benchmarks.runtime_files` measures a whole job from file to
-file.
+- ``command``: `msspl-fuse` on a pair of half-float EXRs with beauty, albedo and normal, from start to written file, and
+  a program that denoises the full-resolution render with prefiltered Open Image Denoise (OIDN).
+- ``frame``: the call on arrays alone, as in the paper's table of runtimes.
+- ``shots``: :mod:`research.benchmarks.shots.moving_wall`, frame by frame and averaged with neighbours.
+- ``passes``: all layers of eight light groups, or of a rendered pair, beside OIDN on each layer. All groups have light
+  everywhere, which takes longest. Ours reads the layers from the files; OIDN gets arrays, without black layers.
+- ``render``: Mitsuba 3 on the development scenes, for one sample in each of 1024 x 1024 pixels.
+
+:mod:`research.benchmarks.timer` runs each in a fresh process, in turn with the others.
 """
 
 from __future__ import annotations
 
 import argparse
 import fnmatch
-import json
 import os
-import platform
-import re
-import resource
 import statistics
-import subprocess
 import sys
-import time
-from collections.abc import Callable
+import tempfile
+from collections.abc import Callable, Sequence
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
-from research.benchmarks import results
+import numpy as np
+
+from research.benchmarks import results, timer
 from research.benchmarks.results import Row
 
 #: Width of the squares of :func:`frame` in pixels.
 SQUARE = 24
 OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
-#: See :func:`research.benchmarks.oidn.denoise_prefiltered`: with OIDN's base networks for albedo and normal.
+#: OIDN prefiltered with its base networks for albedo and normal.
 OIDN_BASE_GUIDES = "OIDN prefiltered with base guides"
 #: See :func:`research.benchmarks.peers.oidn_split`.
 OIDN_SPLIT = "OIDN prefiltered, on every second pixel"
-#: As :mod:`research.benchmarks.quality` calls them -> as they are called here, where it does not matter which render
-#: they get.
+#: Method of :mod:`research.benchmarks.accuracy` -> its name here, where it does not matter which render it gets.
 SAME_WORK = {
     "OIDN on the HRLS": OIDN,
     "OIDN, same samples": OIDN,
@@ -50,12 +56,20 @@ SAME_WORK = {
     "OIDN prefiltered with base guides, same samples": OIDN_BASE_GUIDES,
     "OIDN prefiltered and split, same samples": OIDN_SPLIT,
 }
+#: Light groups of the frame whose passes are timed.
+GROUPS = 8
+BEAUTY, OURS = "beauty", "ours"
+PLAIN, PREFILTERED = "OIDN on each layer", "OIDN on each layer, prefiltered once"
+#: Values of ``--temporal``: the first one is what the others are compared with.
+OFF = "off"
+WAYS = (OFF, "2", "auto")
+#: spp and scale with which rendering is timed.
+RENDER_SPP, RENDER_SCALE = 4, 4
+MEGAPIXEL = 1024 * 1024
 
 
 def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
-    """Layers (height, width, 3) of lit squares. The light has the noise of 1 spp, which depends on ``seed``."""
-    import numpy as np
-
+    """Return layers (height, width, 3) of lit squares. The light has the noise of 1 spp, which depends on ``seed``."""
     squares = np.random.default_rng(0).random((2, -(-height // SQUARE), -(-width // SQUARE), 3), np.float32)
     albedo, normal = squares.repeat(SQUARE, axis=1).repeat(SQUARE, axis=2)[:, :height, :width]
     normal = 2 * normal - 1
@@ -66,7 +80,7 @@ def frame(height: int, width: int, seed: int = 0) -> dict[str, Any]:
 
 
 def pair(height: int, width: int, scale: int) -> tuple[Any, Any]:
-    """Both renders of such a frame, with as many samples in each."""
+    """Return both renders of such a frame, with as many samples in each."""
     from oiio_msspl import Render
     from oiio_msspl.image.filters import box_downsample
 
@@ -74,17 +88,42 @@ def pair(height: int, width: int, scale: int) -> tuple[Any, Any]:
     return Render.from_arrays("lr", **low), Render.from_arrays("hr", **frame(height, width))
 
 
+def write_pair(folder: Path, width: int, height: int, scale: int, groups: int = 0) -> tuple[Path, Path]:
+    """Write both renders as half-float EXRs, with light groups that sum to the beauty; return their paths."""
+    import OpenEXR
+
+    from oiio_msspl.image.arrays import planes_of
+    from oiio_msspl.image.filters import box_downsample
+
+    shares = np.random.default_rng(1).dirichlet(np.ones(groups or 1), (-(-height // 8), -(-width // 8)))
+    shares = shares.repeat(8, axis=0).repeat(8, axis=1)[:height, :width].astype(np.float32)
+    paths = folder / "lr.exr", folder / "hr.exr"
+    for path, factor, seed in zip(paths, (scale, 1), (1, 0), strict=True):
+        pixels = frame(height, width, seed)
+        lights = {f"light_{i}": pixels["rgb"] * shares[..., i, None] for i in range(groups)}
+        layers = {"": pixels["rgb"], "albedo": pixels["albedo"], "N": pixels["normal"], **lights}
+        channels = {
+            f"{layer}.{component}".lstrip("."): np.ascontiguousarray(plane, np.float16)
+            for layer, image in layers.items()
+            for component, plane in zip("RGB", planes_of(box_downsample(image, factor)), strict=True)
+        }
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with OpenEXR.File(header, channels) as file:
+            file.write(str(path))
+    return paths
+
+
 def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[[], Any]:
-    """A call of :func:`oiio_msspl.fuse` on arrays."""
+    """Return a call of :func:`oiio_msspl.fuse` on arrays."""
     from oiio_msspl import Session, find_model, fuse
 
     session = Session(find_model(0, name), threads=threads)
     low, high = pair(height, width, session.contract.scale)
-    return lambda: fuse(low, high, session)
+    return partial(fuse, low, high, session)
 
 
-def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
-    """A call of OIDN on arrays."""
+def prepare_oidn(name: str, height: int, width: int, _: int = 0) -> Callable[[], Any]:
+    """Return a call of OIDN on arrays."""
     from oiio_msspl import Render
     from research.benchmarks import oidn, peers
 
@@ -93,122 +132,217 @@ def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
     if name == OIDN_SPLIT:
         return partial(peers.oidn_split, Render.from_arrays("full", **layers))
     if name in (OIDN_PREFILTERED, OIDN_BASE_GUIDES):
-        guides = "high" if name == OIDN_PREFILTERED else "balanced"
-        return lambda: oidn.denoise_prefiltered(**images, guides=guides)
-    return lambda: oidn.denoise(**images, quality="fast" if name == OIDN_FAST else "high")
+        return partial(oidn.denoise_prefiltered, **images, guides="high" if name == OIDN_PREFILTERED else "balanced")
+    return partial(oidn.denoise, **images, quality="fast" if name == OIDN_FAST else "high")
 
 
-def measure(call: Callable[[], Any], repeats: int) -> dict[str, Any]:
-    """Seconds of each repeat, and the peak memory of this process."""
-    call()
-    seconds = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        call()
-        seconds.append(time.perf_counter() - start)
-    return {"seconds": seconds, "peak_mb": peak_mb()}
+def oidn_version() -> Row:
+    """Return the column ``oidn``: the version of Open Image Denoise."""
+    return {"oidn": ".".join(version("pyoidn").split(".")[:3])}
 
 
-def peak_mb() -> float:
-    """Largest resident set of this process so far, in MB.
-
-    On Linux, `getrusage` would also count the program that started this one, so the kernel's own mark is read.
-    """
-    status = Path("/proc/self/status")
-    if status.exists() and (found := re.search(r"VmHWM:\s+(\d+) kB", status.read_text())):
-        return int(found[1]) / (1 << 10)
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
-
-
-def processor() -> str:
-    """The processor's name, and whether it has AMX or VNNI, with which networks of 8 bits are faster.
-
-    On Linux Python does not know the name, so it comes from /proc/cpuinfo. Elsewhere, neither is mentioned.
-    """
-    info = Path("/proc/cpuinfo")
-    return named(info.read_text()) if info.exists() else platform.processor()
-
-
-def named(cpuinfo: str) -> str:
-    """The processor's name from the text of /proc/cpuinfo."""
-    names, flags = (re.findall(rf"{key}\s*: (.*)", cpuinfo) for key in ("model name", "flags"))
-    name = names[0] if names else platform.processor()
-    if not flags:
-        return name
-    has = next((each for each in ("AMX", "VNNI") if each.lower() in flags[0]), None)
-    return f"{name} with {has}" if has else f"{name} without VNNI"
-
-
-def in_process(module: str, *arguments: str) -> dict[str, Any]:
-    """Run a module in its own process; what it prints, read as JSON."""
-    done = subprocess.run([sys.executable, "-m", module, *arguments], capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    found: dict[str, Any] = json.loads(done.stdout)
-    return found
-
-
-def compare(args: argparse.Namespace) -> list[Row]:
-    """A row for each method: median, fastest and slowest seconds, and peak memory."""
+def time_frame(args: argparse.Namespace) -> list[Row]:
+    """Time each method on arrays."""
     from oiio_msspl.model.catalogue import shipped_models
 
-    cases = [*(args.model or shipped_models()), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_BASE_GUIDES, OIDN_SPLIT]
-    cases = [case for case in cases if fnmatch.fnmatchcase(case, args.methods or "*")]
-    measured: dict[str, list[dict[str, Any]]] = {case: [] for case in cases}
-    settings = "--size", args.size, "--repeats", str(args.repeats), "--threads", str(args.threads)
-    for _ in range(args.rounds):
-        for case, rounds in measured.items():
-            rounds.append(in_process("research.benchmarks.runtime", "--measure", case, *settings))
+    width, height = args.size
+    cases = [*shipped_models(), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_BASE_GUIDES, OIDN_SPLIT]
+    jobs = {}
+    for case in fnmatch.filter(cases, args.methods):
+        name = "prepare_oidn" if case in SAME_WORK.values() else "prepare_model"
+        arguments = (case, height, width, args.threads)
+        jobs[case] = timer.Function(f"research.benchmarks.runtime:{name}", arguments, args.repeats)
+    return [
+        {"method": case, "size": f"{width}x{height}", **results.model_of(case), **timer.summary(runs)}
+        | (oidn_version() if case in SAME_WORK.values() else {})
+        for case, runs in timer.in_turn(jobs, args.rounds).items()
+    ]
+
+
+def time_command(args: argparse.Namespace) -> list[Row]:
+    """Time whole commands: read files, fuse or denoise, write."""
+    from oiio_msspl.model.catalogue import find_model
+
+    width, height = args.size
+    with tempfile.TemporaryDirectory() as folder:
+        low, high = write_pair(Path(folder), width, height, args.scale)
+        fuse = [str(Path(sys.executable).with_name("msspl-fuse")), str(low), str(high), "-o", f"{folder}/out.exr"]
+        fuse += ["--overwrite", "--no-preview"]
+        jobs = {find_model(args.scale, name).stem: [*fuse, "--model", name] for name in args.quality}
+        if not args.without_oidn:
+            oidn = [sys.executable, "-m", "research.benchmarks.oidn", str(high), f"{folder}/oidn.exr"]
+            jobs[OIDN_PREFILTERED] = oidn
+        runs = timer.in_turn(jobs, args.rounds)
+    size = {"size": f"{width}x{height}", "scale": args.scale}
+    return [
+        {"method": name, **size, **results.model_of(name), **timer.summary(done), "load": os.getloadavg()[2]}
+        | (oidn_version() if name == OIDN_PREFILTERED else {})
+        for name, done in runs.items()
+    ]
+
+
+def fuse_shot_in_process(folder: str, quality: str, frames: str) -> None:
+    """Fuse a shot of :mod:`research.benchmarks.shots.moving_wall`."""
+    from oiio_msspl import fuse_shot
+    from oiio_msspl.jobs.plan import TemporalOptions
+
+    files = [Path(folder, name) for name in ("lr", "hr", "out")]
+    files[2].mkdir(exist_ok=True)
+    report = fuse_shot(*files, model=quality, temporal=TemporalOptions(frames), overwrite=True)
+    if report.exit_code:
+        raise SystemExit(next(result.message for result in report.results.values() if result.message))
+
+
+def time_shots(args: argparse.Namespace) -> list[Row]:
+    """Time a shot for each quality: frame by frame, and averaged with neighbours."""
+    from oiio_msspl.model.catalogue import find_model
+    from research.benchmarks.shots.moving_wall import write_shot
+
+    width, height = args.size
+    ways = [(quality, frames) for quality in args.quality for frames in WAYS]
+    with tempfile.TemporaryDirectory() as folder:
+        write_shot(Path(folder), args.frames, width, height, args.scale, args.lamps)
+        name = "research.benchmarks.runtime:fuse_shot_in_process"
+        runs = timer.in_turn({way: timer.Function(name, (folder, *way)) for way in ways}, args.rounds)
+    shot = {"frames": args.frames, "size": f"{width}x{height}", "scale": args.scale, "lamps": args.lamps}
+    return [
+        {"quality": quality, "temporal": frames, **shot, "model": find_model(args.scale, quality).stem}
+        | timer.summary(runs[quality, frames])
+        for quality, frames in ways
+    ]
+
+
+def pass_calls(low: Any, high: Any, models: Sequence[str], scale: int) -> dict[tuple[str, str, str], Callable[[], Any]]:
+    """Return what is timed, by set, method and model: the beauty, and the layers of each set, ours and OIDN's."""
+    from oiio_msspl import fuse
+    from oiio_msspl.aovs.features import ALBEDO, NORMAL
+    from oiio_msspl.fusion.passes.fuse import fuse_passes
+    from oiio_msspl.fusion.tiles.network import layer_fuser
+    from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, strips_memory
+    from oiio_msspl.model.catalogue import load_model
+    from research.benchmarks.oidn import denoise, denoise_with_clean, prefiltered
+    from research.benchmarks.passes import layers_of
+
+    guides = high.read(high.data_window, [ALBEDO, NORMAL])
+
+    def passes(layers: Any, session: Any, beauty: Any) -> None:
+        cache_bytes = strips_memory(MAX_MEMORY, beauty.nbytes)  # as in the job of a frame
+        fuser = layer_fuser(session, beauty)
+        made = fuse_passes(
+            low, high, beauty.rgb, beauty.alignment, [layers], cache_bytes, guides=beauty.clean_aovs, fuse_layers=fuser
+        )
+        assert not made.refused
+
+    def each_plain(noisy: Sequence[Any]) -> None:
+        for layer in noisy:
+            denoise(layer, guides[ALBEDO], guides[NORMAL])
+
+    def each_prefiltered(noisy: Sequence[Any]) -> None:
+        clean = prefiltered(guides)
+        for layer in noisy:
+            denoise_with_clean(layer, clean)
+
+    calls: dict[tuple[str, str, str], Callable[[], Any]] = {}
+    sessions = [load_model(scale, model) for model in models]
+    beauties = {session.name: fuse(low, high, session, clean_aovs=True) for session in sessions}
+    for session in sessions:
+        calls["", BEAUTY, session.name] = partial(fuse, low, high, session)
+    for layers in high.additive_sets:
+        noisy = [layer for layer in layers_of(high, layers) if layer.any()]
+        title = f"{layers.name}: {len(noisy)} of {len(layers.layers)} layers have light"
+        for session in sessions:
+            calls[title, OURS, session.name] = partial(passes, layers, session, beauties[session.name])
+        calls[title, PLAIN, ""] = partial(each_plain, noisy)
+        calls[title, PREFILTERED, ""] = partial(each_prefiltered, noisy)
+    return calls
+
+
+def time_passes(args: argparse.Namespace) -> list[Row]:
+    """Time passes in this process, because both peers share what they read; the calls take turns."""
+    from oiio_msspl import map_render, open_exr
+    from oiio_msspl.fusion.tiles.alignment import align
+
+    times: dict[tuple[str, str, str], list[float]] = {}
+    with tempfile.TemporaryDirectory() as folder:
+        width, height = args.size
+        paths = args.pair or write_pair(Path(folder), width, height, args.scale, GROUPS)
+        low, high = (map_render(open_exr(path)) for path in paths)
+        scale, window = align(low, high).scale, high.data_window
+        calls = pass_calls(low, high, args.quality, scale)
+        for _ in range(args.rounds + 1):
+            for key, call in calls.items():
+                times.setdefault(key, []).extend(timer.seconds_of(call, 1, 0))
+    size = {
+        "size": f"{window.width}x{window.height}",
+        "scale": scale,
+        "kind": "rendered" if args.pair else "light everywhere",
+    }
+    return [
+        {"set": name, "method": method, **size, "cores": os.cpu_count(), **({"model": model} if model else {})}
+        | {"seconds": statistics.median(seconds[1:])}
+        for (name, method, model), seconds in times.items()
+    ]
+
+
+def _render(mi: Any, scene: Any, integrator: Any, spp: int) -> Any:
+    return mi.render(scene, integrator=integrator, spp=spp).numpy()
+
+
+def time_render(args: argparse.Namespace) -> list[Row]:
+    """Time one sample in each of 1024 x 1024 pixels of every scene, for either render."""
+    import mitsuba as mi
+
+    from research.benchmarks.render.film import CROP, frame_size, set_crop
+
+    mi.set_variant("llvm_ad_rgb")
     rows = []
-    for case, rounds in measured.items():
-        seconds = [value for done in rounds for value in done["seconds"]]
-        row: Row = {"method": case, "size": args.size, "machine": processor(), "cores": os.cpu_count()}
-        row |= {"seconds": statistics.median(seconds), "fastest": min(seconds), "slowest": max(seconds)}
-        row |= {"peak_mb": max(done["peak_mb"] for done in rounds)}
-        if case in SAME_WORK.values():
-            row["version"] = ".".join(version("pyoidn").split(".")[:3])
+    for path in sorted(args.scenes.glob("*/*.xml")):
+        scene, path_tracer = mi.load_file(str(path)), {"type": "path", "max_depth": 12}
+        integrator: Any = mi.load_dict({"type": "aov", "aovs": "albedo:albedo,nn:sh_normal", "img": path_tracer})
+        sensor = scene.sensors()[0]
+        parameters, full = mi.traverse(sensor), frame_size(sensor)
+        row: Row = {"scene": path.parent.name}
+        for name, scale in (("hrls_s", 1), ("lrhs_s", RENDER_SCALE)):
+            size, crop, spp = full // scale, np.array(CROP) // scale, RENDER_SPP * scale**2
+            set_crop(mi, parameters, size, crop, (size - crop) // 2)
+            render = partial(_render, mi, scene, integrator, spp)
+            seconds = statistics.median(timer.seconds_of(render, args.rounds))
+            row[name] = seconds * MEGAPIXEL / float(crop[0] * crop[1] * spp)
         rows.append(row)
     return rows
 
 
-def layout(rows: list[Row]) -> str:
-    """A line for each method, beside OIDN's time."""
-    found = results.index(rows, "method")
-    body = []
-    for name, row in found.items():
-        of_oidn = f"{row['seconds'] / found[OIDN]['seconds']:.2f}" if OIDN in found else ""
-        spread = f"{row['fastest']:.2f} to {row['slowest']:.2f}"
-        title = name.replace(OIDN, f"{OIDN} {row['version']}", 1) if "version" in row else f"`{name}`"
-        body.append([title, f"{row['seconds']:.2f}", spread, of_oidn, f"{row['peak_mb']:.0f}"])
-    head = f"{rows[0]['size'].replace('x', ' x ')}, {rows[0]['cores']} cores, {rows[0]['machine']}"
-    return results.markdown([head, "median s", "fastest to slowest", "of OIDN's time", "peak MB"], body)
+#: Question -> how it is measured, the columns that tell its rows apart, and the size of the frame.
+QUESTIONS = {
+    "frame": (time_frame, ("method", "machine"), "1024x1024"),
+    "command": (time_command, ("method", "size", "machine"), "1920x1080"),
+    "shots": (time_shots, ("quality", "temporal", "lamps", "machine"), "1920x1080"),
+    "passes": (time_passes, ("set", "method", "model", "scale", "kind", "machine"), "1920x1080"),
+    "render": (time_render, ("scene", "machine"), "1024x1024"),
+}
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--size", default="1024x1024")
-    parser.add_argument("--repeats", type=int, default=2, help="calls that are timed in a process")
-    parser.add_argument("--rounds", type=int, default=5, help="processes for each method, in turn")
-    parser.add_argument("--threads", type=int, default=0, help="of ONNX Runtime; 0: one a core")
-    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; default: all")
-    parser.add_argument("--methods", metavar="PATTERN", help="measure only these; --table then keeps its other rows")
-    parser.add_argument("--measure", help=argparse.SUPPRESS)
-    results.add_option(parser)
+    """Measure one question."""
+    parser = results.parser(__doc__)
+    parser.add_argument("question", choices=QUESTIONS)
+    parser.add_argument("scenes", type=Path, nargs="?", help="render: the folder of scenes")
+    parser.add_argument("--size", metavar="WxH")
+    parser.add_argument("--scale", type=int, default=2)
+    parser.add_argument("--rounds", type=int, default=3, help="times that all are measured, in turn")
+    parser.add_argument("--quality", nargs="+", default=["fast", "balanced", "best", "paper"], help="or models")
+    parser.add_argument("--methods", metavar="PATTERN", default="*", help="frame: measure only these")
+    parser.add_argument("--repeats", type=int, default=2, help="frame: calls that are timed in a process")
+    parser.add_argument("--threads", type=int, default=0, help="frame: of ONNX Runtime; 0: one a core")
+    parser.add_argument("--without-oidn", action="store_true", help="command: leave OIDN out")
+    parser.add_argument("--frames", type=int, default=24, help="shots: frames of the shot")
+    parser.add_argument("--lamps", type=int, default=0, help="shots: light groups whose passes are fused")
+    parser.add_argument("--pair", type=Path, nargs=2, metavar=("LR.exr", "HR.exr"), help="passes: a rendered pair")
     args = parser.parse_args()
-    if args.measure:
-        width, height = (int(v) for v in args.size.split("x"))
-        if args.measure in SAME_WORK.values():
-            call = prepare_oidn(args.measure, height, width)
-        else:
-            call = prepare_model(args.measure, height, width, args.threads)
-        print(json.dumps(measure(call, args.repeats)))
-        return
-    rows = compare(args)
-    print(layout(rows))
-    if args.table and args.methods:
-        results.merge(args.table, rows, ("method",))
-    elif args.table:
-        results.write(args.table, rows)
+    measure, keys, size = QUESTIONS[args.question]
+    args.size = [int(side) for side in (args.size or size).split("x")]
+    rows = [{"machine": results.processor(), **row} for row in measure(args)]
+    results.show(results.plain, rows, args.table, keys)
 
 
 if __name__ == "__main__":

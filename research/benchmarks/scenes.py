@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The development scenes: pairs of renders with a reference, of scenes that no network was trained on.
+"""Load the development scenes: pairs of renders with a reference, of scenes that no network was trained on.
 
 Models and defaults are chosen by them, so they are no blind test. A folder holds one of two kinds:
 
@@ -9,7 +9,6 @@ Models and defaults are chosen by them, so they are no blind test. A folder hold
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -43,14 +42,12 @@ class Scene:
     """The HRLS of a number of spp."""
     lrhs: Callable[[int, int], ReadableRender]
     """The LRHS of a scale s and n: it has n samples for every HRLS pixel, which is ``s^2 n`` spp."""
-    nearest: Callable[[int, int], ReadableRender | None] = lambda scale, spp: None
-    """The same as in the paper's data set, which keeps one of s x s pixels; None if there is none."""
     has: Callable[[int], bool] = lambda spp: True
     """Whether there is an HRLS of a number of spp."""
 
 
 def load(folder: Path) -> list[Scene]:
-    """All scenes of a folder.
+    """Return all scenes of a folder.
 
     Raises:
         SystemExit: there are none.
@@ -64,7 +61,7 @@ def load(folder: Path) -> list[Scene]:
 
 
 def beauty(source: ReadableRender) -> Array:
-    """The beauty (h, w, 3) of a whole render, without NaN, Inf and negative values."""
+    """Return the beauty (h, w, 3) of a whole render, without NaN, Inf and negative values."""
     return repair(source.read(source.data_window, ["rgb"])["rgb"])[0]
 
 
@@ -82,7 +79,7 @@ def _render(folder: Path) -> Scene:
 
 
 def of_view(view: View) -> Scene:
-    """A rendered view as a scene."""
+    """Return a rendered view as a scene."""
     reference = as_float32(view.ref)
     exposure = np.float32(find_exposure(reference))
     whole = slice(None)
@@ -102,15 +99,4 @@ def of_view(view: View) -> Scene:
         layers = {name: box_downsample(features[name], scale) for name in (ALBEDO, NORMAL)}
         return Render.from_arrays(f"{view.path.name}, x{scale}", rgb=image, **layers)
 
-    def nearest(scale: int, spp: int) -> ReadableRender | None:
-        passes = range(len(view.lr_spp))
-        subsets = itertools.chain.from_iterable(itertools.combinations(passes, n) for n in range(1, len(passes) + 1))
-        chosen = next((list(c) for c in subsets if view.lr_spp[list(c)].sum() == scale**2 * spp), None)
-        if (
-            chosen is None or 1 not in view.lr
-        ):  # an LRHS that was rendered at 1/s of the resolution has no single HRLS pixels
-            return None
-        image = mean_lrhs(view, chosen, scale, nearest=True) * exposure
-        return Render.from_arrays(f"{view.path.name}, x{scale} nearest", rgb=image)
-
-    return Scene(view.scene, reference * exposure, hrls, lrhs, nearest)
+    return Scene(view.scene, reference * exposure, hrls, lrhs)

@@ -1,10 +1,12 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Puts the tables of `research/benchmarks/results` into the pages.
+"""Put the tables of results into the pages.
 
     python -m research.benchmarks.tables
+    python -m research.benchmarks.tables --check
 
-In the pages of `TABLES`, everything between ``<!-- begin: NAME -->`` and ``<!-- end -->`` is replaced by what the
-function NAME returns. The text around it stays. The table that ``msspl models`` prints is written, too.
+In the pages of `TABLES`, everything between ``<!-- begin: NAME -->`` and ``<!-- end -->`` is replaced by the table of
+that name, with a line that says what its rows were measured with. The text around it stays. The table that
+``msspl models`` prints is written, too. ``--check`` writes nothing and fails if a page is out of date.
 """
 
 from __future__ import annotations
@@ -12,644 +14,455 @@ from __future__ import annotations
 import argparse
 import itertools
 import re
-from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
-from oiio_msspl.model.contract import SCALES, SPREAD
-from research.benchmarks import (
-    confidence,
-    goals,
-    layers,
-    quality,
-    results,
-    runtime_files,
-    runtime_passes,
-    runtime_temporal,
-    versus,
-)
-from research.benchmarks import pair_checks as pair_checks_benchmark
-from research.benchmarks import passes as passes_benchmark
-from research.benchmarks import runtime as runtimes
-from research.benchmarks import temporal_passes as temporal_passes_benchmark
+from oiio_msspl.model.contract import SPREAD
+from research.benchmarks import accuracy, paper, passes, results, runtime
+from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label, matching
 from research.benchmarks.results import MEAN, Row
-from research.benchmarks.runtime import OIDN, OIDN_PREFILTERED, SAME_WORK
+from research.benchmarks.runtime import SAME_WORK
 from research.benchmarks.scenes import NOISY_REFERENCE
-from research.benchmarks.stability import report as stability_report
-from research.benchmarks.temporal import report as temporal_report
-from research.benchmarks.temporal.methods import (
+from research.benchmarks.shots.methods import (
     ALONE,
     NEIGHBOURS,
     OIDN_BEST,
+    OIDN_NEIGHBOURS,
     OIDN_SPLIT,
     OIDN_SPLIT_NEIGHBOURS,
     QUALITIES,
 )
-from research.benchmarks.temporal.methods import SCALES as TEMPORAL_SCALES
-from research.benchmarks.temporal.sequence import MASKS
+from research.benchmarks.stability.report import ENLARGED
 
 ROOT = Path(__file__).parents[2]
-FAMILIES = ("paper", "joint-small", "joint", "joint-large")
-#: OIDN on both renders at its best: see :func:`research.benchmarks.peers.match_local_means`.
-JOINED = "OIDN prefiltered on both x2, together"
-#: Methods of :mod:`research.benchmarks.quality` that most tables compare the models with.
-PEERS = (
-    "OIDN on the HRLS",
-    "OIDN prefiltered on the HRLS",
-    "OIDN on both x2, together",
-    JOINED,
-    "OIDN, same samples",
-    "OIDN prefiltered, same samples",
+
+
+def _on(instructions: str) -> dict[str, Wanted]:
+    """Return the condition that a row was measured on a processor with these instructions for networks."""
+    return {"machine": lambda name: name is not None and name.endswith(instructions)}
+
+
+def strongest(rows: Sequence[Row], input_name: str) -> str:
+    """Return the call of OIDN on this input with the highest mean PSNR over all average spp."""
+    means = [row for row in rows if row["scene"] == MEAN and row["method"].startswith("OIDN")]
+    psnr: dict[str, list[float]] = {}
+    for row in means:
+        if row["method"].endswith(input_name):
+            psnr.setdefault(row["method"], []).append(row["psnr"])
+    return max(psnr, key=lambda method: float(np.mean(psnr[method])))
+
+
+FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "joint-large-x2"
+ON_HRLS, JOINED, SAME_SAMPLES = (
+    strongest(results.read("accuracy"), name) for name in (" on the HRLS", " on both x2, together", ", same samples")
 )
-DEFAULT = "joint-x2"
-#: Models of the qualities "balanced" and "best", and the latter with most samples in the HRLS.
-BETTER = (DEFAULT, "joint-large-x2", "joint-large-x2, 7:1")
-#: A method of README's table -> its title, and what it needs.
-WHEN_IT_PAYS = {
-    "joint-small-x2": ("`--quality fast` (`joint-small-x2`)", "LRHS and HRLS"),
-    "joint-x2": ("`--quality balanced` (`joint-x2`)", "LRHS and HRLS"),
-    "joint-large-x2": ("`--quality best` (`joint-large-x2`)", "LRHS and HRLS"),
-    "OIDN on the HRLS": ("OIDN on the HRLS", "HRLS"),
-    "OIDN prefiltered on the HRLS": ("OIDN on the HRLS, prefiltered", "HRLS"),
-    "OIDN prefiltered with base guides on the HRLS": ("the same with base networks for albedo and normal", "HRLS"),
-    JOINED: ("OIDN on both renders, prefiltered, and joined", "LRHS and HRLS"),
-    "OIDN, same samples": ("OIDN at full resolution", "all samples at full resolution"),
-    "OIDN prefiltered, same samples": ("OIDN at full resolution, prefiltered", "all samples at full resolution"),
-}
 #: OIDN at its best -> which render it gets.
-AT_ITS_BEST = {
-    "OIDN prefiltered on the HRLS": "on the HRLS",
-    "OIDN prefiltered, same samples": "at full resolution",
-}
-#: OIDN's calls on the renders by LuxCore.
-LUXCORE_PEERS = (
-    "OIDN on the HRLS",
-    "OIDN prefiltered on the HRLS",
-    "OIDN, same samples",
-    "OIDN prefiltered, same samples",
-)
-#: Tables of accuracy on all methods, and the renders they are about.
+PLACES = {ON_HRLS: "on the HRLS", JOINED: "on both renders, joined", SAME_SAMPLES: "at full resolution, same samples"}
 SETS = {
-    "Mitsuba": "quality",
-    "box": "quality_box",
-    "Blackman-Harris": "quality_blackman_harris",
-    "Cycles": "quality_cycles",
+    "Mitsuba": "accuracy",
+    "box": "accuracy_box",
+    "Blackman-Harris": "accuracy_blackman_harris",
+    "Cycles": "accuracy_cycles",
 }
-
-#: Instructions of a processor for networks -> tables of times that were measured on it: of methods, and of rendering.
-MACHINES = {
-    "AMX": ("runtime_amx", "render_time_amx"),
-    "VNNI": ("runtime_vnni", "render_time_vnni"),
-    "neither": ("runtime", "render_time"),
+BY_SCENE = ("scene", "spp", "method")
+#: Instructions of a processor for networks -> how a machine's name ends.
+MACHINES = {"AMX": "with AMX", "VNNI": "with VNNI", "neither": "without VNNI"}
+METHODS = {
+    FAST: "`--quality fast`",
+    BALANCED: "`--quality balanced`",
+    BEST: "`--quality best`",
+    ON_HRLS: "OIDN on the HRLS, prefiltered",
+    JOINED: "OIDN on both renders, prefiltered, and joined",
+    SAME_SAMPLES: "OIDN at full resolution, prefiltered",
+    "paper-x2": "`--model paper`",
 }
+SCENES = (MEAN, "cornell-box", "lamp", "spaceship", "staircase2", "tire", *NOISY_REFERENCE)
+#: Pixel filters, the spread ones first.
+KINDS = tuple(dict.fromkeys(row["filter"] for row in results.read("filters")))
+#: The larger frame of the times on a GPU.
+LARGE = {"size": "1920 x 1088"}
+VERDICTS = ("holds", "suffers", "fails")
+#: Wrong pairs on the page, and right ones.
+PAIRS = (
+    "right, whole frame",
+    "crop 3 % tighter",
+    "normals of another scene",
+    "albedo of another scene",
+    "shift by 1 LRHS pixel",
+    "LRHS scaled down: lanczos3",
+    "exposure one stop up",
+)
+#: Sequences that were measured with two neighbours on each side.
+NEEDS = {ON_HRLS: "HRLS", SAME_SAMPLES: "all samples at full resolution"}
 
-#: Methods that are compared on the same views with two pixel filters.
-SAME_VIEWS = (
-    "joint-small-x2",
-    "joint-x2",
-    "OIDN on the HRLS",
-    "OIDN prefiltered on the HRLS",
-    "OIDN, same samples",
-    "OIDN prefiltered, same samples",
+
+WHEN_IT_PAYS = Table(
+    ("accuracy", "time_command"),
+    (*BY_SCENE, "size"),
+    ("method", "needs"),
+    [
+        Line([METHODS[m], NEEDS.get(m, "LRHS and HRLS")], {"method": m})
+        for m in (FAST, BALANCED, BEST, ON_HRLS, SAME_SAMPLES, "paper-x2")
+    ],
+    [
+        Column("PSNR, 2 spp", "psnr", {"source": "accuracy", "scene": MEAN, "spp": 2}),
+        Column("PSNR, 8 spp", "psnr", {"source": "accuracy", "scene": MEAN, "spp": 8}),
+        Column("RelMSE, 2 spp", "relmse", {"source": "accuracy", "scene": MEAN, "spp": 2}),
+        Column("RelMSE, 8 spp", "relmse", {"source": "accuracy", "scene": MEAN, "spp": 8}),
+        Column(
+            "whole command at 1080p, processor seconds",
+            "cpu_seconds",
+            {"source": "time_command", "size": "1920x1080"},
+            form="{:.1f}",
+            renamed=SAME_WORK,
+        ),
+    ],
 )
 
-Found = Mapping[Hashable, Row]
-#: Methods of README's table of spread noise, and their titles.
-SPREAD_NOISE = {
-    "HRLS": "HRLS alone",
-    "joint-x2": "`joint-x2`",
-    "joint-small-spread-x2": "`--quality fast` (`joint-small-spread-x2`)",
-    "joint-spread-x2": "`--quality balanced` (`joint-spread-x2`)",
-    "joint-large-spread-x2": "`--quality best` (`joint-large-spread-x2`)",
-    "paper-x2": "`paper-x2`",
-    "OIDN on the HRLS": "OIDN on the HRLS",
-    "OIDN prefiltered on the HRLS": "OIDN on the HRLS, prefiltered",
-    "OIDN, same samples": "OIDN at full resolution",
-    "OIDN prefiltered, same samples": "OIDN at full resolution, prefiltered",
-    "OIDN prefiltered and split, same samples": "the same on every second pixel",
-}
+
+def _accuracy_columns(source: str, spps: Sequence[int] = accuracy.AVERAGES) -> list[Column]:
+    """Return columns of mean PSNR and RelMSE for some average spp."""
+    where = {"source": source, "scene": MEAN}
+    return [Column(f"{spp} spp: PSNR / RelMSE", "psnr/relmse", {**where, "spp": spp}) for spp in spps]
 
 
-def title(method: str) -> str:
-    """A method's name, as code if it is a model's."""
-    return f"`{method}`" if method.startswith(FAMILIES) else method
+ACCURACY_BY_SCENE = Table(
+    ("accuracy",),
+    BY_SCENE,
+    ("PSNR at 2 spp",),
+    [Line([title], {"method": method, "spp": 2}) for method, title in METHODS.items()],
+    [Column(name, "psnr", {"scene": name}) for name in SCENES],
+    means=True,
+)
+
+HOW_SURE = Table(
+    tuple(SETS.values()),
+    BY_SCENE,
+    ("gain over prefiltered OIDN",),
+    [
+        Line([f"{METHODS[model]}, OIDN {place}"], {"method": model, "scene": clean}, {"method": peer})
+        for (peer, place), model in itertools.product(PLACES.items(), (BALANCED, BEST))
+    ],
+    [
+        Column(f"{name}, {spp} spp: {title}", measure, {"source": SETS[name], "spp": spp}, how)
+        for name, spp in (("Mitsuba", 2), ("Mitsuba", 8), ("box", 2), ("Blackman-Harris", 2), ("Cycles", 2))
+        for title, measure, how in (("PSNR", "psnr", "interval"), ("RelMSE", "relmse", "ratio interval"))
+    ],
+)
 
 
-def models(scales: Sequence[int] = SCALES, families: Sequence[str] = FAMILIES) -> list[str]:
-    """Names of the shipped models."""
-    return [f"{family}-x{scale}" for family in families for scale in scales]
+#: Method with the ending of a division of the samples.
+def _divided(more: int, less: int) -> dict[str, str]:
+    return {method: f"{method}, {more}:{less}" for method in METHODS}
 
 
-def means_of(rows: Iterable[Row]) -> Found:
-    """The mean rows of :mod:`research.benchmarks.quality` by (spp, method)."""
-    return results.index((row for row in rows if row["scene"] == MEAN), "spp", "method")
+SAMPLE_COUNTS = Table(
+    ("accuracy_box",),
+    BY_SCENE,
+    ("PSNR, samples of the HRLS : LRHS",),
+    [Line([METHODS[method]], {"method": method, "scene": MEAN}) for method in (BALANCED, BEST, ON_HRLS, SAME_SAMPLES)],
+    [
+        Column(f"{spp} spp, {more}:{less}", "psnr", {"spp": spp}, renamed=_divided(more, less) if more > 1 else {})
+        for spp, more, less in ((4, 1, 1), (4, 3, 1), (8, 1, 1), (8, 3, 1), (8, 7, 1))
+    ],
+)
 
+SPREAD_NOISE = Table(
+    ("accuracy_gauss",),
+    BY_SCENE,
+    ("method",),
+    [
+        Line([title], {"method": method})
+        for method, title in {
+            f"joint-small{SPREAD}-x2": "`--quality fast`",
+            f"joint{SPREAD}-x2": "`--quality balanced`",
+            f"joint-large{SPREAD}-x2": "`--quality best`",
+            SAME_SAMPLES: METHODS[SAME_SAMPLES],
+            "OIDN prefiltered and split, same samples": "the call above on every second pixel",
+        }.items()
+    ],
+    _accuracy_columns("accuracy_gauss", (2, 8)),
+    means=True,
+)
 
-def share_of_oidn(times: Found, method: str) -> str:
-    """Time of a method of :mod:`research.benchmarks.quality` as a share of OIDN's; empty if it was not measured.
+FILTERS = Table(
+    ("filters",),
+    ("filter", "spp", "method"),
+    ("PSNR at 2 spp",),
+    ("method",),
+    [Column(name, "psnr", {"spp": 2, "filter": name}) for name in KINDS],
+)
 
-    Args:
-        times: rows of :mod:`research.benchmarks.runtime` by method.
-    """
-    time = times.get(SAME_WORK.get(method, method))
-    return f"{time['seconds'] / times[OIDN]['seconds']:.2f}" if time else ""
-
-
-def when_it_pays() -> str:
-    """Accuracy at 2 and 8 spp on average, and time, of what a user can choose from."""
-    rows = results.read("quality")
-    runs = [results.index(results.read(table), "method") for table, _ in MACHINES.values()]
-    means = means_of(rows)
-    body = []
-    for method, (name, needs) in WHEN_IT_PAYS.items():
-        relative = [share_of_oidn(times, method) for times in runs]
-        cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
-        body.append([name, needs, *cells, *relative])
-    head = ["method", "needs", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE"]
-    head += [f"time / OIDN's, {name}" for name in MACHINES]
-    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
-
-
-def how_sure() -> str:
-    """The qualities "balanced" and "best" against OIDN at its best, by scene."""
-    rows = results.read("quality")
-    peers = AT_ITS_BEST | {JOINED: "on both renders, joined"}
-    body = []
-    for (peer, render), model, spp in itertools.product(peers.items(), BETTER, (2, 8)):
-        if peer != goals.SAME_SAMPLES:  # it reads the HRLS that the model reads, which may have most of the samples
-            peer = ", ".join([peer, *model.split(", ")[1:]])
-        if found := versus.compare(rows, model, peer, spp):
-            cells = [versus.cell(found.psnr, "+.2f"), f"{found.without_too_easy:+.2f}", found.wins]
-            body.append([render, title(model), str(spp), *cells, ", ".join(found.verdicts)])
-    head = ["against OIDN, prefiltered", "model", "spp", "PSNR gained, dB", f"without {versus.TOO_EASY}", "better on"]
-    return results.markdown([*head, "PSNR, RelMSE"], body)
-
-
-def against_oidn() -> str:
-    """Models against OIDN at its best, with intervals, on all renders on which both were measured."""
-    tables = {name: results.read(table) for name, table in SETS.items()}
-    text = versus.table(
-        tables,
-        ("joint-large-x2", "joint-large-x4", "joint-x2", "joint-x4", "joint-small-x4"),
-        AT_ITS_BEST,
-        quality.AVERAGES,
-    )
-    missing = [name for name, rows in tables.items() if not versus.compare(rows, DEFAULT, next(iter(AT_ITS_BEST)), 2)]
-    return text + f"\nPrefiltered OIDN was not measured on these renders: {', '.join(missing)}.\n" * bool(missing)
-
-
-def goals_of_accuracy() -> str:
-    """What the qualities were to reach in accuracy, and what they reach."""
-    return goals.accuracy({title: results.read(table) for title, table in SETS.items()})
-
-
-def goals_of_time() -> str:
-    """The same for time."""
-    return goals.time({title: results.read(table) for title, (table, _) in MACHINES.items()})
-
-
-def spread_noise() -> str:
-    """Accuracy on renders whose pixel filter has spread the noise, on how many scenes that is best, and time."""
-    rows = results.read("quality_gauss")
-    times = results.index(results.read(MACHINES["VNNI"][0]), "method")
-    means, found = means_of(rows), results.index(rows, *quality.KEYS)
-    clean = versus.clean_scenes(rows)
-    body = []
-    for method, name in SPREAD_NOISE.items():
-        cells = [quality.cell(means.get((spp, method)), measure) for spp in (2, 8) for measure in ("psnr", "relmse")]
-        best = sum(max(SPREAD_NOISE, key=lambda m, s=scene: found[s, 2, m]["psnr"]) == method for scene in clean)
-        body.append([name, *cells, f"{best} of {len(clean)}", share_of_oidn(times, method)])
-    head = ["method", "2 spp: PSNR", "RelMSE", "8 spp: PSNR", "RelMSE", "scenes on which it is best (PSNR, 2 spp)"]
-    head.append("time / OIDN's, VNNI")
-    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
-
-
-def same_views() -> str:
-    """The same views with a box filter, and with a Gaussian that spreads samples, for which other models are made."""
-    films = {name: results.read(f"quality_film_{name}") for name in ("box", "gaussian")}
-    found = {name: results.index(rows, *quality.KEYS) for name, rows in films.items()}
-    clean = versus.clean_scenes(films["box"])
-    body = []
-    for method in SAME_VIEWS:
-        spread = method.replace("-x", f"{SPREAD}-x") if method.startswith(FAMILIES) else method
-        names = {"box": method, "gaussian": spread}
-        line = [title(method)]
-        for spp in (2, 8):
-            line += [quality.cell(found[film][MEAN, spp, name], "psnr", "relmse") for film, name in names.items()]
-            box, gaussian = ([found[film][n, spp, name]["psnr"] for n in clean] for film, name in names.items())
-            line.append(versus.cell(versus.with_interval(np.subtract(gaussian, box)), "+.2f"))
-        body.append(line)
-    head = [f"{spp} spp, {name}" for spp in (2, 8) for name in ("box", "Gaussian", "difference, dB")]
-    return f"{results.markdown(['PSNR / RelMSE', *head], body)}\n{quality.mean_note(films['box'])}\n"
-
-
-def gpu_times() -> str:
-    """Milliseconds a frame on a GPU."""
-    found = results.index(rows := results.read("gpu"), "size", "method")
-    sizes = dict.fromkeys(row["size"] for row in rows)
-    body = []
-    for method in dict.fromkeys(row["method"] for row in rows):
-        taken = [found[size, method] for size in sizes]
-        last = taken[-1]
-        cells = [f"{row['ms']:.1f} ms" for row in taken]
-        cells += [f"{last['ms'] / found[last['size'], peer]['ms']:.2f}" for peer in ("OIDN", "OIDN prefiltered")]
-        cells += [f"{last[name]:.1f} ms" if name in last else "" for name in ("with_copies_ms", "floor_ms")]
-        body.append([title(method), *cells])
-    of_last = [f"time / {peer}'s" for peer in ("OIDN", "prefiltered OIDN")] + ["with copies", "convolutions, at least"]
-    (card,) = {row["card"] for row in rows}
-    return f"{results.markdown([card, *sizes, *of_last], body)}\n"
-
-
-def by_filter(rows: Sequence[Row] | None = None) -> str:
-    """Accuracy for each pixel filter, by :mod:`research.benchmarks.pixel_filters`."""
-    rows = rows or results.read("pixel_filters")
-    found = results.index(rows, "filter", "spp", "method")
-    columns = list(dict.fromkeys((row["spp"], row["method"]) for row in rows))
-    body = [
-        [kind, *(quality.cell(found[kind, *column], "psnr", "relmse") for column in columns)]
-        for kind in dict.fromkeys(row["filter"] for row in rows)
-    ]
-    return results.markdown(["PSNR / RelMSE", *(f"{spp} spp, {title(method)}" for spp, method in columns)], body)
-
-
-def layer_worth() -> str:
-    """What each layer is worth at 2 spp."""
-    return layers.layout([row for row in results.read("layers") if row["spp"] == 2])
-
-
-def scenes() -> str:
-    """All measures of all methods on the development scenes."""
-    return quality.layout(results.read("quality"))
-
-
-def runtime() -> str:
-    """Time and memory of a frame on arrays, on several processors, and of one from file to file."""
-    frames = "\n".join(runtimes.layout(results.read(table)) for table, _ in MACHINES.values())
-    return f"{frames}\n{runtime_files.layout(results.read('runtime_files'))}"
-
-
-def filters() -> str:
-    """Both pixel filters, with all layers, and two models against OIDN with the same samples by scene."""
-    tables = {"box": results.read("quality_box"), "Blackman-Harris": results.read("quality_blackman_harris")}
-    means = {name: means_of(rows) for name, rows in tables.items()}
-    names = [*PEERS, *models(SCALES[:2], FAMILIES[1:])]
-    names += [f"{name}, {a}:{b}" for name in models(SCALES[:2], ("joint", "joint-large")) for a, b in quality.UNEVEN]
-    head = ["PSNR / RelMSE", *(f"{name}, {spp} spp" for name in tables for spp in quality.AVERAGES)]
-    cases = [(name, spp) for name in tables for spp in quality.AVERAGES]
-    body = _measured(
-        [title(method), *(quality.cell(means[name].get((spp, method)), "psnr", "relmse") for name, spp in cases)]
-        for method in names
-    )
-    clean = versus.clean_scenes(tables["box"])
-    differences = []
-    for (name, rows), model, spp in itertools.product(tables.items(), BETTER[:2], quality.AVERAGES):
-        if found := versus.compare(rows, model, "OIDN prefiltered, same samples", spp):
-            by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
-            without = f"{found.without_too_easy:+.2f}"
-            psnr = versus.cell(found.psnr, "+.2f")
-            differences.append([f"{name}, `{model}`, {spp}", psnr, without, found.wins, *by_scene])
-    between = "\nPSNR minus that of prefiltered OIDN on full resolution with the same samples:\n\n"
-    columns = ["filter, model, spp", MEAN, f"without {versus.TOO_EASY}", "better on", *clean]
-    return (
-        f"{results.markdown(head, body)}\n{quality.mean_note(tables['box'])}\n{between}"
-        f"{results.markdown(columns, differences)}"
-    )
-
-
-def cycles() -> str:
-    """Views by Cycles."""
-    rows = results.read("quality_cycles")
-    means = means_of(rows)
-    names = [*PEERS, *models(), *(f"joint-large-x2, {a}:{b}" for a, b in quality.UNEVEN)]
-    body = _measured(
-        [title(name), *(quality.cell(means.get((spp, name)), "psnr", "relmse", "flip") for spp in quality.AVERAGES)]
-        for name in names
-    )
-    head = ["PSNR / RelMSE / FLIP", *(f"{spp} spp" for spp in quality.AVERAGES)]
-    clean = versus.clean_scenes(rows)
-    differences = []
-    for (peer, which), model, spp in itertools.product(AT_ITS_BEST.items(), BETTER[:2], quality.AVERAGES):
-        if found := versus.compare(rows, model, peer, spp):
-            by_scene = (f"{found.by_scene[scene]:+.2f}" for scene in clean)
-            differences.append([f"`{model}`, {which}, {spp}", versus.cell(found.psnr, "+.2f"), found.wins, *by_scene])
-    return (
-        f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
-        "\nPSNR minus that of prefiltered OIDN, which gets the HRLS or as many samples at full resolution:\n\n"
-        f"{results.markdown(['model, OIDN, spp', MEAN, 'better on', *clean], differences)}"
-    )
-
-
-def luxcore() -> str:
-    """A room by LuxCore, with either filter."""
-    rows = results.read("quality_luxcore")
-    found = results.index(rows, *quality.KEYS)
-    cases = [(scene, spp) for scene in versus.clean_scenes(rows) for spp in quality.AVERAGES]
-    body = _measured(
-        [title(method), *(quality.cell(found.get((*case, method)), "psnr", "relmse") for case in cases)]
-        for method in (*LUXCORE_PEERS, *models(SCALES[:2]))
-    )
-    return results.markdown(["PSNR / RelMSE", *(f"{scene}, {spp} spp" for scene, spp in cases)], body)
-
-
-def division() -> str:
-    """PSNR when the HRLS has more than half of the samples: box filter, all layers."""
-    rows = results.read("quality_box")
-    means = means_of(rows)
-    ways = ["", *(f", {more}:{less}" for more, less in quality.UNEVEN)]
-    columns = [(spp, way) for spp in quality.AVERAGES[1:] for way in ways if (spp, DEFAULT + way) in means]
-    body = _measured(
-        [title(name), *(quality.cell(means.get((spp, name + way)), "psnr") for spp, way in columns)]
-        for name in (
-            "joint-large-x2",
-            "joint-x2",
-            "joint-x4",
-            "joint-small-x4",
-            "OIDN, same samples",
-            "OIDN prefiltered, same samples",
+TIME = Table(
+    ("time_frame",),
+    ("method", "machine"),
+    ("seconds for 1024 x 1024 in memory, 2 cores",),
+    [Line([label(method)], {"method": method}) for method in (FAST, BALANCED, BEST, "paper-x2")]
+    + [Line([method], {"method": method}) for method in (runtime.OIDN_FAST, runtime.OIDN, runtime.OIDN_PREFILTERED)],
+    [
+        column
+        for name, ending in MACHINES.items()
+        for column in (
+            Column(name, "seconds", _on(ending)),
+            Column("of OIDN's", "seconds", _on(ending), "ratio", against={"method": runtime.OIDN}),
         )
-    )
-    head = ["", *(f"{spp} spp{way or ', 1:1'}" for spp, way in columns)]
-    return f"{results.markdown(head, body)}\n{quality.mean_note(rows)}\n"
+    ],
+)
+
+GPU_TIMES = Table(
+    ("gpu",),
+    ("size", "method"),
+    ("milliseconds",),
+    ("method",),
+    [
+        Column("1024 x 1024", "ms", {"size": "1024 x 1024"}, form="{:.1f}"),
+        Column("1920 x 1088", "ms", LARGE, form="{:.1f}"),
+        Column("time / OIDN's", "ms", LARGE, "ratio", against={"method": "OIDN"}),
+        Column("time / prefiltered OIDN's", "ms", LARGE, "ratio", against={"method": "OIDN prefiltered"}),
+        Column("with copies", "with_copies_ms", LARGE, form="{:.1f}"),
+        Column("convolutions, at least", "floor_ms", LARGE, form="{:.1f}"),
+    ],
+)
 
 
-def _measured(body: Iterable[list[str]]) -> list[list[str]]:
-    """The lines that have more than a title."""
-    return [line for line in body if any(line[1:])]
+#: A sequence's rows with neighbours -> those of single frames.
+def _alone(row: Row) -> dict[str, str]:
+    return {"method": row["method"].replace(NEIGHBOURS, ALONE)}
 
 
-#: Seconds for one sample in each pixel of a frame, as candidates for the break-even cost.
-_COSTS = np.geomspace(0.1, 100, 301)
+def _oidn(row: Row) -> dict[str, Any]:
+    return {"method": OIDN_SPLIT if row["source"] == "shots_spread" else OIDN_BEST, "scale": 1}
 
 
-def total() -> str:
-    """PSNR gained over OIDN at the same total time, render included, and the render cost at which a method gains.
-
-    The faster method gets more samples for the time that it saves. OIDN's PSNR at those samples is interpolated over
-    the logarithm of its measured ones.
-    """
-    rows = results.read("quality")
-    body = [line for machine in MACHINES.values() for line in _total(rows, *(results.read(table) for table in machine))]
-    head = ["PSNR gained", "over", "spp", "gains if a sample costs", MEAN, f"without {versus.TOO_EASY}", "better on"]
-    return results.markdown(["on", *head], body)
+def _averaged_oidn(row: Row) -> dict[str, Any]:
+    return {"method": OIDN_SPLIT_NEIGHBOURS if row["source"] == "shots_spread" else OIDN_NEIGHBOURS}
 
 
-def _total(rows: Sequence[Row], runtime: Sequence[Row], render_time: Sequence[Row]) -> Iterator[list[str]]:
-    """The lines of one machine."""
-    times = results.index(runtime, "method")
-    costs = {row["scene"]: row["hrls_s"] for row in render_time}
-    psnr = {(row["method"], row["spp"], row["scene"]): row["psnr"] for row in rows}
-    clean = [name for name in costs if name not in NOISY_REFERENCE]
-    # Each of OIDN's two calls on the HRLS of 1 spp, then on full resolution
-    peers = {
-        call: [(f"{call} on the HRLS", 2), *((f"{call}, same samples", spp) for spp in quality.AVERAGES)]
-        for call in (OIDN, OIDN_PREFILTERED)
-        if call in times
-    }
-    octaves = np.log2([1, *quality.AVERAGES])
-
-    def gain(name: str, call: str, spp: int, scene: str, more: NDArray[np.float64]) -> NDArray[np.float64]:
-        """PSNR of a method minus that of OIDN with ``more`` samples. Beyond 8 spp OIDN's last slope goes on."""
-        values = [psnr[method, n, scene] for method, n in peers[call]]
-        at = np.log2(np.maximum(spp + more, 1.0))  # OIDN needs at least one sample
-        beyond = np.maximum(at - octaves[-1], 0.0) * (values[-1] - values[-2]) / (octaves[-1] - octaves[-2])
-        return np.asarray(psnr[name, spp, scene] - np.interp(at, octaves, values) - beyond)
-
-    for model, call, spp in itertools.product(
-        ("joint-x2", "joint-x4", "joint-large-x2", "joint-large-x4"), peers, quality.AVERAGES
-    ):
-        if model not in times:
-            continue
-        slower = times[model]["seconds"] - times[call]["seconds"]
-        for name in [model, *(f"{model}, {a}:{b}" for a, b in quality.UNEVEN)]:
-            if (name, spp, clean[0]) not in psnr:
-                continue
-            gains = {scene: float(gain(name, call, spp, scene, np.array(slower / costs[scene]))) for scene in clean}
-            by_cost = np.mean([gain(name, call, spp, scene, slower / _COSTS) for scene in clean], axis=0)
-            pays = _COSTS[by_cost >= 0].tolist()
-            without = np.mean([value for scene, value in gains.items() if scene != versus.TOO_EASY])
-            cells = (versus.cell(versus.with_interval(np.array(list(gains.values()))), "+.2f"), f"{without:+.2f}")
-            wins = f"{sum(value > 0 for value in gains.values())} of {len(gains)}"
-            yield [times[model]["machine"], title(name), call, str(spp), _range_of(pays), *cells, wins]
-
-
-def _range_of(costs: Sequence[float]) -> str:
-    """Some of `_COSTS` in words. A method slower than OIDN gains from some cost on, a faster one up to some cost."""
-    if len(costs) in (0, len(_COSTS)):
-        return "anything" if costs else "never"
-    return f"up to {costs[-1]:.2g} s" if costs[0] == _COSTS[0] else f"at least {costs[0]:.2g} s"
-
-
-def errors() -> str:
-    """Predicted errors beside actual ones."""
-    return confidence.layout(results.read("confidence"))
-
-
-def over_time() -> str:
-    """Sequences that are averaged with their neighbours."""
-    return temporal_report.layout(results.read("temporal"))
-
-
-def over_time_spread() -> str:
-    """The same where the pixel filter has spread the noise, beside OIDN on every second pixel."""
-    rows = results.read("temporal_spread")
-    found = results.index(rows, "sequence", "scale", "method")
-    body = []
-    for (name, prefix), row in itertools.product(QUALITIES.items(), rows):
-        if row["method"] != prefix + NEIGHBOURS:
-            continue
-        sequence, scale = row["sequence"], row["scale"]
-        alone, averaged_peer = (found[sequence, scale, method] for method in (prefix + ALONE, OIDN_SPLIT_NEIGHBOURS))
-        usual, peer = (found[sequence, 1, method] for method in (OIDN_BEST, OIDN_SPLIT))
-        gains = [row["psnr"] - other["psnr"] for other in (alone, usual, peer, averaged_peer)]
-        flicker = [row["flicker"] / other["flicker"] for other in (alone, peer, averaged_peer)]
-        least = min((row[mask] - alone[mask], mask) for mask in MASKS if mask in row)
-        cells = [f"`{name}`", sequence, f"x{scale}", f"{row['psnr']:.2f}", *(f"{gain:+.2f}" for gain in gains)]
-        body.append([*cells, *(f"{ratio:.2f}" for ratio in flicker), f"{least[0]:+.2f} ({least[1]})"])
-    head = ["quality", "sequence", "scale", "PSNR", "over single frames, dB", "over OIDN prefiltered, dB"]
-    head += ["over OIDN on every second pixel, dB", "over that with neighbours, dB", "flicker, of single frames'"]
-    head += ["of OIDN's on every second pixel", "of that with neighbours"]
-    return results.markdown([*head, "least gain in a mask, dB"], body)
-
-
-def without_vectors() -> str:
-    """What averaging gains if the HRLS has no motion vectors, beside what it gains with them."""
-    tables = [results.read(name) for name in ("temporal_without_vectors", "temporal")]
-    found = [results.index(rows, "sequence", "scale", "method") for rows in tables]
-    measures = ["psnr", *(mask for mask in MASKS if any(mask in row for row in tables[0]))]
-    body = []
-    for (name, prefix), row in itertools.product(QUALITIES.items(), tables[0]):
-        if row["method"] != prefix + NEIGHBOURS:
-            continue
-        cells = [f"`{name}`", row["sequence"], f"x{row['scale']}"]
-        for measure in measures:
-            for rows in found:
-                pair = (rows[row["sequence"], row["scale"], prefix + way] for way in (NEIGHBOURS, ALONE))
-                averaged, alone = (each[measure] for each in pair)
-                cells.append(f"{averaged - alone:+.2f}")
-        body.append(cells)
-    head = ["quality", "sequence", "scale"]
-    for measure in ("all pixels", *measures[1:]):
-        head += [f"{measure}, dB", "with vectors"]
-    return results.markdown(head, body)
-
-
-def stability() -> str:
-    """How often each method holds, suffers and fails, and its holes and stamps."""
-    by_scale: dict[int, list[Row]] = {}
-    for row in results.read("stability"):
-        by_scale.setdefault(row["scale"], []).append(row)
-    return "\n".join(
-        f"{len({(row['group'], row['case']) for row in rows})} cases at x{scale}:\n\n{stability_report.summary(rows)}"
-        for scale, rows in sorted(by_scale.items())
-    )
-
-
-def pair_checks() -> str:
-    """Wrong pairs that get a warning, and right ones that do."""
-    return pair_checks_benchmark.layout(results.read("pair_checks"))
-
-
-def passes() -> str:
-    """Fused passes, beside other ways to clean them."""
-    rows = results.read("passes")
-    scenes = ", ".join(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
-    return f"{passes_benchmark.layout(rows)}\nMeans over all layers of these scenes: {scenes}.\n"
-
-
-def passes_half() -> str:
-    """Light groups that a network fuses at half of the resolution."""
-    rows = results.read("passes_half")
-    scenes = ", ".join(dict.fromkeys(row["scene"] for row in rows if row["scene"] != results.MEAN))
-    return f"{passes_benchmark.layout(rows)}\nMeans over all light groups of these scenes: {scenes}.\n"
-
-
-def passes_spread() -> str:
-    """The same where the pixel filter has spread the noise, without the methods that are worse than others there."""
-    rows = results.read("passes_spread")
-    scenes = ", ".join(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
-    # Mitsuba stores no layer as light and colour
-    shown = [
-        {key: value for key, value in row.items() if not key.startswith("gain_stored")}
-        for row in rows
-        if row["method"] in passes_benchmark.WITH_SPREAD_NOISE
+def _shot_lines(source: str, title: str, scales: Sequence[int]) -> list[Line]:
+    return [
+        Line([f"`--quality {q}`, x{scale}{title}"], {"source": source, "method": prefix + NEIGHBOURS, "scale": scale})
+        for (q, prefix), scale in itertools.product(QUALITIES.items(), scales)
     ]
-    return f"{passes_benchmark.layout(shown)}\nMeans over all layers of these scenes: {scenes}.\n"
 
 
-def single_passes() -> str:
-    """Each fused layer, beside other ways to clean it."""
-    return passes_benchmark.layout_of_layers(results.read("passes"))
+SHOTS = Table(
+    ("shots", "shots_spread", "shots_without_vectors"),
+    ("sequence", "scale", "method"),
+    ("frames averaged with neighbours",),
+    [
+        *_shot_lines("shots", "", (2, 4)),
+        *_shot_lines("shots_without_vectors", ", without vectors", (2,))[1:],
+        *_shot_lines("shots_spread", ", spread noise", (2,)),
+    ],
+    [
+        Column("sequences", "psnr", how="count"),
+        Column("PSNR over single frames, dB", "psnr", how="interval", against=_alone),
+        Column("over OIDN at its best, dB", "psnr", how="interval", against=_oidn),
+        Column("over that with neighbours, dB", "psnr", how="interval", against=_averaged_oidn),
+        Column("in uncovered surfaces", "disocclusion", how="difference", against=_alone),
+        Column("where light changes", "light", how="difference", against=_alone),
+        Column("flicker, of single frames'", "flicker", how="ratio", against=_alone),
+        Column("of OIDN's", "flicker", how="ratio", against=_oidn),
+        Column("of that with neighbours", "flicker", how="ratio", against=_averaged_oidn),
+    ],
+)
+
+TIME_OF_SHOTS = Table(
+    ("time_shots",),
+    ("quality", "temporal", "machine", "lamps"),
+    ("machine", "frames", "quality", "`--temporal`"),
+    ("machine", "frames", "quality", "temporal"),
+    [
+        Column("seconds a frame", "seconds/frames", how="quotient", form="{:.2f}"),
+        Column("ratio", "seconds", how="ratio", against={"temporal": "off"}),
+        Column("peak MB", "peak_mb", form="{:.0f}"),
+    ],
+    {"lamps": 0},
+)
 
 
-def passes_time() -> str:
-    """Time of fused passes on a frame of real size: light everywhere, at x2 on three processors and at x4, and a
-    rendered frame."""
-    kinds = ("", "_vnni", "_avx2", "_x4", "_cycles")
-    tables = [f"runtime_passes{kind}" for kind in kinds]
-    return "\n".join(runtime_passes.layout(results.read(table)) for table in tables)
+def _passes(source: str, gains: Sequence[str], methods: Wanted = lambda name: True) -> Table:
+    """Return a table of means over scenes of a table of :mod:`research.benchmarks.passes`."""
+    mean, by_scene = {"scene": MEAN, "layer": passes.ALL}, {"scene": clean, "layer": passes.ALL}
+    titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
+    titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
+    form = {name: "{:.4f}" if "relmse" in name else "{:.2f}" for name in titles}
+    columns = [Column(title, name, mean, form=form[name]) for name, title in titles.items()]
+    columns += [
+        Column(f"gain over {peer}, dB", "psnr", by_scene, "interval", against={"method": peer}) for peer in gains
+    ]
+    single = {"scene": clean, "layer": lambda name: name != passes.ALL}
+    columns.append(Column("better on", "psnr", single, "wins", against={"method": passes.PEER}))
+    by = ("set", "spp", "method")
+    return Table((source,), ("scene", *by, "layer"), by, by, columns, {"method": methods})
 
 
-def temporal_time() -> str:
-    """Time of shots whose frames are averaged with their neighbours."""
-    tables = ("runtime_temporal", "runtime_temporal_avx2")
-    return "\n".join(runtime_temporal.layout(results.read(table)) for table in tables)
+SINGLE_PASSES = Table(
+    ("passes",),
+    ("scene", "set", "spp", "method", "layer"),
+    ("set", "spp", "layer"),
+    ("set", "spp", "kind"),
+    [Column("number", "psnr", {"method": passes.PEER}, "count")]
+    + [Column(method, "psnr/relmse", {"method": method}) for method in passes.IN_LAYERS],
+    {"scene": clean, "layer": lambda name: name != passes.ALL},
+)
 
+PASSES_SUMMARY = Table(
+    ("passes",),
+    ("scene", "set", "spp", "method", "layer"),
+    ("layers at 2 spp",),
+    [Line([method], {"method": method}) for method in (passes.PEER, "msspl-x2", "msspl-x2, best")],
+    [
+        Column(f"{name}: {title}", measure, {"set": name, "spp": 2, "scene": MEAN, "layer": passes.ALL})
+        for name in ("light groups", "components")
+        for title, measure in {"PSNR / RelMSE": "psnr/relmse", "time / OIDN's": "time"}.items()
+    ],
+)
 
-def temporal_time_of_passes() -> str:
-    """The same with passes."""
-    return runtime_temporal.layout(results.read("runtime_temporal_passes"))
+PASSES_TIME = Table(
+    ("time_passes",),
+    ("set", "method", "model", "scale", "kind", "machine"),
+    ("machine", "frame", "scale", "set", "method", "model"),
+    ("machine", "kind", "scale", "set", "method", "model"),
+    [
+        Column("seconds", "seconds"),
+        Column("of plain OIDN's", "seconds", how="ratio", against={"method": runtime.PLAIN, "model": None}),
+        Column("of prefiltered OIDN's", "seconds", how="ratio", against={"method": runtime.PREFILTERED, "model": None}),
+        Column("of the beauty's", "seconds", how="ratio", against={"set": None, "method": runtime.BEAUTY}),
+    ],
+)
 
+STABILITY = Table(
+    ("stability",),
+    ("scale", "scenes", "group", "case", "method"),
+    ("method",),
+    ("family",),
+    [
+        column
+        for scale in (2, 4)
+        for column in (
+            *(Column(f"x{scale}: {v}", f"verdict={v}", {"scale": scale}, "count") for v in VERDICTS),
+            Column("furthest outside", "range", {"scale": scale}, "max", "x{:.3g}"),
+            Column("holes", "holes", {"scale": scale}, "sum", "{:.0f}"),
+            Column("stamps", "stamps", {"scale": scale}, "sum", "{:.0f}"),
+        )
+    ],
+    {"method": lambda name: name not in (ENLARGED, "OIDN on the HRLS")},
+)
 
-def temporal_passes() -> str:
-    """What neighbouring frames gain for passes."""
-    return temporal_passes_benchmark.layout(results.read("temporal_passes"))
+PAIR_CHECKS = Table(
+    ("pair_checks",),
+    ("scenes", "pairs"),
+    ("pairs",),
+    [Line([name], {"pairs": name}) for name in PAIRS],
+    [
+        column
+        for name in ("chosen", "fresh")
+        for column in (
+            Column(f"{name}: number", "count", {"scenes": name}, form="{:.0f}"),
+            Column("with a warning", "after/count", {"scenes": name}, "quotient", "{:.1%}"),
+        )
+    ],
+)
 
+CONFIDENCE = Table(
+    ("confidence",),
+    ("method",),
+    ("model",),
+    ("method",),
+    [
+        Column("predicted error, log-encoded", "predicted", form="{:.4f}"),
+        Column("actual error", "actual", form="{:.4f}"),
+        Column(
+            "share of the error in the tenth of the pixels with the largest prediction", "worst_tenth", form="{:.0%}"
+        ),
+        Column("correlation of logarithms, 8 x 8 pixels", "correlation"),
+    ],
+)
 
-def temporal_counts() -> str:
-    """What averaging gains over single frames with two frames on each side, and with `auto`."""
-    tables = {"2": results.read("temporal_2"), "auto": results.read("temporal")}
-    sequences = dict.fromkeys(row["sequence"] for row in tables["2"])
-    body = []
-    for (name, prefix), (frames, rows) in itertools.product(QUALITIES.items(), tables.items()):
-        found = results.index(rows, "sequence", "scale", "method")
-        pairs = [
-            [found[sequence, scale, prefix + way] for way in (NEIGHBOURS, ALONE)]
-            for sequence, scale in itertools.product(sequences, TEMPORAL_SCALES)
-        ]
-        gain = np.mean([averaged["psnr"] - alone["psnr"] for averaged, alone in pairs])
-        flicker = np.mean([averaged["flicker"] / alone["flicker"] for averaged, alone in pairs])
-        body.append([f"`--quality {name} --temporal {frames}`", f"{gain:+.2f}", f"{flicker:.2f}"])
-    head = [f"mean of {', '.join(sequences)} at x2 and x4", "PSNR gained, dB", "flicker, of single frames'"]
-    return results.markdown(head, body)
-
-
-TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
-    ROOT / "README.md": (when_it_pays, how_sure, spread_noise),
-    ROOT / "docs/design/results.md": (
-        goals_of_accuracy,
-        goals_of_time,
-        against_oidn,
-        scenes,
-        runtime,
-        total,
-        filters,
-        same_views,
-        by_filter,
-        layer_worth,
-        cycles,
-        luxcore,
-        division,
-        errors,
-        over_time,
-        over_time_spread,
-        without_vectors,
-        stability,
-        pair_checks,
-    ),
-    ROOT / "docs/guide/gpu.md": (gpu_times,),
-    ROOT / "docs/design/passes.md": (passes_half, passes, single_passes, passes_spread, passes_time),
-    ROOT / "docs/design/temporal.md": (temporal_time,),
+Block = Table | Callable[[], str]
+TABLES: dict[Path, dict[str, Block]] = {
+    ROOT / "README.md": {"when_it_pays": WHEN_IT_PAYS},
+    ROOT / "docs/design/results.md": {
+        "accuracy_by_scene": ACCURACY_BY_SCENE,
+        "how_sure": HOW_SURE,
+        "sample_counts": SAMPLE_COUNTS,
+        "spread_noise": SPREAD_NOISE,
+        "filters": FILTERS,
+        "time": TIME,
+        "shots": SHOTS,
+        "passes_summary": PASSES_SUMMARY,
+        "stability": STABILITY,
+        "pair_checks": PAIR_CHECKS,
+        "confidence": CONFIDENCE,
+        "paper": paper.findings,
+    },
+    ROOT / "docs/guide/gpu.md": {"gpu_times": GPU_TIMES},
+    ROOT / "docs/design/passes.md": {
+        "passes_half": _passes("passes_half", (passes.PEER,)),
+        "passes": _passes("passes", (passes.PEER, passes.STORED_PEER)),
+        "single_passes": SINGLE_PASSES,
+        "passes_spread": _passes(
+            "passes_spread", (passes.PEER, passes.SPLIT_PEER), lambda name: name in passes.WITH_SPREAD_NOISE
+        ),
+        "passes_time": PASSES_TIME,
+    },
+    ROOT / "docs/design/temporal.md": {
+        "temporal_time": TIME_OF_SHOTS,
+    },
 }
 
 
 def measured_models() -> str:
-    """The table of :func:`oiio_msspl.model.catalogue.measured`, which ``msspl models`` prints."""
-    sets = {noise: means_of(results.read(table)) for noise, table in (("", "quality"), (SPREAD, "quality_gauss"))}
-    runs = [results.index(results.read(table), "method") for table, _ in MACHINES.values()]
+    """Return the table of :func:`oiio_msspl.model.catalogue.measured`, which ``msspl models`` prints."""
+    sets = {"": "accuracy", SPREAD: "accuracy_gauss"}
+    means = {
+        noise: results.index(results.where(results.read(table), scene=MEAN), "spp", "method")
+        for noise, table in sets.items()
+    }
+    times = results.read("time_frame")
+    runs = [results.index(matching(times, _on(ending)), "method") for ending in MACHINES.values()]
     lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
-        means = sets[SPREAD if f"{SPREAD}-x" in name else ""]
-        cells = [
-            f"{means[spp, name][m]:.4g}" if (spp, name) in means else "" for spp in (2, 8) for m in ("psnr", "relmse")
-        ]
-        cells += [f"{times[name]['seconds'] / times[OIDN]['seconds']:.3g}" if name in times else "" for times in runs]
+        rows = [means[SPREAD if f"{SPREAD}-x" in name else ""].get((spp, name)) for spp in (2, 8)]
+        cells = [f"{row[m]:.4g}" if row else "" for row in rows for m in ("psnr", "relmse")]
+        cells += [f"{run[name]['seconds'] / run[runtime.OIDN]['seconds']:.3g}" if name in run else "" for run in runs]
         lines.append(",".join([name, *cells]))
     return "\n".join(lines) + "\n"
 
 
-def laid_out(text: str, tables: Sequence[Callable[[], str]]) -> str:
-    """A page with its tables replaced.
+def laid_out(page: str, blocks: Mapping[str, Block]) -> str:
+    """Return the text of a page with its blocks replaced.
 
     Raises:
         SystemExit: the page has no place for one of them.
     """
-    for make in tables:
-        place = re.compile(rf"(<!-- begin: {make.__name__} -->\n).*?(<!-- end -->)", re.DOTALL)
-        if not place.search(text):
-            raise SystemExit(f"no <!-- begin: {make.__name__} --> ... <!-- end -->")
-        made = make().strip("\n")
-        text = place.sub(lambda found, made=made: f"{found[1]}\n{made}\n\n{found[2]}", text)  # type: ignore[misc]
-    return text
+    for name, block in blocks.items():
+        place = re.compile(rf"(<!-- begin: {name} -->\n).*?(<!-- end -->)", re.DOTALL)
+        if not place.search(page):
+            raise SystemExit(f"no <!-- begin: {name} --> ... <!-- end -->")
+        made = (block.text() if isinstance(block, Table) else block()).strip("\n")
+        page = place.sub(lambda found, made=made: f"{found[1]}{made}\n{found[2]}", page)  # type: ignore[misc]
+    return page
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter).parse_args()
-    for path, tables in TABLES.items():
-        path.write_text(laid_out(path.read_text(), tables))
-    MEASURED.write_text(measured_models())
+    """Write the tables, or check them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--check", action="store_true", help="write nothing; fail if a page is out of date")
+    args = parser.parse_args()
+    made = {path: laid_out(path.read_text(), blocks) for path, blocks in TABLES.items()}
+    made[MEASURED] = measured_models()
+    old = [path for path, text in made.items() if path.read_text() != text]
+    if args.check:
+        sys.exit("\n".join(f"{path.relative_to(ROOT)}: out of date" for path in old) or None)
+    for path in old:
+        path.write_text(made[path])
 
 
 if __name__ == "__main__":

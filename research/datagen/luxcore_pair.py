@@ -3,7 +3,7 @@
 
 Writes hr.exr, lr.exr and (with --ref-spp) ref.exr, RGB alone: the case of a renderer that gives no
 albedo, no normal and no depth.  --aovs adds ALBEDO, AVG_SHADING_NORMAL and DEPTH, a file each, as
-LuxCore writes them.  --benchmark writes all renders that research.benchmarks.quality reads.  See
+LuxCore writes them.  --benchmark writes all renders that research.benchmarks.accuracy reads.  See
 datagen/README.md for the commands.
 """
 
@@ -20,7 +20,7 @@ import pyluxcore
 AOVS = ("ALBEDO", "AVG_SHADING_NORMAL", "DEPTH")
 # LuxCore's filters, and half of their width in pixels: one pixel, and LuxCore's default.
 FILTERS = {"box": ("BOX", 0.5), "blackman-harris": ("BLACKMANHARRIS", 1.5)}
-# Samples for every HRLS pixel of the renders for research.benchmarks.quality, and their scales.
+# Samples for every HRLS pixel of the renders for research.benchmarks.accuracy, and their scales.
 BENCHMARK_SPP, BENCHMARK_SCALES = (1, 2, 4, 8), (2, 4, 8)
 
 
@@ -219,7 +219,7 @@ def main(argv):
     p.add_argument("--raw", action="store_true", help="leave the frame where LuxCore puts it")
     p.add_argument("--aovs", action="store_true")
     p.add_argument("--filter", choices=FILTERS, default="box")
-    p.add_argument("--benchmark", action="store_true", help="write all renders that research.benchmarks.quality reads")
+    p.add_argument("--benchmark", action="store_true", help="write all renders that research.benchmarks.accuracy reads")
     p.add_argument("--seed", type=int, default=1)
     p.add_argument("--threads", type=int, default=1)
     args = p.parse_args(argv)

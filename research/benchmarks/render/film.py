@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the renders of benchmarks share: which part of a frame is rendered, and how it is stored."""
+"""Set which part of a frame is rendered, and store it: what the renders of benchmarks share."""
 
 from __future__ import annotations
 
@@ -9,22 +9,22 @@ from typing import Any
 
 import numpy as np
 import OpenImageIO as oiio
+from numpy.typing import NDArray
 
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.atomic import replacing
-from oiio_msspl.image.arrays import Array
 
 #: Longer side of the whole frame, and width and height of the crop that is rendered, in pixels.
 LONGER, CROP = 1280, (384, 256)
 
 
 def frame_size(sensor: Any, longer: int = LONGER) -> np.ndarray:
-    """Width and height of a Mitsuba sensor's frame, scaled to a longer side; both are multiples of 8."""
+    """Return width and height of a Mitsuba sensor's frame, scaled to a longer side; both are multiples of 8."""
     original = np.array(sensor.film().size())
     return np.asarray(np.round(original * longer / original.max() / 8).astype(int) * 8)
 
 
-def set_crop(mi: Any, parameters: Any, frame: Sequence[int], crop: Sequence[int], offset: Sequence[int]) -> None:
+def set_crop(mi: Any, parameters: Any, frame: Any, crop: Any, offset: Any) -> None:
     """Set which part of the frame is rendered, in pixels as (x, y). ``parameters``: those of a traversed sensor."""
     parameters["film.size"] = mi.ScalarVector2u(*frame)
     parameters["film.crop_size"] = mi.ScalarVector2u(*crop)
@@ -32,7 +32,7 @@ def set_crop(mi: Any, parameters: Any, frame: Sequence[int], crop: Sequence[int]
     parameters.update()
 
 
-def write_exr(path: Path, image: Array, channels: Sequence[str], pixel_type: str = "half") -> None:
+def write_exr(path: Path, image: NDArray[Any], channels: Sequence[str], pixel_type: str = "half") -> None:
     """Write (h, w, c) as half or float; the channels get the first c names.
 
     Raises:
@@ -45,7 +45,7 @@ def write_exr(path: Path, image: Array, channels: Sequence[str], pixel_type: str
     spec.attribute("Software", "Mitsuba 3")
     largest = 65000 if pixel_type == "half" else np.inf
     with replacing(path, overwrite=True) as temporary:
-        writer = oiio.ImageOutput.create(str(temporary))
+        writer: Any = oiio.ImageOutput.create(str(temporary))
         ok = writer.open(str(temporary), spec)
         ok = ok and writer.write_image(np.ascontiguousarray(np.clip(image, -largest, largest), dtype=np.float32))
         if not (writer.close() and ok):

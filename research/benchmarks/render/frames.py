@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders whole frames of scenes for `research.benchmarks.pair_checks`, with Mitsuba 3.
+"""Render whole frames of scenes for `research.benchmarks.pair_checks`, with Mitsuba 3.
 
     python -m research.benchmarks.render.frames SCENES OUT
 
@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from oiio_msspl.image.arrays import Array
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import frame_size, set_crop, write_exr
 from research.benchmarks.render.sequences import CHANNELS, MAX_DEPTH
@@ -50,7 +50,7 @@ def render(mi: Any, file: Path, out: Path, camera: str) -> None:
     distance = float(scene.ray_intersect(ray).t.numpy()[0])
     distance = distance if np.isfinite(distance) else 5.0
 
-    def shoot(to_world: Array, scale: int, spp: int, seed: int) -> Array:
+    def shoot(to_world: NDArray[Any], scale: int, spp: int, seed: int) -> NDArray[Any]:
         parameters["to_world"] = mi.Transform4f(mi.Matrix4f(to_world))
         size = [int(v) // scale for v in frame]
         set_crop(mi, parameters, size, size, (0, 0))
@@ -70,14 +70,14 @@ def render(mi: Any, file: Path, out: Path, camera: str) -> None:
             write_exr(path, shoot(orbit @ _turn(pan), scale, spp, seed), CHANNELS)
 
 
-def _turn(degrees: float) -> Array:
-    """A turn around the camera's upward axis, (4, 4)."""
+def _turn(degrees: float) -> NDArray[Any]:
+    """Return a turn around the camera's upward axis, (4, 4)."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, 0, s, 0], [0, 1, 0, 0], [-s, 0, c, 0], [0, 0, 0, 1]])
 
 
-def _move(distance: float) -> Array:
-    """A move along the camera's viewing direction, (4, 4)."""
+def _move(distance: float) -> NDArray[Any]:
+    """Return a move along the camera's viewing direction, (4, 4)."""
     matrix = np.eye(4)
     matrix[2, 3] = distance
     return matrix

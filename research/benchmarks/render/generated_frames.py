@@ -1,11 +1,10 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders whole frames of generated scenes for `research.benchmarks.pair_checks`, with Mitsuba 3.
+"""Render whole frames of generated scenes for `research.benchmarks.pair_checks`, with Mitsuba 3.
 
     python -m research.benchmarks.render.generated_frames OUT --assets ASSETS
 
 The scenes are those of `research.datagen.mitsuba`, two cameras each. Every camera gets a folder with HRLS of 1 and 8
-spp, with
-LRHS of one sample for every HRLS pixel, and with one of four samples at x4. All have albedo and normal. Even seeds have
+spp, LRHS of one sample for every HRLS pixel, and one of four samples at x4. All have albedo and normal. Even seeds have
 a box filter of one pixel. Odd seeds have a Gaussian filter that spreads every sample over the pixels around it. Frames
 of the second camera have an odd size. Files that exist are kept.
 """

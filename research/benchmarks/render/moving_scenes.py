@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A room in which one thing changes, for `research.benchmarks.render.sequences`: an object, the light or the camera.
+"""Build a room for `research.benchmarks.render.sequences` in which an object, the light or the camera changes.
 
 Lengths are metres, z is up. The random parts have fixed seeds, so a frame always shows the same room.
 """
@@ -77,7 +77,7 @@ class Room:
 
 
 def camera_matrix(animation: Animation, at: float) -> np.ndarray:
-    """Camera to world, (4, 4); the camera has x to the left, as Mitsuba's. ``at``: frames from the middle."""
+    """Return the matrix from camera (x to the left) to world, (4, 4). ``at``: frames from the middle."""
     forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
     left = np.cross([0, 0, 1], forward)
     left /= np.linalg.norm(left)
@@ -88,13 +88,13 @@ def camera_matrix(animation: Animation, at: float) -> np.ndarray:
 
 
 def focus_distance() -> float:
-    """Metres from the camera to the block in the middle, along the camera's axis."""
+    """Return the metres from the camera to the block in the middle, along the camera's axis."""
     forward = (TARGET - CAMERA) / np.linalg.norm(TARGET - CAMERA)
     return float((BLOCK + np.array([0, 0, 0.3]) - CAMERA) @ forward)
 
 
 def object_matrix(animation: Animation, at: float) -> np.ndarray:
-    """Where the moving object is, (4, 4)."""
+    """Return where the moving object is, (4, 4)."""
     matrix = np.eye(4)
     matrix[:3, :3] = meshes.rotation((0, 0, 1), at * animation.turn)
     matrix[:3, 3] = BLOCK + at * np.array([animation.slide, 0, -animation.flakes])
@@ -102,7 +102,7 @@ def object_matrix(animation: Animation, at: float) -> np.ndarray:
 
 
 def build_room(animation: Animation, frame: int, at: float) -> Room:
-    """The room at a frame. ``at``: frames from the middle of the sequence."""
+    """Return the room at a frame. ``at``: frames from the middle of the sequence."""
     from research.datagen.mitsuba import materials
     from research.datagen.mitsuba.scenes import Scene
 
@@ -131,7 +131,8 @@ def build_room(animation: Animation, frame: int, at: float) -> Room:
     if animation.lamp_on:
         second = meshes.rectangle(0.4, 0.4).rotated(meshes.rotation((1, 0, 0), np.pi)).moved(-1.6, 1.2, height - 0.02)
         scene.light(second, np.array([130.0, 85.0, 45.0]) if frame >= LAMP_ON else np.full(3, 1e-6))
-    moved, reflecting = [], []
+    moved: list[str] = []
+    reflecting: list[str] = []
 
     def marked(names: list[str], mesh: Mesh, bsdf: Any) -> None:
         names.append(f"mesh{len(scene._parts)}")

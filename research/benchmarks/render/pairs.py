@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders pairs and references of scenes for `research.benchmarks.quality`, with either pixel filter and all layers.
+"""Render pairs and references of scenes for `research.benchmarks.accuracy`, with either pixel filter and all layers.
 
     python -m research.benchmarks.render.pairs SCENES OUT --filter blackman-harris
 

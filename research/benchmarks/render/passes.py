@@ -1,16 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders pairs and references whose layers sum to the beauty, for `research.benchmarks.passes`.
+"""Render pairs and references whose layers sum to the beauty, for `research.benchmarks.passes`.
 
     python -m research.benchmarks.render.passes SCENES OUT
     python -m research.benchmarks.render.passes SCENES OUT2 --spread
 
 Of every ``NAME/scene.xml`` the crop of `research.benchmarks.render.pairs` is rendered with Mitsuba 3, once for each
-group of
-lamps with the same random numbers: a lamp's share of each path, as renderers write light groups. So the file has two
-additive sets: ``light_1`` to ``light_n``, and ``diffuse``, ``specular`` and ``other`` (seen directly, or through
-glass). There are HRLS of 1, 2 and 4 spp, LRHS with as many samples a HRLS pixel, and a reference. Mitsuba orders the
-lamps of a scene anew when it loads it, so all files of a scene come from one run: a scene whose files all exist is
-kept. With ``--spread``, each sample counts in the pixels around it, too, as with Mitsuba's default filter.
+group of lamps with the same random numbers: a lamp's share of each path, as renderers write light groups. So the file
+has two additive sets: ``light_1`` to ``light_n``, and ``diffuse``, ``specular`` and ``other`` (seen directly or
+through glass). There are HRLS of 1, 2 and 4 spp, LRHS with as many samples a HRLS pixel, and a reference. Mitsuba
+orders the lamps of a scene anew when it loads it, so all files of a scene come from one run: a scene whose files all
+exist is kept. With ``--spread``, each sample counts in the pixels around it, too, as with Mitsuba's default filter.
 """
 
 from __future__ import annotations

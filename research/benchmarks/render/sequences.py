@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Renders short sequences for `research.benchmarks.temporal`, with Mitsuba 3.
+"""Render short sequences for `research.benchmarks.shots`, with Mitsuba 3.
 
     python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
     python -m research.benchmarks.render.sequences SPREAD --scenes SCENES --spread
@@ -32,9 +32,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.image.arrays import Array
 from research.benchmarks.render.film import set_crop, write_exr
 from research.benchmarks.render.moving_scenes import (
     ANGLE,
@@ -63,8 +63,10 @@ REFERENCE_HALF = 48
 LAUNCH = 2_000_000
 
 AOVS = "albedo:albedo,nn:sh_normal,dd:depth,pp:position"
-CHANNELS = ("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z", "dd.Z")
-CHANNELS += ("position.X", "position.Y", "position.Z")
+CHANNELS = (
+    *("R", "G", "B", "albedo.R", "albedo.G", "albedo.B", "nn.X", "nn.Y", "nn.Z"),
+    *("dd.Z", "position.X", "position.Y", "position.Z"),
+)
 MOTION = ("motionBack.X", "motionBack.Y", "motionFore.X", "motionFore.Y")
 MASK = ("position.X", "position.Y", "position.Z", "depth.Z", "moves.Y", "reflects.Y")
 #: Scene -> centre of the crop, as shares of the frame.
@@ -79,20 +81,20 @@ class Camera:
     pinhole, and ``focus`` the distance at which it is sharp.
     """
 
-    to_world: Array
+    to_world: NDArray[Any]
     focal: float
     centre: tuple[float, float]
     aperture: float = 0.0
     focus: float = 1.0
 
-    def project(self, positions: Array) -> Array:
-        """World positions (..., 3) to pixels (..., 2), y downwards."""
+    def project(self, positions: NDArray[Any]) -> NDArray[Any]:
+        """Project world positions (..., 3) to pixels (..., 2), y downwards."""
         inverse = np.linalg.inv(self.to_world)
         seen = positions @ inverse[:3, :3].T + inverse[:3, 3]
         return np.asarray(self.centre) - self.focal * seen[..., :2] / seen[..., 2:]
 
-    def rays(self) -> tuple[Array, Array]:
-        """Origins and directions through the centres of the pixels, (pixels, 3) each."""
+    def rays(self) -> tuple[NDArray[Any], NDArray[Any]]:
+        """Return origins and directions through the centres of the pixels, (pixels, 3) each."""
         y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
         seen = [(self.centre[0] - x) / self.focal, (self.centre[1] - y) / self.focal, np.ones_like(x)]
         directions = np.stack(seen, axis=-1).reshape(-1, 3) @ self.to_world[:3, :3].T
@@ -131,7 +133,7 @@ class _FileScene:
     def room(self, frame: int, at: float) -> Room:
         return self._room
 
-    def object_moves(self, at: float, other: float) -> Array:
+    def object_moves(self, at: float, other: float) -> NDArray[Any]:
         return np.eye(4)
 
 
@@ -151,24 +153,24 @@ class _AnimatedRoom:
     def room(self, frame: int, at: float) -> Room:
         return build_room(self._animation, frame, at)
 
-    def object_moves(self, at: float, other: float) -> Array:
-        """From the moving object's place at one time to that at another, (4, 4)."""
+    def object_moves(self, at: float, other: float) -> NDArray[Any]:
+        """Return the matrix from the moving object's place at one time to that at another, (4, 4)."""
         return np.asarray(object_matrix(self._animation, other) @ np.linalg.inv(object_matrix(self._animation, at)))
 
 
-def surfaces(mi: Any, room: Room, camera: Camera) -> Array:
-    """What the centre of each pixel shows, (h, w, 6): `MASK`. A ray that hits nothing has the depth 0."""
+def surfaces(mi: Any, room: Room, camera: Camera) -> NDArray[Any]:
+    """Return what the centre of each pixel shows, (h, w, 6): `MASK`. A ray that hits nothing has the depth 0."""
     origins, directions = camera.rays()
     ray = mi.Ray3f(mi.Point3f(*origins.T), mi.Vector3f(*directions.T))
     hit = room.scene.ray_intersect(ray)
     valid = np.array(hit.is_valid())
     depth = np.where(valid, np.array(hit.t), 0)
 
-    def any_of(shapes: list[Any]) -> Array:
-        found = np.zeros(len(depth), bool)
+    def any_of(shapes: list[Any]) -> NDArray[Any]:
+        hits = np.zeros(len(depth), bool)
         for shape in shapes:
-            found |= np.array(hit.shape == mi.ShapePtr(shape))
-        return found
+            hits |= np.array(hit.shape == mi.ShapePtr(shape))
+        return hits
 
     far = np.where(valid, depth, 1e5)[:, None]
     columns = [origins + far * directions, depth[:, None]]
@@ -176,8 +178,8 @@ def surfaces(mi: Any, room: Room, camera: Camera) -> Array:
     return np.concatenate(columns, axis=1).reshape(HEIGHT, WIDTH, 6)
 
 
-def motion(shown: Array, scene: Any, at: float, other: float) -> Array:
-    """Where the surfaces (h, w, 6) of one time are at another, in pixels from their place, (h, w, 2)."""
+def motion(shown: NDArray[Any], scene: Any, at: float, other: float) -> NDArray[Any]:
+    """Return where the surfaces (h, w, 6) of one time are at another, in pixels from their place, (h, w, 2)."""
     positions = shown[..., :3]
     matrix = scene.object_moves(at, other)
     moved = positions @ matrix[:3, :3].T + matrix[:3, 3]
@@ -226,10 +228,10 @@ def _shoot(
     scale: int,
     seed: int,
     pixel_filter: str,
-) -> Array:
-    """A frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
+) -> NDArray[Any]:
+    """Return a frame at 1/``scale`` of the resolution, float64 (h, w, 13): `CHANNELS`, or (h, w, 3) without AOVs."""
     angle = np.degrees(2 * np.arctan(scene.size[0] / 2 / camera.focal))
-    lens = {"type": "perspective"}
+    lens: dict[str, Any] = {"type": "perspective"}
     if camera.aperture:
         lens = {"type": "thinlens", "aperture_radius": camera.aperture, "focus_distance": camera.focus}
     sensor = mi.load_dict({

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Analytic scenes with exact references, and renders of them with the noise of one-sample Monte Carlo.
+"""Define scenes with exact references, and render them with the noise of one-sample Monte Carlo.
 
 A scene is defined at ``SUB`` x ``SUB`` points in each pixel. A sample picks one of the points under its pixel filter.
 Then it picks the front, with the probability of its coverage, or the back; whether it sees the light (Bernoulli); and
@@ -9,6 +9,7 @@ expectation of this, computed without sampling. The mean of many renders converg
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
 from typing import Any
 
@@ -28,7 +29,7 @@ CHANNELS = {"albedo": 3, "normal": 3, "direct": 1, "visible": 1, "ambient": 1, "
 
 
 def surface(shape: tuple[int, int], **features: NDArray | float | tuple[float, ...]) -> Array:
-    """Features at every point, (h * SUB, w * SUB, 15). Missing ones are 0, and the normal faces the camera.
+    """Return features at every point, (h * SUB, w * SUB, 15). Missing ones are 0, and the normal faces the camera.
 
     Radiance is ``albedo * (direct * visible + ambient) + gloss + emission``; ``visible`` is a probability.
     """
@@ -38,7 +39,7 @@ def surface(shape: tuple[int, int], **features: NDArray | float | tuple[float, .
 
 
 def split(points: Array) -> dict[str, Array]:
-    """Stacked features (..., 15) by name."""
+    """Return stacked features (..., 15) by name."""
     ends = np.cumsum(list(CHANNELS.values()))
     return dict(zip(CHANNELS, np.split(points, ends[:-1], axis=-1), strict=True))
 
@@ -50,7 +51,7 @@ class Scene:
     back: Array
     """See :func:`surface`."""
     front: Array | None = None
-    """The same for what covers the back."""
+    """Features of what covers the back."""
     coverage: Array | None = None
     """Probability that a sample at a point hits the front, (h * SUB, w * SUB, 1), as with lens or motion blur."""
 
@@ -64,18 +65,18 @@ class Footprint:
 
 
 def box(scale: int = 1) -> Footprint:
-    """The box filter of a pixel that is ``scale`` HRLS pixels wide."""
+    """Return the box filter of a pixel that is ``scale`` HRLS pixels wide."""
     count = SUB * scale
     return Footprint(np.arange(count), np.full(count, 1 / count))
 
 
 def point(scale: int) -> Footprint:
-    """Only one of the HRLS pixels that an LRHS pixel covers, as in the paper's nearest-neighbour LRHS."""
+    """Return the filter of one of the HRLS pixels that an LRHS pixel covers, as in the paper's LRHS."""
     return Footprint(scale // 2 * SUB + np.arange(SUB), np.full(SUB, 1 / SUB))
 
 
 def blackman_harris(scale: int = 1, width: float = 3.0) -> Footprint:
-    """The Blackman-Harris window over ``width`` pixels, as renderers sample it by importance."""
+    """Return the Blackman-Harris window over ``width`` pixels, as renderers sample it by importance."""
     count = round(width * SUB * scale)
     phase = 2 * np.pi * (np.arange(count) + 0.5) / count
     window = 0.35875 - 0.48829 * np.cos(phase) + 0.14128 * np.cos(2 * phase) - 0.01168 * np.cos(3 * phase)
@@ -83,25 +84,23 @@ def blackman_harris(scale: int = 1, width: float = 3.0) -> Footprint:
 
 
 def reference(scene: Scene, footprint: Footprint | None = None, scale: int = 1) -> Array:
-    """Expected colour of every pixel, (h / scale, w / scale, 3), with a pixel filter (the box if None)."""
+    """Return expected colour of every pixel, (h / scale, w / scale, 3), with a pixel filter (the box if None)."""
     footprint = footprint or box(scale)
     image = _expected(scene.back)
-    if scene.front is not None:
+    if scene.front is not None and scene.coverage is not None:
         image += scene.coverage * (_expected(scene.front) - image)
     for axis in (0, 1):
         first = np.arange(0, image.shape[axis], SUB * scale)
         last = image.shape[axis] - 1
-        image = sum(
-            weight * image.take(np.clip(first + offset, 0, last), axis)
-            for offset, weight in zip(footprint.offsets, footprint.weights, strict=True)
-        )
+        shifted = (image.take(np.clip(first + offset, 0, last), axis) for offset in footprint.offsets)
+        image = functools.reduce(np.add, (w * part for w, part in zip(footprint.weights, shifted, strict=True)))
     return image.astype(np.float32)
 
 
 def render(
     scene: Scene, spp: int, rng: np.random.Generator, *, footprint: Footprint | None = None, scale: int = 1
 ) -> Render:
-    """All layers at 1 / ``scale`` of the scene's resolution. The variance needs at least 2 spp."""
+    """Render all layers at 1 / ``scale`` of the scene's resolution. The variance needs at least 2 spp."""
     footprint = footprint or box(scale)
     height, width = (n // (SUB * scale) for n in scene.back.shape[:2])
     corners = np.mgrid[0:height, 0:width] * (SUB * scale)
@@ -115,7 +114,8 @@ def render(
     if spp > 1:
         variance = squares - np.square(luminance(total["rgb"].astype(np.float32)))[..., None]
         total["variance"] = np.maximum(variance, 0) / (spp - 1)
-    return Render.from_arrays("HRLS" if scale == 1 else "LRHS", **total)
+    layers = {name: values.astype(np.float32) for name, values in total.items()}
+    return Render.from_arrays("HRLS" if scale == 1 else "LRHS", **layers)
 
 
 def _expected(points: Array) -> Array:
@@ -133,7 +133,7 @@ def _sample(
         for corner, size in zip(corners, scene.back.shape[:2], strict=True)
     )
     points = scene.back[rows, columns]
-    if scene.front is not None:
+    if scene.front is not None and scene.coverage is not None:
         hit = rng.random((*shape, 1)) < scene.coverage[rows, columns]
         points = np.where(hit, scene.front[rows, columns], points)
     f = split(points)
@@ -141,40 +141,40 @@ def _sample(
     diffuse = f["albedo"] * (f["direct"] * seen + f["ambient"] * rng.exponential(size=(*shape, 1)))
     rare = (rng.random((*shape, 1)) < GLOSS_SEEN) / GLOSS_SEEN
     specular = f["gloss"] * rare * rng.exponential(size=(*shape, 1))
-    layers = {"albedo": f["albedo"], "normal": f["normal"], "diffuse": diffuse, "specular": specular}
-    return {
-        name: values.astype(np.float32)
-        for name, values in {**layers, "rgb": diffuse + specular + f["emission"]}.items()
-    }
+    layers: dict[str, NDArray[Any]] = {"albedo": f["albedo"], "normal": f["normal"], "diffuse": diffuse}
+    layers |= {"specular": specular, "rgb": diffuse + specular + f["emission"]}
+    return {name: values.astype(np.float32) for name, values in layers.items()}
 
 
 # Scenes. Lengths are shares of the frame. Those named ``pixels`` are in pixels: a hair is thin at any frame size.
 
 
 def grid(size: int) -> tuple[Array, Array]:
-    """(x, y) of all points of a square frame, in [0, 1]."""
+    """Return (x, y) of all points of a square frame, in [0, 1]."""
     along = (np.arange(size * SUB, dtype=np.float32) + 0.5) / np.float32(size * SUB)
     x, y = np.meshgrid(along, along)
     return x[..., None], y[..., None]
 
 
 def where(mask: NDArray[np.bool_], yes: Any, no: Any) -> Array:
-    """np.where in single precision, to save memory."""
+    """Call np.where in single precision, to save memory."""
     return np.where(mask, np.asarray(yes, np.float32), np.asarray(no, np.float32))
 
 
 def moved(scene: Scene, x: int, y: int) -> Scene:
-    """A scene shifted by whole pixels to the right and down. Its border values are repeated."""
+    """Return a scene shifted by whole pixels to the right and down. Its border values are repeated."""
     rows, columns = (
         np.clip(np.arange(size) - pixels * SUB, 0, size - 1)
         for size, pixels in zip(scene.back.shape, (y, x), strict=False)
     )
     parts = (scene.back, scene.front, scene.coverage)
-    return Scene(*(None if part is None else part[rows][:, columns] for part in parts))
+    back, front, coverage = (None if part is None else part[rows][:, columns] for part in parts)
+    assert back is not None
+    return Scene(back, front, coverage)
 
 
 def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 1.0) -> Scene:
-    """A checkered wall, a floor of thin tiles, a ball with its soft shadow, a glossy box, a few posts of all widths.
+    """Make a checkered wall, a floor of thin tiles, a ball with its soft shadow, a glossy box, posts of all widths.
 
     ``light`` scales the direct light. The ambient light stays.
     """
@@ -214,7 +214,7 @@ def room(size: int, *, ball: tuple[float, float] = (0.35, 0.52), light: float = 
 
 
 def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
-    """Emitters in front of a scene whose own light is dimmed. They have no albedo, as in renderers."""
+    """Put emitters in front of a scene whose own light is dimmed. They have no albedo, as in renderers."""
     features = split(scene.back)
     lit = emission.max(axis=-1, keepdims=True) > 0
     features["emission"] = where(lit, emission, 0)
@@ -225,7 +225,7 @@ def with_emission(scene: Scene, emission: NDArray, dim: float = 1.0) -> Scene:
 
 
 def small_lights(size: int, radiance: float) -> Scene:
-    """Lamps with a radius of 0.3 to 3 pixels in front of a dim room, from ``radiance`` / 1000 to ``radiance``."""
+    """Make lamps with a radius of 0.3 to 3 pixels in front of a dim room, from ``radiance`` / 1000 to ``radiance``."""
     x, y = grid(size)
     rng = np.random.default_rng(5)
     emission = np.zeros((*x.shape[:2], 3), np.float32)
@@ -238,7 +238,7 @@ def small_lights(size: int, radiance: float) -> Scene:
 
 
 def emitters(size: int) -> Scene:
-    """Bright panels with hard edges, one seen through a grille."""
+    """Make bright panels with hard edges, one seen through a grille."""
     x, y = grid(size)
     panel = (np.abs(x - 0.3) < 0.18) & (np.abs(y - 0.22) < 0.1)
     window = (np.abs(x - 0.72) < 0.17) & (np.abs(y - 0.5) < 0.3)
@@ -248,16 +248,24 @@ def emitters(size: int) -> Scene:
 
 
 def near_black(size: int, traces: float = 0.0) -> Scene:
-    """A room in which one sample of 200 finds the light. ``traces`` is the share of the glossy light that stays; its
-    tails reach down to the smallest floats."""
+    """Make a room in which one sample of 200 finds the light.
+
+    ``traces`` is the share of the glossy light that stays; its tails reach down to the smallest floats.
+    """
     features = split(room(size).back)
-    features |= {"visible": features["visible"] * 0.005, "ambient": np.float32(0), "gloss": features["gloss"] * traces}
+    features |= {
+        "visible": features["visible"] * 0.005,
+        "ambient": np.zeros(1, np.float32),
+        "gloss": features["gloss"] * traces,
+    }
     return Scene(surface(features["albedo"].shape[:2], **features))
 
 
 def door_ajar(size: int, seen: float) -> Scene:
-    """A room with a plain white wall, lit through a door that is hardly open: a share ``seen`` of the samples finds the
-    light, which gets weaker to the left. Nothing else is lit."""
+    """Make a room with a plain white wall, lit through a door that is hardly open.
+
+    A share ``seen`` of the samples finds the light, which gets weaker to the left. Nothing else is lit.
+    """
     x, y = grid(size)
     features = split(room(size).back)
     wall = y < 0.66
@@ -269,8 +277,10 @@ def door_ajar(size: int, seen: float) -> Scene:
 
 
 def slit(size: int, radiance: float) -> Scene:
-    """A lamp behind a wall, seen through a vertical slit of a quarter of a pixel and a horizontal one of two pixels.
-    One sample of 50 finds its light in the room."""
+    """Make a lamp behind a wall, seen through a vertical slit of a quarter of a pixel and a horizontal one of two.
+
+    One sample of 50 finds its light in the room.
+    """
     x, y = grid(size)
     upright = (np.abs(x * size - size // 2 - 0.375) < 0.5 / SUB) & (y > 0.2) & (y < 0.6)
     level = (np.abs(y - 0.3) * size < 1) & (np.abs(x - 0.2) < 0.12)
@@ -279,14 +289,14 @@ def slit(size: int, radiance: float) -> Scene:
 
 
 def dark_room(size: int) -> Scene:
-    """A room in which one sample of 10 finds the light, with a trace of ambient light."""
+    """Return a room in which one sample of 10 finds the light, with a trace of ambient light."""
     features = split(room(size).back)
     features |= {"visible": 0.1 * features["visible"], "ambient": 0.01 * features["ambient"]}
     return Scene(surface(features["albedo"].shape[:2], **features))
 
 
 def defocused(size: int) -> Scene:
-    """Out-of-focus discs in front of the room. At their rims each sample hits the front or the back."""
+    """Make out-of-focus discs in front of the room. At their rims each sample hits the front or the back."""
     x, y = grid(size)
     coverage = np.zeros_like(x)
     albedo = np.zeros((*x.shape[:2], 3), np.float32)
@@ -302,12 +312,12 @@ def defocused(size: int) -> Scene:
 
 
 def moving(size: int) -> Scene:
-    """A textured bar that moves by 60 pixels while the shutter is open, and a small light that leaves a streak."""
+    """Make a textured bar that moves by 60 pixels in an open shutter, and a small light that leaves a streak."""
     x, y = grid(size)
     travel = 60 / size
 
     def time_over(left: float, right: float) -> NDArray:
-        """Share of the time that something between left and right, moving to the right, is at x."""
+        """Return the share of the time that something between left and right, moving to the right, is at x."""
         return np.clip((np.minimum(x - left, travel) - np.maximum(x - right, 0)) / travel, 0, 1)
 
     bar = time_over(0.2, 0.4) * ((y > 0.3) & (y < 0.5))
@@ -327,7 +337,7 @@ def moving(size: int) -> Scene:
 
 
 def hairy(size: int) -> Scene:
-    """Curved hairs with a width of 0.1 to 0.8 pixels, lighter than their background."""
+    """Make curved hairs with a width of 0.1 to 0.8 pixels, lighter than their background."""
     x, y = grid(size)
     cell = 1 / SUB
     coverage = np.zeros_like(x)
@@ -346,7 +356,7 @@ def hairy(size: int) -> Scene:
 
 
 def glassy(size: int) -> Scene:
-    """A pane and a lens of albedo 1. Only the specular layer shows what is behind them."""
+    """Return a pane and a lens of albedo 1. Only the specular layer shows what is behind them."""
     x, y = grid(size)
     features = split(room(size).back)
     pane = (np.abs(x - 0.68) < 0.22) & (np.abs(y - 0.5) < 0.35)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measures a result, and words a verdict from the figures."""
+"""Measure a result, and word a verdict from the figures."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ STEP_INSIDE = 3.0
 
 
 def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warnings: list[str]) -> dict[str, Any]:
-    """All figures of one result.
+    """Return all figures of one result.
 
     Args:
         image: the result (h, w, 3), linear.
@@ -94,7 +94,7 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
 
 
 def verdict(row: dict[str, Any]) -> tuple[str, str]:
-    """("holds", "suffers" or "fails", a sentence) from the figures of :func:`measure` and the case's ``group``."""
+    """Return "holds", "suffers" or "fails", and a sentence, from the figures of :func:`measure` and the ``group``."""
     if not row["finite"] or not math.isfinite(row["relmse"]):
         return "fails", "NaN or Inf comes out."
     faults = []
@@ -123,7 +123,7 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def holes(image: Array, truth: Array, floor: float, scale: int) -> NDArray[np.bool_]:
-    """Pixels (h, w) that are much darker than the reference and than their surroundings.
+    """Return the pixels (h, w) that are much darker than the reference and than their surroundings.
 
     Their luminance is below `HOLE` of the reference's and below `HOLE_AROUND` of the median of the result within
     `HOLE_REACH` LRHS pixels. Pixels whose reference is below ``floor`` are no holes.
@@ -139,7 +139,7 @@ def holes(image: Array, truth: Array, floor: float, scale: int) -> NDArray[np.bo
 
 
 def stamps(image: Array, truth: Array, floor: float) -> int:
-    """How many rectangles stand out that no light made: a quarter of their corners, rounded up.
+    """Count the rectangles stand out that no light made: a quarter of their corners, rounded up.
 
     Networks compute in squares of 2 x 2 pixels or more, and an LRHS pixel has at least as many, so the sides of such a
     rectangle lie along the `CELL` x `CELL` grid. A corner is a square that has a step both at a vertical and at a
@@ -154,7 +154,7 @@ def stamps(image: Array, truth: Array, floor: float) -> int:
 
 
 def _sides(ratio: Array) -> NDArray[np.int64]:
-    """How many of the left and right side of every square are steps to a higher ratio, (h / CELL, w / CELL)."""
+    """Count how many of the left and right side of every square are steps to a higher ratio, (h / CELL, w / CELL)."""
     height, width = (n // CELL for n in ratio.shape)
     lines = ratio[: height * CELL, : width * CELL].reshape(height, CELL, width * CELL).mean(axis=1)
     steps = np.pad(np.diff(lines, axis=1), ((0, 0), (0, 1))).reshape(height, width, CELL)
@@ -167,7 +167,7 @@ def _sides(ratio: Array) -> NDArray[np.int64]:
 
 
 def trimmed(errors: NDArray[np.float64]) -> float:
-    """Mean without the share `TRIMMED` of the largest values."""
+    """Return the mean without the share `TRIMMED` of the largest values."""
     kept = errors.size - max(1, round(TRIMMED * errors.size))
     return float(np.partition(errors.ravel(), kept - 1)[:kept].mean())
 
@@ -176,8 +176,10 @@ def repaired(values: Array) -> Array:
     return repair(values)[0]
 
 
-def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) -> Array:
-    """Largest or smallest value within ``reach`` pixels along x and y."""
+def window(
+    values: NDArray[Any], reach: int, extreme: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
+) -> NDArray[Any]:
+    """Return the largest or smallest value within ``reach`` pixels along x and y."""
     for axis in (0, 1):
         size = values.shape[axis]
         padded = np.pad(values, [(reach, reach) if i == axis else (0, 0) for i in range(values.ndim)], mode="edge")
@@ -188,7 +190,7 @@ def window(values: Array, reach: int, extreme: Callable[[Array, Array], Array]) 
 
 
 def input_range(pair: Pair) -> tuple[Array, Array]:
-    """Smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
+    """Return the smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
     low, high = repaired(pair.lr.layers[RGB]), repaired(pair.hr.layers[RGB])
     s = pair.scale
     result = []
@@ -199,7 +201,7 @@ def input_range(pair: Pair) -> tuple[Array, Array]:
 
 
 def touched(before: Pair, after: Pair) -> NDArray[np.bool_]:
-    """Where either render differs within ``NEAR`` LRHS pixels, (h, w)."""
+    """Return where either render differs within ``NEAR`` LRHS pixels, (h, w)."""
     s = after.scale
     low = _differs(before.lr.layers[RGB], after.lr.layers[RGB])
     high = np.zeros((low.shape[0] * s, low.shape[1] * s), bool)
@@ -212,4 +214,4 @@ def touched(before: Pair, after: Pair) -> NDArray[np.bool_]:
 
 
 def _differs(a: Array, b: Array) -> NDArray[np.bool_]:
-    return ~np.isclose(a, b, rtol=0, atol=0, equal_nan=True).all(axis=-1)
+    return np.asarray(~np.isclose(a, b, rtol=0, atol=0, equal_nan=True).all(axis=-1))

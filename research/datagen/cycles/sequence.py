@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: GPL-3.0-or-later
-"""A short sequence with Cycles' own Vector pass, for :mod:`research.benchmarks.temporal`.
+"""A short sequence with Cycles' own Vector pass, for :mod:`research.benchmarks.shots`.
 
     python -m research.datagen.cycles.sequence SEQUENCES
 

@@ -10,8 +10,8 @@ pytest.importorskip("torch")
 
 from oiio_msspl import Render
 from oiio_msspl.model.encoding import find_exposure
-from research.benchmarks import chart, paper, peers, quality, results, runtime, scenes, tables, versus
-from research.benchmarks.every_second_pixel import on_every_second_pixel, without_grid
+from research.benchmarks import accuracy, chart, peers, scenes, tables
+from research.benchmarks.peers import on_every_second_pixel, without_grid
 from research.datagen import views
 from tests.browser import BROWSER, dump_dom
 from tests.conftest import downsample, picture, rgb, write_exr
@@ -42,12 +42,6 @@ def test_views_for_testing_are_scenes(tmp_path):
         low = scene.lrhs(8, spp)
         assert low.data_window.width == 8
         np.testing.assert_allclose(scenes.beauty(low), value * scale, rtol=2e-3)
-    # 4 spp are those of the fourth pass, 16 those of all five; more there are not
-    for factor, spp, value in ((2, 1, 4), (2, 4, (1 + 2 + 2 * 3 + 4 * 4 + 8 * 5) / 16)):
-        low = scene.nearest(factor, spp)
-        assert low.data_window.width == 32
-        np.testing.assert_allclose(scenes.beauty(low), value * scale, rtol=2e-3)
-    assert scene.nearest(4, 2) is None
 
 
 def test_folders_of_renders_are_scenes(tmp_path):
@@ -68,42 +62,19 @@ def test_a_folder_without_scenes_is_refused(tmp_path):
         scenes.load(tmp_path)
 
 
-def test_a_table_keeps_four_digits_and_leaves_out_empty_cells(tmp_path):
-    path = tmp_path / "table.csv"
-    results.write(path, [{"method": "a, b", "psnr": 31.05678}, {"method": "2^-10", "relmse": 0.0012346, "count": 3}])
-    assert path.read_text() == 'method,psnr,relmse,count\n"a, b",31.06,,\n2^-10,,0.001235,3\n'
-    rows = [{"method": "a, b", "psnr": 31.06}, {"method": "2^-10", "relmse": 0.001235, "count": 3}]
-    assert results.read(path) == rows
-    results.merge(path, [{"method": "2^-10", "relmse": 1.0}, {"method": "c", "psnr": 1.0}], ("method",))
-    assert results.read(path) == [rows[0], {"method": "2^-10", "relmse": 1}, {"method": "c", "psnr": 1.0}]
-
-
-def test_means_leave_out_noisy_references_and_methods_that_were_not_measured_everywhere():
-    def row(scene, method, psnr):
-        return {"scene": scene, "spp": 2, "method": method, "psnr": psnr}
-
-    noisy = next(iter(scenes.NOISY_REFERENCE))
-    rows = [row("a", "x", 10.0), row("a", "x", 20.0), row("b", "x", 25.0), row(noisy, "x", 99.0), row("a", "y", 1.0)]
-    mean, *of_scenes = quality.with_means(rows)
-    assert mean == row("mean", "x", 20.0)  # the two views of "a" count once
-    assert of_scenes == [row("a", "x", 15.0), *rows[2:]]
-    left_out = f"Left out, because the reference is noisy: {noisy}."
-    assert quality.mean_note(of_scenes) == f"Means are over 2 scenes: a, b. {left_out}"
-
-
-def test_quality_measures_only_the_methods_that_are_asked_for(tmp_path, bilinear_models):
+def test_accuracy_measures_only_the_methods_that_are_asked_for(tmp_path, bilinear_models):
     """The HRLS is the reference here, so it scores an infinite PSNR; "LRHS x4 nearest" does not."""
     clean = picture(32, 32)
     source = Render.from_arrays("HRLS", rgb=clean)
     low = {scale: Render.from_arrays("LRHS", rgb=downsample(clean, scale)) for scale in (2, 4, 8)}
     scene = scenes.Scene("a", clean, lambda spp: source, lambda scale, spp: low[scale])
-    rows = quality.measure(scene, [], pattern="[HL]R[HL]S*")
+    rows = accuracy.measure(scene, [], pattern="[HL]R[HL]S*")
     assert {row["method"] for row in rows} == {"HRLS", *(f"LRHS x{s} {m}" for s in low for m in ("nearest", "bicubic"))}
-    assert {row["spp"] for row in rows} == set(quality.AVERAGES)
+    assert {row["spp"] for row in rows} == set(accuracy.AVERAGES)
     psnr = {row["method"]: row["psnr"] for row in rows}
     assert psnr["HRLS"] > 60 > psnr["LRHS x2 bicubic"] > psnr["LRHS x8 bicubic"]
-    assert quality.load_models([str(bilinear_models[4])], "OIDN*") == []
-    (session,) = quality.load_models([str(bilinear_models[4])], "*, 3:1")
+    assert accuracy.load_models([str(bilinear_models[4])], "OIDN*") == []
+    (session,) = accuracy.load_models([str(bilinear_models[4])], "*, 3:1")
     assert session.contract.scale == 4
 
 
@@ -136,111 +107,6 @@ def test_prefiltering_helps_where_the_auxiliary_layers_are_noisy():
     assert np.square(prefiltered - clean).mean() < 0.9 * np.square(plain - clean).mean()
 
 
-def test_every_table_can_be_laid_out():
-    """Each line has as many cells as its head, and what was measured is in it."""
-    functions = [make for of_page in tables.TABLES.values() for make in of_page]
-    for make in functions:
-        text = make()
-        blocks = [block.splitlines() for block in re.findall(r"(?:^\|.*\|\n)+", text, re.MULTILINE)]
-        assert blocks, make.__name__
-        for head, rule, *body in blocks:
-            assert rule.replace(" ", "") == "|" + "---|" * (head.count("|") - 1)
-            assert body and {line.count("|") for line in body} == {head.count("|")}, make.__name__
-    body = tables.when_it_pays().split("\n\n")[0].splitlines()[2:]
-    assert len(body) == len(tables.WHEN_IT_PAYS) <= 9
-    for method, line in zip(tables.WHEN_IT_PAYS, body, strict=True):
-        cells = [cell.strip() for cell in line.split("|")[3:7]]
-        assert all(re.fullmatch(r"\d+\.\d+", cell) for cell in cells), method
-    assert "# The paper's tables" in paper.page()
-
-
-def _rows(method, psnr, relmse=None):
-    """A row of a scene for each value; the first scene is the easy one, and a noisy one comes last."""
-    names = [versus.TOO_EASY, *"abcdefgh"[: len(psnr) - 1], *scenes.NOISY_REFERENCE]
-    relmse = relmse or [0.01] * len(psnr)
-    values = zip(names, [*psnr, 0.0], [*relmse, 9.0], strict=True)
-    return [{"scene": name, "spp": 2, "method": method, "psnr": p, "relmse": r} for name, p, r in values]
-
-
-def test_a_lead_that_one_scene_carries_is_open():
-    """The interval over scenes decides, not the mean; the scene with a noisy reference does not count."""
-    other = _rows("OIDN", [30.0] * 5)
-    carried = versus.compare(_rows("ours", [36.0, 29.9, 29.8, 30.1, 29.9]) + other, "ours", "OIDN", 2)
-    assert carried.psnr[0] == pytest.approx(1.14)
-    assert carried.psnr[1] < 0 < carried.psnr[2]
-    assert carried.verdicts[0] == "open"
-    assert carried.without_too_easy == pytest.approx(-0.075)
-    assert carried.wins == "2 of 5"
-    ahead = versus.compare(_rows("ours", [30.2, 30.5, 30.3, 30.2, 30.4], [0.008] * 5) + other, "ours", "OIDN", 2)
-    assert ahead.verdicts == ("ahead", "ahead")
-    assert ahead.relmse == pytest.approx((0.8, 0.8, 0.8))
-    behind = versus.compare(_rows("ours", [29.8, 29.5, 29.7, 29.8, 29.6], [0.02] * 5) + other, "ours", "OIDN", 2)
-    assert behind.verdicts == ("behind", "behind")
-    assert versus.compare(_rows("ours", [36.0])[:1] + other, "ours", "OIDN", 2) is None  # four scenes are missing
-
-
-def test_the_interval_is_that_of_the_mean_over_drawn_scenes():
-    """For many scenes, the bootstrap's interval is the normal one: 1.96 standard errors to each side."""
-    values = np.random.default_rng(4).normal(1, 2, 400)
-    mean, low, high = versus.with_interval(values)
-    error = values.std() / np.sqrt(values.size)
-    assert mean == values.mean()
-    assert (mean - low, high - mean) == (pytest.approx(1.96 * error, rel=0.05), pytest.approx(1.96 * error, rel=0.05))
-    assert versus.with_interval(values) == (mean, low, high)
-
-
-def test_a_finding_that_the_measures_dispute_is_no_agreement():
-    """Two of the paper's findings hold by PSNR and not by RelMSE."""
-    text = paper.page()
-    (disputed,) = (line for line in text.splitlines() if "the LRHS's do not" in line)
-    assert "PSNR and RelMSE disagree" in disputed
-    (agreed,) = (line for line in text.splitlines() if "an HRLS beats super-resolution" in line)
-    assert agreed.endswith("| agrees |")
-    table3 = text.split("## Table 3")[1].split("## Table 4")[0]
-    assert "paper, " not in table3  # it is measured otherwise there
-
-
-@pytest.mark.parametrize(
-    ("flags", "name"),
-    [
-        ("flags\t\t: fpu avx2", "X without VNNI"),
-        ("flags\t\t: fpu avx_vnni", "X with VNNI"),
-        ("flags\t\t: fpu avx_vnni amx_int8", "X with AMX"),
-        ("", "X"),
-    ],
-)
-def test_a_time_says_what_the_processor_has_for_networks(flags, name):
-    assert runtime.named(f"model name\t: X\n{flags}\n") == name
-
-
-def test_times_of_different_machines_are_not_mixed():
-    """Times of methods and of rendering come from the same machine, and each line of the comparison names it."""
-    table = tables.total()
-    for methods, _ in tables.MACHINES.values():
-        (machine,) = {row["machine"] for row in results.read(methods)}
-        assert f"\n| {machine} |" in table
-    assert "OIDN prefiltered" in {row["method"] for row in results.read("runtime")}
-
-
-def test_a_page_has_its_tables_replaced():
-    def table():
-        return "| new |\n"
-
-    page = "a\n<!-- begin: table -->\nold\n<!-- end -->\nb\n"
-    made = "a\n<!-- begin: table -->\n\n| new |\n\n<!-- end -->\nb\n"
-    assert tables.laid_out(page, [table]) == made
-    assert tables.laid_out(made, [table]) == made
-    with pytest.raises(SystemExit, match="no <!-- begin: table"):
-        tables.laid_out("", [table])
-
-
-@pytest.mark.parametrize("path", tables.TABLES, ids=lambda path: path.name)
-def test_pages_have_the_figures_that_were_measured(path):
-    """`python -m research.benchmarks.tables` brings the pages up to date."""
-    text = path.read_text()
-    assert tables.laid_out(text, tables.TABLES[path]) == text
-
-
 def test_the_chart_is_up_to_date():
     """`python -m research.benchmarks.chart -o docs/chart.html` makes it."""
     assert (tables.ROOT / "docs/chart.html").read_text() == chart.page(chart.data())
@@ -269,20 +135,6 @@ def test_the_chart_draws_every_point(measure, scene, time):
     for method, spp, seconds, value in expected:
         assert found[method, spp] == (pytest.approx(seconds, rel=1e-3), value)
     assert dom.count("<polyline") > 0
-
-
-def test_curves_of_a_log_go_on_from_run_to_run(tmp_path):
-    from research.benchmarks import curves
-
-    lines = ["run,step,minutes,loss,psnr", "a,0,0,0,20", "a,5,2,0.5,21", "b,0,0,0,19", "b,9,3,0.4,22"]
-    (tmp_path / "training_x.csv").write_text("\n".join(lines) + "\n")
-    assert curves.read(tmp_path / "training_x.csv") == {
-        "a": (([0, 2], [0, 1]), ([2], [0.5])),
-        "b": (([2, 5], [0, 3]), ([5], [0.4])),
-    }
-    pytest.importorskip("matplotlib")
-    curves.draw([tmp_path / "training_x.csv"], tmp_path / "curves.png")
-    assert (tmp_path / "curves.png").stat().st_size > 1000
 
 
 def test_oidn_on_every_second_pixel_gets_four_pictures_of_the_frame():

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from oiio_msspl import Session
-from research.benchmarks import passes
+from research.benchmarks import passes, results
 from tests.conftest import downsample, picture, rgb, write_exr
 
 SIZE = 64
@@ -57,22 +57,17 @@ def test_every_bright_layer_has_a_row_and_products_are_scored_with_their_colour(
     assert found["components", "OIDN", "Diffuse Direct"] < found["components", "OIDN, rescaled", "Diffuse Direct"] - 10
 
 
-def test_the_table_shows_means_gains_and_wins(rows):
-    better = [row | {"scene": "other", "psnr": row["psnr"] + 3 * (row["method"] == "msspl-x4")} for row in rows]
-    both = rows + better
-    means = passes.means(both)
-    mean = {(row["set"], row["method"]): row for row in means}
-    ours, theirs = (mean["components", method] for method in ("msspl-x4", passes.PEER))
-    assert (theirs["gain"], theirs["wins"], theirs["layers"]) == (0, 0, 4)
-    assert ours["gain"] == pytest.approx(ours["psnr"] - theirs["psnr"])
-    assert ours["gain_high"] - ours["gain_low"] == pytest.approx(3)
-    first = passes.means(rows)
-    assert ours["psnr"] == pytest.approx(
-        next(r for r in first if r["method"] == "msspl-x4" and r["set"] == "components")["psnr"] + 1.5
-    )
-    text = passes.layout(both + means)
-    assert f"gain over {passes.PEER}, dB | gain over {passes.STORED_PEER}, dB | better on |" in text
-    assert "of 4 |" in text and "gain_stored" not in mean["light groups", "msspl-x4"]
+def test_means_are_over_all_scenes_and_as_old_as_their_oldest_row(rows):
+    stamped = [row | {"date": "2026-01-02"} for row in rows]
+    better = [row | {"scene": "other", "psnr": row["psnr"] + 3, "date": "2026-01-01"} for row in rows]
+    both = stamped + better
+    single = results.index((row for row in rows if row["layer"] == passes.ALL), "set", "method")
+    for mean in passes.means(both):
+        assert mean["psnr"] == pytest.approx(single[mean["set"], mean["method"]]["psnr"] + 1.5)
+        assert (mean["scene"], mean["layer"], mean["date"]) == ("mean", passes.ALL, "2026-01-01")
+    models = {mean["method"]: mean.get("model") for mean in passes.means(both)}
+    assert (models["msspl-x4"], models["msspl-x4, best"]) == ("joint-x4", "joint-large-x4")
+    assert models[passes.PEER] == "joint-large-x4" and models["OIDN"] is None
     # A method that was not measured on every scene has no mean.
     part = [row for row in both if (row["scene"], row["method"]) != ("other", "ratio")]
     assert not [row for row in passes.means(part) if row["method"] == "ratio"]

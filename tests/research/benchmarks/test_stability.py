@@ -7,8 +7,7 @@ from oiio_msspl.model.session import Session
 from research.benchmarks import results
 from research.benchmarks.stability import analytic, cases, measures, report
 from research.benchmarks.stability.__main__ import enlarged, ours, run
-from research.benchmarks.stability.bases import Analytic
-from research.benchmarks.stability.gallery import Gallery
+from research.benchmarks.stability.bases import Base
 from tests.conftest import downsample
 
 SIZE = 32
@@ -53,10 +52,9 @@ def test_a_moved_scene_is_the_moved_picture():
 
 
 def test_every_case_runs_and_stays_finite(bilinear_models, tmp_path):
-    """All cases, measures, pictures and tables, with a model that reads only the LRHS."""
+    """All cases and measures, with a model that reads only the LRHS."""
     methods = {report.ENLARGED: enlarged, "bilinear": ours(Session(bilinear_models[4]))}
-    gallery = Gallery()
-    measured = run(None, 4, methods, SIZE, gallery)
+    measured = run(4, methods, SIZE)
     assert {row["group"] for row in measured} == {*cases.ANYWHERE, *cases.MADE}
     for row in measured:
         figures = [value for value in row.values() if isinstance(value, float)]
@@ -69,26 +67,12 @@ def test_every_case_runs_and_stays_finite(bilinear_models, tmp_path):
     rows = report.judged(measured)
     assert len(rows) == len(measured)
     results.write(tmp_path / "stability.csv", rows)
-    text = report.document(results.read(tmp_path / "stability.csv"))
-    assert all(row["case"] in text and row.get("sentence", "") in text for row in rows)
-    gallery.write_worst(tmp_path / "worst.png", rows)
-    gallery.write_groups(tmp_path / "groups")
-    assert (tmp_path / "worst.png").stat().st_size > 1000
-    assert len(list((tmp_path / "groups").glob("x4-*.png"))) == len(cases.ANYWHERE) + len(cases.MADE)
-
-
-def test_several_views_are_one_row():
-    """The range is the worst of all views, PSNR is their mean, and the verdict is on these."""
-    key = {"scale": 4, "scenes": "views", "group": "x", "case": "y", "method": "z"}
-    view = {"finite": True, "worst_pixel": 1.0, "relmse": 0.1, "relmse_trimmed": 0.1, "relmse_enlarged": 0.2}
-    view |= {"outside": 0.0, "warnings": [], "holes": 0, "stamps": 0}
-    (row,) = report.judged([{**key, **view, "psnr": 20.0, "range": 1.0}, {**key, **view, "psnr": 30.0, "range": 2.0}])
-    assert (row["psnr"], row["range"], row["verdict"]) == (25.0, 2.0, "suffers")
+    assert [row["verdict"] for row in results.read(tmp_path / "stability.csv") if row["method"] == "bilinear"]
 
 
 def test_the_verdict_names_what_is_wrong():
     """A converged result holds; one that rings, glows or drifts does not, and says why."""
-    pair = Analytic("room", analytic.room(SIZE)).pair(4, 64)
+    pair = Base("room", analytic.room(SIZE)).pair(4, 64)
     case = cases.Case("x", pair, pair)
     small = enlarged(pair)[0]
 
@@ -111,7 +95,7 @@ def _counts(image, truth, scale, floor=1e-3):
 
 
 def _textured(shape=(96, 96)):
-    """A reference (h, w, 3) with soft and hard edges, one of them to a tenth of the brightness."""
+    """Return a reference (h, w, 3) with soft and hard edges, one of them to a tenth of the brightness."""
     y, x = np.mgrid[: shape[0], : shape[1]] / shape[1]
     grey = 0.3 + 0.2 * np.sin(9 * x + 5 * y) + 0.3 * (x > 0.6)
     return np.float32(np.where(y > 0.8, 0.05, 1) * grey)[..., None] * np.float32([1, 0.9, 0.8])
@@ -159,15 +143,11 @@ def test_what_is_dark_in_the_reference_is_no_hole():
 
 
 def test_holes_and_stamps_are_faults():
-    """They are in the verdict's sentence, and the table adds them up."""
+    """They are in the verdict's sentence."""
     row = {"finite": True, "relmse": 0.1, "relmse_trimmed": 0.1, "relmse_enlarged": 0.2, "range": 1.0, "warnings": []}
     row |= {"worst_pixel": 1.0, "psnr": 30.0, "group": "x", "holes": 3, "stamps": 1}
     assert measures.verdict(row) == ("suffers", "3 holes; 1 stamp.")
     assert measures.verdict(row | {"holes": 0, "stamps": 0})[0] == "holds"
-    key = {"scale": 4, "scenes": "views", "group": "x", "case": "y", "method": "z"}
-    rows = report.judged([row | key, row | key, row | key | {"case": "w", "holes": 0, "stamps": 0}])
-    assert [(row["holes"], row["stamps"]) for row in rows] == [(6, 2), (0, 0)]
-    assert "| inside | 6 in 1 case | 2 in 1 case |" in report.summary(rows)
 
 
 @pytest.mark.parametrize("made", [lambda size: analytic.door_ajar(size, 1 / 50), analytic.dark_room])

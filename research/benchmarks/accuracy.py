@@ -1,0 +1,227 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure how accurate every method is, at equal average samples.
+
+    python -m research.benchmarks.accuracy RENDERS --flip --table research/benchmarks/results/accuracy.csv
+    python -m research.benchmarks.accuracy VIEWS --flip --table research/benchmarks/results/accuracy_cycles.csv
+    python -m research.benchmarks.accuracy RENDERS --methods '*prefiltered*' --table
+    research/benchmarks/results/accuracy.csv
+
+:mod:`research.benchmarks.scenes` says what the folders hold. A frame has 2, 4 or 8 spp on average: spp_LRHS / s^2 +
+spp_HRLS.
+
+Methods that get an LRHS and an HRLS, each with half of the samples as in the paper:
+
+- the models of this project, by name. "joint-x2, 3:1" has three quarters of the samples in the HRLS.
+- "OIDN on both x2": OIDN on the HRLS, with the local means of OIDN on the LRHS.
+- "OIDN on both x2, together": OIDN on the HRLS, with the local means of
+  :func:`research.benchmarks.peers.oidn_on_average`. "OIDN prefiltered on both x2, together" has prefiltered OIDN on
+  the HRLS.
+
+Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), "full resolution" and
+"OIDN, same samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
+:func:`research.benchmarks.oidn.denoise_prefiltered`; "with base guides" has OIDN's base networks for albedo and
+normal, which saves a third of its time. "OIDN prefiltered and split" is that on every second pixel. All others are
+OIDN's plain call with the quality "high".
+"""
+
+from __future__ import annotations
+
+import fnmatch
+import functools
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import fuse
+from oiio_msspl.compare import scores, upsample_bicubic
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.colour import srgb
+from oiio_msspl.model.catalogue import load_model, shipped_models
+from oiio_msspl.model.contract import SCALES
+from oiio_msspl.model.session import Session
+from research.benchmarks import results, scenes
+from research.benchmarks.peers import match_local_means, oidn, oidn_on_average, oidn_prefiltered, oidn_split
+from research.benchmarks.results import MEAN, Row
+from research.benchmarks.scenes import NOISY_REFERENCE, beauty
+
+#: Average spp. The HRLS and the LRHS have half of it each, as in the paper's tables.
+AVERAGES = (2, 4, 8)
+#: Other divisions of the samples, HRLS : LRHS. They are measured where they give whole numbers.
+UNEVEN = ((3, 1), (7, 1))
+#: Column -> its title and its format.
+MEASURES = {
+    "psnr": ("PSNR (sRGB, dB)", "{:.2f}"),
+    "relmse": ("RelMSE (0.5, 0.01)", "{:.4f}"),
+    "relmse_gharbi": ("RelMSE (1, 1e-4)", "{:.3f}"),
+    "ssim": ("SSIM", "{:.4f}"),
+    "flip": ("FLIP", "{:.4f}"),
+}
+#: A function that computes a picture (h, w, 3).
+Picture = Callable[[], Array]
+#: Columns that tell the rows apart.
+KEYS = ("scene", "spp", "method")
+
+
+def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Iterator[tuple[str, Picture]]:
+    """Yield every method's name, and a function that computes its picture (h, w, 3) for this scene and average spp."""
+    hr, full = scene.hrls(spp // 2), scene.hrls(spp)
+    denoised, prefiltered = functools.cache(partial(oidn, hr)), functools.cache(partial(oidn_prefiltered, hr))
+    yield "HRLS", partial(beauty, hr)
+    yield "OIDN on the HRLS", denoised
+    yield "OIDN fast on the HRLS", partial(oidn, hr, "fast")
+    yield "OIDN prefiltered on the HRLS", prefiltered
+    yield "OIDN prefiltered with base guides on the HRLS", partial(oidn_prefiltered, hr, "balanced")
+    yield "full resolution", partial(beauty, full)
+    yield "OIDN, same samples", partial(oidn, full)
+    yield "OIDN prefiltered, same samples", partial(oidn_prefiltered, full)
+    yield "OIDN prefiltered with base guides, same samples", partial(oidn_prefiltered, full, "balanced")
+    yield "OIDN prefiltered and split, same samples", partial(oidn_split, full)
+    for scale in SCALES:
+        lr = scene.lrhs(scale, spp // 2)
+        yield from _lrhs_methods(lr, scale, scene.reference.shape)
+        for call, picture in (("OIDN", denoised), ("OIDN prefiltered", prefiltered)):
+            if call == "OIDN":
+                yield f"{call} on both x{scale}", partial(_joined, picture, partial(oidn, lr))
+            yield f"{call} on both x{scale}, together", partial(_joined, picture, partial(oidn_on_average, lr, hr))
+        for session in sessions:
+            if session.contract.scale == scale:
+                yield session.name, partial(_fused, session, lr, hr)
+    yield from _uneven_methods(scene, sessions, spp)
+
+
+def _lrhs_methods(lr: ReadableRender, scale: int, shape: Sequence[int]) -> Iterator[tuple[str, Picture]]:
+    """Yield the methods that enlarge the LRHS to (h, w)."""
+    height, width = shape[:2]
+    yield f"LRHS x{scale} nearest", lambda: beauty(lr).repeat(scale, 0).repeat(scale, 1)
+    yield f"LRHS x{scale} bicubic", lambda: upsample_bicubic(beauty(lr), width, height)
+    yield f"OIDN on the LRHS x{scale}, bicubic", lambda: upsample_bicubic(oidn(lr), width, height)
+
+
+def _uneven_methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Iterator[tuple[str, Picture]]:
+    """Yield the methods with most samples in the HRLS, where the shares are whole numbers and the HRLS exists."""
+    for more, less in UNEVEN:
+        unit, rest = divmod(spp, more + less)
+        if rest or not scene.has(unit * more):
+            continue
+        hr, division = scene.hrls(unit * more), f"{more}:{less}"
+        yield f"OIDN on the HRLS, {division}", partial(oidn, hr)
+        yield f"OIDN prefiltered on the HRLS, {division}", partial(oidn_prefiltered, hr)
+        for session in sessions:
+            lr = scene.lrhs(session.contract.scale, unit * less)
+            yield f"{session.name}, {division}", partial(_fused, session, lr, hr)
+
+
+def _fused(session: Session, lr: ReadableRender, hr: ReadableRender) -> Array:
+    return fuse(lr, hr, session).rgb
+
+
+def _joined(picture: Picture, means: Picture) -> Array:
+    return match_local_means(picture(), means())
+
+
+def load_models(names: Sequence[str], pattern: str) -> list[Session]:
+    """Load the models for which :func:`methods` has a name that matches the pattern."""
+    endings = ("", *(f", {more}:{less}" for more, less in UNEVEN))
+    sessions = [load_model(0, name) for name in names]
+    return [s for s in sessions if any(fnmatch.fnmatchcase(s.name + ending, pattern) for ending in endings)]
+
+
+def measure(scene: scenes.Scene, sessions: Sequence[Session], *, flip: bool = False, pattern: str = "*") -> list[Row]:
+    """Return a row for each average spp and each method whose name matches the pattern."""
+    rows = []
+    for spp in AVERAGES:
+        for method, picture in methods(scene, sessions, spp):
+            if fnmatch.fnmatchcase(method, pattern):
+                image = picture()
+                row: Row = {"scene": scene.name, "spp": spp, "method": method, **results.model_of(method)}
+                row |= scores(image, scene.reference)
+                rows.append(row | ({"flip": mean_flip(image, scene.reference)} if flip else {}))
+    return rows
+
+
+def mean_flip(image: Array, reference: Array) -> float:
+    """Return the mean FLIP of two linear pictures, shown in sRGB and seen at 67 pixels per degree."""
+    import flip_evaluator
+
+    return float(flip_evaluator.evaluate(srgb(reference), srgb(image), "LDR", applyMagma=False)[1])
+
+
+def with_means(rows: Sequence[Row]) -> list[Row]:
+    """Return one row for each scene, average spp and method, behind means over all scenes whose reference is clean.
+
+    A scene with several views counts once. A method that was not measured on all of these scenes gets no mean.
+    """
+    views: dict[tuple[int, str, str], list[Row]] = {}
+    for row in rows:
+        views.setdefault((row["spp"], row["method"], row["scene"]), []).append(row)
+    by_scene = [_mean(members, members[0]["scene"]) for members in views.values()]
+    clean = {row["scene"] for row in rows} - NOISY_REFERENCE
+    by_method: dict[tuple[int, str], list[Row]] = {}
+    for row in by_scene:
+        if row["scene"] in clean:
+            by_method.setdefault((row["spp"], row["method"]), []).append(row)
+    return [_mean(members, MEAN) for members in by_method.values() if len(members) == len(clean)] + by_scene
+
+
+def _mean(rows: Sequence[Row], scene: str) -> Row:
+    key = {"scene": scene} | {name: rows[0][name] for name in ("spp", "method", "model") if name in rows[0]}
+    return key | {name: float(np.mean([row[name] for row in rows])) for name in MEASURES if name in rows[0]}
+
+
+def layout(rows: Sequence[Row]) -> str:
+    """Lay out a table of all measures for each average spp: means, then PSNR and RelMSE by scene."""
+    names = list(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
+    by_key = results.index(rows, *KEYS)
+    shown = [measure for measure in MEASURES if measure in rows[0]]
+    text = mean_note(rows) + "\n"
+    for spp in dict.fromkeys(row["spp"] for row in rows):
+        body = []
+        for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
+            means = [cell(by_key.get((MEAN, spp, method)), measure) for measure in shown]
+            body.append([method, *means, *(cell(by_key.get((n, spp, method)), "psnr", "relmse") for n in names)])
+        titles = [MEASURES[measure][0] for measure in shown]
+        text += f"\n{spp} spp on average\n\n{results.markdown(['method', *titles, *names], body)}"
+    return text
+
+
+def mean_note(rows: Sequence[Row]) -> str:
+    """Say what the means are over."""
+    names = list(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
+    clean = [name for name in names if name not in NOISY_REFERENCE]
+    left_out = [name for name in names if name in NOISY_REFERENCE]
+    note = f"Means are over {len(clean)} scenes: {', '.join(clean)}."
+    return note + f" Left out, because the reference is noisy: {', '.join(left_out)}." * bool(left_out)
+
+
+def cell(row: Row | None, *measures: str) -> str:
+    """Return some measures of a row as text; empty if there is no row."""
+    return " / ".join(_digits(measure, row[measure]) for measure in measures) if row else ""
+
+
+def _digits(measure: str, value: float) -> str:
+    """Return a value as text, with no more than the four digits that the table has."""
+    return f"{value:.4g}" if "relmse" in measure and value >= 1 else MEASURES[measure][1].format(value)
+
+
+def main() -> None:
+    """Measure the scenes of a folder."""
+    parser = results.parser(__doc__)
+    parser.add_argument("folder", type=Path, help="renders or views")
+    parser.add_argument("--model", action="append", default=[], help="a shipped model or an ONNX file; default: all")
+    parser.add_argument("--methods", metavar="PATTERN", help="measure only these; --table then keeps its other rows")
+    parser.add_argument("--flip", action="store_true", help="also measure FLIP, which takes most of the time")
+    args = parser.parse_args()
+    pattern = args.methods or "*"
+    sessions = load_models(args.model or list(shipped_models()), pattern)
+    loaded = scenes.load(args.folder)
+    rows = [row for scene in loaded for row in measure(scene, sessions, flip=args.flip, pattern=pattern)]
+    if not rows:
+        parser.error(f"no method matches {args.methods}")
+    results.show(layout, with_means(rows), args.table, KEYS if args.methods else ())
+
+
+if __name__ == "__main__":
+    main()

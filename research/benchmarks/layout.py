@@ -1,0 +1,176 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Lay out tables of results from specifications: which rows of which CSV files, and what each column shows of them."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from research.benchmarks import accuracy, results, versus
+from research.benchmarks.results import MEAN, Row
+from research.benchmarks.scenes import NOISY_REFERENCE
+
+#: Value that a row must have, or a test of it.
+Wanted = Any
+
+
+@dataclass(frozen=True)
+class Column:
+    """What the cells of a column show: a measure of the rows that the line and the column want."""
+
+    title: str
+    measure: str
+    """A column of the CSV file; two columns with ``/`` between them."""
+    where: Mapping[str, Wanted] = field(default_factory=dict)
+    how: str = "mean"
+    """mean, sum or max of the rows; count (of those whose measure is what stands behind ``=``); quotient of two
+    measures' sums; or a comparison with their peers: difference, interval (that with its 95 % interval), ratio (mean of
+    ratios), ratio interval (ratio of means with its 95 % interval), wins."""
+    form: str = ""
+    """Format of a number; by default that of the measure."""
+    against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]] = field(default_factory=dict)
+    """How a row's peer differs from it. Without it, that of the line."""
+    renamed: Mapping[str, str] = field(default_factory=dict)
+    """Method of the line -> its name in the rows of this column."""
+
+
+@dataclass(frozen=True)
+class Line:
+    """A line's first cells, the rows that it is about, and their peers."""
+
+    cells: Sequence[str]
+    where: Mapping[str, Wanted]
+    against: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Table:
+    """A table of a page."""
+
+    sources: Sequence[str]
+    """CSV files. A row's column ``source`` is the name of its file."""
+    keys: Sequence[str]
+    """Columns that tell the rows of a file apart."""
+    head: Sequence[str]
+    """Titles of the lines' first cells."""
+    lines: Sequence[Line] | Sequence[str]
+    """The lines; or names of columns: then each combination of their values is a line."""
+    columns: Sequence[Column]
+    where: Mapping[str, Wanted] = field(default_factory=dict)
+    means: bool = False
+    """Say which scenes means are over."""
+
+    def text(self) -> str:
+        """Lay the table out, with what its rows were measured with."""
+        rows = [row | {"source": name} for name in self.sources for row in results.read(name)]
+        for row in rows:
+            row["kind"] = row.get("kind", re.sub(r"_\d+$", "", row.get("layer", "")))  # lamps count as one layer
+            row["family"] = re.sub(r"-x\d$", "", row.get("method", ""))
+        rows = matching(rows, self.where)
+        peers = results.index(rows, "source", *self.keys)
+        used: list[Row] = []
+        body = []
+        for line in self._lines(rows):
+            cells = [self._cell(column, line, rows, peers, used) for column in self.columns]
+            if any(cells):
+                body.append([*line.cells, *cells])
+        text = results.markdown([*self.head, *(column.title for column in self.columns)], body)
+        first = [row for row in rows if row["source"] == self.sources[0]]
+        return f"{text}\n{accuracy.mean_note(first) + ' ' if self.means else ''}{results.stamp_note(used)}\n"
+
+    def _lines(self, rows: Sequence[Row]) -> Iterator[Line]:
+        for line in self.lines:
+            if isinstance(line, Line):
+                yield line
+        names = [name for name in self.lines if isinstance(name, str)]
+        for values in dict.fromkeys(tuple(row.get(name) for name in names) for row in rows) if names else ():
+            yield Line([label(value) for value in values], dict(zip(names, values, strict=True)))
+
+    def _cell(self, column: Column, line: Line, rows: Sequence[Row], peers: Mapping[Any, Row], used: list[Row]) -> str:
+        wanted = {**line.where, **column.where}
+        if "method" in wanted and column.renamed:
+            wanted["method"] = column.renamed.get(wanted["method"], wanted["method"])
+        chosen = [row for row in matching(rows, wanted) if all(name in row for name in _measures(column))]
+        if not chosen:
+            return ""
+        against = column.against or line.against
+        if column.how not in COMPARISONS:
+            used += chosen
+            return _summary(column, chosen)
+        pairs = [(row, peers.get(self._peer_key(row, against))) for row in chosen]
+        compared = [(row, peer) for row, peer in pairs if peer is not None and column.measure in peer]
+        if len(compared) < len(pairs) or all(row == peer for row, peer in pairs):
+            return ""
+        used += itertools.chain.from_iterable(compared)
+        return _comparison(column, compared)
+
+    def _peer_key(self, row: Row, against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]]) -> tuple[Any, ...]:
+        peer = {**row, **(against(row) if callable(against) else against)}
+        return tuple(peer.get(name) for name in ("source", *self.keys))
+
+
+COMPARISONS = ("difference", "interval", "ratio", "ratio interval", "wins")
+
+
+def _measures(column: Column) -> list[str]:
+    return column.measure.partition("=")[0].split("/")
+
+
+def _summary(column: Column, rows: Sequence[Row]) -> str:
+    """Return a measure of some rows as text."""
+    columns = [[row[name] for row in rows] for name in _measures(column)]
+    if column.how == "count":
+        _, _, wanted = column.measure.partition("=")
+        return str(sum(not wanted or value == wanted for value in columns[0]))
+    if column.how == "quotient":
+        return column.form.format(sum(columns[0]) / sum(columns[1]))
+    functions: dict[str, Callable[[list[float]], Any]] = {"mean": np.mean, "sum": np.sum, "max": np.max}
+    reduced = functions[column.how]
+    values = [float(reduced(values)) for values in columns]
+    return " / ".join(_format(column, name, value) for name, value in zip(_measures(column), values, strict=True))
+
+
+def _format(column: Column, measure: str, value: float) -> str:
+    if measure not in accuracy.MEASURES or column.form:
+        return (column.form or "{:.2f}").format(value)
+    return accuracy.cell({measure: value}, measure)
+
+
+def _comparison(column: Column, pairs: Sequence[tuple[Row, Row]]) -> str:
+    """Return a comparison of rows with their peers as text."""
+    ours, theirs = (np.array([pair[side][column.measure] for pair in pairs], float) for side in (0, 1))
+    differences = ours - theirs
+    if column.how == "wins":
+        return f"{int((differences > 0).sum())} of {len(pairs)}"
+    if column.how == "interval":
+        return versus.cell(versus.with_interval(differences), "+.2f")
+    if column.how == "difference":
+        return (column.form or "{:+.2f}").format(float(differences.mean()))
+    if column.how == "ratio interval":
+        return versus.cell(versus.ratio_with_interval(ours, theirs), ".2f")
+    return (column.form or "{:.2f}").format(float((ours / theirs).mean()))
+
+
+def matching(rows: Sequence[Row], wanted: Mapping[str, Wanted]) -> list[Row]:
+    """Return the rows that have the wanted values, or whose values pass the tests."""
+    return [row for row in rows if all(_fits(row.get(name), value) for name, value in wanted.items())]
+
+
+def _fits(value: Any, wanted: Wanted) -> bool:
+    return bool(wanted(value)) if callable(wanted) else value == wanted
+
+
+def label(value: Any) -> str:
+    """Return a value as the first cell of a line: a model's name as code."""
+    text = "" if value is None else str(value)
+    return f"`{text}`" if results.model_of(text) else text
+
+
+def clean(scene: str) -> bool:
+    """Return whether this is a scene that means are over."""
+    return scene != MEAN and scene not in NOISY_REFERENCE

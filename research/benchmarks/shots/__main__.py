@@ -1,0 +1,131 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure sequences that are fused frame by frame and with their neighbours, beside OIDN's.
+
+    python -m research.benchmarks.render.sequences SEQUENCES --scenes SCENES
+    python -m research.datagen.cycles.sequence SEQUENCES
+    python -m research.benchmarks.shots SEQUENCES --table research/benchmarks/results/shots.csv
+    python -m research.benchmarks.shots SPREAD --spread --table research/benchmarks/results/shots_spread.csv
+
+The things in ``cycles/slide`` move to the side alone, so its pixels don't tell which way y points. If the benchmark
+says so, give that sequence Blender's format, in one line::
+
+    --motion-format layer=Vector,channels=XY,to=previous,x=right,y=up,unit=pixels
+                   +layer=Vector,channels=ZW,to=next,x=left,y=down,unit=pixels
+
+:mod:`research.benchmarks.shots.measures` defines the measures. ``--picture`` and ``--film`` draw the first sequence.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import map_render, open_exr
+from oiio_msspl.errors import InputError, MssplError
+from oiio_msspl.exr.atomic import check_target
+from oiio_msspl.image.colour import srgb
+from oiio_msspl.jobs.plan import AUTO, TemporalOptions
+from oiio_msspl.model.catalogue import QUALITIES as MODELS
+from oiio_msspl.model.contract import SPREAD
+from research.benchmarks import results
+from research.benchmarks.results import Row
+from research.benchmarks.scenes import beauty
+from research.benchmarks.shots.measures import flicker, psnr, relmse
+from research.benchmarks.shots.methods import ALONE, NEIGHBOURS, OIDN_BEST, QUALITIES, Made, all_methods
+from research.benchmarks.shots.pictures import film, strip
+from research.benchmarks.shots.sequence import Sequence, load, without_vectors
+
+KEYS = ("sequence", "scale", "method")
+#: What is drawn: scale, frames, rows and columns, and the row that is shown over time; rows and columns of the film.
+DRAWN_SCALE, FRAMES, CROP, ROW = 4, [3, 4, 5], (slice(104, 216), slice(90, 250)), 160
+
+
+def model_of(method: str, scale: int, *, spread: bool) -> Row:
+    """Return the column ``model`` of a method; nothing for OIDN."""
+    for quality, prefix in reversed(QUALITIES.items()):
+        if method in (prefix + ALONE, prefix + NEIGHBOURS):
+            return {"model": f"{MODELS[quality]}{SPREAD if spread else ''}-x{scale}"}
+    return {}
+
+
+def measure(sequence: Sequence, made: list[Made], *, spread: bool = False) -> Iterator[Row]:
+    """Yield a row for each method."""
+    truth = srgb(sequence.truth[0]), srgb(sequence.truth[1])
+    for method in made:
+        images = srgb(method.images)
+        by_frame = [psnr(image, (first, second)) for image, first, second in zip(images, *truth, strict=True)]
+        row: Row = {"sequence": sequence.name, "scale": method.scale, "method": method.method}
+        row |= model_of(method.method, method.scale, spread=spread)
+        row |= {"psnr": float(np.mean(by_frame)), "worst": min(by_frame)}
+        row |= {"relmse": relmse(method.images, sequence.truth), "flicker": flicker(images, truth)}
+        row |= {name: psnr(images, truth, mask) for name, mask in sequence.masks.items()}
+        yield row | {"motion": method.motion}
+
+
+def main() -> int:
+    """Measure sequences; return the exit code."""
+    parser = results.parser(__doc__)
+    parser.add_argument("folder", type=Path, help="the sequences")
+    parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
+    parser.add_argument("--motion-format", help="as that of msspl-fuse, for all these sequences")
+    parser.add_argument("--without-vectors", action="store_true", help="leave out the motion vectors of Mitsuba's")
+    parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
+    parser.add_argument("--temporal", default=AUTO, metavar="N", help="as that of msspl-fuse")
+    parser.add_argument("--methods", default="*", metavar="PATTERN", help="measure only these")
+    parser.add_argument("--picture", type=Path, help="draw a PNG")
+    parser.add_argument("--film", type=Path, help="draw an animated WebP")
+    args = parser.parse_args()
+    try:
+        run(args)
+    except MssplError as error:
+        print(error, file=sys.stderr)
+        return error.exit_code
+    return 0
+
+
+def run(args: argparse.Namespace) -> None:
+    """Measure sequences. Their rows replace those of the same sequences and methods in the table.
+
+    Raises:
+        InputError: there are none, one is not complete, or a picture can't be written.
+    """
+    for path in filter(None, (args.picture, args.film)):
+        check_target(path, overwrite=True)
+    files = args.folder.glob("*/*/hr.0001.exr")
+    names = args.sequence or sorted(f"{path.parent.parent.name}/{path.parent.name}" for path in files)
+    if not names:
+        raise InputError(
+            f"{args.folder}: holds no sequences; python -m research.benchmarks.render.sequences makes them"
+        )
+    for index, name in enumerate(names):
+        sequence = load(args.folder / name, args.motion_format)
+        options = TemporalOptions(args.temporal, args.motion_format)
+        with tempfile.TemporaryDirectory() as folder:
+            judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
+            made = list(all_methods(judged, options, args.methods, spread=args.spread))
+        rows = list(measure(sequence, made, spread=args.spread))
+        results.show(results.plain, rows, args.table, KEYS)
+        if index == 0 and (args.picture or args.film):
+            draw(args, sequence, made)
+
+
+def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None:
+    """Draw a sequence."""
+    by_method = {method.method: method.images for method in made if method.scale in (1, DRAWN_SCALE)}
+    hrls = np.stack([beauty(map_render(open_exr(sequence.folder / f"hr.{n:04d}.exr"))) for n in sequence.numbers])
+    truth = (sequence.truth[0] + sequence.truth[1]) / np.float32(2)
+    titles = {"HRLS": hrls, ALONE: by_method[ALONE], NEIGHBOURS: by_method[NEIGHBOURS], OIDN_BEST: by_method[OIDN_BEST]}
+    shown = {title: srgb(images) for title, images in (titles | {"reference": truth}).items()}
+    if args.picture:
+        strip(args.picture, shown, FRAMES, CROP, ROW)
+    if args.film:
+        film(args.film, {title: images for title, images in shown.items() if title != "HRLS"}, CROP)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,144 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Make the frames of a sequence by each method, through the code that fuses shots."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import map_render, open_exr
+from oiio_msspl.errors import InputError
+from oiio_msspl.exr.render import ReadableRender
+from oiio_msspl.fusion.fuse import FusedFrame
+from oiio_msspl.fusion.neighbours.renders import RenderPair
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.checks import model_of_shot
+from oiio_msspl.jobs.frame import ShotFrame
+from oiio_msspl.jobs.inputs import InputOptions
+from oiio_msspl.jobs.plan import ShotPlan, TemporalOptions, plan_temporal
+from oiio_msspl.jobs.run import ShotRun
+from oiio_msspl.jobs.sequence import FrameFiles, find_shot
+from oiio_msspl.jobs.settings import Settings
+from research.benchmarks.peers import oidn, oidn_prefiltered, oidn_split
+from research.benchmarks.shots.sequence import Sequence as MovingSequence
+
+ALONE, NEIGHBOURS = "frame by frame", "with neighbours"
+OIDN, OIDN_BEST, OIDN_SPLIT = "OIDN", "OIDN prefiltered", "OIDN on every second pixel"
+OIDN_NEIGHBOURS, OIDN_SPLIT_NEIGHBOURS = f"{OIDN_BEST}, {NEIGHBOURS}", f"{OIDN_SPLIT}, {NEIGHBOURS}"
+SCALES = (2, 4)
+#: The qualities that are measured: what the names of their methods begin with.
+QUALITIES = {"balanced": "", "best": "best, "}
+
+
+@dataclass(frozen=True)
+class Made:
+    """A method's frames."""
+
+    method: str
+    scale: int
+    """Of the LRHS; 1 for what reads none."""
+    images: Array
+    """Linear (frames, h, w, 3)."""
+    motion: str = ""
+    """Say how the motion is known; empty for single frames."""
+
+
+def all_methods(
+    sequence: MovingSequence, options: TemporalOptions = TemporalOptions(), pattern: str = "*", *, spread: bool = False
+) -> Iterator[Made]:
+    """Yield each method on a sequence whose name matches the pattern.
+
+    OIDN denoises renders with the samples of both renders together. With neighbours, these renders and OIDN's frames
+    are averaged exactly as ours are with `best`. The test of the light gets the same LRHS. ``options`` say which
+    neighbours are averaged. If a pixel filter has ``spread`` the noise, OIDN also reads every second pixel.
+    """
+    full = [map_render(open_exr(sequence.folder / f"full.{n:04d}.exr")) for n in sequence.numbers]
+    peers = {OIDN: oidn, OIDN_BEST: oidn_prefiltered} | ({OIDN_SPLIT: oidn_split} if spread else {})
+    for name, denoised in peers.items():
+        if fnmatchcase(name, pattern):
+            yield Made(name, 1, np.stack([denoised(render) for render in full]))
+    for scale in SCALES:
+        for name, run in _by_scale(sequence, scale, options, spread):
+            if fnmatchcase(name, pattern):
+                yield Made(name, scale, _images(run), _motion(run.plan) if run.plan.count else "")
+
+
+class _RunOfPeer(ShotRun):
+    """A shot whose full-resolution renders are averaged as ours are, and then denoised by another program.
+
+    Args:
+        denoised: what denoises a render.
+        folder: of the full-resolution renders.
+        settings, plan, wanted: of the shot.
+    """
+
+    def __init__(
+        self,
+        denoised: Callable[[ReadableRender], Array],
+        folder: Path,
+        settings: Settings,
+        plan: ShotPlan,
+        wanted: Sequence[FrameFiles],
+    ) -> None:
+        super().__init__(settings, plan, wanted)
+        self._denoised, self._folder = denoised, folder
+
+    def read(self, files: FrameFiles) -> list[ShotFrame]:
+        """Read a frame whose HRLS has the pixels of the full render, and its own motion vectors."""
+        views = super().read(files)
+        full = map_render(open_exr(self._folder / f"full.{files.number:04d}.exr"))
+        views[0].renders = RenderPair(views[0].renders.lr, full.load())
+        return views
+
+    def fuse(self, frame: ShotFrame) -> FusedFrame:
+        """Denoise the averaged full-resolution render."""
+        rgb = self._denoised(frame.averaged.hr)
+        lrhs, hrls = frame.averaged.luminances
+        alignment = frame.averaged.alignment
+        return FusedFrame(rgb, None, None, alignment, 1.0, repaired={}, lrhs_luminance=lrhs, hrls_luminance=hrls)
+
+
+def _by_scale(
+    sequence: MovingSequence, scale: int, options: TemporalOptions, spread: bool
+) -> Iterator[tuple[str, ShotRun]]:
+    """Yield the methods that read an LRHS: the name, and how a shot is fused."""
+    folder = sequence.folder
+    shot = find_shot(folder / f"lr_x{scale}.####.exr", folder / "hr.####.exr", folder / "fused.####.exr")
+    for quality, prefix in QUALITIES.items():
+        # More threads only wait for each other: the pictures are small.
+        settings = Settings(model=model_of_shot(shot, InputOptions(), quality), threads=1)
+        plan = plan_temporal(shot, InputOptions(), options, settings.model)
+        yield prefix + ALONE, ShotRun(settings, ShotPlan(), shot.frames)
+        yield prefix + NEIGHBOURS, ShotRun(settings, plan, shot.frames)
+    # The peers' frames have the neighbours of the last quality, `best`.
+    peers = {OIDN_NEIGHBOURS: oidn_prefiltered} | ({OIDN_SPLIT_NEIGHBOURS: oidn_split} if spread else {})
+    for name, denoised in peers.items():
+        yield name, _RunOfPeer(denoised, folder, settings, plan, shot.frames)
+
+
+def _motion(plan: ShotPlan) -> str:
+    """Say how the motion is known."""
+    motion = plan.views[None].motion
+    return f"{motion.kind}: {plan.text}" if motion else plan.text
+
+
+def _images(run: ShotRun) -> Array:
+    """Return the images of all frames.
+
+    Raises:
+        MssplError: a frame can't be fused.
+        InputError: a neighbour is not averaged.
+    """
+    images = []
+    for files in run.order:
+        for frame in run.take(run.read(files)):
+            frame.require()
+            assert frame.picture is not None
+            if left_out := [text for text in frame.picture.warnings if "is not averaged" in text]:
+                raise InputError(f"{frame.files.hr}: {left_out[0]}")
+            images.append(frame.picture.rgb)
+    return np.stack(images)

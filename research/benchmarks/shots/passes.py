@@ -1,0 +1,81 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Measure what neighbouring frames gain for passes: accuracy and flicker of light groups in a shot.
+
+    python -m research.benchmarks.shots.passes --table research/benchmarks/results/shots_passes.csv
+
+The shot is that of :mod:`research.benchmarks.shots.moving_wall`: a wall past which the camera moves, lit by lamps. Its
+clean light is known. Flicker is the mean absolute difference of the error from one frame to the next, along the motion.
+"""
+
+from __future__ import annotations
+
+import itertools
+import tempfile
+from pathlib import Path
+
+import numpy as np
+
+from oiio_msspl import fuse_shot
+from oiio_msspl.aovs.matching import map_render
+from oiio_msspl.exr.reader import open_exr
+from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
+from oiio_msspl.image.arrays import Array
+from oiio_msspl.jobs.plan import TemporalOptions
+from oiio_msspl.model.catalogue import find_model
+from research.benchmarks import results
+from research.benchmarks.results import Row
+from research.benchmarks.shots.moving_wall import STEP, clean_frame, write_shot
+
+SIZE, LAMPS = (320, 180), 4
+#: Frames at either end of the shot have fewer neighbours and are not scored.
+ENDS = 6
+
+
+def images_of(path: Path) -> list[Array]:
+    """Return beauty and light groups of a frame, (h, w, 3) each."""
+    render = map_render(open_exr(path))
+    (lamps,) = render.additive_sets
+    pixels = with_layers(render, lamps).read(render.data_window, ["rgb", *layer_keys(lamps)])
+    return [pixels[name] for name in ("rgb", *layer_keys(lamps))]
+
+
+def scores(errors: Array) -> tuple[float, float]:
+    """Return PSNR in dB, and flicker, of errors (frames, h, w, 3)."""
+    moved = errors[1:, :, :-STEP] - errors[:-1, :, STEP:]
+    return float(-10 * np.log10(np.mean(errors**2))), float(np.abs(moved).mean())
+
+
+def measure(folder: Path, count: int, scale: int, quality: str, frames: str) -> list[Row]:
+    """Return a row for the beauty, and one for the mean of all passes."""
+    out = folder / f"{quality} {frames}"
+    out.mkdir()
+    report = fuse_shot(folder / "lr", folder / "hr", out, model=quality, temporal=TemporalOptions(frames))
+    if report.exit_code:
+        raise SystemExit(next(result.message for result in report.results.values() if result.message))
+    errors = []
+    for number in range(1 + ENDS, count + 1 - ENDS):
+        _, lights = clean_frame(number, count, *SIZE, LAMPS)
+        fused = images_of(out / f"hr.{number:04d}.exr")
+        errors.append([image - clean for image, clean in zip(fused, [sum(lights), *lights], strict=True)])
+    beauty, *passes = (scores(images) for images in np.swapaxes(np.array(errors), 0, 1))
+    scored = {"beauty": beauty, "passes": np.mean(passes, axis=0)}
+    key: Row = {"scale": scale, "quality": quality, "temporal": frames, "model": find_model(scale, quality).stem}
+    return [key | {"of": name, "psnr": float(psnr), "flicker": float(f)} for name, (psnr, f) in scored.items()]
+
+
+def main() -> None:
+    """Measure both qualities at both scales, frame by frame and with neighbours."""
+    parser = results.parser(__doc__)
+    parser.add_argument("--frames", type=int, default=18)
+    args = parser.parse_args()
+    rows: list[Row] = []
+    for scale in (2, 4):
+        with tempfile.TemporaryDirectory() as folder:
+            write_shot(Path(folder), args.frames, *SIZE, scale, LAMPS)
+            for quality, frames in itertools.product(("balanced", "best"), ("off", "auto")):
+                rows += measure(Path(folder), args.frames, scale, quality, frames)
+    results.show(results.plain, rows, args.table)
+
+
+if __name__ == "__main__":
+    main()

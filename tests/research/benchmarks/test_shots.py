@@ -1,0 +1,75 @@
+# SPDX-License-Identifier: Apache-2.0
+"""`research.benchmarks.shots` measures the right amount on sequences whose errors are known."""
+
+import math
+
+import numpy as np
+import pytest
+
+from research.benchmarks.shots.measures import blur, flicker, psnr, relmse, warped
+from tests.conftest import picture
+
+SIGMA = 0.02
+
+
+def still(frames=6, height=96, width=128):
+    return np.repeat(picture(height, width).clip(0, 1)[None], frames, axis=0)
+
+
+def noise(shape, seed=0):
+    return np.random.default_rng(seed).normal(0, SIGMA, shape).astype(np.float32)
+
+
+def panned(frames=6, step=3):
+    wide = picture(96, 128 + frames * step).clip(0, 1)
+    return np.stack([wide[:, step * t : step * t + 128] for t in range(frames)])
+
+
+def test_identical_frames_do_not_flicker_however_wrong_they_are():
+    assert flicker(still() * 0.5, (still(), still())) == 0
+
+
+def test_motion_that_the_reference_shares_is_no_flicker():
+    moving = panned()
+    assert flicker(moving + 0.1, (moving, moving)) < 1e-6
+    assert flicker(moving, (still(), still())) > 0.01
+
+
+def test_independent_noise_flickers_by_the_root_of_two_of_its_deviation():
+    truth = still()
+    assert flicker(truth + noise(truth.shape), (truth, truth)) == pytest.approx(math.sqrt(2) * SIGMA, rel=0.01)
+
+
+def test_noise_of_the_reference_halves_cancels_out():
+    truth = still()
+    halves = tuple(truth + noise(truth.shape, seed) for seed in (1, 2))
+    assert flicker(truth + noise(truth.shape, 3), halves) == pytest.approx(math.sqrt(2) * SIGMA, rel=0.02)
+    assert psnr((truth + 0.1)[0], tuple(h[0] for h in halves)) == pytest.approx(20, abs=0.1)
+
+
+def test_blur_keeps_a_constant_picture_up_to_its_border():
+    assert blur(np.full((2, 40, 50, 3), 0.7, np.float32), 8) == pytest.approx(0.7, abs=1e-5)
+
+
+def test_psnr_in_a_mask_counts_that_alone():
+    truth = still(2)
+    wrong, mask = truth.copy(), np.zeros(truth.shape[:3], bool)
+    wrong[:, :10] += 0.1
+    mask[:, :10] = True
+    assert psnr(wrong, (truth, truth), mask) == pytest.approx(20, abs=1e-3)
+    assert psnr(wrong, (truth, truth), ~mask) == math.inf
+
+
+def test_noise_of_the_reference_halves_hardly_counts_in_relmse():
+    truth = still(2) + 0.2
+    halves = tuple(truth + noise(truth.shape, seed) for seed in (1, 2))
+    expected = 0.5 * np.mean(np.square(0.1 * truth) / (np.square(truth) + 0.01))
+    assert relmse(1.1 * truth, (truth, truth)) == pytest.approx(expected, rel=1e-4)
+    assert relmse(1.1 * truth, halves) == pytest.approx(expected, rel=0.1)  # some noise is left in the divisor
+    assert relmse(1.1 * truth, (halves[0], halves[0])) > 1.2 * expected
+
+
+def test_warping_brings_the_next_frame_of_a_pan_to_its_place():
+    moving = panned(step=3)
+    vectors = np.broadcast_to(np.float32((-3, 0)), (96, 128, 2))
+    assert warped(moving[1], vectors)[:, 3:] == pytest.approx(moving[0][:, 3:], abs=1e-6)

@@ -97,7 +97,6 @@ PAIRS = (
     "LRHS scaled down: lanczos3",
     "exposure one stop up",
 )
-#: Sequences that were measured with two neighbours on each side.
 NEEDS = {ON_HRLS: "HRLS", SAME_SAMPLES: "all samples at full resolution"}
 
 

@@ -16,7 +16,8 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.checks.pair import HrlsAverages, bounded_luminance, check_pair
-from oiio_msspl.fusion.passes.fuse import FusedPasses, LayerFuser
+from oiio_msspl.fusion.passes.fuse import FusedPasses
+from oiio_msspl.fusion.passes.network import LayerFuser
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.alpha import alpha_as_colour, fuse_alpha
 from oiio_msspl.fusion.tiles.features import RepairCounts, TilePair, read_lrhs, read_tile

@@ -25,7 +25,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame, fuse
 from oiio_msspl.fusion.neighbours.renders import RenderPair, average_renders, lacking_passes
-from oiio_msspl.fusion.passes.plan import pass_features
+from oiio_msspl.fusion.passes.layers import pass_features
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import FIXED_MEMORY, MAX_MEMORY
 from oiio_msspl.image.arrays import Array, Mask, kept

@@ -34,7 +34,7 @@ from oiio_msspl.aovs.additive_sets import AdditiveSet
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.fusion.fuse import layer_fuser
-from oiio_msspl.fusion.passes.fuse import fuse_passes
+from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, strips_memory
 from oiio_msspl.image.arrays import Array, box_downsample, planes_of
@@ -82,16 +82,8 @@ def methods(lr: MappedRender, hr: MappedRender, sessions: Sequence[Session]) -> 
 
     def passes(layers: AdditiveSet, session: Session, beauty: FusedFrame) -> None:
         cache_bytes = strips_memory(MAX_MEMORY, beauty.nbytes)  # as in the job of a frame
-        done = fuse_passes(
-            lr,
-            hr,
-            beauty.rgb,
-            beauty.alignment,
-            [layers],
-            cache_bytes,
-            guides=beauty.clean_aovs,
-            fuse_layers=layer_fuser(session, beauty),
-        )
+        inputs = PassInputs(lr, hr, beauty.rgb, beauty.alignment, [layers], beauty.clean_aovs)
+        done = fuse_passes(inputs, fuse_layers=layer_fuser(session, beauty), cache_bytes=cache_bytes)
         assert not done.refused
 
     def each_plain(noisy: Sequence[Array]) -> None:

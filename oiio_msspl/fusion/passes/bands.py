@@ -65,9 +65,7 @@ class PassSources:
         return planes_of(mirrored(self.rgb, self.alignment.hr_data_window, area)).astype(np.float32)
 
     def unload(self) -> None:
-        """Give the memory of pixels that wait in temporary files back to the system."""
-        for render in (self.low, self.high):
-            render.unload()
+        """Give the memory of guides that wait in temporary files back to the system."""
         for image in self.guides.values():
             unload(image)
 

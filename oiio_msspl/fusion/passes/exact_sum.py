@@ -7,12 +7,9 @@ in it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
-from oiio_msspl.aovs.additive_sets import AdditiveLayer
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.motion.vectors import sample_linear
@@ -54,6 +51,9 @@ def make_exact(
         shares: of the layers, where none has a sample near.
         doubts: see :func:`doubts_of`; None if the LRHS has no layer.
     """
+    for planes, layer in zip(layers, job.estimated, strict=False):
+        if layer in band.ranges:
+            np.clip(planes, *band.ranges[layer], out=planes)
     # The squares of light beyond 1e19 overflow, so there is no fit there.
     layers[:, ~np.isfinite(layers).all(axis=0)] = 0
     np.clip(layers, 0, BRIGHTEST, out=layers)
@@ -138,15 +138,6 @@ def spread_rest(layers: Array, beauty: Array, doubts: Array | None) -> None:
         part *= wanted
 
     for_row_blocks(work, beauty.shape[1], layers[:, :, 0].size)
-
-
-def total_of(lights: Mapping[AdditiveLayer, Array], layers: Sequence[AdditiveLayer]) -> Array:
-    """Add up the light of some layers."""
-    first, *others = layers
-    total = lights[first].copy()
-    for layer in others:
-        total += lights[layer]
-    return total
 
 
 class SharesAround:

@@ -9,18 +9,18 @@ from __future__ import annotations
 
 import itertools
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import partial, reduce
 
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.exr.render import Render, Window
+from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.passes.bands import Band, Guides, PassSources, band_windows
-from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact, total_of
+from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
 from oiio_msspl.fusion.passes.fit import fit_to_beauty
 from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, load_pixels, lrhs_names
 from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
@@ -98,36 +98,37 @@ def fuse_passes(
     plan = plan_passes(low, high, inputs.sets)
     jobs, sources = plan.jobs, _sources_of(inputs, low, high)
     fused = _blank_result(plan, inputs, ReplacedChannels() if pixels is None else pixels)
-    network = LayersByNetwork(sources, fuse_layers) if fuse_layers and any(job.lrhs for job in jobs) else None
+    network = LayersByNetwork(sources, jobs, fuse_layers)
+    bands = len(band_windows(inputs.alignment))
     steps = pass_steps(inputs.alignment, inputs.sets, by_network=fuse_layers is not None)
-    tell = _Progress(progress, steps, inputs.alignment, jobs, network)
-    if network is not None:
-        for _ in itertools.chain.from_iterable(map(network.fuse, jobs)):
-            tell(tell.bands)
+    tell = _counter(progress, steps - bands * sum(1 + network.count(job) for job in jobs), steps)
+    for _ in itertools.chain.from_iterable(map(network.fuse, jobs)):
+        tell(bands)
     later = {part for job in jobs for parts in job.derived.values() for part in parts}
     clipped, repaired = Counter[str](), Counter[str]()
     shares = SharesAround(sources)
     with high.pixels.cache_strips(cache_bytes // 2), low.pixels.cache_strips(cache_bytes // 2):
-
-        def prepare(core: Window) -> Band:
-            with half_of_the_threads():
-                return Band(sources, core, jobs, network.full_size.light if network else ())
-
-        # The next band is read and compared while the layers of this one are fused.
-        for band in one_ahead(map(prepare, band_windows(inputs.alignment))) if jobs else ():
+        for band in _read_bands(sources, jobs, network):
             lights: dict[AdditiveLayer, Array] = {}
             for job in jobs:
                 with half_of_the_threads():
                     made = _fuse_set(job, band, network, shares, lights)
-                    clipped[job.layers.name] += _store(made, band, inputs.alignment, fused.pixels, lights)
+                    new = {layer: light for layer, light in made.items() if layer not in lights}
+                    clipped[job.layers.name] += _store(new, band, inputs.alignment.hr_data_window, fused.pixels)
                 # Copies, because a layer alone would keep the memory of its whole set.
                 lights |= {layer: made[layer].copy() for layer in made.keys() & later}
                 tell(1)
             repaired.update(band.repaired)
-            sources.unload()
-            if network is not None:
-                network.unload()
-    fused.warnings += _warnings(clipped, repaired)
+    fused.warnings += [
+        f"{name}: {count} values are too bright for half and were clipped to {HALF_MAX:.0f}, so the layers do not sum "
+        "to the beauty there; render them as float"
+        for name, count in clipped.items()
+        if count
+    ]
+    fused.warnings += [
+        f"{name}: {count} values of the HRLS are NaN or infinite; they were repaired"
+        for name, count in repaired.items()
+    ]
     return fused
 
 
@@ -140,34 +141,22 @@ def pass_steps(alignment: Alignment, sets: Sequence[AdditiveSet], *, by_network:
     return len(band_windows(alignment)) * (len(sets) + layers)
 
 
-class _Progress:
-    """Counts the steps that are done."""
+def _counter(progress: Callable[[int, int], None] | None, done: int, steps: int) -> Callable[[int], None]:
+    """Return a function that adds to the steps that are done, and tells their number."""
 
-    def __init__(
-        self,
-        progress: Callable[[int, int], None] | None,
-        steps: int,
-        alignment: Alignment,
-        jobs: Sequence[PassJob],
-        network: LayersByNetwork | None,
-    ) -> None:
-        self._progress, self._steps, self.bands = progress, steps, len(band_windows(alignment))
-        by_network = network is not None
-        self._done = steps - self.bands * sum(1 + by_network * len(job.estimated) for job in jobs)
-        self(0)
+    def tell(count: int) -> None:
+        nonlocal done
+        done += count
+        if progress is not None:
+            progress(done, steps)
 
-    def __call__(self, count: int) -> None:
-        self._done += count
-        if self._progress is not None:
-            self._progress(self._done, self._steps)
+    tell(0)
+    return tell
 
 
 def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, LayerLight]:
-    """Return the light of all layers of LRHS and HRLS.
-
-    Both files are decoded at once if a network needs whole layers, or if the frame is small. A large frame is read in
-    strips otherwise, and once more for those that are compared.
-    """
+    """Return the light of all layers of LRHS and HRLS."""
+    # A large frame is read in strips if no network needs whole layers, and the strips that are compared twice.
     decode = inputs.averaged is None and (by_network or not is_large(inputs.hr))
     return in_parallel(
         partial(light_of, inputs.lr, lrhs_names(inputs.lr, inputs.sets), decode=decode),
@@ -176,7 +165,7 @@ def _read_light(inputs: PassInputs, *, by_network: bool) -> tuple[LayerLight, La
 
 
 def _sources_of(inputs: PassInputs, low: LayerLight, high: LayerLight) -> PassSources:
-    renders = low.pixels, high.pixels
+    renders: tuple[ReadableRender, ReadableRender] = (low.pixels, high.pixels)
     if inputs.averaged is not None:
         # Light is divided by the colours of this frame, because those are written.
         colours = load_pixels(high.file, high.colours.values()).layers
@@ -198,75 +187,51 @@ def _blank_result(plan: PassPlan, inputs: PassInputs, pixels: ReplacedChannels) 
     )
 
 
-def _fuse_set(
-    job: PassJob,
-    band: Band,
-    network: LayersByNetwork | None,
-    shares: SharesAround,
-    earlier: Mapping[AdditiveLayer, Array],
-) -> dict[AdditiveLayer, Array]:
-    """Return the light of each layer of a set, (3, h, w) over the core of a band.
+def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersByNetwork) -> Iterator[Band]:
+    """Yield bands from top to bottom. The next one is read and compared while the layers of one are fused."""
 
-    Args:
-        earlier: light of layers of earlier sets.
-    """
-    lights = {layer: total_of(earlier, parts) for layer, parts in job.derived.items()}
+    def prepare(core: Window) -> Band:
+        with half_of_the_threads():
+            return Band(sources, core, jobs, network.at_full_size)
+
+    for band in one_ahead(map(prepare, band_windows(sources.alignment))) if jobs else ():
+        yield band
+        sources.unload()
+        network.unload()
+
+
+def _fuse_set(
+    job: PassJob, band: Band, network: LayersByNetwork, shares: SharesAround, earlier: Mapping[AdditiveLayer, Array]
+) -> dict[AdditiveLayer, Array]:
+    """Return the light of each layer of a set, (3, h, w) over the core of a band, given that of earlier sets."""
+    lights = {layer: _sum(earlier[part] for part in parts) for layer, parts in job.derived.items()}
     if job.estimated:
         rest = band.beauty
         if lights:
-            rest = rest - total_of(lights, list(lights))
+            rest = rest - _sum(lights.values())
             rest[rest < ROUNDING * band.beauty] = 0
         renders = band.renders_of(job)
         doubts = doubts_of(job, band, *renders) if job.lrhs else None
-        layers = _estimate(job, band, network, renders)
+        layers = np.zeros((len(job.estimated) + job.remainder, *rest.shape), np.float32)
+        fused = network.estimate(band, job, layers)
+        if band.needs_fit(job):
+            fit_to_beauty(band, job, renders, layers, [i for i in range(len(layers)) if i not in fused])
         make_exact(layers, rest, job, band, shares, doubts)
         lights |= dict(zip(job.estimated, layers, strict=False))
-    return lights | {layer: total_of(lights, parts) for layer, parts in job.coarser.items()}
+    return lights | {layer: _sum(lights[part] for part in parts) for layer, parts in job.coarser.items()}
 
 
-def _estimate(job: PassJob, band: Band, network: LayersByNetwork | None, renders: Sequence[Array]) -> Array:
-    """Return the estimated layers of a set, and the light in no layer, (layers, 3, h, w) over the core of a band."""
-    layers = np.zeros((len(job.estimated) + job.remainder, *band.beauty.shape), np.float32)
-    missing = set(range(len(layers)))
-    for way in network.ways if network else ():
-        missing.difference_update(way.estimate(band, job, layers))
-    if band.needs_fit(job):
-        fit_to_beauty(band, job, renders, layers, sorted(missing))
-    for planes, layer in zip(layers, job.estimated, strict=False):
-        if layer in band.ranges:
-            np.clip(planes, *band.ranges[layer], out=planes)
-    return layers
+def _sum(lights: Iterable[Array]) -> Array:
+    return reduce(np.add, lights)
 
 
-def _store(
-    lights: Mapping[AdditiveLayer, Array],
-    band: Band,
-    alignment: Alignment,
-    pixels: ReplacedChannels,
-    earlier: Collection[AdditiveLayer],
-) -> int:
-    """Store layers, without those that an earlier set has stored. Return how many values were too bright."""
-    window, core = alignment.hr_data_window, band.hrls_core
-    inside = core.intersect(window)
+def _store(lights: Mapping[AdditiveLayer, Array], band: Band, window: Window, pixels: ReplacedChannels) -> int:
+    """Store layers over an HRLS of this data window. Return how many values were too bright."""
+    inside = band.hrls_core.intersect(window)
     clipped = 0
     for layer, light in lights.items():
-        if layer in earlier:
-            continue
         if layer.factor in band.colours:
             light = np.divide(light, np.maximum(band.colours[layer.factor], DARKEST_COLOUR), dtype=np.float32)
         for channel, plane in zip(layer.channels, light, strict=True):
-            clipped += pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(core)])
+            clipped += pixels.put(channel, inside.y0 - window.y0, plane[inside.slices(band.hrls_core)])
     return clipped
-
-
-def _warnings(clipped: Mapping[str, int], repaired: Mapping[str, int]) -> list[str]:
-    too_bright = [
-        f"{name}: {count} values are too bright for half and were clipped to {HALF_MAX:.0f}, so the layers do not sum "
-        "to the beauty there; render them as float"
-        for name, count in clipped.items()
-        if count
-    ]
-    return too_bright + [
-        f"{name}: {count} values of the HRLS are NaN or infinite; they were repaired"
-        for name, count in repaired.items()
-    ]

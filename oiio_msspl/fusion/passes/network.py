@@ -6,8 +6,10 @@ That is more accurate than a fit, and takes a run of the network for each layer.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+import itertools
+from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import replace
+from typing import cast
 
 import numpy as np
 
@@ -37,12 +39,7 @@ LayerFuser = Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Arr
 
 
 class AtFullSize:
-    """Layers that a network fuses at the frame's resolution.
-
-    Args:
-        low, high: both renders.
-        alignment: of these.
-    """
+    """Layers that a network fuses at the frame's resolution."""
 
     def __init__(self, low: Render, high: Render, alignment: Alignment) -> None:
         self._low, self._high, self.alignment = low, high, alignment
@@ -53,7 +50,7 @@ class AtFullSize:
         return _as_beauty(self._low, name), _as_beauty(self._high, name)
 
     def estimate(self, band: Band, job: PassJob, out: Array) -> list[int]:
-        """Copy fused light of a set into ``out``, (layers, 3, h, w) over the core of a band. Return which layers."""
+        """Copy the fused light, see :meth:`LayersByNetwork.estimate`."""
         fused = [i for i, layer in enumerate(job.estimated) if layer in self.light]
         for i in fused:
             out[i] = band.over_core(self.light[job.estimated[i]])
@@ -64,10 +61,6 @@ class AtHalfSize:
     """Layers of an x2 pair that a network fuses at the LRHS's resolution, and that are fitted to the beauty then.
 
     The HRLS is averaged over 2 x 2 pixels, over the whole grid.
-
-    Args:
-        low, high: both renders.
-        alignment: of these.
     """
 
     def __init__(self, low: Render, high: Render, alignment: Alignment) -> None:
@@ -85,7 +78,7 @@ class AtHalfSize:
         return _as_beauty(self._low, name), half
 
     def estimate(self, band: Band, job: PassJob, out: Array) -> list[int]:
-        """Fit the fused light of a set to the beauty, and draw the fit towards it, see :meth:`AtFullSize.estimate`."""
+        """Fit the fused light to the beauty, and draw the fit towards it, see :meth:`LayersByNetwork.estimate`."""
         fused = [i for i, layer in enumerate(job.estimated) if layer in self.light]
         if fused and band.needs_fit(job):
             area = band.area.slices(self.alignment.grid)
@@ -108,19 +101,28 @@ class AtHalfSize:
 
 
 class LayersByNetwork:
-    """The layers of a frame that a network fuses, by either way.
+    """The layers of a frame that a network fuses, in either way.
 
     Args:
-        sources: of the frame, decoded.
-        fuse: the network.
+        sources: of the frame, decoded if there is a network.
+        jobs: the sets.
+        fuse: the network; None if there is none.
     """
 
-    def __init__(self, sources: PassSources, fuse: LayerFuser) -> None:
-        low, high = sources.low, sources.high
-        assert isinstance(low, Render) and isinstance(high, Render)
-        self._low, self._high, self._alignment, self._fuse = low, high, sources.alignment, fuse
-        self.full_size = AtFullSize(low, high, sources.alignment)
-        self.ways: list[AtFullSize | AtHalfSize] = [self.full_size]
+    def __init__(self, sources: PassSources, jobs: Sequence[PassJob], fuse: LayerFuser | None) -> None:
+        self._fuse, self._scale = fuse if any(job.lrhs for job in jobs) else None, sources.alignment.scale
+        self._renders = cast(tuple[Render, Render], (sources.low, sources.high))
+        self._full_size = AtFullSize(*self._renders, sources.alignment)
+        self._ways: list[AtFullSize | AtHalfSize] = [self._full_size]
+
+    @property
+    def at_full_size(self) -> Collection[AdditiveLayer]:
+        """The layers that were fused at full resolution."""
+        return self._full_size.light
+
+    def count(self, job: PassJob) -> int:
+        """Return how many layers :meth:`fuse` yields."""
+        return len(job.estimated) if self._fuse else 0
 
     def fuse(self, job: PassJob) -> Iterator[AdditiveLayer]:
         """Fuse the layers of a set that have light in both renders.
@@ -128,31 +130,39 @@ class LayersByNetwork:
         Yields:
             Each layer that is to be estimated, whether a network has fused it or not.
         """
+        if self._fuse is None:
+            return
         lit = {layer: job.names[layer] for layer in job.estimated if job.names[layer] in job.lrhs}
-        renders = self._low, self._high
-        lit = {layer: name for layer, name in lit.items() if not any(is_black(render, name) for render in renders)}
-        for render in renders:
-            render.unload()
+        lit = {layer: name for layer, name in lit.items() if not any(is_black(x, name) for x in self._renders)}
+        self.unload()
         way = self._way(job, len(lit))
         fused = self._fuse((way.pair(name) for name in lit.values()), way.alignment)
         for layer in job.estimated:
             if layer in lit:
-                way.light[layer] = next(fused)
-                unload(way.light[layer])
+                way.light[layer] = light = next(fused)
+                for channel in range(3):
+                    if not any(render.layers[lit[layer]][..., channel].any() for render in self._renders):
+                        light[..., channel] = 0  # a saturated lamp gets no light of another colour
+                unload(light)
             yield layer
 
     def _way(self, job: PassJob, count: int) -> AtFullSize | AtHalfSize:
         """Choose how to fuse a set of which so many layers have light."""
-        if self._alignment.scale != HALF or job.layers.name != LIGHT_GROUPS or count <= MOST_AT_FULL_SIZE:
-            return self.full_size
-        self.ways.append(AtHalfSize(self._low, self._high, self._alignment))
-        return self.ways[-1]
+        if self._scale != HALF or job.layers.name != LIGHT_GROUPS or count <= MOST_AT_FULL_SIZE:
+            return self._full_size
+        self._ways.append(AtHalfSize(*self._renders, self._full_size.alignment))
+        return self._ways[-1]
+
+    def estimate(self, band: Band, job: PassJob, out: Array) -> set[int]:
+        """Put the fused layers of a set into ``out``, (layers, 3, h, w) over the core of a band. Return which ones."""
+        return {i for way in self._ways for i in way.estimate(band, job, out)}
 
     def unload(self) -> None:
-        """Give the memory of light that waits in temporary files back to the system."""
-        for way in self.ways:
-            for image in way.light.values():
-                unload(image)
+        """Give the memory of pixels that wait in temporary files back to the system."""
+        for render in self._renders:
+            render.unload()
+        for image in itertools.chain.from_iterable(way.light.values() for way in self._ways):
+            unload(image)
 
 
 def _as_beauty(render: Render, name: str) -> Render:
@@ -162,12 +172,9 @@ def _as_beauty(render: Render, name: str) -> Render:
 
 
 def _draw_towards(image: Array, means: Array) -> None:
-    """Change a fitted layer (3, h, w), so that its means over 2 x 2 pixels are half-way to ``means``.
-
-    These are the layer as the network has fused it. Half-way is the geometric mean of both. A fit can't tell apart two
-    lamps that are equally bright and a few pixels apart, so the light of one would leak into the layer of the other.
-    The network can, but its result has more noise than the fit.
-    """
+    """Change a fitted layer (3, h, w), so that its means over 2 x 2 pixels are half-way to ``means``, the network's."""
+    # A fit can't tell apart two lamps that are equally bright and a few pixels apart, so the light of one would leak
+    # into the layer of the other. The network can, but its result has more noise. Half-way is the geometric mean.
 
     def work(rows: slice) -> None:
         part = image[:, rows]

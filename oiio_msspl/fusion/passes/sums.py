@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,24 +85,28 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
     outside = [layer.name for layer in layers if not _in_beauty_window(light, layer)]
     if outside:
         return SumCheck(1.0, problem=f"{outside[0]} has another data window")
-    measured = _Comparison(layers)
+    sums, of_layers = np.zeros(4), np.zeros((len(layers), 5))
     for strip in _strips_of(light, layers, total):
-        measured.add(strip)
+        sums += strip.sums()
+        of_layers += strip.layer_sums()
     light.pixels.unload()
-    if not measured.finite.all():
-        broken = layers[int(measured.finite.argmin())].name
-        return SumCheck(1.0, problem=f"the layer {broken} is NaN or infinite")
-    if measured.light == 0:
+    whole, wrong, missing, surplus = sums.tolist()
+    negative, positive, equal, lit, finite = of_layers.T
+    if not finite.all():
+        return SumCheck(1.0, problem=f"the layer {layers[int(finite.argmin())].name} is NaN or infinite")
+    if whole == 0:
         return SumCheck(0.0, problem="the beauty is black")
-    residual, surplus = measured.wrong / measured.light, measured.surplus / measured.light
-    if negative := measured.negative_layer():
-        return SumCheck(float(residual), problem=f"the layer {negative} is negative", negative=True)
-    residual = float(residual)
-    if residual <= TOLERANCE:
-        return SumCheck(residual, noise_free=measured.noise_free())
-    if surplus <= TOLERANCE:
-        return SumCheck(residual, remainder=True, noise_free=measured.noise_free())
-    if abs(measured.missing - measured.surplus) < measured.wrong / 4:
+    residual = wrong / whole
+    # Pixel filters with negative lobes make some values negative. Light that is taken away is another matter: a fused
+    # layer is nowhere negative.
+    taken = np.where(negative > positive, negative, 0)
+    if taken.max(initial=0) > TOLERANCE * whole:
+        return SumCheck(residual, problem=f"the layer {layers[int(taken.argmax())].name} is negative", negative=True)
+    clean = (lit >= FEWEST) & (equal >= NOISE_FREE * lit)
+    if residual <= TOLERANCE or surplus / whole <= TOLERANCE:
+        noise_free = frozenset(layer for layer, is_clean in zip(layers, clean, strict=True) if is_clean)
+        return SumCheck(residual, remainder=residual > TOLERANCE, noise_free=noise_free)
+    if abs(missing - surplus) < wrong / 4:
         reason = "is the beauty denoised, or made with another pixel filter?"
         lossy = _lossy_compression(light.file, layers)
         if lossy and residual < LOSSY:
@@ -109,7 +114,7 @@ def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLay
         return SumCheck(residual, problem=f"they differ by {residual:.1%} both ways; {reason}")
     superfluous = _superfluous(light, layers) if total is None else []
     advice = f"without {' and '.join(superfluous)} they would sum to it" if superfluous else "some layers overlap"
-    return SumCheck(residual, problem=f"they have {surplus:.1%} more light; {advice}")
+    return SumCheck(residual, problem=f"they have {surplus / whole:.1%} more light; {advice}")
 
 
 def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
@@ -126,53 +131,31 @@ def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveL
     return not check.problem and not check.remainder
 
 
-@dataclass(frozen=True)
-class _Strip:
-    """Some rows of the layers of a set: (h, w, 3) each."""
+class _Strip(NamedTuple):
+    """Some rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values."""
 
     layers: list[Array]
     total: NDArray[np.float64]
-    """What the layers should sum to."""
     rest: NDArray[np.float64]
-    """What the layers lack of it."""
     usable: NDArray[np.bool_]
-    """Which values can be compared."""
 
+    def sums(self) -> NDArray[np.float64]:
+        """Return the sums of light, of what is wrong, of what is missing and of what is too much."""
+        rest = self.rest[self.usable]
+        parts = self.total[self.usable], rest, np.maximum(rest, 0), np.maximum(-rest, 0)
+        return np.array([np.abs(part).sum() for part in parts])
 
-class _Comparison:
-    """Sums over the strips: the light of layers, and what they lack."""
-
-    def __init__(self, layers: Sequence[AdditiveLayer]) -> None:
-        self._layers = layers
-        self.light = self.wrong = self.missing = self.surplus = 0.0
-        self.finite = np.zeros(len(layers), np.bool_)
-        self._negative, self._positive = np.zeros((2, len(layers)))
-        self._alike = np.zeros((len(layers), 2), np.int64)
-
-    def add(self, strip: _Strip) -> None:
-        rest, usable = strip.rest[strip.usable], strip.usable
-        self.light += np.abs(strip.total[usable]).sum()
-        self.wrong += np.abs(rest).sum()
-        self.missing += np.maximum(rest, 0).sum()
-        self.surplus += np.maximum(-rest, 0).sum()
-        self._alike += [_equal_pixels(pixels) for pixels in strip.layers]
-        self._negative += [-np.minimum(pixels, 0)[usable].sum(dtype=np.float64) for pixels in strip.layers]
-        self._positive += [np.maximum(pixels, 0)[usable].sum(dtype=np.float64) for pixels in strip.layers]
-        if not self.finite.all():
-            self.finite |= [bool(np.isfinite(pixels).any()) for pixels in strip.layers]
-
-    def negative_layer(self) -> str:
-        """Return the name of a layer that takes light away; empty if none does.
-
-        Pixel filters with negative lobes make some values negative. Light that is taken away is another matter: a fused
-        layer is nowhere negative.
-        """
-        taken = np.where(self._negative > self._positive, self._negative, 0)
-        return self._layers[int(taken.argmax())].name if taken.max(initial=0) > TOLERANCE * self.light else ""
-
-    def noise_free(self) -> frozenset[AdditiveLayer]:
-        counts = zip(self._layers, self._alike, strict=True)
-        return frozenset(layer for layer, (equal, lit) in counts if lit >= FEWEST and equal >= NOISE_FREE * lit)
+    def layer_sums(self) -> NDArray[np.float64]:
+        """Return for each layer: its negative and its positive light, equal pixels, lit ones, and if one is finite."""
+        return np.array([
+            [
+                -np.minimum(pixels, 0)[self.usable].sum(dtype=np.float64),
+                np.maximum(pixels, 0)[self.usable].sum(dtype=np.float64),
+                *_equal_pixels(pixels),
+                np.isfinite(pixels).any(),
+            ]
+            for pixels in self.layers
+        ])  # fmt: skip
 
 
 def _superfluous(light: LayerLight, layers: Sequence[AdditiveLayer]) -> list[str]:

@@ -90,7 +90,7 @@ class Band:
         self, sources: PassSources, core: Window, jobs: Sequence[PassJob], full_size: Collection[AdditiveLayer]
     ) -> None:
         alignment = sources.alignment
-        self._sources, self._full_size, self.scale = sources, full_size, alignment.scale
+        self.sources, self._full_size, self.scale = sources, full_size, alignment.scale
         reach = 2 * sum(STEPS[self.scale]) + 2
         self.area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach).intersect(alignment.grid)
         """The core and the pixels around that are read, in LRHS pixels."""
@@ -102,7 +102,33 @@ class Band:
         self.low_beauty = downsampled(self._beauty, self.scale)
         """The fused beauty (3, h, w) over the area, at the LRHS's resolution."""
         self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job)]
-        self._read([job for job in jobs if job.lrhs or job in self._to_fit], jobs)
+        factors = {layer.factor for job in jobs for layer in job.estimated}
+        colours = {factor: name for factor, name in sources.colours.items() if factor in factors}
+        names = {name: layer for job in jobs for layer, name in job.names.items()}
+        # A file decodes all layers together, so all are read at once.
+        needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self._to_fit else [])]
+        window, counts = alignment.hr_data_window, RepairCounts()
+        features = read_features(sources.high, self._hrls_area, window, needed, counts=counts, counted=self.hrls_core)
+        self.repaired = {names[name].name: count for name, count in counts.repaired.items() if name in names}
+        """How many values of each layer of the HRLS were NaN or infinite."""
+        self.colours: dict[Factor, Array] = {
+            factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()
+        }
+        """What products of light and colour are divided by, (3, h, w) over the core."""
+        images = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
+        self.ranges = {
+            layer: self._range_around(features[job.names[layer]])
+            for job in jobs
+            for layer in job.noise_free.intersection(job.estimated)
+        }
+        """For each layer without noise, the lowest and highest values around each pixel of the core, (3, h, w)."""
+        self._low_layers = {name: box_downsample(values, self.scale) for name, values in features.items()}
+        lrhs = [name for job in jobs for name in job.lrhs]
+        self._lrhs_layers = {}
+        if lrhs:
+            self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs], RepairCounts())
+        self._fits: dict[Sequence[int], BeautyFit] = {}
+        self._guides = self._compared(images) if self._to_fit else None
 
     @property
     def beauty(self) -> Array:
@@ -113,30 +139,24 @@ class Band:
         """Return whether a set has light here that no network has fused at full resolution."""
         return job in self._to_fit
 
-    def fit_at(self, steps: Sequence[int]) -> BeautyFit:
-        """Return the beauty that layers are fitted to, with these ``STEPS``."""
-        key = tuple(steps)
-        if key not in self._fits:
-            self._fits[key] = BeautyFit(self._beauty, self._guides, self.scale, steps, self.rows)
-        return self._fits[key]
+    def fit_at(self, steps: tuple[int, ...]) -> BeautyFit:
+        """Return the beauty that layers are fitted to, see :data:`oiio_msspl.fusion.passes.lines.STEPS`."""
+        if steps not in self._fits:
+            assert self._guides is not None
+            self._fits[steps] = BeautyFit(self._beauty, self._guides, self.scale, steps, self.rows)
+        return self._fits[steps]
 
     def over_core(self, image: NDArray[Any]) -> Array:
         """Return an image (height, width, 3) over the HRLS's data window as planes over the core, mirrored beyond."""
-        return planes_of(mirrored(image, self._sources.alignment.hr_data_window, self.hrls_core))
+        return planes_of(mirrored(image, self.sources.alignment.hr_data_window, self.hrls_core))
 
     def renders_of(self, job: PassJob) -> list[Array]:
-        """Return the layers of the HRLS, and of the LRHS if it has some, see :func:`dimmed`; none if not read."""
-        if not job.lrhs and job not in self._to_fit:
-            return []
+        """Return the layers of the HRLS, and of the LRHS if it has some, see :func:`dimmed`."""
         renders = [self._low_layers, self._lrhs_layers] if job.lrhs else [self._low_layers]
         return [dimmed(job, pixels, self.low_beauty) for pixels in renders]
 
-    @property
-    def dark(self) -> float:
-        return self._sources.dark
-
     def _has_light_to_fit(self, job: PassJob) -> bool:
-        area, low, high = self.area, self._sources.low, self._sources.high
+        area, low, high = self.area, self.sources.low, self.sources.high
         # An LRHS of an odd size is up to a pixel away.
         low_area = Window(area.x0, area.y0 - 1, area.x1, area.y1 + 1)
         names = [job.names[layer] for layer in job.estimated if layer not in self._full_size]
@@ -144,63 +164,21 @@ class Band:
             return True
         return any(not is_black(low, name, low_area) for name in names if name in job.lrhs)
 
-    def _read(self, read: Sequence[PassJob], jobs: Sequence[PassJob]) -> None:
-        """Read all that the band needs of the sets ``read``, at once, because a file decodes all layers together.
-
-        The light of layers stays at low resolution, and the colours of products over the core.
-        """
-        sources, alignment = self._sources, self._sources.alignment
-        names = {name: layer for job in read for layer, name in job.names.items()}
-        factors = {layer.factor for job in jobs for layer in job.estimated if layer.factor is not None}
-        colours = {factor: name for factor, name in sources.colours.items() if factor in factors}
-        needed = [*colours.values(), *([RGB, *names] if read else []), *([ALBEDO, NORMAL] if self._to_fit else [])]
-        features, counts, window = {}, RepairCounts(), alignment.hr_data_window
-        if needed:
-            area, core = self._hrls_area, self.hrls_core
-            features = read_features(sources.high, area, window, needed, counts=counts, counted=core)
-        self.repaired = {names[name].name: count for name, count in counts.repaired.items() if name in names}
-        """How many values of each layer of the HRLS were NaN or infinite."""
-        self.colours: dict[Factor, Array] = {
-            factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()
-        }
-        """What products of light and colour are divided by, (3, h, w) over the core."""
-        images = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
-        self.ranges: dict[AdditiveLayer, tuple[Array, Array]] = {}
-        """For each layer without noise, the lowest and highest values around each pixel of the core, (3, h, w)."""
-        for job in read:
-            for layer in job.noise_free.intersection(job.estimated):
-                self.ranges[layer] = self._range_around(features[job.names[layer]])
-        self._low_layers = {name: box_downsample(values, self.scale) for name, values in features.items()}
-        lrhs = [name for job in read for name in job.lrhs]
-        self._lrhs_layers = {}
-        if lrhs:
-            self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs], RepairCounts())
-        self._fits: dict[tuple[int, ...], BeautyFit] = {}
-        self._guides = self._compared(images) if self._to_fit else np.zeros(0, np.float32)
-
     def _range_around(self, samples: Array) -> tuple[Array, Array]:
-        """Return the lowest and highest values of 3 x 3 pixels of the HRLS (h, w, 3).
-
-        The LRHS's pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the
-        edge.
-        """
+        # LRHS pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the edge.
         lowest, highest = -max_3x3(-samples), max_3x3(samples)
         return planes_of(lowest[self._hrls_rows]), planes_of(highest[self._hrls_rows])
 
     def _compared(self, images: Guides) -> Array:
-        """Return planes by which pixels are compared, in units of their spread.
-
-        Args:
-            images: albedo and normal of the HRLS (h, w, 3). Guides without noise take their place.
-        """
-        log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + self.dark)
+        """Return planes by which pixels are compared, given albedo and normal (h, w, 3) of the HRLS."""
+        log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + self.sources.dark)
         planes = [log[None] / SPREAD[RGB]]
         for name, image in images.items():
             noisy = planes_of(image)
             guide = smoothed(noisy, log)
-            if name in self._sources.guides:
-                window = self._sources.alignment.hr_data_window
-                clean = planes_of(mirrored(self._sources.guides[name], window, self._hrls_area))
+            if name in self.sources.guides:
+                window = self.sources.alignment.hr_data_window
+                clean = planes_of(mirrored(self.sources.guides[name], window, self._hrls_area))
                 # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
                 guide = np.where((noisy > 1).any(axis=0), guide, clean)
             planes.append(guide / SPREAD[name])

@@ -49,5 +49,5 @@ def _likeness(band: Band, layers: Array) -> Array:
     their layers.
     """
     lights = (layers.sum(axis=(0, 1), dtype=np.float64), band.low_beauty.sum(axis=0, dtype=np.float64))
-    rendered, fused = (np.log(light + 3 * band.dark) for light in lights)
+    rendered, fused = (np.log(light + 3 * band.sources.dark) for light in lights)
     return np.exp(-np.square((rendered - fused) / LIGHT_SPREAD)).astype(np.float32)

@@ -141,7 +141,7 @@ class LayersByNetwork:
             if layer in lit:
                 way.light[layer] = light = next(fused)
                 for channel in range(3):
-                    if not any(render.layers[lit[layer]][..., channel].any() for render in self._renders):
+                    if not any((render.layers[lit[layer]][..., channel] > 0).any() for render in self._renders):
                         light[..., channel] = 0  # a saturated lamp gets no light of another colour
                 unload(light)
             yield layer

@@ -664,8 +664,9 @@ def test_passes_that_layers_leaves_out_are_said_to_be_left_out(tmp_path, bilinea
 
 
 def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeypatch):
-    """Decoded rows are kept, or decoded again for each band that needs them."""
+    """Decoded rows of a large frame are kept, or decoded again for each band that needs them."""
     pair = write_pair(tmp_path, lights())
+    monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 1000)
     monkeypatch.setattr("oiio_msspl.fusion.passes.bands.BAND_ROWS", 16)
     decode, decoded, results = ExrFile._decode, [], []
     monkeypatch.setattr(ExrFile, "_decode", lambda *given: decoded.append(given) or decode(*given))
@@ -678,6 +679,26 @@ def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeyp
     assert times[1] > 1.5 * times[0]
     for (_, first), (_, second) in zip(*results, strict=True):
         assert all(same_bits(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("by_network", [False, True])
+def test_each_row_of_the_layers_is_decoded_once(tmp_path, monkeypatch, by_network):
+    """To check the sums of two sets, and to fuse them in several bands."""
+    pair = [map_render(open_exr(path)) for path in write_levels(tmp_path, {"diffuse_key": {"diffuse", "key"}})]
+    session = load_model(4, "best", threads=1)
+    beauty = fuse(*pair, session)
+    monkeypatch.setattr(bands, "BAND_ROWS", 32)
+    decode, rows = ExrFile._decode, {render.file.path: [] for render in pair}
+
+    def count(file, part, first, last, *others):
+        rows[file.path] += range(first, last)
+        return decode(file, part, first, last, *others)
+
+    monkeypatch.setattr(ExrFile, "_decode", count)
+    inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets)
+    fuse_passes(inputs, fuse_layers=layer_fuser(session, beauty) if by_network else None)
+    for render in pair:
+        assert sorted(rows[render.file.path]) == list(range(render.data_window.height))
 
 
 def lobes_by_light():

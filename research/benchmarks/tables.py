@@ -610,7 +610,6 @@ TABLES: dict[Path, tuple[Callable[[], str], ...]] = {
         pair_checks,
     ),
     ROOT / "docs/guide/gpu.md": (gpu_times,),
-    ROOT / "docs/design/passes.md": (passes_half, passes, single_passes, passes_spread, passes_time),
     ROOT / "docs/design/temporal.md": (temporal_passes, temporal_time, temporal_time_of_passes, temporal_counts),
 }
 

@@ -15,7 +15,7 @@ from oiio_msspl.exr.contents import dropped_channels, stored_type
 from oiio_msspl.exr.render import Render
 from oiio_msspl.exr.write_options import WriteOptions
 from oiio_msspl.fusion.fuse import FusedFrame
-from oiio_msspl.fusion.passes.fuse import fuse_passes, pass_steps
+from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes, pass_steps
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.fusion.tiles.tiling import strips_memory, tile_count
@@ -87,7 +87,7 @@ def fuse_frame_passes(
         write: ``passes`` says which, and ``pixel_type`` how the beauty is stored.
         max_memory: bytes that the process should stay below.
         progress: called with (steps done, steps in all) of this part of the work.
-        averaged: see :func:`oiio_msspl.fusion.passes.fuse.fuse_passes`.
+        averaged: see :class:`oiio_msspl.fusion.passes.fuse.PassInputs`.
 
     Raises:
         InputError: pixels can't be decoded.
@@ -101,16 +101,10 @@ def fuse_frame_passes(
             beauty = np.minimum(beauty, np.float32(HALF_MAX)).astype(np.float16)
         with limit_threads(session.threads):
             fused.passes = fuse_passes(
-                lr,
-                hr,
-                beauty,
-                fused.alignment,
-                sets,
-                cache_bytes=strips_memory(max_memory, fused.nbytes),
-                pixels=fused.replaced,
-                guides=fused.clean_aovs,
+                PassInputs(lr, hr, beauty, fused.alignment, sets, fused.clean_aovs, averaged),
+                fused.replaced,
                 fuse_layers=layer_fuser(session, fused),
-                averaged=averaged,
+                cache_bytes=strips_memory(max_memory, fused.nbytes),
                 progress=progress,
             )
         fused.replaced = fused.passes.pixels

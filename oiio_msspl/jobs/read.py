@@ -13,7 +13,7 @@ from oiio_msspl.aovs.views import name_of
 from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_separate
 from oiio_msspl.fusion.neighbours.renders import RenderPair
-from oiio_msspl.fusion.passes.plan import pass_features
+from oiio_msspl.fusion.passes.layers import pass_features
 from oiio_msspl.fusion.tiles.alignment import align
 from oiio_msspl.image.arrays import kept
 from oiio_msspl.jobs.checks import check_written_layers

@@ -114,5 +114,5 @@ def load_model(scale: int, name: str | None = None, device: str = "cpu", threads
     if path not in endings:
         return Session(path, device, threads)
     family = QUALITIES["fast"] + endings[path]
-    half = WEIGHTS / f"{MEAN_MODEL}{endings[path]}-x1.onnx" if scale == 2 else find_model(scale // 2, family)
+    half = WEIGHTS / f"{MEAN_MODEL}{endings[path]}-x1.onnx" if scale == 2 else None
     return Session(path, device, threads, layers=find_model(scale, family), half_layers=half)

@@ -59,8 +59,9 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.passes.fuse import DARKEST_COLOUR, fuse_passes
-from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
+from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR
+from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
+from oiio_msspl.fusion.passes.layers import layer_names, light_of
 from oiio_msspl.fusion.tiles.network import layer_fuser
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
@@ -102,8 +103,9 @@ WITH_SPREAD_NOISE = ("HRLS", PEER, SPLIT_PEER, "msspl-x2", "msspl-x2, best", "ms
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
     """Return the layers of a set, (layers, h, w, 3)."""
-    pixels = with_layers(render, layers).read(render.data_window, layer_keys(layers))
-    return np.stack([np.maximum(pixels[name], 0) for name in layer_keys(layers)])
+    names = layer_names([layers])
+    pixels = light_of(render, names).pixels.read(render.data_window, names.values())
+    return np.stack([np.maximum(pixels[names[layer]], 0) for layer in layers.layers])
 
 
 def rescaled(layers: Array, beauty: Array) -> Array:
@@ -157,16 +159,9 @@ def methods(
 
     def ours(low: MappedRender, model: str, *, half: bool = False) -> Array:
         frame, session = fused[model]
-        with patch("oiio_msspl.fusion.passes.fuse.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
-            made = fuse_passes(
-                low,
-                hr,
-                frame.rgb,
-                frame.alignment,
-                [layers],
-                guides=frame.clean_aovs,
-                fuse_layers=layer_fuser(session, frame),
-            )
+        with patch("oiio_msspl.fusion.passes.network.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
+            inputs = PassInputs(low, hr, frame.rgb, frame.alignment, [layers], frame.clean_aovs)
+            made = fuse_passes(inputs, fuse_layers=layer_fuser(session, frame))
         assert not made.refused
         height = hr.data_window.height
         planes = [[made.pixels.get(c, 0, height) for c in layer.channels] for layer in layers.layers]

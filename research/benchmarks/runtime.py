@@ -216,7 +216,7 @@ def pass_calls(low: Any, high: Any, models: Sequence[str], scale: int) -> dict[t
     """Return what is timed, by set, method and model: the beauty, and the layers of each set, ours and OIDN's."""
     from oiio_msspl import fuse
     from oiio_msspl.aovs.features import ALBEDO, NORMAL
-    from oiio_msspl.fusion.passes.fuse import fuse_passes
+    from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
     from oiio_msspl.fusion.tiles.network import layer_fuser
     from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, strips_memory
     from oiio_msspl.model.catalogue import load_model
@@ -228,9 +228,8 @@ def pass_calls(low: Any, high: Any, models: Sequence[str], scale: int) -> dict[t
     def passes(layers: Any, session: Any, beauty: Any) -> None:
         cache_bytes = strips_memory(MAX_MEMORY, beauty.nbytes)  # as in the job of a frame
         fuser = layer_fuser(session, beauty)
-        made = fuse_passes(
-            low, high, beauty.rgb, beauty.alignment, [layers], cache_bytes, guides=beauty.clean_aovs, fuse_layers=fuser
-        )
+        inputs = PassInputs(low, high, beauty.rgb, beauty.alignment, [layers], beauty.clean_aovs)
+        made = fuse_passes(inputs, fuse_layers=fuser, cache_bytes=cache_bytes)
         assert not made.refused
 
     def each_plain(noisy: Sequence[Any]) -> None:

@@ -285,32 +285,6 @@ TIME_OF_SHOTS = Table(
 )
 
 
-def _passes(source: str, gains: Sequence[str], methods: Wanted = lambda name: True) -> Table:
-    """Return a table of means over scenes of a table of :mod:`research.benchmarks.passes`."""
-    mean, by_scene = {"scene": MEAN, "layer": passes.ALL}, {"scene": clean, "layer": passes.ALL}
-    titles = {"psnr": "PSNR", "relmse": "RelMSE", "regraded_psnr": "regraded: PSNR", "regraded_relmse": "RelMSE"}
-    titles |= {"worst_psnr": "worst: PSNR", "time": "time / OIDN's"}
-    form = {name: "{:.4f}" if "relmse" in name else "{:.2f}" for name in titles}
-    columns = [Column(title, name, mean, form=form[name]) for name, title in titles.items()]
-    columns += [
-        Column(f"gain over {peer}, dB", "psnr", by_scene, "interval", against={"method": peer}) for peer in gains
-    ]
-    single = {"scene": clean, "layer": lambda name: name != passes.ALL}
-    columns.append(Column("better on", "psnr", single, "wins", against={"method": passes.PEER}))
-    by = ("set", "spp", "method")
-    return Table((source,), ("scene", *by, "layer"), by, by, columns, {"method": methods})
-
-
-SINGLE_PASSES = Table(
-    ("passes",),
-    ("scene", "set", "spp", "method", "layer"),
-    ("set", "spp", "layer"),
-    ("set", "spp", "kind"),
-    [Column("number", "psnr", {"method": passes.PEER}, "count")]
-    + [Column(method, "psnr/relmse", {"method": method}) for method in passes.IN_LAYERS],
-    {"scene": clean, "layer": lambda name: name != passes.ALL},
-)
-
 PASSES_SUMMARY = Table(
     ("passes",),
     ("scene", "set", "spp", "method", "layer"),
@@ -320,19 +294,6 @@ PASSES_SUMMARY = Table(
         Column(f"{name}: {title}", measure, {"set": name, "spp": 2, "scene": MEAN, "layer": passes.ALL})
         for name in ("light groups", "components")
         for title, measure in {"PSNR / RelMSE": "psnr/relmse", "time / OIDN's": "time"}.items()
-    ],
-)
-
-PASSES_TIME = Table(
-    ("time_passes",),
-    ("set", "method", "model", "scale", "kind", "machine"),
-    ("machine", "frame", "scale", "set", "method", "model"),
-    ("machine", "kind", "scale", "set", "method", "model"),
-    [
-        Column("seconds", "seconds"),
-        Column("of plain OIDN's", "seconds", how="ratio", against={"method": runtime.PLAIN, "model": None}),
-        Column("of prefiltered OIDN's", "seconds", how="ratio", against={"method": runtime.PREFILTERED, "model": None}),
-        Column("of the beauty's", "seconds", how="ratio", against={"set": None, "method": runtime.BEAUTY}),
     ],
 )
 
@@ -402,15 +363,6 @@ TABLES: dict[Path, dict[str, Block]] = {
         "paper": paper.findings,
     },
     ROOT / "docs/guide/gpu.md": {"gpu_times": GPU_TIMES},
-    ROOT / "docs/design/passes.md": {
-        "passes_half": _passes("passes_half", (passes.PEER,)),
-        "passes": _passes("passes", (passes.PEER, passes.STORED_PEER)),
-        "single_passes": SINGLE_PASSES,
-        "passes_spread": _passes(
-            "passes_spread", (passes.PEER, passes.SPLIT_PEER), lambda name: name in passes.WITH_SPREAD_NOISE
-        ),
-        "passes_time": PASSES_TIME,
-    },
     ROOT / "docs/design/temporal.md": {
         "temporal_time": TIME_OF_SHOTS,
     },

@@ -1,118 +1,141 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The layers of a set at the LRHS's resolution, as both renders have them, and their shares of the light around."""
+"""The light of the layers of one render, which is decoded once for all that needs it."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TypeVar
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
-from oiio_msspl.aovs.features import RGB
-from oiio_msspl.exr.render import ReadableRender, Window
-from oiio_msspl.fusion.motion.vectors import sample_linear
-from oiio_msspl.fusion.passes.fit import downsampled
-from oiio_msspl.fusion.passes.plan import PassJob
-from oiio_msspl.fusion.tiles.alignment import Alignment
-from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
-from oiio_msspl.image.arrays import Array, planes_of
-from oiio_msspl.image.filters import box_downsample, filled, max_3x3
+from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
+from oiio_msspl.aovs.features import ALBEDO, LIGHT_OF, NORMAL, RGB
+from oiio_msspl.aovs.formula import FeatureFormula
+from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.exr.reader import Channel
+from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.image.arrays import has_many_pixels
 
-T = TypeVar("T", bound=np.generic)
-
-#: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
-FIREFLY = 4.0
-#: HRLS pixels on a side of the squares over which the shares of layers are averaged.
-SQUARE = 64
+#: Channels of a colour that light is multiplied by.
+Factor = tuple[Channel, ...]
+#: Rows of an image that are looked at together.
+ROWS = 128
 
 
-def dimmed(job: PassJob, pixels: Mapping[str, Array], beauty: Array) -> Array:
-    """The layers of one render at low resolution, (layers, 3, h, w), without fireflies. Layers that it lacks are black.
-    The rest of its beauty is the last layer, if layers are missing or light is in none.
+@dataclass(frozen=True)
+class LayerLight:
+    """The light of the layers of a render, as features of :attr:`pixels`."""
 
-    Args:
-        pixels: features (h, w, 3) of the render.
-        beauty: the fused one (3, h, w).
-    """
-    black = np.zeros_like(beauty)
-    layers = np.stack([planes_of(pixels[key]) if key in pixels else black for key in job.keys.values()])
-    if job.remainder or not pixels.keys() >= set(job.keys.values()):
-        rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
-        layers = np.concatenate([layers, rest[None]])
-    light = layers.sum(axis=(0, 1))
-    allowed = FIREFLY * max_3x3(beauty.sum(axis=0))
-    layers *= np.minimum(1, allowed / np.maximum(light, 1e-20))
-    return layers
+    file: MappedRender
+    """Has these features, the beauty, albedo, normal and :attr:`colours`."""
+    names: Mapping[AdditiveLayer, str]
+    """Names of features, by layer."""
+    decoded: Render | None = None
+    """All of them; None if each read decodes what it needs."""
 
+    @property
+    def pixels(self) -> ReadableRender:
+        """Where the features are read."""
+        return self.decoded or self.file
 
-def in_both(job: PassJob, count: int) -> NDArray[np.bool_]:
-    """Which of the first ``count`` layers of a set both renders have. The remainder comes behind them: both have it if
-    they have all layers."""
-    both = [key in job.lrhs for key in job.keys.values()]
-    return np.array([*both, all(both)])[:count]
+    @property
+    def colours(self) -> dict[Factor, str]:
+        """Names, as features, of the colours by which layers are multiplied."""
+        return _colour_names(self.names)
 
 
-def to_be_fitted(job: PassJob, layers: NDArray[T]) -> NDArray[T]:
-    """Those layers of a set, on the first axis, that are to be fitted."""
-    known = [i for i, layer in enumerate(job.layers.layers) if layer in job.known]
-    return np.delete(layers, known, axis=0) if known else layers
-
-
-class SharesAround:
-    """How the layers of a set share the light around a pixel: means over squares of the frame, interpolated.
-
-    The beauty is divided by them where no layer has a sample near. The renders are read once more for that, and only if
-    there is such a pixel. The shares do not depend on the bands in which a frame is fused.
+def light_of(render: MappedRender, names: Mapping[AdditiveLayer, str], *, decode: bool = False) -> LayerLight:
+    """Return the light of layers of a render.
 
     Args:
-        low, high: both renders with all layers.
-        rgb: the fused beauty, (height, width, 3) over the HRLS's data window.
-        alignment: of the pair.
+        render: the file.
+        names: see :attr:`LayerLight.names`.
+        decode: whether all pixels are decoded now, once: into temporary files if there are many.
+
+    Raises:
+        InputError: pixels can't be decoded.
     """
+    formulas = {name: render.features[name] for name in (RGB, ALBEDO, NORMAL) if name in render.features}
+    formulas |= {name: layer.formula for layer, name in names.items()}
+    formulas |= {name: FeatureFormula((factor,)) for factor, name in _colour_names(names).items()}
+    file = replace(render, features=formulas)
+    return LayerLight(file, names, load_pixels(file, formulas) if decode else None)
 
-    def __init__(self, low: ReadableRender, high: ReadableRender, rgb: Array, alignment: Alignment) -> None:
-        self._low, self._high, self._rgb, self._alignment = low, high, rgb, alignment
-        #: By the name of a set, for each square, (rows, columns, layers).
-        self._shares: dict[str, Array] = {}
 
-    def at(self, job: PassJob, x: NDArray[np.intp], y: NDArray[np.intp]) -> Array:
-        """The shares of the layers that are to be fitted, (layers, n), at HRLS pixels (n) of the frame."""
-        if job.layers.name not in self._shares:
-            self._shares[job.layers.name] = self._measure(job)
-        grid, scale = self._alignment.grid, self._alignment.scale
-        columns, rows = (
-            ((pixels - start * scale + 0.5) / SQUARE - 0.5).astype(np.float32)
-            for pixels, start in ((x, grid.x0), (y, grid.y0))
-        )
-        return sample_linear(self._shares[job.layers.name], columns, rows).T
+def load_pixels(render: MappedRender, features: Iterable[str]) -> Render:
+    """Decode features of a render: into temporary files if there are many pixels."""
+    return render.load(features, on_disk=is_large(render))
 
-    def _measure(self, job: PassJob) -> Array:
-        """The shares in each square of the frame, (rows, columns, layers): those of the squares around where a square
-        has no light, and equal ones if none has any."""
-        grid, side = self._alignment.grid, SQUARE // self._alignment.scale
-        tops = range(grid.y0, grid.y1, side)
-        light = np.stack([self._light_of(job, Window(grid.x0, top, grid.x1, min(top + side, grid.y1))) for top in tops])
-        total = light.sum(axis=-1, keepdims=True)
-        lit = total[..., 0] > 0
-        if not lit.any():
-            return np.full(light.shape, 1, np.float32)
-        return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), ~lit)
 
-    def _light_of(self, job: PassJob, area: Window) -> NDArray[np.float64]:
-        """The light of the layers in each square of a row of squares, (columns, layers)."""
-        scale, window = self._alignment.scale, self._alignment.hr_data_window
-        hrls_area = in_hrls_pixels(area, scale)
-        beauty = downsampled(planes_of(mirrored(self._rgb, window, hrls_area)).astype(np.float32), scale)
-        features = read_features(self._high, hrls_area, window, [RGB, *job.keys.values()])
-        layers = dimmed(job, {name: box_downsample(image, scale) for name, image in features.items()}, beauty)
-        if job.lrhs:
-            theirs = read_lrhs(self._low, self._alignment, area, [RGB, *job.lrhs], RepairCounts())
-            both = in_both(job, len(layers))
-            layers[both] = (layers[both] + dimmed(job, theirs, beauty)[: len(layers)][both]) / 2
-        for render in (self._low, self._high):
-            render.unload()
-        # Relative to the beauty, or a bright thing in a square would decide for all of it.
-        layers /= np.maximum(max_3x3(beauty.sum(axis=0)), 1e-20)
-        lines = to_be_fitted(job, layers).sum(axis=(1, 2), dtype=np.float64)
-        return np.add.reduceat(lines, range(0, area.width, SQUARE // scale), axis=1).T
+def is_large(render: MappedRender) -> bool:
+    """Return whether a render has many pixels."""
+    return has_many_pixels(render.data_window.height, render.data_window.width)
+
+
+def _colour_names(layers: Iterable[AdditiveLayer]) -> dict[Factor, str]:
+    factors = dict.fromkeys(layer.factor for layer in layers if layer.factor is not None)
+    return {factor: f"colour {i}" for i, factor in enumerate(factors)}
+
+
+def layer_names(sets: Sequence[AdditiveSet]) -> dict[AdditiveLayer, str]:
+    """Return names, as features, of the light of all layers of sets, and then of their coarser layers.
+
+    Frames of a shot have the same names.
+    """
+    layers = [layer for additive_set in sets for layer in additive_set.layers]
+    coarser = [layer for additive_set in sets for layer in additive_set.coarser]
+    names: dict[AdditiveLayer, str] = {}
+    for layer in dict.fromkeys([*layers, *coarser]):
+        name = f"{LIGHT_OF}{layer.name}{' x colour' if layer.factor else ''}"
+        while name in names.values():
+            name += " again"
+        names[layer] = name
+    return names
+
+
+def same_layers(render: MappedRender, additive_set: AdditiveSet) -> dict[AdditiveLayer, AdditiveLayer]:
+    """Return layers of a set, each with the layer of the same name in another render: of the set that has most."""
+    by_name = {(layer.name, layer.factor is None): layer for layer in additive_set.layers}
+    matches = (
+        {by_name[key]: layer for layer in candidate.layers if (key := (layer.name, layer.factor is None)) in by_name}
+        for candidate in render.additive_sets
+    )
+    return max(matches, key=len, default={})
+
+
+def lrhs_names(lr: MappedRender, sets: Sequence[AdditiveSet]) -> dict[AdditiveLayer, str]:
+    """Return the names that the layers of an LRHS have as features: those of the same layers of the HRLS."""
+    names = layer_names(sets)
+    matches = {layer: match for additive_set in sets for layer, match in same_layers(lr, additive_set).items()}
+    return {match: names[layer] for layer, match in matches.items()}
+
+
+def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
+    """Return LRHS and HRLS with the light of layers of additive sets as further features.
+
+    The LRHS may lack some of them.
+    """
+    members = {layer for additive_set in sets for layer in additive_set.layers}
+    high = {name: layer.formula for layer, name in layer_names(sets).items() if layer in members}
+    low = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
+    return replace(lr, features=lr.features | low), replace(hr, features=hr.features | high)
+
+
+def is_black(render: ReadableRender, name: str, area: Window | None = None) -> bool:
+    """Return whether a feature of a render has no light in an area, or anywhere.
+
+    One in a file may have some, because it would have to be decoded.
+
+    Args:
+        render: the render.
+        name: of the feature.
+        area: relative to the top left of the display window.
+    """
+    if not isinstance(render, Render):
+        return False
+    window = render.data_window
+    if area is not None:
+        window = area.shift(render.display_window.x0, render.display_window.y0).intersect(window)
+    tops = range(window.y0, window.y1, ROWS)
+    parts = (Window(window.x0, top, window.x1, min(top + ROWS, window.y1)) for top in tops)
+    return not any(np.any(pixels) for part in parts for pixels in render.read(part, [name]).values())

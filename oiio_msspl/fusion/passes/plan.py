@@ -3,15 +3,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import partial
 
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
-from oiio_msspl.aovs.features import LIGHT_OF
-from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.exr.reader import Channel
-from oiio_msspl.fusion.passes.sums import check_sum, is_sum_of
+from oiio_msspl.fusion.passes.layers import LayerLight, same_layers
+from oiio_msspl.fusion.passes.sums import check_light, is_sum_of
 from oiio_msspl.image.parallel import in_parallel
 
 #: Layers, each with the layers that it is the sum of.
@@ -23,15 +22,14 @@ class PassJob:
     """A set that sums to the beauty."""
 
     layers: AdditiveSet
-    keys: dict[AdditiveLayer, str]
+    names: dict[AdditiveLayer, str]
     """Names, as features, of the light of the layers."""
-    lrhs: dict[str, AdditiveLayer]
-    """The same layers in the LRHS, as far as it has them, by these names."""
+    lrhs: frozenset[str]
+    """Those of these names that the LRHS has, too."""
     lacking: float
     """Share of the beauty's light that is in no layer; 0 if only rounding is lacking."""
-    known: Sums
-    """Layers of this set that are sums of layers of an earlier set, or that both sets have. The other layers are
-    fitted, and share what these leave of the beauty."""
+    derived: Sums
+    """Layers of this set that are sums of layers of an earlier set, or that both sets have."""
     noise_free: frozenset[AdditiveLayer] = frozenset()
     """See :attr:`oiio_msspl.fusion.passes.sums.SumCheck.noise_free`."""
     coarser: Sums = field(default_factory=dict)
@@ -39,82 +37,96 @@ class PassJob:
 
     @property
     def remainder(self) -> bool:
-        """Some light is in no layer."""
+        """Whether some light is in no layer."""
         return self.lacking > 0
 
     @property
-    def fitted(self) -> list[AdditiveLayer]:
-        return [layer for layer in self.layers.layers if layer not in self.known]
-
-    def lit(self, names: Collection[str]) -> dict[AdditiveLayer, str]:
-        """The fitted layers whose light is among the ``names`` of features, and these names."""
-        return {layer: self.keys[layer] for layer in self.fitted if self.keys[layer] in names}
+    def estimated(self) -> list[AdditiveLayer]:
+        """The layers that are not derived. They share what the derived ones leave of the beauty."""
+        return [layer for layer in self.layers.layers if layer not in self.derived]
 
     @property
     def hrls_alone(self) -> str:
-        """Names of fitted layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
-        missing = [layer.name for layer in self.fitted if self.keys[layer] not in self.lrhs]
+        """Names of estimated layers that the LRHS lacks, or "all layers" if it has none; empty if it lacks none."""
+        missing = [layer.name for layer in self.estimated if self.names[layer] not in self.lrhs]
         return "all layers" if missing and not self.lrhs else ", ".join(missing)
 
     @property
     def channels(self) -> list[Channel]:
-        """What is written."""
+        """The channels that are written."""
         return [channel for layer in (*self.layers.layers, *self.coarser) for channel in layer.channels]
 
 
-def plan_passes(
-    lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]
-) -> tuple[list[PassJob], dict[str, str], list[str]]:
-    """The sets that sum to the beauty; why each of the others does not, by name; and warnings of layers of the LRHS.
+@dataclass
+class PassPlan:
+    """What :func:`plan_passes` decides."""
 
-    Sets with more layers come first, because layers of the others may be sums of theirs.
+    jobs: list[PassJob] = field(default_factory=list)
+    """Sets with more layers come first, because layers of the others may be sums of theirs."""
+    refused: dict[str, str] = field(default_factory=dict)
+    """Why other sets are not fused, by name."""
+    warnings: list[str] = field(default_factory=list)
+    """A sentence for each set whose layers the LRHS lacks, or that do not sum to its beauty."""
+
+
+def plan_passes(low: LayerLight, high: LayerLight, sets: Sequence[AdditiveSet]) -> PassPlan:
+    """Find the sets that sum to the beauty.
+
+    Args:
+        low, high: the light of all layers of the sets, in either render.
+        sets: of the HRLS.
+
+    Raises:
+        InputError: pixels can't be decoded.
     """
-    jobs: list[PassJob] = []
-    refused: dict[str, str] = {}
-    warnings: list[str] = []
-    names = _layer_names(sets)
-    for layers in sorted(sets, key=lambda each: -len(each.layers)):
-        check, (lrhs, problem) = in_parallel(partial(check_sum, hr, layers), partial(_usable_layers, lr, layers))
+    plan = PassPlan()
+    for layers in sorted(sets, key=lambda additive_set: -len(additive_set.layers)):
+        check, (lrhs, problem) = in_parallel(
+            partial(check_light, high, layers), partial(_usable_layers, low, high, layers)
+        )
         if check.problem:
-            refused[layers.name] = check.text
+            plan.refused[layers.name] = check.text
             continue
-        # All known layers come from one set. Those of two sets could have more light than the beauty.
-        known = max((_sums_of(hr, layers.layers, job.layers) for job in jobs), key=len, default={})
-        taken = {channel for job in jobs for channel in job.channels}
-        shared = [each.name for each in layers.layers if each not in known and not taken.isdisjoint(each.channels)]
+        # All derived layers come from one set. Those of two sets could have more light than the beauty.
+        derived = max((_sums_of(high, layers.layers, job.layers) for job in plan.jobs), key=len, default={})
+        taken = _channels_of(plan.jobs)
+        shared = [x.name for x in layers.layers if x not in derived and not taken.isdisjoint(x.channels)]
         if shared:
-            refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
+            plan.refused[layers.name] = f"shares {shared[0]} with another set that does not have its other layers"
             continue
-        keys = {layer: names[layer] for layer in layers.layers}
-        theirs = {key: lrhs[layer] for layer, key in keys.items() if layer in lrhs}
-        job = PassJob(layers, keys, theirs, check.residual if check.remainder else 0.0, known, check.noise_free)
-        jobs.append(job)
+        names = {layer: high.names[layer] for layer in layers.layers}
+        job = PassJob(layers, names, lrhs, check.residual if check.remainder else 0.0, derived, check.noise_free)
+        plan.jobs.append(job)
         if problem:
-            warnings.append(
+            plan.warnings.append(
                 f"{layers.name}: the LRHS's layers do not sum to its beauty, so they are not read: {problem}"
             )
-        elif theirs and job.hrls_alone:
-            warnings.append(f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there")
-    taken = {channel for job in jobs for channel in job.channels}
-    for job in jobs:
+        elif lrhs and job.hrls_alone:
+            plan.warnings.append(f"{layers.name}: the LRHS lacks {job.hrls_alone}, so more noise is left there")
+    taken = _channels_of(plan.jobs)
+    for job in plan.jobs:
         for layer in job.layers.coarser:
             if taken.isdisjoint(layer.channels):
-                job.coarser.update(_sums_of(hr, [layer], job.layers))
-    return jobs, refused, warnings
+                job.coarser.update(_sums_of(high, [layer], job.layers))
+    return plan
 
 
-def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> Sums:
-    """Those of some layers that a set has, or that by name and pixels are sums of its layers.
+def _channels_of(jobs: Sequence[PassJob]) -> set[Channel]:
+    return {channel for job in jobs for channel in job.channels}
+
+
+def _sums_of(high: LayerLight, layers: Sequence[AdditiveLayer], finer: AdditiveSet) -> Sums:
+    """Return those layers that a set has, or that are sums of its layers by name and pixels.
 
     No layer of the set belongs to two sums.
     """
     sums: Sums = {}
     used: set[AdditiveLayer] = set()
     for layer in layers:
-        parts = tuple(each for each in finer.layers if layer.words < each.words) if layer.words else ()
+        parts = tuple(part for part in finer.layers if layer.words < part.words) if layer.words else ()
         if layer in finer.layers:
             parts = (layer,)
-        elif layer.factor is not None or len(parts) < 2 or not is_sum_of(hr, layer, parts):
+        elif layer.factor is not None or len(parts) < 2 or not is_sum_of(high, layer, parts):
             continue
         if used.isdisjoint(parts):
             sums[layer] = parts
@@ -122,41 +134,11 @@ def _sums_of(hr: MappedRender, layers: Sequence[AdditiveLayer], finer: AdditiveS
     return sums
 
 
-def _usable_layers(lr: MappedRender, layers: AdditiveSet) -> tuple[dict[AdditiveLayer, AdditiveLayer], str]:
-    """The layers of :func:`_same_layers`; and why they can't be used, if they do not sum to the LRHS's beauty.
+def _usable_layers(low: LayerLight, high: LayerLight, layers: AdditiveSet) -> tuple[frozenset[str], str]:
+    """Return names of the layers that the LRHS has; and why they can't be used, if they do not sum to its beauty.
 
     They may lack some of its light.
     """
-    found = _same_layers(lr, layers)
-    problem = check_sum(lr, AdditiveSet(layers.name, tuple(found.values()))).problem if found else ""
-    return ({}, problem) if problem else (found, "")
-
-
-def _same_layers(render: MappedRender, layers: AdditiveSet) -> dict[AdditiveLayer, AdditiveLayer]:
-    """Layers of a set, each with the layer of the same name in another render: in the set that has most of them."""
-    by_name = {(layer.name, layer.factor is None): layer for layer in layers.layers}
-    found = (
-        {by_name[key]: each for each in candidate.layers if (key := (each.name, each.factor is None)) in by_name}
-        for candidate in render.additive_sets
-    )
-    return max(found, key=len, default={})
-
-
-def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet]) -> tuple[MappedRender, MappedRender]:
-    """LRHS and HRLS, with the light of layers of additive sets as further features. The LRHS may lack some of them."""
-    names = _layer_names(sets)
-    low = {layer: each for additive_set in sets for layer, each in _same_layers(lr, additive_set).items()}
-    low_light = {names[layer]: each.formula for layer, each in low.items()}
-    high_light = {name: layer.formula for layer, name in names.items()}
-    return replace(lr, features=lr.features | low_light), replace(hr, features=hr.features | high_light)
-
-
-def _layer_names(sets: Sequence[AdditiveSet]) -> dict[AdditiveLayer, str]:
-    """Names, as features, of the light of all layers. Frames of a shot have the same names."""
-    names: dict[AdditiveLayer, str] = {}
-    for layer in dict.fromkeys(layer for each in sets for layer in each.layers):
-        name = f"{LIGHT_OF}{layer.name}{' x colour' if layer.factor else ''}"
-        while name in names.values():
-            name += " again"
-        names[layer] = name
-    return names
+    matches = same_layers(low.file, layers)
+    problem = check_light(low, AdditiveSet(layers.name, tuple(matches.values()))).problem if matches else ""
+    return (frozenset(), problem) if problem else (frozenset(high.names[layer] for layer in matches), "")

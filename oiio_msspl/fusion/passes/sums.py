@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,10 @@ from numpy.typing import NDArray
 from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.aovs.mapped_render import MappedRender
+from oiio_msspl.exr.reader import Channel
 from oiio_msspl.exr.render import Window
 from oiio_msspl.exr.write_options import LOSSLESS
+from oiio_msspl.fusion.passes.layers import LayerLight, layer_names, light_of
 from oiio_msspl.image.arrays import HALF_MAX, Array
 from oiio_msspl.image.parallel import one_ahead
 
@@ -33,7 +36,7 @@ FEWEST = 64
 
 @dataclass(frozen=True)
 class SumCheck:
-    """What :func:`check_sum` found."""
+    """What :func:`check_sum` says of a set."""
 
     residual: float
     """Sum of |beauty - layers| divided by the sum of |beauty|."""
@@ -44,11 +47,11 @@ class SumCheck:
     negative: bool = False
     """They sum to it, but a layer takes light away."""
     noise_free: frozenset[AdditiveLayer] = frozenset()
-    """Layers without noise, but for that of edges: they show a lamp or the sky directly."""
+    """Layers without noise except at edges: they show a lamp or the sky directly."""
 
     @property
     def text(self) -> str:
-        """In words."""
+        """The result in words."""
         if self.negative:
             return f"can't be fused: {self.problem}"
         if self.problem:
@@ -58,152 +61,167 @@ class SumCheck:
         return f"sums to the beauty (residual {self.residual:.2g})"
 
 
-def check_sum(render: MappedRender, additive_set: AdditiveSet, *, advise: bool = True) -> SumCheck:
+def check_sum(render: MappedRender, additive_set: AdditiveSet) -> SumCheck:
     """Compare the sum of a set's layers with the beauty of the same file, on some strips of rows.
-
-    Args:
-        advise: if the layers have more light, read them again to find out which are too many.
 
     Raises:
         InputError: pixels can't be decoded.
     """
-    window = render.data_window
-    other = [
-        layer.name for layer in additive_set.layers for c in layer.channels if _window_of(render, c.part) != window
-    ]
-    if other:
-        return SumCheck(1.0, problem=f"{other[0]} has another data window")
-    light = wrong = missing = surplus = 0.0
-    negative, positive = np.zeros((2, len(additive_set.layers)))
-    finite = np.zeros(len(additive_set.layers), np.bool_)
-    alike = np.zeros((len(additive_set.layers), 2), np.int64)
-    for layers, beauty, rest, usable in _strips_of(render, additive_set):
-        light, wrong = light + np.abs(beauty[usable]).sum(), wrong + np.abs(rest[usable]).sum()
-        missing += np.maximum(rest[usable], 0).sum()
-        surplus += np.maximum(-rest[usable], 0).sum()
-        alike += [_equal_pixels(pixels) for pixels in layers]
-        negative += [-np.minimum(pixels, 0)[usable].sum(dtype=np.float64) for pixels in layers]
-        positive += [np.maximum(pixels, 0)[usable].sum(dtype=np.float64) for pixels in layers]
-        if not finite.all():
-            finite |= [bool(np.isfinite(pixels).any()) for pixels in layers]
+    return check_light(light_of(render, layer_names([additive_set])), additive_set)
+
+
+def check_light(light: LayerLight, additive_set: AdditiveSet, total: AdditiveLayer | None = None) -> SumCheck:
+    """Compare the sum of a set's layers with the beauty, or with another layer, on some strips of rows.
+
+    Args:
+        light: has the layers.
+        additive_set: the layers to add up.
+        total: what they should sum to; None for the beauty. Then the check also says which layers are too many.
+
+    Raises:
+        InputError: pixels can't be decoded.
+    """
+    layers = additive_set.layers
+    outside = [layer.name for layer in layers if not _in_beauty_window(light, layer)]
+    if outside:
+        return SumCheck(1.0, problem=f"{outside[0]} has another data window")
+    sums, of_layers = np.zeros(4), np.zeros((len(layers), 5))
+    for strip in _strips_of(light, layers, total):
+        sums += strip.sums()
+        of_layers += strip.layer_sums()
+    light.pixels.unload()
+    whole, wrong, missing, surplus = sums.tolist()
+    negative, positive, equal, lit, finite = of_layers.T
     if not finite.all():
-        broken = additive_set.layers[int(finite.argmin())].name
-        return SumCheck(1.0, problem=f"the layer {broken} is NaN or infinite")
-    if light == 0:
+        return SumCheck(1.0, problem=f"the layer {layers[int(finite.argmin())].name} is NaN or infinite")
+    if whole == 0:
         return SumCheck(0.0, problem="the beauty is black")
+    residual = wrong / whole
     # Pixel filters with negative lobes make some values negative. Light that is taken away is another matter: a fused
     # layer is nowhere negative.
     taken = np.where(negative > positive, negative, 0)
-    if taken.max(initial=0) > TOLERANCE * light:
-        name = additive_set.layers[int(taken.argmax())].name
-        return SumCheck(float(wrong / light), problem=f"the layer {name} is negative", negative=True)
-    residual = float(wrong / light)
-    noise_free = frozenset(
-        layer
-        for layer, (equal, lit) in zip(additive_set.layers, alike, strict=True)
-        if lit >= FEWEST and equal >= NOISE_FREE * lit
-    )
-    if residual <= TOLERANCE:
-        return SumCheck(residual, noise_free=noise_free)
-    if surplus / light <= TOLERANCE:
-        return SumCheck(residual, remainder=True, noise_free=noise_free)
+    if taken.max(initial=0) > TOLERANCE * whole:
+        return SumCheck(residual, problem=f"the layer {layers[int(taken.argmax())].name} is negative", negative=True)
+    clean = (lit >= FEWEST) & (equal >= NOISE_FREE * lit)
+    if residual <= TOLERANCE or surplus / whole <= TOLERANCE:
+        noise_free = frozenset(layer for layer, is_clean in zip(layers, clean, strict=True) if is_clean)
+        return SumCheck(residual, remainder=residual > TOLERANCE, noise_free=noise_free)
     if abs(missing - surplus) < wrong / 4:
         reason = "is the beauty denoised, or made with another pixel filter?"
-        lossy = _lossy_compression(render, additive_set)
+        lossy = _lossy_compression(light.file, layers)
         if lossy and residual < LOSSY:
             reason = f"the compression {lossy} is lossy, so store them with zip or piz"
         return SumCheck(residual, problem=f"they differ by {residual:.1%} both ways; {reason}")
-    superfluous = _superfluous(render, additive_set) if advise else []
+    superfluous = _superfluous(light, layers) if total is None else []
     advice = f"without {' and '.join(superfluous)} they would sum to it" if superfluous else "some layers overlap"
-    return SumCheck(residual, problem=f"they have {surplus / light:.1%} more light; {advice}")
+    return SumCheck(residual, problem=f"they have {surplus / whole:.1%} more light; {advice}")
 
 
-def _superfluous(render: MappedRender, additive_set: AdditiveSet) -> list[str]:
-    """The names of what a set has too much of to sum to the beauty: one layer, or all that by their names are sums of
-    others. Empty if the rest would not sum to it either.
+def is_sum_of(light: LayerLight, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
+    """Return whether a layer is the sum of others of the same file, on some strips of rows.
+
+    A layer with another data window than the beauty's is no sum.
+
+    Raises:
+        InputError: pixels can't be decoded.
     """
-    all_layers = additive_set.layers
-    choices = [[i] for i in range(len(all_layers))]
-    choices.append([i for i, each in enumerate(all_layers) if any(each.words < other.words for other in all_layers)])
-    light, wrong = 0.0, np.zeros(len(choices))
-    for layers, beauty, rest, usable in _strips_of(render, additive_set):
-        light += np.abs(beauty[usable]).sum()
-        wrong += [np.abs(rest[usable] + sum(layers[i][usable] for i in left_out)).sum() for left_out in choices]
+    if not _in_beauty_window(light, layer):
+        return False
+    check = check_light(light, AdditiveSet(layer.name, tuple(parts)), layer)
+    return not check.problem and not check.remainder
+
+
+class _Strip(NamedTuple):
+    """Some rows of a set, (h, w, 3): its layers, what they should sum to, what they lack of it, and usable values."""
+
+    layers: list[Array]
+    total: NDArray[np.float64]
+    rest: NDArray[np.float64]
+    usable: NDArray[np.bool_]
+
+    def sums(self) -> NDArray[np.float64]:
+        """Return the sums of light, of what is wrong, of what is missing and of what is too much."""
+        rest = self.rest[self.usable]
+        parts = self.total[self.usable], rest, np.maximum(rest, 0), np.maximum(-rest, 0)
+        return np.array([np.abs(part).sum() for part in parts])
+
+    def layer_sums(self) -> NDArray[np.float64]:
+        """Return for each layer: its negative and its positive light, equal pixels, lit ones, and if one is finite."""
+        return np.array([
+            [
+                -np.minimum(pixels, 0)[self.usable].sum(dtype=np.float64),
+                np.maximum(pixels, 0)[self.usable].sum(dtype=np.float64),
+                *_equal_pixels(pixels),
+                np.isfinite(pixels).any(),
+            ]
+            for pixels in self.layers
+        ])  # fmt: skip
+
+
+def _superfluous(light: LayerLight, layers: Sequence[AdditiveLayer]) -> list[str]:
+    """Return names of layers without which the others sum to the beauty: one, or all that are sums of others by name.
+
+    Empty if the rest would not sum to it either.
+    """
+    choices = [[i] for i in range(len(layers))]
+    choices.append([i for i, layer in enumerate(layers) if any(layer.words < finer.words for finer in layers)])
+    total, wrong = 0.0, np.zeros(len(choices))
+    for strip in _strips_of(light, layers):
+        rest, usable = strip.rest[strip.usable], strip.usable
+        total += np.abs(strip.total[usable]).sum()
+        wrong += [np.abs(rest + sum(strip.layers[i][usable] for i in choice)).sum() for choice in choices]
     best = int(wrong.argmin())
-    return [all_layers[i].name for i in choices[best]] if wrong[best] <= TOLERANCE * light else []
+    return [layers[i].name for i in choices[best]] if wrong[best] <= TOLERANCE * total else []
 
 
-def _lossy_compression(render: MappedRender, additive_set: AdditiveSet) -> str:
-    """The compression with which the beauty or a layer has lost precision; empty if none has."""
-    channels = [*render.beauty_channels, *(channel for layer in additive_set.layers for channel in layer.channels)]
+def _lossy_compression(render: MappedRender, layers: Sequence[AdditiveLayer]) -> str:
+    """Return the compression with which the beauty or a layer has lost precision; empty if none has."""
+    channels = [*render.beauty_channels, *(channel for layer in layers for channel in layer.channels)]
     used = ((render.file.parts[channel.part].compression, channel.type) for channel in channels)
     # PXR24 keeps all bits of half floats.
     return min((name for name, kind in used if name not in LOSSLESS and (name, kind) != ("pxr24", "half")), default="")
 
 
 def _strips_of(
-    render: MappedRender, additive_set: AdditiveSet
-) -> Iterator[tuple[list[Array], NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]]:
-    """For strips of rows from top to bottom: the layers, the beauty, what the layers lack of it, and which of its
-    values can be compared, (h, w, 3) each."""
-    window, layers, keys = render.data_window, with_layers(render, additive_set), layer_keys(additive_set)
+    light: LayerLight, layers: Sequence[AdditiveLayer], total: AdditiveLayer | None = None
+) -> Iterator[_Strip]:
+    """Yield strips from top to bottom."""
+    window, names = light.file.data_window, [light.names[layer] for layer in layers]
+    whole = RGB if total is None else light.names[total]
+    channels: Sequence[Channel] = light.file.beauty_channels if total is None else total.channels
     # Where a beauty of half floats is clipped, its layers have more light.
-    brightest = HALF_MAX if render.beauty_channels[0].type == "half" else np.inf
-    strips = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _strips(window))
-    for features in one_ahead(layers.read(strip, [RGB, *keys]) for strip in strips):
-        beauty, pixels = features[RGB].astype(np.float64), [features[key] for key in keys]
+    brightest = HALF_MAX if channels[0].type == "half" else np.inf
+    windows = (Window(window.x0, y, window.x1, min(y + ROWS, window.y1)) for y in _first_rows(window))
+    for features in one_ahead(light.pixels.read(rows, [whole, *names]) for rows in windows):
+        sought, pixels = features[whole].astype(np.float64), [features[name] for name in names]
         with np.errstate(invalid="ignore", over="ignore"):
-            rest = beauty - sum(pixels)
-        yield pixels, beauty, rest, np.isfinite(rest) & (beauty < brightest)
+            rest = sought - sum(pixels)
+        yield _Strip(pixels, sought, rest, np.isfinite(rest) & (sought < brightest))
 
 
-def _equal_pixels(pixels: Array) -> tuple[int, int]:
-    """How many lit pixels of a layer (h, w, 3) equal one of the four next to them, and how many are lit."""
-    red, green, blue = np.moveaxis(pixels, -1, 0)
-    with np.errstate(invalid="ignore", over="ignore"):
-        light = red + green + blue
-    lit = light > 0
-    equal = np.zeros_like(lit)
-    for here, found in ((light, equal), (light.T, equal.T)):
-        with np.errstate(invalid="ignore", over="ignore"):
-            same = np.abs(here[1:] - here[:-1]) <= np.float32(EQUAL / 2) * (here[1:] + here[:-1])
-        found[1:] |= same
-        found[:-1] |= same
-    return int(np.count_nonzero(equal & lit)), int(np.count_nonzero(lit))
-
-
-def is_sum_of(render: MappedRender, layer: AdditiveLayer, parts: Sequence[AdditiveLayer]) -> bool:
-    """Whether a layer is the sum of others of the same file, on some strips of rows. A layer with another data window
-    than the beauty's is none.
-
-    Raises:
-        InputError: pixels can't be decoded.
-    """
-    if any(_window_of(render, channel.part) != render.data_window for channel in layer.channels):
-        return False
-    whole = replace(render, features={RGB: layer.formula}, alpha=None)
-    check = check_sum(whole, AdditiveSet(layer.name, tuple(parts)), advise=False)
-    return not check.problem and not check.remainder
-
-
-def with_layers(render: MappedRender, additive_set: AdditiveSet) -> MappedRender:
-    """The render with the light of each layer as a feature beside the beauty, see :func:`layer_keys`."""
-    formulas = dict(zip(layer_keys(additive_set), (layer.formula for layer in additive_set.layers), strict=True))
-    return replace(render, features={RGB: render.features[RGB], **formulas}, alpha=None)
-
-
-def layer_keys(additive_set: AdditiveSet) -> list[str]:
-    """Names of the layers' features."""
-    return [f"layer {i}" for i in range(len(additive_set.layers))]
-
-
-def _strips(window: Window) -> list[int]:
-    """First rows of the strips that are compared."""
+def _first_rows(window: Window) -> list[int]:
+    """Return the first rows of the strips that are compared."""
     if window.height <= STRIPS * ROWS:
         return list(range(window.y0, window.y1, ROWS))
     last = (window.height - ROWS) // ROWS
     return [window.y0 + round(i * last / (STRIPS - 1)) * ROWS for i in range(STRIPS)]
 
 
-def _window_of(render: MappedRender, part: int) -> Window:
-    return render.file.parts[part].data_window
+def _equal_pixels(pixels: Array) -> tuple[int, int]:
+    """Count the lit pixels of a layer (h, w, 3) that equal one of the four next to them, and all lit ones."""
+    red, green, blue = np.moveaxis(pixels, -1, 0)
+    with np.errstate(invalid="ignore", over="ignore"):
+        light = red + green + blue
+    lit = light > 0
+    equal = np.zeros_like(lit)
+    for values, result in ((light, equal), (light.T, equal.T)):
+        with np.errstate(invalid="ignore", over="ignore"):
+            same = np.abs(values[1:] - values[:-1]) <= np.float32(EQUAL / 2) * (values[1:] + values[:-1])
+        result[1:] |= same
+        result[:-1] |= same
+    return int(np.count_nonzero(equal & lit)), int(np.count_nonzero(lit))
+
+
+def _in_beauty_window(light: LayerLight, layer: AdditiveLayer) -> bool:
+    parts, window = light.file.file.parts, light.file.data_window
+    return all(parts[channel.part].data_window == window for channel in layer.channels)

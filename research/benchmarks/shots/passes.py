@@ -18,7 +18,7 @@ import numpy as np
 from oiio_msspl import fuse_shot
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.passes.sums import layer_keys, with_layers
+from oiio_msspl.fusion.passes.layers import layer_names, light_of
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.jobs.plan import TemporalOptions
 from oiio_msspl.model.catalogue import find_model
@@ -35,8 +35,9 @@ def images_of(path: Path) -> list[Array]:
     """Return beauty and light groups of a frame, (h, w, 3) each."""
     render = map_render(open_exr(path))
     (lamps,) = render.additive_sets
-    pixels = with_layers(render, lamps).read(render.data_window, ["rgb", *layer_keys(lamps)])
-    return [pixels[name] for name in ("rgb", *layer_keys(lamps))]
+    names = ["rgb", *layer_names([lamps]).values()]
+    pixels = light_of(render, layer_names([lamps])).pixels.read(render.data_window, names)
+    return [pixels[name] for name in names]
 
 
 def scores(errors: Array) -> tuple[float, float]:

@@ -12,8 +12,9 @@ from oiio_msspl import InputError, InputOptions, WriteOptions, fuse_files
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.reader import ExrFile, open_exr
 from oiio_msspl.fusion.fuse import fuse
-from oiio_msspl.fusion.passes import fuse as passes
-from oiio_msspl.fusion.passes.fuse import _make_sum, fuse_passes, pass_steps
+from oiio_msspl.fusion.passes import bands, network
+from oiio_msspl.fusion.passes.exact_sum import spread_rest
+from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes, pass_steps
 from oiio_msspl.fusion.passes.sums import check_sum
 from oiio_msspl.fusion.tiles import tiling
 from oiio_msspl.fusion.tiles.alignment import align
@@ -24,6 +25,8 @@ from oiio_msspl.model.catalogue import load_model
 from tests.conftest import downsample, noisy, picture, read_bits, rgb, same_bits, write_exr
 
 HEIGHT, WIDTH = 90, 122  # no multiple of 4
+#: Of the pairs of :func:`write_pair`.
+SCALE = 4
 HALF_ROUNDING = 2**-11
 
 
@@ -35,16 +38,21 @@ def lights():
     return {"light_key": colour * (1 - 0.8 * x)[..., None], "light_spot": np.float32(2) * disk * (0.2, 0.5, 1.0)}
 
 
+def downsampled(image):
+    """An image (h, w, 3) at the resolution of the LRHS."""
+    return downsample(np.pad(image, ((0, -HEIGHT % SCALE), (0, -WIDTH % SCALE), (0, 0)), "edge"), SCALE)
+
+
 def write_pair(
     folder, layers, dtype=np.float32, low=True, extra=None, beauty=None, noise_free=(), firefly=None, hrls_alone=()
 ):
-    """An LRHS of 16 spp at x4 and an HRLS of 1 spp whose ``layers`` (clean, by name) sum to the beauty.
+    """An LRHS of 16 spp at x4 (4 spp at x2) and an HRLS of 1 spp whose ``layers`` (clean, by name) sum to the beauty.
 
     ``firefly``: file, layer and pixel that has one. ``low``: the LRHS has the layers, except those of ``hrls_alone``.
     """
-    small = {name: downsample(np.pad(v, ((0, 2), (0, 2), (0, 0)), "edge"), 4) for name, v in layers.items()}
+    small = {name: downsampled(values) for name, values in layers.items()}
     paths = []
-    for name, clean, spp in (("lr", small, 16), ("hr", layers, 1)):
+    for name, clean, spp in (("lr", small, SCALE**2), ("hr", layers, 1)):
         samples = {
             n: (v if n in noise_free else noisy(v.astype(np.float32), spp, seed)).astype(dtype)
             for seed, (n, v) in enumerate(clean.items())
@@ -65,9 +73,10 @@ def write_pair(
 
 @pytest.fixture(params=["fit", "network", "half"])
 def model(request, bilinear_models, monkeypatch):
-    """A model whose passes are fitted, and one whose passes a network fuses, at full or at half of the resolution."""
+    """A model whose passes are fitted, and one whose passes a network fuses, at full or, at x2, half resolution."""
     if request.param == "half":
-        monkeypatch.setattr(passes, "MOST_AT_FULL_SIZE", 0)
+        monkeypatch.setattr(network, "MOST_AT_FULL_SIZE", 0)
+        monkeypatch.setattr("tests.fusion.passes.test_fuse.SCALE", 2)
     return str(bilinear_models[4]) if request.param == "fit" else "best"
 
 
@@ -125,7 +134,7 @@ def test_an_albedo_without_noise_sharpens_components(tmp_path):
     errors = []
     for guides in ({}, {"albedo": albedo.astype(np.float16)}):
         beauty = sum(clean.values()).astype(np.float32)
-        result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets, guides=guides)
+        result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets, guides))
         found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.sets[0].layers[0].channels], axis=-1)
         errors.append(np.abs(found - clean["light_a"]).mean())
     assert errors[1] < 0.5 * errors[0]
@@ -139,7 +148,7 @@ def test_a_beauty_of_halves_is_fitted_in_32_bits(tmp_path):
     half = sum(clean.values()).astype(np.float16)
     found = []
     for beauty in (half, half.astype(np.float32)):
-        result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets)
+        result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets))
         channels = [c for layer in result.sets[0].layers for c in layer.channels]
         found.append(np.stack([result.pixels.get(channel, 0, HEIGHT) for channel in channels]))
     np.testing.assert_array_equal(*found)
@@ -155,7 +164,7 @@ def test_lamps_are_told_apart_by_albedos_above_1(tmp_path):
     guides = {"albedo": np.ones_like(beauty)}
     errors = []
     for given in ({}, guides):
-        result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets, guides=given)
+        result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets, given))
         found = np.stack([result.pixels.get(c, 0, HEIGHT) for c in result.sets[0].layers[0].channels], axis=-1)
         errors.append(np.abs(found - clean["light_a"]).mean())
     assert errors[1] == errors[0]
@@ -174,10 +183,7 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
     found, steps = [], []
     for fuser in (None, layer_fuser(session, beauty)):
         result = fuse_passes(
-            *pair,
-            beauty.rgb,
-            beauty.alignment,
-            pair[1].additive_sets,
+            PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets),
             fuse_layers=fuser,
             progress=lambda *told: steps.append(told),
         )
@@ -191,7 +197,7 @@ def test_a_network_keeps_detail_that_the_beauty_does_not_show(tmp_path, low):
 
 @pytest.mark.parametrize("scale", [2, 4, 8])
 @pytest.mark.parametrize("count", [5, 6])
-def test_many_light_groups_are_fused_at_half_of_the_resolution(tmp_path, scale, count):
+def test_many_light_groups_are_fused_at_half_of_the_resolution_at_x2(tmp_path, scale, count):
     """They are nearer to the truth than without a network, in a frame whose size is no multiple of the scale."""
     y, x = np.mgrid[0:HEIGHT, 0:WIDTH]
     surface = 0.2 + 0.6 * ((x // 9 + y // 7) % 2)[..., None] * np.ones(3)
@@ -212,9 +218,8 @@ def test_many_light_groups_are_fused_at_half_of_the_resolution(tmp_path, scale, 
     session = load_model(scale, "best", threads=1)
     beauty, errors = fuse(*pair, session, clean_aovs=True), []
     for fuser in (None, layer_fuser(session, beauty)):
-        result = fuse_passes(
-            *pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, guides=beauty.clean_aovs, fuse_layers=fuser
-        )
+        inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, beauty.clean_aovs)
+        result = fuse_passes(inputs, fuse_layers=fuser)
         found = {
             each.name: np.stack([result.pixels.get(c, 0, HEIGHT) for c in each.channels], axis=-1)
             for each in result.sets[0].layers
@@ -222,7 +227,8 @@ def test_many_light_groups_are_fused_at_half_of_the_resolution(tmp_path, scale, 
         assert_sum([each.astype(np.float64) for each in found.values()], beauty.rgb.astype(np.float64))
         errors.append(np.mean([np.abs(found[name] - clean[name]).mean() for name in clean]))
     at_full_size, at_half_size = (vars(session).get(name) for name in ("layer_session", "half_layer_session"))
-    assert (at_full_size is None) == (count == 6) and (at_half_size is None) == (count == 5)
+    half = scale == 2 and count == 6
+    assert (at_full_size is None) == half and (at_half_size is None) == (not half)
     assert errors[1] < errors[0]
 
 
@@ -238,7 +244,7 @@ def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
         files.append(write_exr(tmp_path / f"{name}.exr", channels))
     low, high = (map_render(open_exr(file)) for file in files)
     beauty = np.full((HEIGHT, WIDTH, 3), 0.6, np.float32)
-    result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets)
+    result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets))
     found = result.pixels.get(result.sets[0].layers[1].channels[0], 0, HEIGHT)
     assert found[8:-8, 8:-8].min() > 0.1 * np.median(found)  # a corner has few samples around
 
@@ -247,7 +253,7 @@ def test_a_lamp_with_few_samples_leaves_no_dark_specks(tmp_path):
 @pytest.mark.parametrize("rows", [32, 128])
 def test_where_no_layer_has_a_sample_the_beauty_is_divided_as_around(tmp_path, monkeypatch, low, rows):
     """Whatever the height of the bands: here most of them have no sample at all."""
-    monkeypatch.setattr(passes, "BAND_ROWS", rows)
+    monkeypatch.setattr(bands, "BAND_ROWS", rows)
     parts = {"light_a": 0.6, "light_b": 0.2, "light_off": 0.0}
     for name, size in (("lr", (96, 32)), ("hr", (384, 128))):
         light = np.zeros((*size, 3), np.float32)
@@ -257,7 +263,8 @@ def test_where_no_layer_has_a_sample_the_beauty_is_divided_as_around(tmp_path, m
             channels |= rgb(light * np.float32(part), f"{layer_name}.") if low or name == "hr" else {}
         write_exr(tmp_path / f"{name}.exr", channels)
     lr, hr = (map_render(open_exr(tmp_path / f"{name}.exr")) for name in ("lr", "hr"))
-    result = fuse_passes(lr, hr, np.full((384, 128, 3), 0.8, np.float32), align(lr, hr), hr.additive_sets)
+    beauty = np.full((384, 128, 3), 0.8, np.float32)
+    result = fuse_passes(PassInputs(lr, hr, beauty, align(lr, hr), hr.additive_sets))
     for each in result.sets[0].layers:
         found = result.pixels.get(each.channels[0], 0, 384)
         np.testing.assert_allclose(found, parts[each.name], rtol=1e-3, err_msg=each.name)
@@ -276,8 +283,9 @@ def test_bands_of_rows_agree(tmp_path, monkeypatch, samples):
     lr = map_render(open_exr(write_exr(tmp_path / "lr.exr", rgb(np.ones((160, 32, 3), np.float32)))))
     found = []
     for rows in (128, 32):
-        monkeypatch.setattr(passes, "BAND_ROWS", rows)
-        result = fuse_passes(lr, hr, np.full((320, 64, 3), samples, np.float32), align(lr, hr), hr.additive_sets)
+        monkeypatch.setattr(bands, "BAND_ROWS", rows)
+        beauty = np.full((320, 64, 3), samples, np.float32)
+        result = fuse_passes(PassInputs(lr, hr, beauty, align(lr, hr), hr.additive_sets))
         found.append([result.pixels.get(each.channels[0], 0, 320) for each in result.sets[0].layers])
         np.testing.assert_allclose(sum(found[-1]), samples, rtol=1e-5)
     np.testing.assert_allclose(found[0], found[1], rtol=1e-3)
@@ -301,7 +309,8 @@ def test_a_network_reads_only_the_part_of_the_frame_where_a_layer_has_light(tmp_
         if whole:
             monkeypatch.setattr(FramePair, "_lit_part", lambda *_: None)
         fuser = layer_fuser(session, beauty)
-        result = fuse_passes(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets, fuse_layers=fuser)
+        inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets)
+        result = fuse_passes(inputs, fuse_layers=fuser)
         channels = result.sets[0].layers[1].channels
         found.append(np.stack([result.pixels.get(c, 0, HEIGHT) for c in channels], axis=-1))
     assert sizes[0] == sizes[2] == sizes[3] == 2 * sizes[1]
@@ -383,7 +392,7 @@ def test_a_firefly_in_one_layer_leaves_no_speck_in_any(tmp_path, model, file, pi
 )
 def test_what_layers_lack_is_spread_by_light_and_doubt(beauty, doubts, expected):
     layers = np.full((2, 3, 1, 1), 0.5, np.float32)
-    _make_sum(
+    spread_rest(
         layers, np.full((3, 1, 1), beauty, np.float32), None if doubts is None else np.float32(doubts)[:, None, None]
     )
     np.testing.assert_allclose(layers[:, 0, 0, 0], expected, rtol=1e-2 if expected[-1] == 0.68 else 2e-6)
@@ -394,7 +403,7 @@ def test_no_layer_becomes_black_however_far_the_sum_is_off():
     layers = (10 ** rng.uniform(-30, 29, (4, 3, 8, 50))).astype(np.float32)
     beauty = (10 ** rng.uniform(-30, 29, (3, 8, 50))).astype(np.float32)
     before = layers.copy()
-    _make_sum(layers, beauty, rng.uniform(0.25, 1, (4, 8, 50)).astype(np.float32))
+    spread_rest(layers, beauty, rng.uniform(0.25, 1, (4, 8, 50)).astype(np.float32))
     np.testing.assert_allclose(layers.sum(axis=0, dtype=np.float64), beauty, rtol=3e-6)
     is_more = beauty > before.sum(axis=0, dtype=np.float64)
     assert (layers >= before * 0.999)[is_more & (before > 1e-6 * before.sum(axis=0, dtype=np.float64))].all()
@@ -488,7 +497,7 @@ def test_light_in_no_layer_is_left_out(tmp_path, model):
 def test_products_of_light_and_colour_sum_too(tmp_path, model, low, dtype):
     colour = np.where(picture(HEIGHT, WIDTH) > 0.3, np.float32(0.8), np.float32(0.0))
     clean = {"DiffDir": lights()["light_key"], "DiffInd": 0.3 * picture(HEIGHT, WIDTH), "Emit": lights()["light_spot"]}
-    small = downsample(np.pad(colour, ((0, 2), (0, 2), (0, 0)), "edge"), 4)
+    small = downsampled(colour)
     colours = {HEIGHT: colour.astype(dtype), len(small): small.astype(dtype)}
 
     def beauty(layers):
@@ -518,7 +527,7 @@ def test_hardly_any_light_in_all_layers_stays_finite(tmp_path):
     dark = np.full((HEIGHT, WIDTH, 3), 1e-41, np.float32)
     low, high = (map_render(open_exr(file)) for file in write_pair(tmp_path, {"light_a": dark, "light_b": dark}))
     beauty = np.full((HEIGHT, WIDTH, 3), 0.1, np.float32)
-    result = fuse_passes(low, high, beauty, align(low, high), high.additive_sets)
+    result = fuse_passes(PassInputs(low, high, beauty, align(low, high), high.additive_sets))
     channels = [each.channels[0] for each in result.sets[0].layers]
     total = sum(result.pixels.get(channel, 0, HEIGHT) for channel in channels)
     np.testing.assert_allclose(total, 0.1, rtol=1e-5)
@@ -657,9 +666,10 @@ def test_passes_that_layers_leaves_out_are_said_to_be_left_out(tmp_path, bilinea
 
 
 def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeypatch):
-    """Decoded rows are kept, or decoded again for each band that needs them."""
+    """Decoded rows of a large frame are kept, or decoded again for each band that needs them."""
     pair = write_pair(tmp_path, lights())
-    monkeypatch.setattr("oiio_msspl.fusion.passes.fuse.BAND_ROWS", 16)
+    monkeypatch.setattr("oiio_msspl.image.arrays.MOST_PIXELS", 1000)
+    monkeypatch.setattr("oiio_msspl.fusion.passes.bands.BAND_ROWS", 16)
     decode, decoded, results = ExrFile._decode, [], []
     monkeypatch.setattr(ExrFile, "_decode", lambda *given: decoded.append(given) or decode(*given))
     for share in (tiling.STRIPS_FRACTION, 0):
@@ -671,6 +681,26 @@ def test_the_result_does_not_depend_on_memory(tmp_path, bilinear_models, monkeyp
     assert times[1] > 1.5 * times[0]
     for (_, first), (_, second) in zip(*results, strict=True):
         assert all(same_bits(first[name], second[name]) for name in first)
+
+
+@pytest.mark.parametrize("by_network", [False, True])
+def test_each_row_of_the_layers_is_decoded_once(tmp_path, monkeypatch, by_network):
+    """To check the sums of two sets, and to fuse them in several bands."""
+    pair = [map_render(open_exr(path)) for path in write_levels(tmp_path, {"diffuse_key": {"diffuse", "key"}})]
+    session = load_model(4, "best", threads=1)
+    beauty = fuse(*pair, session)
+    monkeypatch.setattr(bands, "BAND_ROWS", 32)
+    decode, rows = ExrFile._decode, {render.file.path: [] for render in pair}
+
+    def count(file, part, first, last, *others):
+        rows[file.path] += range(first, last)
+        return decode(file, part, first, last, *others)
+
+    monkeypatch.setattr(ExrFile, "_decode", count)
+    inputs = PassInputs(*pair, beauty.rgb, beauty.alignment, pair[1].additive_sets)
+    fuse_passes(inputs, fuse_layers=layer_fuser(session, beauty) if by_network else None)
+    for render in pair:
+        assert sorted(rows[render.file.path]) == list(range(render.data_window.height))
 
 
 def lobes_by_light():
@@ -750,8 +780,8 @@ def test_broken_values_of_a_layer_are_told(tmp_path, model, monkeypatch):
     channels = read_bits(pair[1])[0][1]
     channels["light_key.R"][30:40, 50:60] = np.nan
     write_exr(pair[1], channels)
-    for rows in (passes.BAND_ROWS, 16):
-        monkeypatch.setattr(passes, "BAND_ROWS", rows)
+    for rows in (bands.BAND_ROWS, 16):
+        monkeypatch.setattr(bands, "BAND_ROWS", rows)
         report, out = fused(pair, tmp_path / "out.exr", model)
         assert "light_key: 100 values of the HRLS are NaN or infinite; they were repaired" in report.warnings
         assert_sum([layer(out, name) for name in clean], layer(out))
@@ -840,7 +870,7 @@ def test_an_lrhs_with_a_wide_filter_does_not_blur_small_lamps(tmp_path):
     errors = {}
     for low in ("narrow", "wide"):
         lr, hr = maps[low], maps["hr"]
-        result = fuse_passes(lr, hr, beauty, align(lr, hr), hr.additive_sets).pixels
+        result = fuse_passes(PassInputs(lr, hr, beauty, align(lr, hr), hr.additive_sets)).pixels
         channels = {c.name: c for part in hr.file.parts for c in part.channels}
         made = np.stack([result.get(channels[f"light_lamps.{c}"], 0, len(lamps)) for c in "RGB"], axis=-1)
         errors[low] = np.sqrt(np.mean((made - lamps) ** 2))

@@ -1,0 +1,221 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Reads a frame in bands of rows, each with all that its layers are estimated from."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from oiio_msspl.aovs.additive_sets import AdditiveLayer
+from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
+from oiio_msspl.exr.render import ReadableRender, Window
+from oiio_msspl.fusion.passes.layers import Factor, is_black
+from oiio_msspl.fusion.passes.lines import STEPS, BeautyFit, downsampled, smoothed
+from oiio_msspl.fusion.passes.plan import PassJob
+from oiio_msspl.fusion.tiles.alignment import Alignment
+from oiio_msspl.fusion.tiles.features import RepairCounts, in_hrls_pixels, mirrored, read_features, read_lrhs
+from oiio_msspl.image.arrays import Array, planes_of, unload
+from oiio_msspl.image.filters import box_downsample, max_3x3
+
+T = TypeVar("T", bound=np.generic)
+#: Albedo and normal without noise, of half or float.
+Guides = Mapping[str, NDArray[Any]]
+
+#: HRLS rows that are fused at a time.
+BAND_ROWS = 128
+#: Pixels that differ by this much have 1/e of the weight in an average: albedo, normal, logarithm of the fused beauty.
+SPREAD = {ALBEDO: 0.2, NORMAL: 0.4, RGB: 0.5}
+#: Light below this share of the frame's median counts as equal.
+DARK = 0.3
+#: Light of an LRHS pixel, relative to the fused beauty there, above which its layers are dimmed by one factor.
+FIREFLY = 4.0
+
+
+@dataclass(frozen=True)
+class PassSources:
+    """What the layers of a frame are fused from."""
+
+    low: ReadableRender
+    high: ReadableRender
+    """LRHS and HRLS, with the features of :class:`oiio_msspl.fusion.passes.layers.LayerLight`."""
+    rgb: Array
+    """The fused beauty, (height, width, 3), over the HRLS's data window."""
+    alignment: Alignment
+    guides: Guides
+    """Albedo and normal without noise, (height, width, 3) as the HRLS's; those that there are."""
+    colours: Mapping[Factor, str]
+    """Names, as features of the HRLS, of the colours by which layers are multiplied."""
+
+    @cached_property
+    def dark(self) -> float:
+        """Light that counts as equal to none in logarithms."""
+        lit = self.rgb[::4, ::4][self.rgb[::4, ::4] > 0]
+        return DARK * float(np.median(lit)) if lit.size else 1.0
+
+    def beauty(self, area: Window) -> Array:
+        """Return the fused beauty (3, h, w) over HRLS pixels, mirrored beyond the data window.
+
+        A frame that is stored as half is fused as half. Variances would be lost in its rounding, so this is float32.
+        """
+        return planes_of(mirrored(self.rgb, self.alignment.hr_data_window, area)).astype(np.float32)
+
+    def unload(self) -> None:
+        """Give the memory of guides that wait in temporary files back to the system."""
+        for image in self.guides.values():
+            unload(image)
+
+
+def band_windows(alignment: Alignment) -> list[Window]:
+    """Return the bands of LRHS rows that are fused one after the other."""
+    grid, rows = alignment.grid, BAND_ROWS // alignment.scale
+    return [Window(grid.x0, top, grid.x1, min(top + rows, grid.y1)) for top in range(grid.y0, grid.y1, rows)]
+
+
+class Band:
+    """Some rows of a frame: the fused beauty, and the layers of both renders at the LRHS's resolution.
+
+    Args:
+        sources: of the frame.
+        core: the LRHS pixels that are fused.
+        jobs: the sets.
+        full_size: layers that a network has fused at full resolution.
+    """
+
+    def __init__(
+        self, sources: PassSources, core: Window, jobs: Sequence[PassJob], full_size: Collection[AdditiveLayer]
+    ) -> None:
+        alignment = sources.alignment
+        self.sources, self._full_size, self.scale = sources, full_size, alignment.scale
+        reach = 2 * sum(STEPS[self.scale]) + 2
+        self.area = Window(core.x0, core.y0 - reach, core.x1, core.y1 + reach).intersect(alignment.grid)
+        """The core and the pixels around that are read, in LRHS pixels."""
+        self.rows = core.slices(self.area)[0]
+        """The core's rows in the area."""
+        self.hrls_core, self._hrls_area = (in_hrls_pixels(window, self.scale) for window in (core, self.area))
+        self._hrls_rows = self.hrls_core.slices(self._hrls_area)[0]
+        self._beauty = sources.beauty(self._hrls_area)
+        self.low_beauty = downsampled(self._beauty, self.scale)
+        """The fused beauty (3, h, w) over the area, at the LRHS's resolution."""
+        self._to_fit = [job for job in jobs if job.remainder or self._has_light_to_fit(job)]
+        factors = {layer.factor for job in jobs for layer in job.estimated}
+        colours = {factor: name for factor, name in sources.colours.items() if factor in factors}
+        names = {name: layer for job in jobs for layer, name in job.names.items()}
+        # A file decodes all layers together, so all are read at once.
+        needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self._to_fit else [])]
+        window, counts = alignment.hr_data_window, RepairCounts()
+        features = read_features(sources.high, self._hrls_area, window, needed, counts=counts, counted=self.hrls_core)
+        self.repaired = {names[name].name: count for name, count in counts.repaired.items() if name in names}
+        """How many values of each layer of the HRLS were NaN or infinite."""
+        self.colours: dict[Factor, Array] = {
+            factor: planes_of(features.pop(name)[self._hrls_rows]) for factor, name in colours.items()
+        }
+        """What products of light and colour are divided by, (3, h, w) over the core."""
+        images = {name: features.pop(name) for name in (ALBEDO, NORMAL) if name in features}
+        self.ranges = {
+            layer: self._range_around(features[job.names[layer]])
+            for job in jobs
+            for layer in job.noise_free.intersection(job.estimated)
+        }
+        """For each layer without noise, the lowest and highest values around each pixel of the core, (3, h, w)."""
+        self._low_layers = {name: box_downsample(values, self.scale) for name, values in features.items()}
+        lrhs = [name for job in jobs for name in job.lrhs]
+        self._lrhs_layers = {}
+        if lrhs:
+            self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs], RepairCounts())
+        self._fits: dict[Sequence[int], BeautyFit] = {}
+        self._guides = self._compared(images) if self._to_fit else None
+
+    @property
+    def beauty(self) -> Array:
+        """The fused beauty (3, h, w) over the core."""
+        return self._beauty[:, self._hrls_rows]
+
+    def needs_fit(self, job: PassJob) -> bool:
+        """Return whether a set has light here that no network has fused at full resolution."""
+        return job in self._to_fit
+
+    def fit_at(self, steps: tuple[int, ...]) -> BeautyFit:
+        """Return the beauty that layers are fitted to, see :data:`oiio_msspl.fusion.passes.lines.STEPS`."""
+        if steps not in self._fits:
+            assert self._guides is not None
+            self._fits[steps] = BeautyFit(self._beauty, self._guides, self.scale, steps, self.rows)
+        return self._fits[steps]
+
+    def over_core(self, image: NDArray[Any]) -> Array:
+        """Return an image (height, width, 3) over the HRLS's data window as planes over the core, mirrored beyond."""
+        return planes_of(mirrored(image, self.sources.alignment.hr_data_window, self.hrls_core))
+
+    def renders_of(self, job: PassJob) -> list[Array]:
+        """Return the layers of the HRLS, and of the LRHS if it has some, see :func:`dimmed`."""
+        renders = [self._low_layers, self._lrhs_layers] if job.lrhs else [self._low_layers]
+        return [dimmed(job, pixels, self.low_beauty) for pixels in renders]
+
+    def _has_light_to_fit(self, job: PassJob) -> bool:
+        area, low, high = self.area, self.sources.low, self.sources.high
+        # An LRHS of an odd size is up to a pixel away.
+        low_area = Window(area.x0, area.y0 - 1, area.x1, area.y1 + 1)
+        names = [job.names[layer] for layer in job.estimated if layer not in self._full_size]
+        if any(not is_black(high, name, self._hrls_area) for name in names):
+            return True
+        return any(not is_black(low, name, low_area) for name in names if name in job.lrhs)
+
+    def _range_around(self, samples: Array) -> tuple[Array, Array]:
+        # LRHS pixels at the edge of a window or of a lamp show a part of it, and its light would leak over the edge.
+        lowest, highest = -max_3x3(-samples), max_3x3(samples)
+        return planes_of(lowest[self._hrls_rows]), planes_of(highest[self._hrls_rows])
+
+    def _compared(self, images: Guides) -> Array:
+        """Return planes by which pixels are compared, given albedo and normal (h, w, 3) of the HRLS."""
+        log = np.log(np.maximum(self._beauty.mean(axis=0), 0) + self.sources.dark)
+        planes = [log[None] / SPREAD[RGB]]
+        for name, image in images.items():
+            noisy = planes_of(image)
+            guide = smoothed(noisy, log)
+            if name in self.sources.guides:
+                window = self.sources.alignment.hr_data_window
+                clean = planes_of(mirrored(self.sources.guides[name], window, self._hrls_area))
+                # Some renderers write the colour of an emitter as its albedo, and tell lamps apart by that.
+                guide = np.where((noisy > 1).any(axis=0), guide, clean)
+            planes.append(guide / SPREAD[name])
+        return np.concatenate(planes, dtype=np.float32)
+
+
+def dimmed(job: PassJob, pixels: Mapping[str, Array], beauty: Array) -> Array:
+    """Return the layers of one render at low resolution, (layers, 3, h, w), without fireflies.
+
+    Layers that it lacks are black. The rest of its beauty is the last layer, if layers are missing or light is in none.
+
+    Args:
+        job: the set.
+        pixels: features (h, w, 3) of the render.
+        beauty: the fused one (3, h, w).
+    """
+    black = np.zeros_like(beauty)
+    layers = np.stack([planes_of(pixels[name]) if name in pixels else black for name in job.names.values()])
+    if job.remainder or not pixels.keys() >= set(job.names.values()):
+        rest = np.maximum(planes_of(pixels[RGB]) - layers.sum(axis=0), 0)
+        layers = np.concatenate([layers, rest[None]])
+    light = layers.sum(axis=(0, 1))
+    allowed = FIREFLY * max_3x3(beauty.sum(axis=0))
+    layers *= np.minimum(1, allowed / np.maximum(light, 1e-20))
+    return layers
+
+
+def in_both(job: PassJob, count: int) -> NDArray[np.bool_]:
+    """Return which of the first ``count`` layers of :func:`dimmed` are in both renders.
+
+    The remainder comes last: both have it if they have all layers.
+    """
+    shared = [name in job.lrhs for name in job.names.values()]
+    return np.array([*shared, all(shared)])[:count]
+
+
+def estimated_of(job: PassJob, layers: NDArray[T]) -> NDArray[T]:
+    """Return those layers of :func:`dimmed`, on the first axis, that are to be estimated."""
+    derived = [i for i, layer in enumerate(job.layers.layers) if layer in job.derived]
+    return np.delete(layers, derived, axis=0) if derived else layers

@@ -1,0 +1,262 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Fits layers at the LRHS's resolution as lines of the fused beauty, and applies the lines at full resolution.
+
+The beauty has little noise. A fit takes averages of a layer only, so it is fast. This is first-order regression with
+cross-bilateral weights (Bitterli et al. 2016). The fit at low resolution is that of the fast guided filter (He and Sun
+2015). Everything here works on planes: float32 arrays (n, h, w).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
+
+from oiio_msspl.fusion.tiles.guards import LAYER_REACH
+from oiio_msspl.image.arrays import Array, planes_of
+from oiio_msspl.image.filters import blurred, box_downsample, grown, max_3x3
+from oiio_msspl.image.parallel import for_row_blocks
+
+#: Rows of a band whose weights stay in a core's cache while several planes are averaged.
+CACHED_ROWS = 16
+#: A fit averages 5 x 5 LRHS pixels so far apart, and then the averages likewise. At x2 a pixel has fewer samples, so
+#: more of them are needed.
+STEPS = {2: (1, 3), 4: (1, 2), 8: (1, 2)}
+#: Pixels of the HRLS choose among fits around them with the spread divided by this.
+SHARPER = 1.4
+#: Keeps a fit from following noise: variance that is added to the guide, relative to its mean square.
+RIDGE = 0.03
+#: A layer has no sample where its brightest pixel around is below this share of its mean over pixels that look alike.
+NO_SAMPLE = 0.25
+#: Variance of the logarithm of the fused beauty that counts as flat where albedo and normal are smoothed.
+FLAT = 0.001
+
+
+class LineFit:
+    """Lines ``layer = slope beauty + offset`` around every low-resolution pixel, fitted to pixels that look alike."""
+
+    def __init__(self, beauty: Array, guides: Array, steps: Sequence[int]) -> None:
+        """``beauty``: (3, h, w). ``guides``: (guides, h, w), in units of their spread."""
+        self._beauty, self._steps = beauty, steps
+        self._kernels = [_kernel(guides, step) for step in steps]
+        means = self._mean(np.concatenate([beauty, beauty * beauty]))
+        self._means = means[:3]
+        variances = np.maximum(means[3:] - self._means**2, 0)
+        self._variances = variances + RIDGE * (variances + self._means**2) + np.float32(1e-20)
+
+    def lines(self, layer: Array) -> tuple[Array, Array]:
+        """Return the slopes of a layer (3, h, w) and then its offsets, (6, h, w); and its means (3, h, w)."""
+        means = self._mean(np.concatenate([layer, layer * self._beauty]))
+        mean, products = means[:3], means[3:]
+        slopes = (products - mean * self._means) / self._variances
+        return np.concatenate([slopes, mean - slopes * self._means]), mean
+
+    def _mean(self, planes: Array) -> Array:
+        """Return means (n, h, w) over pixels around that look alike."""
+        for kernel, step in zip(self._kernels, self._steps, strict=True):
+            planes = _mean_around(planes, kernel, step)
+        return planes
+
+
+def _mean_around(planes: Array, weights: Array, step: int) -> Array:
+    """Return means of planes (n, h, w) over 5 x 5 pixels, ``step`` pixels apart, by weights (5, 5, h, w)."""
+    count, height, width = planes.shape
+    reach = 2 * step
+    padded = np.zeros((count, height + 2 * reach, width + 2 * reach), np.float32)
+    padded[:, reach : reach + height, reach : reach + width] = planes
+    around = sliding_window_view(padded, (2 * reach + 1, 2 * reach + 1), axis=(1, 2))[..., ::step, ::step]
+    # NumPy would add up adjacent columns pixel by pixel, which takes three times as long as row by row.
+    columns = [slice(0, 5, 2), slice(1, 5, 2)] if step == 1 else [slice(0, 5)]
+    result = np.zeros_like(planes)
+    for start in range(0, height, CACHED_ROWS):
+        rows = slice(start, start + CACHED_ROWS)
+        for part in columns:
+            result[:, rows] += np.einsum("ijhw,nhwij->nhw", weights[:, part, rows], around[:, rows, :, :, part])
+    return result
+
+
+def _kernel(guides: Array, step: int) -> Array:
+    """Return weights (5, 5, h, w) of 5 x 5 pixels, ``step`` pixels apart, that sum to 1. Pixels outside weigh 0."""
+    height, width = guides.shape[1:]
+    offsets = [(y * step, x * step) for y in range(-2, 3) for x in range(-2, 3)]
+    weights = np.zeros((len(offsets), height, width), np.float32)
+    weights[12] = 1
+
+    def weigh(part: slice) -> None:
+        # Two pixels differ by as much, whichever of them is in the centre.
+        for i, (y, x) in list(enumerate(offsets[:12]))[part]:
+            if -y < height and abs(x) < width:
+                pixels = slice(-y, height), slice(max(-x, 0), width - max(x, 0))
+                shifted = slice(0, height + y), slice(max(x, 0), width - max(-x, 0))
+                with np.errstate(over="ignore", invalid="ignore"):
+                    distance = np.square(guides[:, *pixels] - guides[:, *shifted]).sum(axis=0)
+                distance += np.float32((y * y + x * x) / (8 * step * step))
+                weights[i][pixels] = weights[24 - i][shifted] = np.exp(-distance)
+
+    for_row_blocks(weigh, 12, guides.size)
+    weights /= weights.sum(axis=0)
+    return weights.reshape(5, 5, height, width)
+
+
+class LinesNearby:
+    """Lines at full resolution: means of those of the four low-resolution pixels around that look alike.
+
+    All pixels that lie in the same place of a low-resolution pixel, a *phase*, are computed together. They are as many
+    as low-resolution pixels, so all arrays are contiguous.
+    """
+
+    def __init__(self, low: Array, full: Array, scale: int, rows: slice) -> None:
+        """``low``, ``full``: guides (guides, h, w) in units of their spread. ``rows``: of ``low``, to interpolate."""
+        self._rows, self._scale = rows, scale
+        height, width = rows.stop - rows.start, low.shape[2]
+        #: For each phase, the weights of the two rows and two columns of corners.
+        self._weights = np.empty((scale, scale, 2, 2, height, width), np.float32)
+        whole = self.phases(full[:, rows.start * scale : rows.stop * scale])
+        padded = self._padded(low)
+        for y, x in np.ndindex(scale, scale):
+            weights = self._weights[y, x]
+            for i, j in np.ndindex(2, 2):
+                top, left = self._corner(y) + i, self._corner(x) + j
+                corner = padded[:, top : top + height, left : left + width]
+                distance = np.square(corner - whole[y, x]).sum(axis=0) * np.float32(SHARPER**2)
+                nearness = self._nearness(y, i) * self._nearness(x, j)
+                weights[i, j] = (np.exp(-distance) + np.float32(1e-4)) * np.float32(nearness)
+            weights /= weights.sum(axis=(0, 1))
+
+    def phases(self, planes: Array) -> Array:
+        """Return planes (n, h, w) at full resolution as phases (scale, scale, n, h, w)."""
+        n, height, width = planes.shape
+        parts = planes.reshape(n, height // self._scale, self._scale, width // self._scale, self._scale)
+        return np.ascontiguousarray(parts.transpose(2, 4, 0, 1, 3))
+
+    def apply(self, lines: Array, bounds: Array, guide: Array, out: Array) -> None:
+        """Compute the values of lines at full resolution, within interpolated bounds.
+
+        Args:
+            lines: slopes and offsets (2 n, h, w) at low resolution.
+            bounds: lowest and highest values (2 n, h, w) at low resolution.
+            guide: the values that the lines are functions of, as :meth:`phases` over the chosen rows.
+            out: gets the chosen rows (n, h, w) at full resolution.
+        """
+        n, scale = len(out), self._scale
+        height, width = self._weights.shape[-2:]
+        lines, bounds = self._padded(lines), self._padded(bounds)
+        for start in range(0, height, CACHED_ROWS):
+            stop = min(start + CACHED_ROWS, height)
+            target = out[:, start * scale : stop * scale]
+            for y in range(scale):
+                rows = slice(self._corner(y) + start, self._corner(y) + stop + 1)
+                between = _between(bounds[:, rows][:, :-1], bounds[:, rows][:, 1:], self._nearness(y, 1))
+                pairs = sliding_window_view(lines[:, rows], 2, axis=1)
+                for x in range(scale):
+                    left = self._corner(x)
+                    weights = self._weights[y, x, :, :, start:stop]
+                    line, right = (
+                        np.einsum("ihw,nhwi->nhw", weights[:, j], pairs[:, :, left + j : left + j + width])
+                        for j in (0, 1)
+                    )
+                    line += right
+                    values = line[:n]
+                    values *= guide[y, x, :, start:stop]
+                    values += line[n:]
+                    columns = between[..., left : left + width], between[..., left + 1 : left + 1 + width]
+                    limits = _between(*columns, self._nearness(x, 1))
+                    np.clip(values, limits[:n], limits[n:], out=target[:, y::scale, x::scale])
+
+    def _padded(self, planes: Array) -> Array:
+        """Return the chosen rows of planes (n, h, w), with one pixel more on each side; the edge is repeated."""
+        rows = slice(max(self._rows.start - 1, 0), self._rows.stop + 1)
+        top = 1 - (self._rows.start - rows.start)
+        bottom = max(self._rows.stop + 1 - planes.shape[1], 0)
+        return np.pad(planes[:, rows], ((0, 0), (top, bottom), (1, 1)), mode="edge")
+
+    def _corner(self, phase: int) -> int:
+        """Return the row or column, in :meth:`_padded`, of the first corner of a phase's first pixel."""
+        return int(2 * phase + 1 > self._scale)
+
+    def _nearness(self, phase: int, corner: int) -> float:
+        """Return the weight of the first (0) or second (1) corner of a phase in linear interpolation."""
+        position = (phase + 0.5) / self._scale - 0.5
+        second = position if position > 0 else 1 + position
+        return second if corner else 1 - second
+
+
+def _between(first: Array, second: Array, weight: float) -> Array:
+    """Interpolate linearly; ``weight`` is that of the second."""
+    result = second - first
+    result *= np.float32(weight)
+    result += first
+    return result
+
+
+class BeautyFit:
+    """The fused beauty of some rows, to which layers at the LRHS's resolution are fitted.
+
+    Args:
+        beauty: the fused one, (3, h, w).
+        guides: planes (guides, h, w) in units of their spread.
+        scale: layers have 1/scale of this resolution.
+        steps: see :data:`STEPS`.
+        rows: the rows of the layers that are wanted.
+    """
+
+    def __init__(self, beauty: Array, guides: Array, scale: int, steps: Sequence[int], rows: slice) -> None:
+        self._scale = scale
+        low = downsampled(guides, scale)
+        with np.errstate(over="ignore", invalid="ignore"):
+            self._lines = LineFit(downsampled(beauty, scale), low, steps)
+        self._nearby = LinesNearby(low, guides, scale, rows)
+        self._beauty = self._nearby.phases(beauty[:, rows.start * scale : rows.stop * scale])
+
+    def fit_layers(self, layers: Sequence[Array], results: Sequence[Array], *, few_samples: bool = False) -> None:
+        """Fit layers to the fused beauty.
+
+        Args:
+            layers: (3, h, w) each, at their own resolution.
+            results: get the wanted rows, (3, h, w) each.
+            few_samples: the layers are as rendered, so pixels may have no sample of a light by chance.
+        """
+
+        def fit(part: slice) -> None:
+            # NumPy's settings for errors belong to the thread.
+            with np.errstate(over="ignore", invalid="ignore"):
+                for layer, out in zip(layers[part], results[part], strict=True):
+                    fit_layer(layer, out)
+
+        def fit_layer(layer: Array, out: Array) -> None:
+            lines, means = self._lines.lines(layer)
+            # The renders around bound the fit: where it mixes two surfaces, it would leave their range.
+            lowest, highest = (np.stack([sign * max_3x3(sign * plane) for plane in layer]) for sign in (-1, 1))
+            if few_samples:
+                # Where a rare light has no sample by chance, the mean over pixels that look alike is the bound. This
+                # ends two LRHS pixels before LAYER_REACH, because the bounds are interpolated.
+                near_light = grown(np.any(layer != 0, axis=0), LAYER_REACH // self._scale - 2)
+                highest = np.where(near_light & (highest < means * np.float32(NO_SAMPLE)), means, highest)
+            self._nearby.apply(lines, np.concatenate([lowest, highest]), self._beauty, out)
+
+        for_row_blocks(fit, len(layers), self._beauty.size)
+
+
+def smoothed(planes: Array, log: Array) -> Array:
+    """Remove noise from planes (n, h, w): a guided filter (He et al. 2010) over 3 x 3 pixels.
+
+    ``log``: the logarithm of the beauty's light, (h, w), which guides it.
+    """
+    mean = blurred(log)
+    variance = blurred(log * log) - mean * mean + np.float32(FLAT)
+    result = np.empty_like(planes)
+
+    def smooth(part: slice) -> None:
+        for plane, out in zip(planes[part], result[part], strict=True):
+            average = blurred(plane)
+            slope = (blurred(plane * log) - average * mean) / variance
+            np.add(average, slope * (log - mean), out=out)
+
+    for_row_blocks(smooth, len(planes), log.size)
+    return result
+
+
+def downsampled(planes: Array, scale: int) -> Array:
+    """Average planes (n, h, w) over ``scale`` x ``scale`` pixels."""
+    return planes_of(box_downsample(np.moveaxis(planes, 0, -1), scale))

@@ -95,10 +95,6 @@ COMPONENTS = "components"
 #: How many light groups are fused, and what ``--half`` compares.
 AT_HALF = "msspl, best, at half size"
 BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
-#: Methods in the table of single layers.
-IN_LAYERS = ("HRLS", "ratio", "OIDN", "OIDN, rescaled", PEER, "msspl-x2", "msspl-x2, best", "msspl-x4, best")
-#: Methods in the table of renders whose pixel filter has spread the noise.
-WITH_SPREAD_NOISE = ("HRLS", PEER, SPLIT_PEER, "msspl-x2", "msspl-x2, best", "msspl-x4", "msspl-x4, best")
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:

@@ -19,12 +19,12 @@ NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {
 
 
 def denoiser_of(network: Network, scale: int) -> str:
-    """What denoises the mean of both renders before a network: a value of ``Contract.denoiser``."""
+    """Return the value of ``Contract.denoiser``: what denoises the mean of both renders before a network."""
     return network.denoiser(scale) if isinstance(network, JointFusion) else NO_DENOISER
 
 
 def preparation(architecture: str) -> Prepare | None:
-    """The function that adds a network's further input channels to a pair; None if it has none."""
+    """Return the function that adds a network's further input channels to a pair; None if it has none."""
     return with_mean if architecture == "joint" else None
 
 

@@ -34,12 +34,12 @@ def _tent(t: Tensor) -> Tensor:
 
 
 def _gaussian(t: Tensor) -> Tensor:
-    """Standard deviation of a quarter of the radius, shifted to end at zero, as Mitsuba's."""
+    """Weigh by a standard deviation of a quarter of the radius, shifted to end at zero, as Mitsuba."""
     return torch.exp(-8 * t**2) - math.exp(-8)
 
 
 def _wide_gaussian(t: Tensor) -> Tensor:
-    """Standard deviation of half the radius, cut off there, as Arnold's."""
+    """Weigh by a standard deviation of half the radius, cut off there, as Arnold."""
     return torch.exp(-2 * t**2)
 
 
@@ -49,7 +49,7 @@ def _blackman_harris(t: Tensor) -> Tensor:
 
 
 def _cubic(b: float, c: float) -> Callable[[Tensor], Tensor]:
-    """The cubics of Mitchell and Netravali, "Reconstruction Filters in Computer Graphics" (1988), equation 8."""
+    """Return a cubic of Mitchell and Netravali, "Reconstruction Filters in Computer Graphics" (1988), equation 8."""
 
     def weight(t: Tensor) -> Tensor:
         x = 2 * t
@@ -60,8 +60,7 @@ def _cubic(b: float, c: float) -> Callable[[Tensor], Tensor]:
     return weight
 
 
-def _lanczos(t: Tensor) -> Tensor:
-    """Two lobes."""
+def _lanczos(t: Tensor) -> Tensor:  # two lobes
     return torch.sinc(2 * t) * torch.sinc(t)
 
 
@@ -97,14 +96,16 @@ class PixelFilter:
         return self.splatted and self.reach > 0
 
     def samples_for(self, count: int) -> int:
-        """How many stored samples of a pixel give it ``count``. Importance sampling moves some to other pixels, so it
-        needs more to choose from."""
+        """Return how many stored samples of a pixel give it ``count``.
+
+        Importance sampling moves some to other pixels, so it needs more to choose from.
+        """
         return count if self.splatted else 2 * count + 4
 
     def weights(self, place: Tensor) -> Tensor:
-        """Weights of samples at ``place`` (0 to 1) in pixels -reach ... reach from their own: (2 * reach + 1, ...).
+        """Return the weights of samples at ``place`` (0 to 1) in pixels -reach ... reach: (2 * reach + 1, ...).
 
-        For importance sampling they are probabilities: divided by their sum.
+        For importance sampling they are divided by their sum, so that they are probabilities.
         """
         offsets = torch.arange(-self.reach, self.reach + 1, device=place.device, dtype=place.dtype)
         t = (place - 0.5 - offsets.reshape(-1, *[1] * place.ndim)).abs() / self.radius
@@ -134,9 +135,9 @@ SHARES: tuple[tuple[float, str, float, float, bool], ...] = (
 
 
 def draw_filter(rng: np.random.Generator, *, spread_noise: bool | None = None) -> PixelFilter:
-    """A filter in the shares of ``SHARES``: only those that spread noise, only the others, or any (None)."""
+    """Draw a filter in the shares of ``SHARES``: only those that spread noise, only the others, or any (None)."""
     filters = [(share, PixelFilter(kind, greatest, splatted)) for share, kind, _, greatest, splatted in SHARES]
-    shares = [share if spread_noise in (None, each.spreads_noise) else 0.0 for share, each in filters]
+    shares = [share if spread_noise in (None, kind.spreads_noise) else 0.0 for share, kind in filters]
     _, kind, least, greatest, splatted = SHARES[rng.choice(len(SHARES), p=np.divide(shares, sum(shares)))]
     return PixelFilter(kind, float(rng.uniform(least, greatest)), splatted)
 
@@ -177,7 +178,7 @@ def apply(
     low_height, low_width = height // scale, width // scale
 
     def blocks(samples: Tensor) -> Tensor:
-        """(K, ..., H, W) as (K * s * s, ..., h, w)."""
+        """Reorder (K, ..., H, W) to (K * s * s, ..., h, w)."""
         middle = samples.shape[1:-2]
         split = samples.reshape(k, *middle, low_height, scale, low_width, scale)
         n = split.ndim
@@ -198,7 +199,7 @@ def apply(
 
 
 def _splat(pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor, has_measure: bool) -> Filtered:
-    """A pixel is sum(w L) / sum(w)."""
+    """Compute each pixel as sum(w L) / sum(w)."""
     reach, (height, width) = pixel_filter.reach, x.shape[-2:]
     shape = (height + 2 * reach, width + 2 * reach)
     sums, squares = values.new_zeros(values.shape[1], *shape), values.new_zeros(3, *shape)
@@ -243,7 +244,7 @@ def _distribute(
     height, width = x.shape[-2:]
 
     def moved(position: Tensor) -> Tensor:
-        """A random pixel offset for every sample."""
+        """Draw a pixel offset for every sample."""
         cumulative = pixel_filter.weights(position).cumsum(dim=0)
         drawn = torch.rand(position.shape, generator=generator, device=position.device)
         return (drawn >= cumulative[:-1]).sum(dim=0) - pixel_filter.reach
@@ -262,7 +263,6 @@ def _distribute(
         chosen = order[rank < count]
     else:
         chosen = torch.arange(len(target), device=x.device)
-
     if has_measure:
         values = torch.cat([values, values[:, -1:] ** 2], dim=1)
     columns = values.movedim(1, -1)
@@ -281,8 +281,9 @@ def _distribute(
 
 
 def filter_reference(pixel_filter: PixelFilter, cells: Tensor, per_pixel: int) -> Tensor:
-    """The expected value of :func:`apply` at scale 1, from a reference of R x R cells a pixel: (C, R*H, R*W) to
-    (C, H, W). A cell has the mean weight of the positions in it.
+    """Filter a reference of R x R cells a pixel, (C, R*H, R*W) to (C, H, W): the expected value of :func:`apply`.
+
+    A cell has the mean weight of the positions in it.
     """
     points = 32  # positions per cell, along each side
     place = (torch.arange(per_pixel * points, device=cells.device) + 0.5) / (per_pixel * points)

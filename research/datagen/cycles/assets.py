@@ -43,7 +43,7 @@ def licence_of(model: Path) -> str:
 
 
 def load_model(path: Path) -> list[bpy.types.Object]:
-    """The meshes of an OBJ or glTF file, z up, centred in x and y, standing on z = 0, at most 1 m large.
+    """Import the meshes of an OBJ or glTF file, z up, centred in x and y, standing on z = 0, at most 1 m large.
 
     A model's lights and cameras are left out. Parts keep their materials.
     """

@@ -54,6 +54,7 @@ class Blend(nn.Module):
     def forward(
         self, lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor]
     ) -> Tensor:
+        """Blend as :func:`research.training.joint.blend`."""
         return blend(lrhs, samples, albedo, denoised, logits, self.margin)
 
 
@@ -61,7 +62,7 @@ class Blend(nn.Module):
 
 
 def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
-    """The U-Net's inputs at H and at H/2, for pairs of the network's inputs."""
+    """Return the U-Net's inputs at H and at H/2, for pairs of the network's inputs."""
     plain = CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
     layouts = [
         concatenated(sliced_layout(HRLS_SLICES, 0), plain),
@@ -90,11 +91,11 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
 def calibration_pairs(
     views: Path, scales: Sequence[int], prepare: Prepare | None, count: int = PAIRS, *, spread: bool = False
 ) -> list[tuple[Tensor, Tensor]]:
-    """Inputs of the network, from views as training draws them.
+    """Draw inputs of the network from views, as training does.
 
     Args:
         scales: of each pair, one of these at random.
-        prepare: see :func:`research.training.mean_denoiser.with_denoised_mean`.
+        prepare: see :func:`research.training.denoisers.with_denoised_mean`.
         spread: of views with single samples, only pixel filters that spread noise; otherwise only others.
     """
     sampling = Sampling(spread_noise=spread)
@@ -108,8 +109,8 @@ def calibration_pairs(
 def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> Fit:
     """Quantise the U-Net and its heads, those that ``scale`` and smaller ones need."""
     weights = {}
-    for name, conv in network.convs.items():
-        weights[f"{name}.weight"], weights[f"{name}.bias"] = conv.total()
+    for name, layer in network.convs.items():
+        weights[f"{name}.weight"], weights[f"{name}.bias"] = layer.total()
     for kind in ("weight", "bias"):
         heads = [getattr(head, kind) for head in network.heads]
         last = f"{network.shape.last}.{kind}"
@@ -154,7 +155,7 @@ class JointGraph(Graph):
     def whole(
         self, mixing: onnx.ModelProto, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
-        """The model with the graph of :class:`Blend`, whose inputs have the names of tensors that are made here."""
+        """Return the model with the graph of :class:`Blend`, whose inputs have the names of tensors made here."""
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
         step, half_step = self.constant("step", np.float32(1 / 255)), self.constant("half_step", np.float32(1 / 127.5))
         zeros = self.zeros(albedo)
@@ -169,14 +170,8 @@ class JointGraph(Graph):
         colours = self.slices(self.log_to_pu(colour), HRLS_SLICES)
         full = self.packed([*colours, albedo_codes, normal_codes, zeros], "full")
         low, mean = self.split("lrhs", {"colour": LRHS_CHANNELS, "mean": LRHS_CHANNELS})
-        half = self.packed(
-            [
-                *self.slices(self.log_to_pu(mean), MEAN_SLICES),
-                *self.slices(self.log_to_pu(low), LRHS_SLICES),
-                self.zeros(low),
-            ],
-            "half",
-        )
+        means = self.slices(self.log_to_pu(mean), MEAN_SLICES)
+        half = self.packed([*means, *self.slices(self.log_to_pu(low), LRHS_SLICES), self.zeros(low)], "half")
         if self._scale > 2:
             half = self.repeat(half, 16, self._scale // 2)
         sums = self.colours([full, half], "sums")
@@ -206,8 +201,9 @@ class JointGraph(Graph):
 
 
 def to_onnx(fit: Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
-    """Graph with inputs ``lrhs`` and ``hrls``, outputs ``fused`` and ``log_error``, and with ``layers`` the denoised
-    ``albedo`` and ``normal``.
+    """Return the graph with inputs ``lrhs`` and ``hrls`` and outputs ``fused`` and ``log_error``.
+
+    With ``layers``, it also returns the denoised ``albedo`` and ``normal``.
 
     Args:
         fit: see :func:`fitted`.

@@ -32,6 +32,7 @@ EXAMPLES = ROOT / "examples"
 PAGES = [
     ROOT / "README.md",
     EXAMPLES / "README.md",
+    ROOT / "research/README.md",
     ROOT / "research/benchmarks/README.md",
     ROOT / "research/datagen/README.md",
     *sorted((ROOT / "docs/guide").glob("*.md")),

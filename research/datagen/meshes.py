@@ -242,13 +242,7 @@ def leaves(rng: Rng, centres: np.ndarray, size: float, drop: float = 0.5) -> Mes
     across = unit(np.cross(along, rng.normal(size=(k, 3)))) * size * 0.3
     fold = np.cross(along, across) * (0.6 / size)
     v = np.stack(
-        [
-            centres,
-            centres + along * 0.45 + across + fold,
-            centres + along,
-            centres + along * 0.45 - across + fold,
-        ],
-        1,
+        [centres, centres + along * 0.45 + across + fold, centres + along, centres + along * 0.45 - across + fold], 1
     )
     base = 4 * np.arange(k)[:, None]
     f = np.concatenate([base + [0, 1, 2], base + [0, 2, 3]])
@@ -331,10 +325,7 @@ def table(w: float, d: float, h: float, leg: float) -> Mesh:
 
 def shelf(w: float, d: float, h: float, boards: int) -> Mesh:
     """Return an open shelf; boards are evenly spaced."""
-    parts = [
-        box((-w / 2, -d / 2, 0), (-w / 2 + 0.03, d / 2, h)),
-        box((w / 2 - 0.03, -d / 2, 0), (w / 2, d / 2, h)),
-    ]
+    parts = [box((-w / 2, -d / 2, 0), (-w / 2 + 0.03, d / 2, h)), box((w / 2 - 0.03, -d / 2, 0), (w / 2, d / 2, h))]
     for i in range(boards + 1):
         z = i * (h - 0.03) / boards
         parts.append(box((-w / 2, -d / 2, z), (w / 2, d / 2, z + 0.03)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints of training runs: write, read, and start another network from one.
+"""Networks by name, and checkpoints of training runs: write, read, and start another network from one.
 
 A checkpoint is a dictionary that ``torch.save`` wrote:
 
@@ -17,18 +17,36 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
+from research.training.data import Prepare
 from research.training.joint import JointFusion
-from research.training.networks import NETWORKS, Network
 from research.training.paper import MultiResolutionFusion
+from research.training.render_mean import with_mean
 
 State = dict[str, Any]
+Network = MultiResolutionFusion | JointFusion
+NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {
+    "paper": MultiResolutionFusion,
+    "joint": JointFusion,
+}
 log = logging.getLogger(__name__)
 
 #: Parts of a checkpoint that only a continued run needs.
 RUN_STATE = ("network", "optimizer", "best_psnr")
 #: Parts of a parameter's name that older checkpoints have, and what they are called now.
 RENAMED = {"together.": "mean_denoiser.", ".more": ".extra"}
+
+
+def preparation(architecture: str) -> Prepare | None:
+    """Return the function that adds a network's further input channels to a pair; None if it has none."""
+    return with_mean if architecture == "joint" else None
+
+
+def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Run a network; return the fused image and the logarithm of its expected error, None if it predicts none."""
+    result = network(lrhs, hrls)
+    return result if isinstance(result, tuple) else (result, None)
 
 
 def save(state: State | list[Any], path: Path) -> None:

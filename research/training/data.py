@@ -38,7 +38,7 @@ from research.datagen.samples import MANTISSA, STEP
 from research.datagen.views import NO_REFERENCE, PASS_FEATURES, REF_CELLS, Array, Folder, SampleView, View
 from research.training.encoding import compress, exposure_of, luminance, pack, repair
 from research.training.ops import box_downsample
-from research.training.splat import Filtered, apply, draw_filter, filter_reference
+from research.training.splat import apply, draw_filter, filter_reference
 
 #: A batch by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w), all encoded, in
 #: channels-last memory. Some networks read further channels of the first two.
@@ -109,7 +109,7 @@ class Rendered:
     features: dict[str, Tensor]
     """(patch, patch, channels) by name, of the HRLS"""
     variance: Tensor | None
-    """(patch, patch), of the luminance of the HRLS; None if it has one sample a pixel"""
+    """(patch, patch), of the luminance of the HRLS; None if it has one sample a pixel, or single samples"""
     lrhs: Tensor
     """(H/s, W/s, 3), of the whole view"""
     target: Tensor
@@ -251,31 +251,27 @@ class SampleTensors:
         inner = (slice(None), *crop)
         names = {RGB: "color"} | {name: name for name in PASS_FEATURES if name != RGB}
 
-        def hrls(count: int) -> Filtered:
+        def hrls(count: int) -> Tensor:
             drawn = order[: pixel_filter.samples_for(count)]
             layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
             for name in RADIANCE_FEATURES:
                 layers[name] = _lit(layers[name], light)
             place = self.read("place", drawn, *wide)
-            measure = luminance(layers[RGB].movedim(1, -1))
-            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, count, generator)
+            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), 1, count, generator)[inner]
 
         whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
 
         def lrhs(samples: np.ndarray) -> Tensor:
             chosen = torch.from_numpy(samples).to(device)
             color = _lit(self.read("lr_color", chosen, *whole), light)
-            return apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator).mean
+            return apply(pixel_filter, self.read("lr_place", chosen, *whole), color, scale, None, generator)
 
-        few = hrls(n)
-        features, variance, low = few.mean[inner], few.variance, lrhs(lr_samples)
-        has_variance = n > 1 or pixel_filter.spreads_noise
+        features, low = hrls(n), lrhs(lr_samples)
         if sampling.uneven and rng.random() < sampling.uneven:
             more = _random_parts(height, width, rng).to(device)
-            features = torch.where(more[area], hrls(len(order)).mean[inner], features)
+            features = torch.where(more[area], hrls(len(order)), features)
             coarse = more[::scale, ::scale][: low.shape[-2], : low.shape[-1]]
             low = torch.where(coarse, lrhs(np.arange(lr_count)), low)
-            has_variance = False  # which parts have more samples is not known
         layers = _split(features.movedim(0, -1))
         for name in RADIANCE_FEATURES:
             layers[name] = layers[name].clamp_min(0.0)
@@ -286,8 +282,7 @@ class SampleTensors:
         else:
             ref = self.clean_reference[:, :, *cells]
         target = filter_reference(pixel_filter, _lit(ref, light)[0], REF_CELLS)[inner].movedim(0, -1)
-        known = variance[inner[1:]] if has_variance and variance is not None else None
-        return Rendered(layers, known, low.movedim(0, -1).clamp_min(0.0), target.clamp_min(0.0))
+        return Rendered(layers, None, low.movedim(0, -1).clamp_min(0.0), target.clamp_min(0.0))
 
 
 def _random_parts(height: int, width: int, rng: np.random.Generator, cell: int = 8) -> Tensor:

@@ -15,32 +15,36 @@ output.
 from __future__ import annotations
 
 import argparse
+import collections
 import copy
 import datetime
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
 from torch import nn
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.model.contract import SCALES, SPREAD, Contract
-from research.training import CHECKPOINTS, export_checks
-from research.training.checkpoints import load, load_joint
+from oiio_msspl.model.contract import NO_DENOISER, SCALES, SPREAD, Contract
+from oiio_msspl.model.runtime import load_network
+from research.training import CHECKPOINTS
+from research.training.checkpoints import Network, load, load_joint, run
 from research.training.denoisers import ALIGNMENT, MeanDenoiser, with_denoised_mean
+from research.training.encoding import log_encode
 from research.training.joint import FEATURES, SIZES, JointFusion
-from research.training.networks import Network, denoiser_of
 from research.training.oidn import provenance
 from research.training.paper import MultiResolutionFusion
 from research.training.quantise import joint
 from research.training.quantise.layers import Networks, quantised, varied
 from research.training.tracing import IR_VERSION, prepend, shuffle, traced, unshuffle
-from research.training.whole_model import quantised_denoiser, save, whole_model
+from research.training.whole_model import InTorch, example, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
@@ -55,7 +59,7 @@ Pair = tuple[torch.Tensor, torch.Tensor]
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
     """Return the contract of a checkpoint's network for one of its scales."""
-    denoiser = denoiser_of(network, scale)
+    denoiser = network.denoiser(scale) if isinstance(network, JointFusion) else NO_DENOISER
     # Tiles begin on the grid of the denoiser's lowest level, too, so that it divides a tile as it divides the frame.
     alignment = ALIGNMENT if denoiser else network.multiple // scale
     features: dict[str, Any] = {}
@@ -184,6 +188,43 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
     prepend(graph, casts)
 
 
+# Checks
+
+
+@torch.inference_mode()
+def parity(network: Network, path: Path, denoise: MeanDenoiser | None = None) -> float:
+    """Return the largest difference of an exported file's output from the network's, log-encoded.
+
+    Args:
+        denoise: the denoiser of both renders' mean, if the file's contract has one.
+    """
+    session, contract = load_network(path), Contract.of_file(path)
+    fuse = network.fuse if isinstance(network, JointFusion) else partial(run, network)
+    model = InTorch(contract, fuse, denoise)
+    block = contract.alignment * -(-6 // contract.alignment)  # at least six pixels
+    worst = 0.0
+    for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
+        inputs = example(contract, height, width, seed=height)
+        (fused,) = session.run(["fused"], {name: values.numpy() for name, values in inputs.items()})
+        worst = max(worst, float((log_encode(torch.from_numpy(fused)) - log_encode(model(inputs))).abs().max()))
+    return worst
+
+
+def check_casts(path: Path) -> None:
+    """Refuse a file whose weights ONNX Runtime would cast in every run."""
+    options = onnxruntime.SessionOptions()
+    optimised = path.with_suffix(".optimised")
+    options.optimized_model_filepath = str(optimised)
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    counts = collections.Counter(node.op_type for node in onnx.load(optimised).graph.node)
+    optimised.unlink()
+    if counts["Cast"]:
+        raise SystemExit(
+            f"{path}: {counts['Cast']} casts of weights are left after loading; they would slow every tile"
+        )
+
+
 def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -232,8 +273,8 @@ def main() -> None:
     save(models, args.name if len(scales) > 1 else "")
     for file in files:
         if args.half:
-            export_checks.check_casts(file)
-        difference = export_checks.parity(network, file, denoiser)
+            check_casts(file)
+        difference = parity(network, file, denoiser)
         print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {difference:.2g}")
 
 

@@ -4,16 +4,8 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
-
-
-def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
-    """Return a 3x3 convolution that keeps the image's size."""
-    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
-
-
-# Resampling
 
 
 def box_downsample(image: Tensor, factor: int) -> Tensor:

@@ -35,11 +35,15 @@ from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import HRLS_FEATURES, RGB
 from oiio_msspl.model.contract import SCALES
-from research.training.ops import conv3x3
 
 #: The LRHS branch reads RGB alone.
 LRHS_CHANNELS = HRLS_FEATURES[RGB]
 HRLS_CHANNELS = sum(HRLS_FEATURES.values())
+
+
+def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
+    """Return a 3x3 convolution that keeps the image's size."""
+    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
 
 
 class Deshuffle(nn.Module):

@@ -25,24 +25,6 @@ from torch import Tensor
 # Filters
 
 
-def _box(t: Tensor) -> Tensor:
-    return torch.ones_like(t)
-
-
-def _tent(t: Tensor) -> Tensor:
-    return 1 - t
-
-
-def _gaussian(t: Tensor) -> Tensor:
-    """Weigh by a standard deviation of a quarter of the radius, shifted to end at zero, as Mitsuba."""
-    return torch.exp(-8 * t**2) - math.exp(-8)
-
-
-def _wide_gaussian(t: Tensor) -> Tensor:
-    """Weigh by a standard deviation of half the radius, cut off there, as Arnold."""
-    return torch.exp(-2 * t**2)
-
-
 def _blackman_harris(t: Tensor) -> Tensor:
     a = (0.35875, 0.48829, 0.14128, 0.01168)
     return torch.stack([value * torch.cos(math.pi * k * t) for k, value in enumerate(a)]).sum(dim=0)
@@ -60,20 +42,17 @@ def _cubic(b: float, c: float) -> Callable[[Tensor], Tensor]:
     return weight
 
 
-def _lanczos(t: Tensor) -> Tensor:  # two lobes
-    return torch.sinc(2 * t) * torch.sinc(t)
-
-
-#: Weight at the distance t = |x| / radius, between 0 and 1.
+#: Weight at the distance t = |x| / radius, between 0 and 1. The Gaussian of Mitsuba has a standard deviation of a
+#: quarter of the radius and is shifted to end at zero; Arnold's has half the radius and is cut off.
 KINDS: dict[str, Callable[[Tensor], Tensor]] = {
-    "box": _box,
-    "tent": _tent,
-    "gaussian": _gaussian,
-    "wide-gaussian": _wide_gaussian,
+    "box": torch.ones_like,
+    "tent": lambda t: 1 - t,
+    "gaussian": lambda t: torch.exp(-8 * t**2) - math.exp(-8),
+    "wide-gaussian": lambda t: torch.exp(-2 * t**2),
     "blackman-harris": _blackman_harris,
     "mitchell": _cubic(1 / 3, 1 / 3),
     "catmull-rom": _cubic(0, 1 / 2),
-    "lanczos": _lanczos,
+    "lanczos": lambda t: torch.sinc(2 * t) * torch.sinc(t),
 }
 
 
@@ -145,34 +124,21 @@ def draw_filter(rng: np.random.Generator, *, spread_noise: bool | None = None) -
 # Samples to pixels
 
 
-@dataclass(frozen=True)
-class Filtered:
-    """What samples give for each pixel."""
-
-    mean: Tensor
-    """(C, h, w)"""
-    variance: Tensor | None
-    """(h, w), an estimate of the variance of the pixel's mean of ``measure``; 0 where one sample decides the pixel"""
-
-
 def apply(
-    pixel_filter: PixelFilter,
-    place: Tensor,
-    values: Tensor,
-    measure: Tensor | None = None,
-    scale: int = 1,
-    count: int | None = None,
-    generator: torch.Generator | None = None,
-) -> Filtered:
+    pixel_filter: PixelFilter, place: Tensor, values: Tensor, scale: int = 1,
+    count: int | None = None, generator: torch.Generator | None = None,
+) -> Tensor:  # fmt: skip
     """Filter samples into pixels of s x s of theirs. Samples outside the image are missing, as at the edge of a film.
 
     Args:
         place: (K, H, W, 2), x and y of the samples in their pixels, 0 to 1.
         values: (K, C, H, W).
-        measure: (K, H, W), what the variance is computed of, such as luminance; None for no variance.
         scale: s. H and W are multiples of it.
         count: for importance sampling, at most this many samples in each pixel; for a spread filter without meaning.
         generator: of the random numbers for importance sampling.
+
+    Returns:
+        (C, H / s, W / s)
     """
     k, _, height, width = values.shape
     low_height, low_width = height // scale, width // scale
@@ -188,42 +154,23 @@ def apply(
     rows, columns = (torch.arange(n, device=place.device) % scale for n in (height, width))
     x = blocks((place[..., 0] + columns) / scale)
     y = blocks((place[..., 1] + rows[:, None]) / scale)
-    # What is summed: 1, the values, the measure
     stacked = torch.cat([torch.ones_like(x)[:, None], blocks(values)], dim=1)
-    if measure is not None:
-        stacked = torch.cat([stacked, blocks(measure)[:, None]], dim=1)
-    has_measure = measure is not None
     if pixel_filter.splatted:
-        return _splat(pixel_filter, x, y, stacked, has_measure)
-    return _distribute(pixel_filter, x, y, stacked, has_measure, count, generator)
+        return _splat(pixel_filter, x, y, stacked)
+    return _distribute(pixel_filter, x, y, stacked, count, generator)
 
 
-def _splat(pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor, has_measure: bool) -> Filtered:
-    """Compute each pixel as sum(w L) / sum(w)."""
+def _splat(pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor) -> Tensor:
+    """Compute each pixel as sum(w L) / sum(w); the first channel of the values is 1."""
     reach, (height, width) = pixel_filter.reach, x.shape[-2:]
-    shape = (height + 2 * reach, width + 2 * reach)
-    sums, squares = values.new_zeros(values.shape[1], *shape), values.new_zeros(3, *shape)
-    measured = values[:, -1]
-    moments = torch.stack([torch.ones_like(x), measured, measured**2], dim=1)
+    sums = values.new_zeros(values.shape[1], height + 2 * reach, width + 2 * reach)
     across, down = pixel_filter.weights(x), pixel_filter.weights(y)
     for i, w_y in enumerate(down):
         for j, w_x in enumerate(across):
-            area = (slice(None), slice(i, i + height), slice(j, j + width))
             for k, w in enumerate(w_x * w_y):
-                sums[area].addcmul_(w, values[k])
-                if has_measure:
-                    squares[area].addcmul_(w**2, moments[k])
-    inner = (slice(None), slice(reach, reach + height), slice(reach, reach + width))
-    weight, *rest = sums[inner]
-    weight = torch.where(weight.abs() > 1e-3, weight, 1e-3)  # negative lobes may leave nothing
-    mean = torch.stack(rest) / weight
-    if not has_measure:
-        return Filtered(mean, None)
-    # sum(w^2 (L - m)^2) / sum(w)^2, without bias where all weights are equal
-    m, (w2, w2l, w2ll) = mean[-1], squares[inner]
-    share = w2 / weight**2  # 1 / effective number of samples
-    variance = (w2ll - 2 * m * w2l + m**2 * w2).clamp_min(0) / weight**2
-    return Filtered(mean[:-1], torch.where(share < 0.95, variance / (1 - share).clamp_min(0.05), 0.0))
+                sums[:, i : i + height, j : j + width].addcmul_(w, values[k])
+    weight, *rest = sums[:, reach : reach + height, reach : reach + width]
+    return torch.stack(rest) / torch.where(weight.abs() > 1e-3, weight, 1e-3)  # negative lobes may leave nothing
 
 
 def _distribute(
@@ -231,11 +178,10 @@ def _distribute(
     x: Tensor,
     y: Tensor,
     values: Tensor,
-    has_measure: bool,
     count: int | None,
     generator: torch.Generator | None,
-) -> Filtered:
-    """Count each sample in one pixel, drawn by the filter.
+) -> Tensor:
+    """Count each sample in one pixel, drawn by the filter; the first channel of the values is 1.
 
     The samples of a pixel are then distributed as the filter divided by the sum of the filters of all pixels there,
     which is nearly the filter itself from a width of two pixels. Pixels that get fewer than ``count`` are the mean of
@@ -254,27 +200,19 @@ def _distribute(
     kept = ((column >= 0) & (column < width) & (row >= 0) & (row < height)).flatten()
     target = (row * width + column).flatten()
     target = torch.where(kept, target, height * width)  # a pixel beyond the others, for samples that leave the image
+    chosen = torch.arange(len(target), device=x.device)
     if count is not None:
         # Samples in random order, grouped by their pixel: the first ones of each group count
         shuffled = torch.rand(target.shape, generator=generator, device=x.device, dtype=torch.float64)
         order = (target + shuffled).argsort()
         groups = target[order]
-        rank = torch.arange(len(order), device=x.device) - torch.searchsorted(groups, groups)
-        chosen = order[rank < count]
-    else:
-        chosen = torch.arange(len(target), device=x.device)
-    if has_measure:
-        values = torch.cat([values, values[:, -1:] ** 2], dim=1)
+        chosen = order[chosen - torch.searchsorted(groups, groups) < count]
     columns = values.movedim(1, -1)
     sums = values.new_zeros(height * width + 1, columns.shape[-1])
     sums.index_add_(0, target[chosen], columns.reshape(-1, columns.shape[-1])[chosen])
     sums = sums[:-1].reshape(height, width, -1).movedim(-1, 0)
     n, *rest = torch.where(sums[0] > 0, sums, columns[0].movedim(-1, 0))
-    if not has_measure:
-        return Filtered(torch.stack(rest) / n, None)
-    *rest, total, square = rest
-    squared_error = (square - total**2 / n).clamp_min(0)
-    return Filtered(torch.stack(rest) / n, squared_error / (n * (n - 1).clamp_min(1)))
+    return torch.stack(rest) / n
 
 
 # Reference

@@ -30,9 +30,9 @@ from torch.optim.swa_utils import AveragedModel
 from oiio_msspl.exr.atomic import replacing
 from research.datagen.views import Folder, SampleView, View
 from research.training import checkpoints, losses
+from research.training.checkpoints import NETWORKS, Network, preparation, run
 from research.training.data import Batches, Sampling, spp_range
 from research.training.joint import SIZES, JointFusion
-from research.training.networks import NETWORKS, Network, preparation, run
 from research.training.paper import MultiResolutionFusion
 from research.training.pool import PooledBatches
 from research.training.validation import ValidationPair, evaluate

@@ -13,9 +13,9 @@ import torch
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from research.datagen.views import Array, View, as_float32, mean_lrhs, read_hrls, split_features
+from research.training.checkpoints import Network, run
 from research.training.data import Prepare, to_tensor
 from research.training.encoding import packed
-from research.training.networks import Network, run
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class ValidationPair:
     """The middle of a view with 1 spp in the HRLS and s^2 spp in the LRHS, the paper's (s^2 - 1)."""
 
     lrhs: Array
-    """(h, w, 3), encoded, and the channels that :func:`research.training.networks.preparation` adds."""
+    """(h, w, 3), encoded, and the channels that :func:`research.training.checkpoints.preparation` adds."""
     hrls: Array
     """(s*h, s*w, 16), encoded, and the channels that are added. One sample has no variance, so that is missing."""
     reference: Array

@@ -15,6 +15,7 @@ from research.datagen import textures as tex
 Rng = np.random.Generator
 Material: TypeAlias = bpy.types.Material
 Socket: TypeAlias = bpy.types.NodeSocket
+_SOCKET: type = bpy.types.NodeSocket  # mypy takes no alias in isinstance
 
 
 def rgba(color: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float, float]:
@@ -47,7 +48,7 @@ class Graph:
             setattr(node, name, value)
         for key, value in (inputs or {}).items():
             socket = node.inputs[key]
-            if isinstance(value, Socket):
+            if isinstance(value, _SOCKET):
                 self.tree.links.new(value, socket)
             elif np.ndim(value) == 1:
                 socket.default_value = rgba(value) if socket.type == "RGBA" else [float(v) for v in value]
@@ -62,8 +63,9 @@ class Graph:
         """Mix two colours, (3,) or sockets."""
         node = self.tree.nodes.new("ShaderNodeMix")
         node.data_type, node.blend_type = "RGBA", blend
-        for index, value in ((0, factor), (6, a), (7, b)):  # the sockets of colours follow those of other types
-            if isinstance(value, Socket):
+        sockets: list[tuple[int, Any]] = [(0, factor), (6, a), (7, b)]  # those of colours follow those of other types
+        for index, value in sockets:
+            if isinstance(value, _SOCKET):
                 self.tree.links.new(value, node.inputs[index])
             else:
                 node.inputs[index].default_value = rgba(value) if np.ndim(value) == 1 else float(value)
@@ -240,7 +242,7 @@ def principled(name: str, rng: Rng, inputs: dict[str, Any], graph: Graph | None 
     if chance(rng, bumpy):
         inputs["Normal"] = bump(graph, rng, frequency)
     roughness = inputs.get("Roughness", 0.5)
-    if not isinstance(roughness, Socket) and chance(rng, 0.25):
+    if not isinstance(roughness, _SOCKET) and chance(rng, 0.25):
         patches = graph.add("ShaderNodeTexNoise", {"Vector": graph.coordinates(frequency), "Scale": 1, "Detail": 5})
         inputs["Roughness"] = graph.span(graph.threshold(patches.outputs[0], 0.5, 0.4), roughness * 0.4,
                                          min(roughness * 1.5 + 0.05, 1))  # fmt: skip

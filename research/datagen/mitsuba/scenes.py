@@ -591,10 +591,7 @@ def outdoors(s: Scene) -> None:
         else:
             hole = (length * 0.3, 0.6, length * 0.6, 1.5)
             house = geo.wall(length, rng.uniform(1.8, 4), 0.25, [hole])
-            s.add(
-                house.moved(-length / 2, 0, 0).turned(angle).moved(*p),
-                mat.structure(rng, tex.pattern(rng, 0.1)),
-            )
+            s.add(house.moved(-length / 2, 0, 0).turned(angle).moved(*p), mat.structure(rng, tex.pattern(rng, 0.1)))
         s.focus.append(p + (0, 0, 0.6))
     for _ in range(rng.integers(3, 12)):
         s.put(np.array([*rng.normal(size=2) * 1.5, 0]), 10 ** rng.uniform(-0.9, 0.2), 0.3, 0.1)

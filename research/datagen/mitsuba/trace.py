@@ -157,9 +157,7 @@ def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)
         to_diffuse = dr.select(first, dr.select(delta, 0, _share(part_d, whole)), to_diffuse)
         to_specular = dr.select(
-            first,
-            dr.select(delta, dr.select(mirrored, mi.Spectrum(1), 0), _share(part_g, whole)),
-            to_specular,
+            first, dr.select(delta, dr.select(mirrored, mi.Spectrum(1), 0), _share(part_g, whole)), to_specular
         )
 
         throughput *= weight

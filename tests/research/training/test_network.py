@@ -378,7 +378,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     pytest.importorskip("onnxscript")
     onnx = pytest.importorskip("onnx")
     onnxruntime = pytest.importorskip("onnxruntime")
-    from research.training import export, export_checks
+    from research.training import export
     from research.training.whole_model import whole_model
 
     path = tmp_path / "tiny.onnx"
@@ -386,7 +386,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     network = export.to_onnx(tiny_network, contract, half=half)
     onnx.save(whole_model(network, contract, None), path)
 
-    assert export_checks.parity(tiny_network, path) < (5e-3 if half else 1e-5)
+    assert export.parity(tiny_network, path) < (5e-3 if half else 1e-5)
     kinds = {node.op_type for node in network.graph.node}
     assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
     assert str(Path(__file__).parents[3]).encode() not in path.read_bytes()

@@ -5,8 +5,9 @@
     python -m research.training.average NEW.pt RUN/final.pt --initial 0.25 0.75
 
 The mean of a network and of its continuation by further training often keeps the strengths of both (Wortsman et al.
-2022). The mean of a joint network may include its initial state, which is Open Image Denoise with constant logits. The
-result is stored in half precision, with the provenance of the last checkpoint.
+2022). The mean of a joint network may include its initial state, which is Open Image Denoise with constant logits:
+``--initial`` gives its shares in the network and in the denoiser of both renders' mean. The result is stored in half
+precision, with the provenance of the last checkpoint.
 """
 
 from __future__ import annotations
@@ -69,17 +70,9 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("out", type=Path, help="checkpoint to write")
     parser.add_argument("checkpoints", type=Path, nargs="+", help="checkpoints to average")
-    parser.add_argument(
-        "--shares", type=float, nargs="+", default=(), metavar="SHARE", help="share of each checkpoint (default: equal)"
-    )
-    parser.add_argument(
-        "--initial",
-        type=float,
-        nargs=2,
-        default=(0, 0),
-        metavar="SHARE",
-        help="joint: shares of the initial state in the network and in its denoiser of both renders' mean",
-    )
+    shares, initial = "share of each checkpoint (default: equal)", "joint: shares of the initial state, see above"
+    parser.add_argument("--shares", type=float, nargs="+", default=(), metavar="SHARE", help=shares)
+    parser.add_argument("--initial", type=float, nargs=2, default=(0, 0), metavar="SHARE", help=initial)
     args = parser.parse_args()
     states = [checkpoints.read(path) for path in args.checkpoints]
     checkpoints.save(mean(states, args.shares, tuple(args.initial)), args.out)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import signal
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -47,6 +46,8 @@ Batch = dict[str, Tensor]
 #: Adds the further input channels of a network to an encoded pair, (h, w, 3) and (s*h, s*w, 16).
 Prepare = Callable[[Array, Array], tuple[Array, Array]]
 
+
+CPU = torch.device("cpu")
 
 # How pairs are sampled
 
@@ -308,14 +309,9 @@ def _lit(radiance: Tensor, light: Tensor) -> Tensor:
 
 
 def draw(
-    views: Sequence[ViewTensors | SampleTensors],
-    scale: int,
-    patch: int,
-    count: int,
-    rng: np.random.Generator,
-    sampling: Sampling,
-    prepare: Prepare | None = None,
-) -> Batch:
+    views: Sequence[ViewTensors | SampleTensors], scale: int, patch: int, count: int, rng: np.random.Generator,
+    sampling: Sampling, prepare: Prepare | None = None,
+) -> Batch:  # fmt: skip
     """Draw a batch of ``count`` pairs of ``patch`` x ``patch`` HRLS pixels.
 
     Views, crops, spp, pixel filter, light, exposure and missing features differ within a batch. Mirroring and rotation
@@ -437,44 +433,26 @@ def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
 # All batches
 
 
+@dataclass(frozen=True, eq=False)
 class Batches(IterableDataset):
-    """Endless random batches of a folder's training views.
+    """Endless random batches of a folder's training views."""
 
-    Args:
-        scales: of each batch, one of these at random.
-        patch: width and height of a patch in HRLS pixels.
-        batch: pairs per batch.
-        prepare: returns the function that adds a network's further channels; called in the process that draws.
-        rescan_seconds: how often to look for new views on a CPU. A GPU keeps the views that it has loaded.
-    """
+    folder: Path
+    scales: tuple[int, ...]
+    """Of each batch, one of these at random."""
+    patch: int
+    """Width and height of a patch in HRLS pixels."""
+    batch: int
+    """Pairs per batch."""
+    sampling: Sampling
+    seed: int
+    device: torch.device
+    prepare: Prepare | None = None
 
-    def __init__(
-        self,
-        folder: Path,
-        scales: tuple[int, ...],
-        patch: int,
-        batch: int,
-        sampling: Sampling,
-        seed: int,
-        device: torch.device,
-        prepare: Callable[[], Prepare | None] | None = None,
-        rescan_seconds: float = 120,
-    ) -> None:
-        self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
-        self.seed, self.device, self.prepare, self.rescan_seconds = seed, device, prepare, rescan_seconds
-
-    @torch.no_grad()
     def __iter__(self) -> Iterator[Batch]:
         """Yield batches without end."""
-        folder, prepare = Folder(self.folder), self.prepare and self.prepare()
-        rng = np.random.default_rng(self.seed)
-        while True:
-            views = view_tensors(folder, "train", self.device)
-            deadline = time.monotonic() + self.rescan_seconds
-            while self.device.type != "cpu" or time.monotonic() < deadline:
-                scale = int(rng.choice(self.scales))
-                yield draw(views, scale, self.patch, self.batch, rng, self.sampling, prepare)
-            folder.scan()
+        drawn = self.folder, "train", self.scales, self.patch, self.batch, self.prepare, self.sampling
+        return fixed_batches(*drawn, seed=self.seed, device=self.device)
 
     def loader(self) -> DataLoader:
         """Load batches: on a CPU four ahead of training, in a process of their own."""
@@ -497,23 +475,15 @@ def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewT
 
 
 def fixed_batches(
-    views: Path,
-    split: str,
-    scales: Sequence[int],
-    patch: int,
-    batch: int,
-    prepare: Prepare | None = None,
-    rng: np.random.Generator | None = None,
-    sampling: Sampling = Sampling(),
-    *,
-    without_reference: bool = False,
-) -> Iterator[Batch]:
-    """Yield endless batches on the CPU, the same in every call, for calibration, pruning and the like.
+    views: Path, split: str, scales: Sequence[int], patch: int, batch: int, prepare: Prepare | None = None,
+    sampling: Sampling = Sampling(), *, seed: int = 0, device: torch.device = CPU, without_reference: bool = False,
+) -> Iterator[Batch]:  # fmt: skip
+    """Yield endless batches of the views that a folder has now, the same for each seed.
 
     Args:
         without_reference: also of views that have none; their targets are not to be read.
     """
-    rng, folder, device = rng or np.random.default_rng(0), Folder(views), torch.device("cpu")
+    rng, folder = np.random.default_rng(seed), Folder(views)
     tensors = view_tensors(folder, split, device)
     if without_reference:
         tensors += view_tensors(folder, NO_REFERENCE, device)

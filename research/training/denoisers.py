@@ -15,18 +15,8 @@ import torch
 from torch import Tensor, nn
 
 from oiio_msspl.image.arrays import Array
+from research.training import oidn
 from research.training.encoding import from_srgb, log_to_pu, pu_to_log, srgb
-from research.training.oidn import (
-    ALBEDO_BASE,
-    BASE,
-    LARGE,
-    LARGE_HDR,
-    NORMAL_BASE,
-    SMALL_CLEAN_HDR,
-    FineTunedUNet,
-    Start,
-    untouched,
-)
 from research.training.ops import box_downsample, log2_scale
 from research.training.paper import LRHS_CHANNELS
 from research.training.render_mean import with_mean
@@ -35,21 +25,17 @@ from research.training.render_mean import with_mean
 ALIGNMENT = 16
 #: The extra input channel is the noise.
 EXTRA = 1
+#: The convolutions of the large network's two lowest levels.
+LOWEST = ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b")
 #: By the size of :class:`research.training.joint.JointFusion`. Of the large network, only the outer levels are
 #: trained: the two lowest ones have two thirds of all weights.
 STARTS = {
-    "small": Start(SMALL_CLEAN_HDR, BASE, ("enc_conv0", "dec_conv1a"), EXTRA),
-    "usual": Start(
-        LARGE_HDR,
-        LARGE,
-        ("enc_conv1a", "dec_conv1a"),
-        EXTRA,
-        ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b"),
-    ),
+    "small": oidn.Start(oidn.SMALL_CLEAN_HDR, oidn.BASE, ("enc_conv0", "dec_conv1a"), EXTRA),
+    "usual": oidn.Start(oidn.LARGE_HDR, oidn.LARGE, ("enc_conv1a", "dec_conv1a"), EXTRA, frozen=LOWEST),
 }
 
 
-class MeanDenoiser(FineTunedUNet):
+class MeanDenoiser(oidn.FineTunedUNet):
     """The denoiser of both renders' mean. Its size is a key of ``STARTS``."""
 
     def __init__(self, size: str = "usual") -> None:
@@ -97,7 +83,9 @@ class LayerDenoisers(nn.Module):
 
     def __init__(self) -> None:
         super().__init__()
-        self.albedo, self.normal = (FineTunedUNet(untouched(name, BASE)) for name in (ALBEDO_BASE, NORMAL_BASE))
+        self.albedo, self.normal = (
+            oidn.FineTunedUNet(oidn.untouched(name, oidn.BASE)) for name in (oidn.ALBEDO_BASE, oidn.NORMAL_BASE)
+        )
 
     def forward(self, albedo: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
         """Denoise an albedo in [0, 1] and a normal in [-1, 1], (N, 3, H, W) each; both results are in [0, 1]."""

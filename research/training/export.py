@@ -68,18 +68,13 @@ def contract_of(network: Network, scale: int, name: str, overlap: int, state: di
         # of 16 or 64 pixels has little, and the LRHS's AOVs differ from it where the pixel filter is not a box.
         features = {"lrhs": [RGB, *((ALBEDO, NORMAL) if scale == 2 else ())], "hrls": list(FEATURES)}
     return Contract(
-        **features,
-        denoiser=denoiser,
+        **features, name=name, scale=scale, denoiser=denoiser, alignment=alignment, overlap=overlap,
         bytes_per_pixel=MEMORY[name.rpartition("-x")[0].removesuffix(SPREAD)],
-        name=name,
-        scale=scale,
-        alignment=alignment,
-        overlap=overlap,
         training_spp=state["training_spp"][str(scale)],
         provenance=state["provenance"]
         | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()}
         | (provenance(SIZES[network.size][0]) if isinstance(network, JointFusion) else {}),
-    )
+    )  # fmt: skip
 
 
 def network_example(network: Network, scale: int, alignment: int) -> tuple[torch.Tensor, torch.Tensor]:

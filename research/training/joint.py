@@ -31,26 +31,20 @@ from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, SPREAD
+from research.training import oidn
 from research.training.denoisers import LayerDenoisers, MeanDenoiser, denoise_mean
 from research.training.encoding import LOG_SCALE, log_decode, log_encode, log_to_pu, pu_to_log
-from research.training.oidn import (
-    BASE,
-    BASE_HDR,
-    LARGE,
-    LARGE_HDR,
-    SMALL_HDR,
-    FineTunedConv,
-    convolutions,
-    pretrained_weights,
-    run_unet_on_tensors,
-)
 from research.training.ops import highest_around, log2_scale, pyramid, upsample
 from research.training.paper import LRHS_CHANNELS
 
 #: Features of the HRLS that the network reads.
 FEATURES = (RGB, ALBEDO, NORMAL)
 #: By size: the network of Open Image Denoise from which the U-Net starts, and its shape.
-SIZES = {"small": (SMALL_HDR, BASE), "usual": (BASE_HDR, BASE), "large": (LARGE_HDR, LARGE)}
+SIZES = {
+    "small": (oidn.SMALL_HDR, oidn.BASE),
+    "usual": (oidn.BASE_HDR, oidn.BASE),
+    "large": (oidn.LARGE_HDR, oidn.LARGE),
+}
 #: Initial logits at the LRHS's resolution: the denoised mean of both renders, the denoised HRLS, the HRLS, the LRHS.
 COARSEST = (2.0, 0.0, -2.0, -2.0)
 #: Initial logits at finer levels: the denoised HRLS at the coarser level's brightness, the denoised HRLS, light times
@@ -76,7 +70,7 @@ DECODED = ("dec_conv1b", "dec_conv2b", "dec_conv3b", "dec_conv4b")
 OUTPUTS = (len(FINER) + 1, *[len(FINER) + len(COARSEST)] * 3)
 #: On the way up: the convolution whose outputs are the first inputs of a convolution.
 PREDECESSOR = {
-    name: before for before, name in itertools.pairwise([*(n for level in BASE.up for n in level), BASE.last])
+    name: before for before, name in itertools.pairwise([*(n for level in oidn.BASE.up for n in level), oidn.BASE.last])
 }
 
 
@@ -101,15 +95,15 @@ class JointFusion(nn.Module):
         self.config: dict[str, Any] = {"kept": self.kept, "size": size, "spread": spread}
         self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, sum(HRLS_FEATURES[name] for name in FEATURES)
         network, self.shape = SIZES[size]
-        self.pretrained = pretrained_weights(network)
+        self.pretrained = oidn.pretrained_weights(network)
         # The large size reads the mean that the usual one has denoised
         self.mean_denoiser = None if size == "large" else MeanDenoiser(size)
         self.layers = LayerDenoisers() if size == "large" else None
-        convs: dict[str, FineTunedConv] = {}
-        for name in convolutions(self.pretrained):
+        convs: dict[str, oidn.FineTunedConv] = {}
+        for name in oidn.convolutions(self.pretrained):
             rows, columns = self.pretrained_channels(name)
             weight, bias = self.pretrained[f"{name}.weight"][rows][:, columns], self.pretrained[f"{name}.bias"][rows]
-            convs[name] = FineTunedConv(weight, bias, EXTRA if name in READERS else 0)
+            convs[name] = oidn.FineTunedConv(weight, bias, EXTRA if name in READERS else 0)
         channels = [len(convs[name].pretrained_bias) for name in DECODED]
         heads = [nn.Conv2d(*sizes, 3, padding=1) for sizes in zip(channels, OUTPUTS, strict=True)]
         self.convs: Any = nn.ModuleDict(convs)
@@ -201,7 +195,7 @@ class JointFusion(nn.Module):
             return features[name]
 
         inputs = [image.to(next(self.convs.parameters()).dtype) for image in (full, half)]
-        colour = run_unet_on_tensors(self.shape, inputs, conv)
+        colour = oidn.run_unet_on_tensors(self.shape, inputs, conv)
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))

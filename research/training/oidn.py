@@ -79,13 +79,9 @@ T = TypeVar("T")
 
 
 def run_unet(
-    shape: Shape,
-    inputs: Sequence[T],
-    conv: Callable[[str, T], T],
-    pool: Callable[[T], T],
-    upsample: Callable[[T], T],
-    concat: Callable[[T, T], T],
-) -> T:
+    shape: Shape, inputs: Sequence[T], conv: Callable[[str, T], T],
+    pool: Callable[[T], T], upsample: Callable[[T], T], concat: Callable[[T, T], T],
+) -> T:  # fmt: skip
     """Run a U-Net on any type of value: tensors, lists of tensors, names of a graph's tensors.
 
     Args:

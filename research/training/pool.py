@@ -150,13 +150,9 @@ class Teacher:
 
 @torch.no_grad()
 def draw_pairs(
-    view: View | SampleView,
-    scales: tuple[int, ...],
-    count: int,
-    device: torch.device,
-    denoisers: Denoisers | None = None,
-    teacher: Teacher | None = None,
-) -> list[Pair]:
+    view: View | SampleView, scales: tuple[int, ...], count: int, device: torch.device,
+    denoisers: Denoisers | None = None, teacher: Teacher | None = None,
+) -> list[Pair]:  # fmt: skip
     """Draw a view ``count`` times: ``lrhs`` (7, h, w), ``hrls`` (9, s*h, s*w), ``target`` (3, s*h, s*w), half floats.
 
     The LRHS has the mean of both renders and its noise, see :func:`research.training.render_mean.with_mean`. Or it is
@@ -223,16 +219,9 @@ class PooledBatches:
     """
 
     def __init__(
-        self,
-        pool: Path,
-        scales: tuple[int, ...],
-        patch: int,
-        batch: int,
-        seed: int,
-        device: torch.device,
-        *,
+        self, pool: Path, scales: tuple[int, ...], patch: int, batch: int, seed: int, device: torch.device, *,
         spread: bool | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.spread = spread
         self.pool, self.scales, self.patch, self.batch, self.device = pool, scales, patch, batch, device
         self.rng = np.random.default_rng(seed)

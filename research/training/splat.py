@@ -174,13 +174,9 @@ def _splat(pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor) -> T
 
 
 def _distribute(
-    pixel_filter: PixelFilter,
-    x: Tensor,
-    y: Tensor,
-    values: Tensor,
-    count: int | None,
-    generator: torch.Generator | None,
-) -> Tensor:
+    pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor,
+    count: int | None, generator: torch.Generator | None,
+) -> Tensor:  # fmt: skip
     """Count each sample in one pixel, drawn by the filter; the first channel of the values is 1.
 
     The samples of a pixel are then distributed as the filter divided by the sum of the filters of all pixels there,

@@ -18,13 +18,9 @@ OPSET, IR_VERSION = 18, 9
 
 
 def traced(
-    module: nn.Module,
-    inputs: tuple[Any, ...],
-    names: list[str],
-    outputs: list[str],
-    alignment: int,
+    module: nn.Module, inputs: tuple[Any, ...], names: list[str], outputs: list[str], alignment: int,
     translations: dict[Any, Any] | None = None,
-) -> onnx.ModelProto:
+) -> onnx.ModelProto:  # fmt: skip
     """Export a module for images of any size, and for numbers.
 
     Sides of the first input are multiples of ``alignment``; the other images keep their size relative to the first.
@@ -39,16 +35,9 @@ def traced(
         return {2: size * height, 3: size * width}
 
     program = torch.onnx.export(
-        module.eval(),
-        inputs,
-        input_names=names,
-        output_names=outputs,
-        opset_version=OPSET,
-        dynamo=True,
-        dynamic_shapes=tree_map(dynamic, inputs),
-        custom_translation_table=translations or {},
-        verbose=False,
-    )
+        module.eval(), inputs, input_names=names, output_names=outputs, opset_version=OPSET, dynamo=True, verbose=False,
+        dynamic_shapes=tree_map(dynamic, inputs), custom_translation_table=translations or {},
+    )  # fmt: skip
     assert program is not None
     model = program.model_proto
     _strip_traces(model)

@@ -14,7 +14,6 @@ from __future__ import annotations
 
 import argparse
 import csv
-import functools
 import logging
 import math
 import signal
@@ -162,8 +161,7 @@ class Run:
         if self.args.pool:
             spread = None if self.args.noise is None else self.args.noise == "spread"
             return PooledBatches(self.args.pool, *sizes, seed, self.device, spread=spread)
-        prepare = functools.partial(preparation, self.args.network)
-        return Batches(self.args.data, *sizes, Sampling(), seed, self.device, prepare)
+        return Batches(self.args.data, *sizes, Sampling(), seed, self.device, preparation(self.args.network))
 
     def new_schedule(self) -> LambdaLR:
         """Set the learning rate by the clock, at every ``step()`` of the schedule."""
@@ -274,48 +272,30 @@ class Run:
         self.folder.scan()
         since, interval = self.since, max(time.monotonic() - self.since["time"], 1e-9)
         row = {
-            "step": self.step,
-            "minutes": self.elapsed / 60,
-            "loss": since["loss"] / max(since["steps"], 1),
-            "lr": self.optimizer.param_groups[0]["lr"],
-            "skipped_steps": since["skipped"],
-            "samples_per_s": since["steps"] * self.args.batch / interval,
-            "wait_share": since["waited"] / interval,
-            "train_views": len(self.train_views()),
-            "val_pairs": len(self.validation),
-            **scores,
-        }
+            "step": self.step, "minutes": self.elapsed / 60, "loss": since["loss"] / max(since["steps"], 1),
+            "lr": self.optimizer.param_groups[0]["lr"], "skipped_steps": since["skipped"],
+            "samples_per_s": since["steps"] * self.args.batch / interval, "wait_share": since["waited"] / interval,
+            "train_views": len(self.train_views()), "val_pairs": len(self.validation), **scores,
+        }  # fmt: skip
         log.info("%s", "  ".join(f"{k} {v:.4g}" for k, v in row.items()))
         write_row(self.args.out / "log.csv", row)
 
     def state(self, scores: dict[str, float]) -> checkpoints.State:
         """Return the checkpoint, see :mod:`research.training.checkpoints`."""
         views = self.train_views()
+        provenance = {
+            "steps": self.step, "minutes": round(self.elapsed / 60, 1), "batch": self.args.batch, "patch": self.patch,
+            "loss": self.args.loss, "seed": self.args.seed, **({"init": self.args.init.name} if self.args.init else {}),
+            "views": len(views), "scenes": len({view.scene for view in views}),
+            "sources": sorted({view.source for view in views}), "torch": str(torch.__version__),
+            "validation": {"pairs": len(self.validation), "hrls_spp": 1} | scores,
+        }  # fmt: skip
         return {
-            "network": self.network.state_dict(),
-            "ema": self.average.module.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "architecture": self.args.network,
-            "config": self.network.config,
-            "step": self.step,
-            "seconds": self.elapsed,
-            "best_psnr": self.best_psnr,
-            "training_spp": {str(scale): spp_range(views, scale) for scale in self.scales},
-            "provenance": {
-                "steps": self.step,
-                "minutes": round(self.elapsed / 60, 1),
-                "batch": self.args.batch,
-                "patch": self.patch,
-                "loss": self.args.loss,
-                "seed": self.args.seed,
-                **({"init": self.args.init.name} if self.args.init else {}),
-                "views": len(views),
-                "scenes": len({view.scene for view in views}),
-                "sources": sorted({view.source for view in views}),
-                "torch": str(torch.__version__),
-                "validation": {"pairs": len(self.validation), "hrls_spp": 1} | scores,
-            },
-        }
+            "network": self.network.state_dict(), "ema": self.average.module.state_dict(),
+            "optimizer": self.optimizer.state_dict(), "architecture": self.args.network, "config": self.network.config,
+            "step": self.step, "seconds": self.elapsed, "best_psnr": self.best_psnr,
+            "training_spp": {str(scale): spp_range(views, scale) for scale in self.scales}, "provenance": provenance,
+        }  # fmt: skip
 
 
 def train(args: argparse.Namespace) -> None:

@@ -83,11 +83,9 @@ class InTorch(nn.Module):
     """
 
     def __init__(
-        self,
-        contract: Contract,
-        fuse: Callable[[Tensor, Tensor], Sequence[Tensor | None]],
+        self, contract: Contract, fuse: Callable[[Tensor, Tensor], Sequence[Tensor | None]],
         denoise: Callable[..., Tensor] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.enter, self.fuse, self.denoise = Enter(contract), fuse, denoise
 

@@ -20,18 +20,8 @@ from research.training.encoding import log_to_pu
 from research.training.joint import DECODED, FEATURES, MARGIN, OUTPUTS, JointFusion, blend
 from research.training.ops import log2_scale, upsample
 from research.training.paper import LRHS_CHANNELS
+from research.training.quantise import gptq
 from research.training.quantise.codes import log_encoded_of_code, sliced
-from research.training.quantise.gptq import (
-    COLOURS,
-    SIGNED_RANGE,
-    SIGNED_ZERO,
-    Activations,
-    CodeLayout,
-    Fit,
-    concatenated,
-    run_unet_on_activations,
-    sliced_layout,
-)
 from research.training.quantise.graph import Graph
 from research.training.quantise.layers import Networks, add_layers
 
@@ -61,16 +51,16 @@ class Blend(nn.Module):
 # The U-Net's inputs as codes
 
 
-def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
+def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[gptq.Activations]:
     """Return the U-Net's inputs at H and at H/2, for pairs of the network's inputs."""
-    plain = CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
+    plain = gptq.CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
     layouts = [
-        concatenated(sliced_layout(HRLS_SLICES, 0), plain),
-        concatenated(sliced_layout(MEAN_SLICES, 0), sliced_layout(LRHS_SLICES, 3)),
+        gptq.concatenated(gptq.sliced_layout(HRLS_SLICES, 0), plain),
+        gptq.concatenated(gptq.sliced_layout(MEAN_SLICES, 0), gptq.sliced_layout(LRHS_SLICES, 3)),
     ]
     codes: list[list[Tensor]] = [[], []]
     for lrhs, hrls in pairs:
-        albedo, normal = hrls[:, 3:6].clamp(0, 1) * 255, hrls[:, 6:9] * 127.5 + SIGNED_ZERO
+        albedo, normal = hrls[:, 3:6].clamp(0, 1) * 255, hrls[:, 6:9] * 127.5 + gptq.SIGNED_ZERO
         full = torch.cat(
             [sliced(log_to_pu(hrls[:, :3]), HRLS_SLICES), albedo.round(), normal.round().clamp(0, 255)], dim=1
         )
@@ -83,7 +73,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
             images.append(F.pad(image, (0, 0, 0, 0, 0, 1)))
 
     return [
-        Activations([layout.dequantise(image[0])[None] for image in images], images, layout)
+        gptq.Activations([layout.dequantise(image[0])[None] for image in images], images, layout)
         for images, layout in zip(codes, layouts, strict=True)
     ]
 
@@ -106,7 +96,7 @@ def calibration_pairs(
 # The fit
 
 
-def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> Fit:
+def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> gptq.Fit:
     """Quantise the U-Net and its heads, those that ``scale`` and smaller ones need."""
     weights = {}
     for name, layer in network.convs.items():
@@ -121,17 +111,17 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
     weights = {name: value.detach() for name, value in weights.items()}
     # Without further slices, the small network's finest level reads a third fewer channels. 8 bits cost it 0.05 to
     # 0.07 dB at x2
-    fit = Fit(network.shape, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
+    fit = gptq.Fit(network.shape, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
-    def conv(name: str, values: Activations) -> Activations:
+    def conv(name: str, values: gptq.Activations) -> gptq.Activations:
         result = fit.conv(name, values)
         if 0 < level_of_layer.get(name, 0) < scale.bit_length():
             fit.conv(f"head{level_of_layer[name]}", result)
         return result
 
     with torch.no_grad():
-        run_unet_on_activations(network.shape, unet_inputs(pairs), conv)
+        gptq.run_unet_on_activations(network.shape, unet_inputs(pairs), conv)
     return fit
 
 
@@ -147,7 +137,7 @@ class JointGraph(Graph):
         layers: denoise albedo and normal first, see :mod:`research.training.quantise.layers`.
     """
 
-    def __init__(self, fit: Fit, scale: int, layers: Networks | None = None) -> None:
+    def __init__(self, fit: gptq.Fit, scale: int, layers: Networks | None = None) -> None:
         super().__init__(fit)
         self._scale, self._layers = scale, layers
         self.initializers["unseen"] = log_encoded_of_code(SLICES_OUT)
@@ -164,7 +154,7 @@ class JointGraph(Graph):
             albedo = "albedo"
             normal_codes = self.add("QuantizeLinear", ["normal", step, "zero"], "normal.rounded")
         else:
-            middle = self.constant("middle", np.uint8(SIGNED_ZERO))
+            middle = self.constant("middle", np.uint8(gptq.SIGNED_ZERO))
             normal_codes = self.add("QuantizeLinear", [normal, half_step, middle], "normal.rounded")
         albedo_codes = self.add("QuantizeLinear", [albedo, step, "zero"], "albedo.rounded")
         colours = self.slices(self.log_to_pu(colour), HRLS_SLICES)
@@ -178,8 +168,8 @@ class JointGraph(Graph):
         pixels = self.look_up("unseen", sums, "denoised.pixels")
         self.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
         last = self.fit.shape.last
-        count = len(self.fit.layers[last].step) - COLOURS
-        self.add("Identity", [self._planes(last, COLOURS * SLICES_OUT, count)], "logits0")
+        count = len(self.fit.layers[last].step) - gptq.COLOURS
+        self.add("Identity", [self._planes(last, gptq.COLOURS * SLICES_OUT, count)], "logits0")
         for level in range(1, self._scale.bit_length()):
             name = self.conv(f"head{level}", DECODED[level])
             planes = self._planes(name, 0, len(self.fit.layers[name].step))
@@ -195,12 +185,12 @@ class JointGraph(Graph):
         # To transpose all channels and cut them then takes half of the time of the other order.
         planes = self.add("Transpose", [layer], f"{layer}.planes", perm=[0, 3, 1, 2])
         part = self.cut(planes, start, start + count, f"{layer}.beside")
-        step = self.constant("signed_step", np.float32(2 * SIGNED_RANGE / 255))
-        middle = self.constant("middle", np.uint8(SIGNED_ZERO))
+        step = self.constant("signed_step", np.float32(2 * gptq.SIGNED_RANGE / 255))
+        middle = self.constant("middle", np.uint8(gptq.SIGNED_ZERO))
         return self.add("DequantizeLinear", [part, step, middle], f"{layer}.values")
 
 
-def to_onnx(fit: Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
+def to_onnx(fit: gptq.Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
     """Return the graph with inputs ``lrhs`` and ``hrls`` and outputs ``fused`` and ``log_error``.
 
     With ``layers``, it also returns the denoised ``albedo`` and ``normal``.
@@ -214,6 +204,6 @@ def to_onnx(fit: Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | No
     info, kind = helper.make_tensor_value_info, TensorProto.FLOAT
     channels = sum(HRLS_FEATURES[name] for name in FEATURES)
     inputs = [info("lrhs", kind, [1, 2 * LRHS_CHANNELS, "h", "w"]), info("hrls", kind, [1, channels, "H", "W"])]
-    results = {"fused": COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
+    results = {"fused": gptq.COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
     outputs = [info(name, kind, [1, count, "H", "W"]) for name, count in results.items()]
     return JointGraph(fit, scale, layers).whole(mixing, inputs, outputs)

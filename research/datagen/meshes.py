@@ -198,9 +198,9 @@ def tube(path: np.ndarray, radius: float | np.ndarray, sides: int = 8) -> Mesh:
     """Return a tube along (K, 3) points."""
     t = unit(np.gradient(path, axis=0))
     side = unit(np.cross(t, (0.31, 0.87, 0.39)))
-    other = np.cross(t, side)
+    across = np.cross(t, side)
     angle = np.linspace(0, 2 * np.pi, sides + 1)[:, None]
-    ring = np.cos(angle) * side[:, None] + np.sin(angle) * other[:, None]
+    ring = np.cos(angle) * side[:, None] + np.sin(angle) * across[:, None]
     radius = np.broadcast_to(radius, len(path))
     points = path[:, None] + radius[:, None, None] * ring
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])

@@ -51,8 +51,8 @@ def noise(rng: Rng) -> np.ndarray:
 def photo_like(rng: Rng) -> np.ndarray:
     """Three correlated 1/f channels: the spectrum of a photograph."""
     base, slope = fractal(rng, 1.1), rng.uniform(0.9, 1.4)
-    own = np.stack([fractal(rng, slope) for _ in range(3)], -1)
-    return np.clip(0.6 * base[..., None] + 0.5 * own * (0.4 + color(rng)) - 0.1, 0.01, 0.95) ** 2
+    channels = np.stack([fractal(rng, slope) for _ in range(3)], -1)
+    return np.clip(0.6 * base[..., None] + 0.5 * channels * (0.4 + color(rng)) - 0.1, 0.01, 0.95) ** 2
 
 
 def checker(rng: Rng) -> np.ndarray:

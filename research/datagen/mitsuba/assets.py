@@ -78,7 +78,7 @@ def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray]]:
                 return read_image(str(folder / uri))
         return np.clip(np.broadcast_to(factor, (2, 2, 3)), 0.003, 0.95)
 
-    found: dict[int | None, list[Mesh]] = {}
+    by_material: dict[int | None, list[Mesh]] = {}
 
     def visit(node: dict, matrix: np.ndarray) -> None:
         local = np.eye(4)
@@ -100,13 +100,13 @@ def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray]]:
             if n is not None:
                 n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
             uv = np.asarray(uv, float) * (1, -1) + (0, 1)
-            found.setdefault(p.get("material"), []).append(Mesh(v, f, uv, n).rotated(_TO_Z_UP))
+            by_material.setdefault(p.get("material"), []).append(Mesh(v, f, uv, n).rotated(_TO_Z_UP))
         for child in node.get("children", []):
             visit(doc["nodes"][child], matrix)
 
     for root in doc["scenes"][doc.get("scene", 0)]["nodes"]:
         visit(doc["nodes"][root], np.eye(4))
-    return [(merge(parts), base_color(material)) for material, parts in found.items()]
+    return [(merge(parts), base_color(material)) for material, parts in by_material.items()]
 
 
 class Assets:

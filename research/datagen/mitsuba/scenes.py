@@ -3,7 +3,7 @@
 """Random scenes. A seed and the asset files determine a scene.
 
 Most scenes are hard for a path tracer: rooms lit through small openings, lamps in shades or facing walls, many lights
-of which each sample picks one, glass between light and floor, thin geometry. About one scene in four is easy (large
+where each sample picks one, glass between light and floor, thin geometry. About one scene in four is easy (large
 lights, open sky), so that a network also learns to keep a good image.
 """
 
@@ -542,7 +542,7 @@ def ajar_room(s: Scene) -> None:
 
 
 def many_lights(s: Scene) -> None:
-    """Dozens of small lights, of which a sample picks one."""
+    """Build a room with dozens of small lights. A sample picks one of them."""
     s.shell(int(s.rng.random() < 0.3))
     s.environment(10 ** s.rng.uniform(-1.5, -0.5))
     s.furnish(int(s.rng.integers(2, 7)))

@@ -301,13 +301,13 @@ def run_unet_on_activations(
     def changed(change: Callable[[Tensor], Tensor], values: Activations) -> Activations:
         return Activations([change(i) for i in values.exact], [change(i) for i in values.codes], values.layout)
 
-    def concat(one: Activations, other: Activations) -> Activations:
+    def concat(above: Activations, skipped: Activations) -> Activations:
         exact, codes = (
             [torch.cat(pair, dim=1) for pair in zip(*images, strict=True)]
-            for images in ((one.exact, other.exact), (one.codes, other.codes))
+            for images in ((above.exact, skipped.exact), (above.codes, skipped.codes))
         )
-        source = torch.cat([one.layout.source_channel, other.layout.source_channel + one.exact[0].shape[1]])
-        return Activations(exact, codes, CodeLayout(torch.cat([one.layout.scale, other.layout.scale]), source))
+        source = torch.cat([above.layout.source_channel, skipped.layout.source_channel + above.exact[0].shape[1]])
+        return Activations(exact, codes, CodeLayout(torch.cat([above.layout.scale, skipped.layout.scale]), source))
 
     with torch.no_grad():
         pool = functools.partial(changed, functools.partial(F.max_pool2d, kernel_size=2))

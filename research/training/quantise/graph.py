@@ -207,5 +207,5 @@ class Graph(Nodes):
         repeated = self.add("Expand", [apart, squares], f"{values}.squares")
         return self.add("Reshape", [repeated, large], f"{values}.large")
 
-    def _concat(self, one: str, other: str) -> str:
-        return self.add("Concat", [one, other], f"{one}+{other}", axis=3)
+    def _concat(self, above: str, skipped: str) -> str:
+        return self.add("Concat", [above, skipped], f"{above}+{skipped}", axis=3)

@@ -232,9 +232,10 @@ def blend(
     means, filtered = pyramid(log_decode(samples), first + 1), pyramid(log_decode(denoised), first + 1)
     share = torch.sigmoid(logits[0][:, len(FINER) :])
     tints = pyramid((share * albedo + (1 - share)).clamp_min(MIN_ALBEDO), first + 1)
-    low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
-    coarsest = [mean, log_encode(filtered[first]), log_encode(means[first]), low]
-    fused = mixed(logits[first][:, len(FINER) :], coarsest)
+    candidates = [
+        lrhs[:, LRHS_CHANNELS:], log_encode(filtered[first]), log_encode(means[first]), lrhs[:, :LRHS_CHANNELS]
+    ]  # fmt: skip
+    fused = mixed(logits[first][:, len(FINER) :], candidates)
     for level in reversed(range(first)):
         radiance, below = log_decode(fused), filtered[level + 1]
         light = upsample(radiance / tints[level + 1], 2, "bilinear")

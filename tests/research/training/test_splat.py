@@ -173,7 +173,7 @@ def test_training_draws_filters_from_sample_views(sample_folder: Path, monkeypat
         torch.testing.assert_close(batch["hrls"][:, :3], batch["target"], atol=0.01, rtol=0)
         torch.testing.assert_close(batch["lrhs"], batch["target"][..., ::scale, ::scale], atol=0.01, rtol=0)
         assert (batch["hrls"][:, 3:6] - 0.6).abs().max() < 0.02  # the albedo
-    contract = data.spp_range(view, data.Sampling(), 4)
+    contract = data.spp_range([view], 4)
     assert contract == {"hrls": [1, 8], "lrhs": [16, 64]}
 
 

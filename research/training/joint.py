@@ -232,10 +232,9 @@ def blend(
     means, filtered = pyramid(log_decode(samples), first + 1), pyramid(log_decode(denoised), first + 1)
     share = torch.sigmoid(logits[0][:, len(FINER) :])
     tints = pyramid((share * albedo + (1 - share)).clamp_min(MIN_ALBEDO), first + 1)
-    candidates = [
-        lrhs[:, LRHS_CHANNELS:], log_encode(filtered[first]), log_encode(means[first]), lrhs[:, :LRHS_CHANNELS]
-    ]  # fmt: skip
-    fused = mixed(logits[first][:, len(FINER) :], candidates)
+    fused = mixed(logits[first][:, len(FINER) :], [
+        lrhs[:, LRHS_CHANNELS:], log_encode(filtered[first]), log_encode(means[first]), lrhs[:, :LRHS_CHANNELS],
+    ])  # fmt: skip
     for level in reversed(range(first)):
         radiance, below = log_decode(fused), filtered[level + 1]
         light = upsample(radiance / tints[level + 1], 2, "bilinear")

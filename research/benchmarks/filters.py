@@ -60,7 +60,7 @@ def filtered(view: SampleTensors, prefix: str, pixel_filter: PixelFilter, spp: i
     values = [view.read(prefix + STORED[name], samples, rows, columns) for name in FEATURES]
     place = view.read(f"{prefix}place", samples, rows, columns)
     generator = torch.Generator().manual_seed(scale)
-    mean = apply(pixel_filter, place, torch.cat(values, dim=1), None, scale, spp * scale**2, generator).mean
+    mean = apply(pixel_filter, place, torch.cat(values, dim=1), scale, spp * scale**2, generator)
     return {name: part.movedim(0, -1).numpy() for name, part in zip(FEATURES, mean.split(3), strict=True)}
 
 

@@ -4,5 +4,5 @@
 ``views`` is the file format. ``quality`` rejects useless cameras and estimates the noise of a reference.
 ``command_line`` is the command line of a generator. ``meshes`` and ``textures`` are procedural content for both.
 ``mitsuba`` and ``cycles`` are the generators; ``cycles`` is GPL-3.0-or-later, because it imports Blender's ``bpy``.
-``references`` denoises references, ``shards`` packs views for transport, ``stats`` measures a set of views.
+``references`` denoises references.
 """

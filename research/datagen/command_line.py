@@ -20,17 +20,13 @@ def _seeds(text: str) -> range:
 
 
 def parser(module: str, description: str, ref_spp: int) -> argparse.ArgumentParser:
-    """The options of every renderer; a renderer may add its own."""
+    """Return the options of every renderer; a renderer may add its own."""
     p = argparse.ArgumentParser(prog=f"python -m {module}", description=description)
     p.add_argument(
         "--out", type=Path, required=True, help="folder of the .npz files; finished views are not rendered again"
     )
-    p.add_argument(
-        "--seeds",
-        type=_seeds,
-        default=range(0, 400),
-        help="first:last or first:last:step, last not included (0:400)",
-    )
+    seeds = "first:last or first:last:step, last not included (0:400)"
+    p.add_argument("--seeds", type=_seeds, default=range(0, 400), help=seeds)
     p.add_argument("--views", type=int, default=3, help="views per scene (%(default)s)")
     p.add_argument("--assets", type=Path, help="folder with hdri/ and models/; without it all content is procedural")
     p.add_argument("--minutes", type=float, default=float("inf"), help="start no new scene after this time")
@@ -64,9 +60,7 @@ def render_all(args: argparse.Namespace, render_scene: Callable[[int], tuple[int
             continue
         total += count
         rate = total / (time.monotonic() - start) * 60
-        print(
-            f"{seed:6d} {kind:12s} {count} views, {time.monotonic() - before:5.1f} s; {rate:.1f} views/min",
-            flush=True,
-        )
+        seconds = time.monotonic() - before
+        print(f"{seed:6d} {kind:12s} {count} views, {seconds:5.1f} s; {rate:.1f} views/min", flush=True)
         gc.collect()  # scenes are reference cycles, which only the collector frees
     return 0

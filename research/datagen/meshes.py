@@ -30,9 +30,8 @@ class Mesh:
         return self.v.max(0)
 
     def scaled(self, s: float | tuple[float, float, float]) -> Mesh:
-        s = np.broadcast_to(np.asarray(s, float), 3)
-        n = None if self.n is None else unit(self.n / s)
-        return Mesh(self.v * s, self.f, self.uv, n)
+        sizes = np.broadcast_to(np.asarray(s, float), 3)
+        return Mesh(self.v * sizes, self.f, self.uv, None if self.n is None else unit(self.n / sizes))
 
     def moved(self, *t: float) -> Mesh:
         return Mesh(self.v + np.asarray(t, float), self.f, self.uv, self.n)
@@ -41,7 +40,7 @@ class Mesh:
         return Mesh(self.v @ m.T, self.f, self.uv, None if self.n is None else self.n @ m.T)
 
     def turned(self, angle: float) -> Mesh:
-        """Turned around z by `angle` radians."""
+        """Turn around z by `angle` radians."""
         return self.rotated(rotation((0, 0, 1), angle))
 
     def tiled(self, k: float) -> Mesh:
@@ -117,12 +116,12 @@ def box(low: tuple | np.ndarray, high: tuple | np.ndarray) -> Mesh:
 
 
 def block(w: float, d: float, h: float) -> Mesh:
-    """A box standing on z = 0, centred in x and y."""
+    """Return a box standing on z = 0, centred in x and y."""
     return box((-w / 2, -d / 2, 0), (w / 2, d / 2, h))
 
 
 def surface(points: np.ndarray, uv: np.ndarray) -> Mesh:
-    """A smooth grid surface from (A, B, 3) points; normals from the grid's own differences."""
+    """Return a smooth grid surface from (A, B, 3) points; normals from the grid's own differences."""
     a, b = points.shape[:2]
     normal = unit(np.cross(np.gradient(points, axis=1), np.gradient(points, axis=0)))
     i = (np.arange(a - 1)[:, None] * b + np.arange(b - 1)).ravel()
@@ -159,7 +158,7 @@ def sphere(radius: float, sides: int = 40) -> Mesh:
 
 
 def cylinder(radius: float, height: float, sides: int = 32) -> Mesh:
-    """Closed, standing on z = 0; flat-shaded so the rims stay sharp."""
+    """Return a cylinder that stands on z = 0: closed, and flat-shaded so that the rims stay sharp."""
     m = lathe(np.array([[1e-4, 0], [radius, 0], [radius, height], [1e-4, height]]), sides)
     return Mesh(m.v, m.f, m.uv)
 
@@ -170,7 +169,7 @@ def torus(major: float, minor: float, sides: int = 48) -> Mesh:
 
 
 def vase(rng: Rng, height: float) -> Mesh:
-    """An open vessel with a wall of real thickness, so that it may be of glass."""
+    """Return an open vessel with a wall of real thickness, so that it may be of glass."""
     t = np.linspace(0, 1, 24)
     width = height * rng.uniform(0.15, 0.4)
     r = width * (0.6 + 0.35 * np.sin(t * rng.uniform(2, 7) + rng.uniform(0, 6)) + 0.2 * t)
@@ -182,7 +181,7 @@ def vase(rng: Rng, height: float) -> Mesh:
 
 
 def blob(rng: Rng, radius: float, amount: float) -> Mesh:
-    """A sphere displaced by a few random waves: stone, cushion, clay."""
+    """Return a sphere displaced by a few random waves: stone, cushion, clay."""
     a, b = np.meshgrid(np.linspace(0.02, np.pi - 0.02, 48), np.linspace(0, 2 * np.pi, 65), indexing="ij")
     d = np.stack([np.sin(a) * np.cos(b), np.sin(a) * np.sin(b), np.cos(a)], -1)
     r = np.ones_like(a)
@@ -190,18 +189,18 @@ def blob(rng: Rng, radius: float, amount: float) -> Mesh:
         k = rng.normal(size=3) * rng.uniform(1, 6)
         r += amount / np.linalg.norm(k) * np.sin(d @ k + rng.uniform(0, 6))
     mesh = surface(d * (radius * r)[..., None], np.stack([b * radius, a * radius], -1))
-    if (mesh.n * mesh.v).sum() < 0:
+    if mesh.n is not None and (mesh.n * mesh.v).sum() < 0:
         mesh.n, mesh.f = -mesh.n, mesh.f[:, ::-1].copy()
     return mesh
 
 
 def tube(path: np.ndarray, radius: float | np.ndarray, sides: int = 8) -> Mesh:
-    """A tube along (K, 3) points."""
+    """Return a tube along (K, 3) points."""
     t = unit(np.gradient(path, axis=0))
     side = unit(np.cross(t, (0.31, 0.87, 0.39)))
-    other = np.cross(t, side)
+    across = np.cross(t, side)
     angle = np.linspace(0, 2 * np.pi, sides + 1)[:, None]
-    ring = np.cos(angle) * side[:, None] + np.sin(angle) * other[:, None]
+    ring = np.cos(angle) * side[:, None] + np.sin(angle) * across[:, None]
     radius = np.broadcast_to(radius, len(path))
     points = path[:, None] + radius[:, None, None] * ring
     length = np.concatenate([[0], np.cumsum(np.linalg.norm(np.diff(path, axis=0), axis=1))])
@@ -212,7 +211,7 @@ def tube(path: np.ndarray, radius: float | np.ndarray, sides: int = 8) -> Mesh:
 
 
 def knot(rng: Rng, size: float) -> Mesh:
-    """A (p, q) torus knot."""
+    """Return a (p, q) torus knot."""
     p, q = rng.choice([(2, 3), (3, 2), (3, 4), (2, 5), (5, 2)])
     t = np.linspace(0, 2 * np.pi, 200)
     r = 1 + 0.4 * np.cos(q * t)
@@ -237,19 +236,13 @@ def blades(rng: Rng, roots: np.ndarray, length: float, width: float, bend: float
 
 
 def leaves(rng: Rng, centres: np.ndarray, size: float, drop: float = 0.5) -> Mesh:
-    """A pointed, folded leaf of random orientation on each of (K, 3) centres; u is random per leaf."""
+    """Return a pointed, folded leaf of random orientation on each of (K, 3) centres; u is random per leaf."""
     k = len(centres)
     along = unit(rng.normal(size=(k, 3)) - (0, 0, drop)) * size * rng.uniform(0.5, 1.2, (k, 1))
     across = unit(np.cross(along, rng.normal(size=(k, 3)))) * size * 0.3
     fold = np.cross(along, across) * (0.6 / size)
     v = np.stack(
-        [
-            centres,
-            centres + along * 0.45 + across + fold,
-            centres + along,
-            centres + along * 0.45 - across + fold,
-        ],
-        1,
+        [centres, centres + along * 0.45 + across + fold, centres + along, centres + along * 0.45 - across + fold], 1
     )
     base = 4 * np.arange(k)[:, None]
     f = np.concatenate([base + [0, 1, 2], base + [0, 2, 3]])
@@ -273,7 +266,7 @@ def strands(rng: Rng, roots: np.ndarray, out: np.ndarray, length: float, width: 
 
 
 def branching(rng: Rng, height: float, radius: float, levels: int) -> tuple[Mesh, np.ndarray]:
-    """A bare tree and the (K, 3) points where its leaves grow."""
+    """Return a bare tree and the (K, 3) points where its leaves grow."""
     tubes, tips = [], []
 
     def grow(start: np.ndarray, direction: np.ndarray, length: float, r: float, level: int) -> None:
@@ -294,7 +287,7 @@ def branching(rng: Rng, height: float, radius: float, levels: int) -> tuple[Mesh
 
 
 def wall(length: float, height: float, thick: float, holes: list[tuple[float, float, float, float]]) -> Mesh:
-    """A wall along x from 0 to `length`, y in [0, thick], with (x0, z0, x1, z1) holes cut out."""
+    """Return a wall along x from 0 to `length`, y in [0, thick], with (x0, z0, x1, z1) holes cut out."""
     xs = sorted({0.0, length, *(h[0] for h in holes), *(h[2] for h in holes)})
     zs = sorted({0.0, height, *(h[1] for h in holes), *(h[3] for h in holes)})
     parts = []
@@ -307,7 +300,7 @@ def wall(length: float, height: float, thick: float, holes: list[tuple[float, fl
 
 
 def bars(length: float, height: float, count: int, thick: float, across: bool) -> Mesh:
-    """A grid of square bars in the xz plane: railing, fence, window bars, blinds (`across`: they lie)."""
+    """Return a grid of square bars in the xz plane: railing, fence, window bars, blinds (`across`: they lie)."""
     parts = []
     for i in range(count):
         p = (i + 0.5) / count
@@ -331,11 +324,8 @@ def table(w: float, d: float, h: float, leg: float) -> Mesh:
 
 
 def shelf(w: float, d: float, h: float, boards: int) -> Mesh:
-    """An open shelf; boards are evenly spaced."""
-    parts = [
-        box((-w / 2, -d / 2, 0), (-w / 2 + 0.03, d / 2, h)),
-        box((w / 2 - 0.03, -d / 2, 0), (w / 2, d / 2, h)),
-    ]
+    """Return an open shelf; boards are evenly spaced."""
+    parts = [box((-w / 2, -d / 2, 0), (-w / 2 + 0.03, d / 2, h)), box((w / 2 - 0.03, -d / 2, 0), (w / 2, d / 2, h))]
     for i in range(boards + 1):
         z = i * (h - 0.03) / boards
         parts.append(box((-w / 2, -d / 2, z), (w / 2, d / 2, z + 0.03)))
@@ -343,7 +333,7 @@ def shelf(w: float, d: float, h: float, boards: int) -> Mesh:
 
 
 def books(rng: Rng, w: float, d: float, h: float) -> Mesh:
-    """A row of books along x, each of one colour of a palette texture."""
+    """Return a row of books along x, each of one colour of a palette texture."""
     parts, x = [], 0.0
     while x < w:
         t, tall = rng.uniform(0.012, 0.05), h * rng.uniform(0.6, 0.95)
@@ -359,7 +349,7 @@ def stairs(w: float, step: float, rise: float, count: int) -> Mesh:
 
 
 def rubble(rng: Rng, count: int, spread: float, size: float) -> Mesh:
-    """A heap of boxes, each of one colour of a palette texture."""
+    """Return a heap of boxes, each of one colour of a palette texture."""
     parts = []
     for _ in range(count):
         e = size * rng.uniform(0.2, 1, 3)

@@ -22,7 +22,7 @@ def shows_something(probe: np.ndarray, lit_share: float = 0.6) -> bool:
         return float((np.abs(np.diff(x, axis=0)).max(-1) > threshold).mean())
 
     # Dark regions are wanted. A view that is dark everywhere is not.
-    lit = (light > 3e-3 * max(np.percentile(light, 90), 1e-9)).mean() >= lit_share
+    lit = (light > 3e-3 * max(float(np.percentile(light, 90)), 1e-9)).mean() >= lit_share
     background = (np.abs(normal).max(-1) == 0).mean() > 0.6
     return bool(
         lit and not background and edges(normal, 0.3) >= 0.06 and edges(normal, 0.3) + edges(albedo, 0.08) >= 0.15
@@ -30,7 +30,7 @@ def shows_something(probe: np.ndarray, lit_share: float = 0.6) -> bool:
 
 
 def log_mean(color: np.ndarray) -> float:
-    """The log-mean luminance of linear colour (..., 3)."""
+    """Return the log-mean luminance of linear colour (..., 3)."""
     light = luminance(color)
     return float(np.exp(np.log(light + 1e-4 * light.mean() + 1e-12).mean()))
 
@@ -41,5 +41,6 @@ def psnr_of_mean(a: np.ndarray, b: np.ndarray) -> float:
     The difference of the two renders has four times the variance of the error of their mean.
     """
     exposure = KEY / log_mean((a + b) / 2)
-    error = np.square(srgb(a * exposure) - srgb(b * exposure)).mean() / 4
+    shown = [srgb(np.asarray(image * exposure)) for image in (a, b)]
+    error = np.square(shown[0] - shown[1]).mean() / 4
     return float(-10 * np.log10(max(error, 1e-12)))

@@ -24,7 +24,7 @@ from research.datagen import views
 
 
 def denoised(view: views.View) -> views.Array:
-    """The denoised reference of a view, (H, W, 3), scene-linear."""
+    """Denoise the reference of a view, (H, W, 3), scene-linear."""
     import pyoidn
 
     whole = slice(None)

@@ -41,7 +41,7 @@ STEP, MANTISSA = 2.0**-24, 511
 
 
 def path_of(out: Path, renderer: str, seed: int, view: int) -> Path:
-    """The file of a scene's view."""
+    """Return the file of a scene's view."""
     return out / f"{renderer}-{seed:06d}-{view}{SAMPLES_SUFFIX}"
 
 

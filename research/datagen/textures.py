@@ -14,7 +14,7 @@ SIZE = 512
 
 
 def color(rng: Rng, low: float = 0.02, high: float = 0.85) -> np.ndarray:
-    """A random linear colour; value log-uniform-ish in [low, high], so dark albedos are not rare."""
+    """Draw a linear colour; value log-uniform-ish in [low, high], so dark albedos are not rare."""
     value = low * (high / low) ** rng.beta(2.2, 1.0)
     saturation = rng.beta(1.0, 1.6)
     return np.array(colorsys.hsv_to_rgb(rng.random(), saturation, value), np.float32)
@@ -51,8 +51,8 @@ def noise(rng: Rng) -> np.ndarray:
 def photo_like(rng: Rng) -> np.ndarray:
     """Three correlated 1/f channels: the spectrum of a photograph."""
     base, slope = fractal(rng, 1.1), rng.uniform(0.9, 1.4)
-    own = np.stack([fractal(rng, slope) for _ in range(3)], -1)
-    return np.clip(0.6 * base[..., None] + 0.5 * own * (0.4 + color(rng)) - 0.1, 0.01, 0.95) ** 2
+    channels = np.stack([fractal(rng, slope) for _ in range(3)], -1)
+    return np.clip(0.6 * base[..., None] + 0.5 * channels * (0.4 + color(rng)) - 0.1, 0.01, 0.95) ** 2
 
 
 def checker(rng: Rng) -> np.ndarray:
@@ -113,7 +113,7 @@ def glyphs(rng: Rng) -> np.ndarray:
     letters = np.array(list("abcdefghijklmnopqrstuvwxyz      ABCDEFG0123456789.,"))
     for y in range(4, SIZE - size, int(size * 1.25)):
         if rng.random() < 0.9:
-            draw.text((rng.integers(2, 40), y), "".join(rng.choice(letters, 100)), fill=255, font=font)
+            draw.text((int(rng.integers(2, 40)), y), "".join(rng.choice(letters, 100)), fill=255, font=font)
     t = np.asarray(image, np.float32) / 255
     return _mix(paper, pen, t) if ink else _mix(pen, paper, t)
 
@@ -154,7 +154,7 @@ def palette(rng: Rng) -> np.ndarray:
 
 
 def foliage(rng: Rng) -> np.ndarray:
-    """Like `palette`, but the kindred colours of one plant; darker towards v = 0."""
+    """Return the kindred colours of one plant, as `palette`; darker towards v = 0."""
     base = np.array(colorsys.hsv_to_rgb(rng.uniform(0.08, 0.4), rng.uniform(0.4, 0.9), rng.uniform(0.08, 0.5)))
     c = base * rng.uniform(0.4, 1.5, (1, 64, 1)) * (1 + 0.12 * rng.normal(size=(1, 64, 3)))
     return np.clip(c * np.linspace(1.2, 0.5, 8)[:, None, None], 0.005, 0.9)
@@ -166,7 +166,7 @@ PATTERNS: list[Callable[[Rng], np.ndarray]] = [
 
 
 def pattern(rng: Rng, plainness: float = 0.25) -> np.ndarray:
-    """A plain colour with probability `plainness`, else one of `PATTERNS`."""
+    """Draw a plain colour with probability `plainness`, else one of `PATTERNS`."""
     if rng.random() < plainness:
         return plain(rng)
     image = PATTERNS[rng.integers(len(PATTERNS))](rng)
@@ -174,14 +174,14 @@ def pattern(rng: Rng, plainness: float = 0.25) -> np.ndarray:
 
 
 def sky(rng: Rng, height: int = 512) -> np.ndarray:
-    """An environment (height, 2 height, 3), rows from the zenith down, mostly with a sun."""
+    """Draw an environment (height, 2 height, 3), rows from the zenith down, mostly with a sun."""
     elevation = np.linspace(np.pi / 2, -np.pi / 2, height)[:, None]
     azimuth = np.linspace(0, 2 * np.pi, 2 * height, endpoint=False)[None]
     up = np.clip(np.sin(elevation), 0, 1)
     horizon, zenith = color(rng, 0.3, 1.0), color(rng, 0.1, 0.8) * (0.6, 0.8, 1.3)
     image = _mix(horizon, zenith, np.sqrt(up) + 0 * azimuth)
     cloud = np.clip((fractal(rng, 1.5, size=2 * height)[:height] - 0.5) * 4, 0, 1) * (up > 0)
-    image = _mix(image, np.float32(rng.uniform(0.5, 1.5)), cloud * rng.uniform(0, 1))
+    image = _mix(image, np.full(3, rng.uniform(0.5, 1.5), np.float32), cloud * rng.uniform(0, 1))
     image = np.where((elevation < 0)[..., None], image * color(rng, 0.05, 0.4), image)
     if rng.random() < 0.75:
         at, turn = rng.uniform(0.08, 1.1), rng.uniform(0, 2 * np.pi)

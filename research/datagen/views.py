@@ -69,22 +69,22 @@ NO_REFERENCE = "no-reference"
 
 
 def split_of(seed: int) -> str:
-    """The split of a scene. Whole scenes are held out, never single views of one."""
+    """Return the split of a scene. Whole scenes are held out, never single views of one."""
     return {0: "validation", 1: "test"}.get(seed % 20, "train")
 
 
 def path_of(out: Path, renderer: str, seed: int, view: int) -> Path:
-    """The file of a scene's view."""
+    """Return the file of a scene's view."""
     return out / f"{renderer}-{seed:06d}-{view}.npz"
 
 
 def lr_key(scale: int) -> str:
-    """The array with the LRHS passes at 1/scale of the resolution."""
+    """Return the name of the array with the LRHS passes at 1/scale of the resolution."""
     return "lr" if scale == 1 else f"lr_x{scale}"
 
 
 def denoised_reference(path: Path) -> Path:
-    """The file in which :mod:`research.datagen.references` stores the denoised reference of a view's file."""
+    """Return the file in which :mod:`research.datagen.references` stores the denoised reference of a view's file."""
     return path.with_suffix(".ref.npy")
 
 
@@ -128,7 +128,7 @@ def _half(x: np.ndarray) -> np.ndarray:
 def save(path: Path, arrays: dict[str, np.ndarray]) -> None:
     """Write a view's file; the file appears under its name only when it is complete."""
     with replacing(path, overwrite=True) as temporary:
-        np.savez(temporary, **arrays)
+        np.savez(temporary, **arrays)  # type: ignore[arg-type]
 
 
 # Reading
@@ -237,11 +237,11 @@ class Folder:
                     log.warning("skipped %s: %s", path.name, error)
 
     def split(self, name: str) -> list[View]:
-        """The views of one split, sorted by file name."""
+        """Return the views of one split, sorted by file name."""
         return [view for _, view in sorted(self._views.items()) if view.split == name]
 
     def sample_views(self, split: str) -> list[SampleView]:
-        """The views of one split that keep single samples, sorted by file name."""
+        """Return the views of one split that keep single samples, sorted by file name."""
         return [view for _, view in sorted(self._sample_views.items()) if view.split == split]
 
 
@@ -255,12 +255,12 @@ def split_features(passes: Array) -> dict[str, Array]:
 
 
 def as_float32(values: NDArray, *, signed: bool = False) -> Array:
-    """Stored half floats as finite float32, non-negative unless ``signed``."""
+    """Convert stored half floats to finite float32, non-negative unless ``signed``."""
     return repair(values.astype(np.float32), signed=signed)[0]
 
 
 def mean_lrhs(view: View, passes: NDArray[np.int64] | list[int], scale: int, *, nearest: bool = False) -> Array:
-    """The LRHS of a whole view, (H // s, W // s, 3).
+    """Average the LRHS of a whole view, (H // s, W // s, 3).
 
     Args:
         passes: indices of the ``lr`` passes to average, weighted by their spp.

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Checkpoints of training runs: write, read, and start another network from one.
+"""Networks by name, and checkpoints of training runs: write, read, and start another network from one.
 
 A checkpoint is a dictionary that ``torch.save`` wrote:
 
@@ -17,21 +17,40 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from research.training.networks import NETWORKS, Network
+from research.training.data import Prepare
+from research.training.joint import JointFusion
 from research.training.paper import MultiResolutionFusion
+from research.training.render_mean import with_mean
 
 State = dict[str, Any]
+Network = MultiResolutionFusion | JointFusion
+NETWORKS: dict[str, type[MultiResolutionFusion] | type[JointFusion]] = {
+    "paper": MultiResolutionFusion,
+    "joint": JointFusion,
+}
 log = logging.getLogger(__name__)
 
 #: Parts of a checkpoint that only a continued run needs.
-RUN_STATE = ("network", "optimizer", "best_gain")
+RUN_STATE = ("network", "optimizer", "best_psnr")
 #: Parts of a parameter's name that older checkpoints have, and what they are called now.
 RENAMED = {"together.": "mean_denoiser.", ".more": ".extra"}
 
 
-def save(state: State, path: Path) -> None:
-    """Write a checkpoint whole or not at all, because a run may be killed at any time."""
+def preparation(architecture: str) -> Prepare | None:
+    """Return the function that adds a network's further input channels to a pair; None if it has none."""
+    return with_mean if architecture == "joint" else None
+
+
+def run(network: Network, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor | None]:
+    """Run a network; return the fused image and the logarithm of its expected error, None if it predicts none."""
+    result = network(lrhs, hrls)
+    return result if isinstance(result, tuple) else (result, None)
+
+
+def save(state: State | list[Any], path: Path) -> None:
+    """Write a file whole or not at all, because a run may be killed at any time."""
     partial = path.with_suffix(".partial")
     torch.save(state, partial)
     os.replace(partial, path)
@@ -52,12 +71,29 @@ def _present_name(parameter: str) -> str:
     return parameter
 
 
+def finished(state: State) -> State:
+    """Return a checkpoint without what only a continued run needs."""
+    return {key: value for key, value in state.items() if key not in RUN_STATE}
+
+
 def load(path: Path) -> tuple[Network, State]:
-    """The network of a checkpoint with its averaged weights, and the whole checkpoint."""
+    """Return the network of a checkpoint with its averaged weights, and the whole checkpoint."""
     state = read(path)
     network = NETWORKS[state["architecture"]](**state["config"])
     network.load_state_dict(state["ema"])
     return network.eval(), state
+
+
+def load_joint(path: Path) -> tuple[JointFusion, State]:
+    """Return the joint network of a checkpoint with its averaged weights, and the whole checkpoint.
+
+    Raises:
+        SystemExit: the checkpoint is of another network.
+    """
+    network, state = load(path)
+    if not isinstance(network, JointFusion):
+        raise SystemExit(f"{path}: not a joint network")
+    return network, state
 
 
 def warm_start(network: Network, path: Path) -> None:
@@ -70,8 +106,7 @@ def warm_start(network: Network, path: Path) -> None:
         for deshuffle, shuffle in zip(network.deshuffle, network.upscale, strict=True):
             deshuffle.reset_to_average()
             shuffle.reset_to_bilinear(network.config["channels"])
-    state = read(path)
-    theirs, ours = state["ema"], network.state_dict()
+    theirs, ours = read(path)["ema"], network.state_dict()
     fitting = {name: value for name, value in theirs.items() if name in ours and ours[name].shape == value.shape}
     network.load_state_dict(ours | fitting)
     log.info("took %d of %d tensors from %s", len(fitting), len(ours), path)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import signal
-import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,7 +37,7 @@ from research.datagen.samples import MANTISSA, STEP
 from research.datagen.views import NO_REFERENCE, PASS_FEATURES, REF_CELLS, Array, Folder, SampleView, View
 from research.training.encoding import compress, exposure_of, luminance, pack, repair
 from research.training.ops import box_downsample
-from research.training.splat import Filtered, apply, draw_filter, filter_reference
+from research.training.splat import apply, draw_filter, filter_reference
 
 #: A batch by name: ``lrhs`` (N, 3, h, w), ``hrls`` (N, 16, s*h, s*w), ``target`` (N, 3, s*h, s*w), all encoded, in
 #: channels-last memory. Some networks read further channels of the first two.
@@ -48,10 +47,9 @@ Batch = dict[str, Tensor]
 Prepare = Callable[[Array, Array], tuple[Array, Array]]
 
 
-# How pairs are sampled
+CPU = torch.device("cpu")
 
-#: Height and width of the HR patch for each scale, as in the paper.
-PAPER_PATCH = {2: 96, 4: 192, 8: 256}
+# How pairs are sampled
 
 
 @dataclass(frozen=True)
@@ -62,8 +60,6 @@ class Sampling:
     """Weights of 1, 2, 3, ... spp in the HRLS. Low spp is the difficult case, and the one that users have."""
     lrhs_passes: tuple[float, ...] = (0.65, 0.2, 0.05, 0.05, 0.05)
     """Weights of 1, 2, 3, ... ``lr`` passes in the LRHS."""
-    clip: float = math.inf
-    """Upper bound of radiance, as in the paper. The log encoding needs none."""
     nearest: float = 0.15
     """Share with the paper's nearest-neighbour LRHS instead of a box-filtered one."""
     exposure_stops: float = 0.5
@@ -89,28 +85,14 @@ class Sampling:
     averaged frames of a shot have."""
 
 
-#: The paper's sampling, as far as its text describes it: crops only, all features, clipped, nearest-neighbour LRHS.
-PAPER_SAMPLING = Sampling(
-    hrls_spp=(1.0,) * 8,
-    clip=100.0,
-    nearest=1.0,
-    exposure_stops=0.0,
-    gain_stops=0.0,
-    permute=0.0,
-    grey=0.0,
-    drop_each=0.0,
-    drop_lobes=0.0,
-    drop_variance=0.0,
-    drop_all=0.0,
-)
-
-
-def spp_range(view: View | SampleView, sampling: Sampling, scale: int) -> dict[str, list[int]]:
-    """Lowest and highest spp of the pairs that :func:`draw` makes of a view, for the model's contract."""
-    samples = scale**2 if sampling.nearest < 1 else 1
+def spp_range(views: Sequence[View | SampleView], scale: int) -> dict[str, list[int]]:
+    """Return the lowest and highest spp of the pairs that :func:`draw` makes of views, for the model's contract."""
     return {
-        "hrls": [1, min(len(sampling.hrls_spp), len(view.hr))],
-        "lrhs": [max(2, int(view.lr_spp.min()) * samples), int(view.lr_spp.sum()) * samples],
+        "hrls": [1, max(min(len(Sampling.hrls_spp), len(view.hr)) for view in views)],
+        "lrhs": [
+            scale**2 * min(int(view.lr_spp.min()) for view in views),
+            scale**2 * max(int(view.lr_spp.sum()) for view in views),
+        ],
     }
 
 
@@ -128,7 +110,7 @@ class Rendered:
     features: dict[str, Tensor]
     """(patch, patch, channels) by name, of the HRLS"""
     variance: Tensor | None
-    """(patch, patch), of the luminance of the HRLS; None if it has one sample a pixel"""
+    """(patch, patch), of the luminance of the HRLS; None if it has one sample a pixel, or single samples"""
     lrhs: Tensor
     """(H/s, W/s, 3), of the whole view"""
     target: Tensor
@@ -136,7 +118,7 @@ class Rendered:
 
 
 def _draw_spp(spp: np.ndarray, sampling: Sampling, nearest: bool, rng: np.random.Generator) -> tuple[int, np.ndarray]:
-    """Samples per pixel of the HRLS, and the passes of the LRHS, whose spp are given."""
+    """Draw the samples per pixel of the HRLS, and the passes of the LRHS, whose spp are given."""
     while True:
         n = 1 + int(rng.choice(len(sampling.hrls_spp), p=_normalised(sampling.hrls_spp)))
         k = 1 + int(rng.choice(len(sampling.lrhs_passes), p=_normalised(sampling.lrhs_passes)))
@@ -158,7 +140,7 @@ class ViewTensors:
 
     @classmethod
     def of(cls, view: View, device: torch.device) -> ViewTensors:
-        """On a CPU the tensors share the file's mapped memory."""
+        """Open a view. On a CPU the tensors share the file's mapped memory."""
 
         def on_device(array: np.ndarray) -> Tensor:
             return torch.from_numpy(array).to(device)
@@ -166,13 +148,12 @@ class ViewTensors:
         lr = {scale: on_device(passes) for scale, passes in view.lr.items()}
         return cls(on_device(view.hr), lr, on_device(view.ref), view.lr_spp)
 
-    def lrhs(self, passes: np.ndarray, scale: int, clip: float, *, nearest: bool) -> Tensor:
-        """As :func:`research.datagen.views.mean_lrhs`, clipped before pixels are averaged: (H/s, W/s, 3)."""
+    def lrhs(self, passes: np.ndarray, scale: int, *, nearest: bool) -> Tensor:
+        """Average passes, as :func:`research.datagen.views.mean_lrhs`: (H/s, W/s, 3)."""
         stored = self.lr[scale if scale in self.lr else 1]
         weights = torch.from_numpy((self.lr_spp[passes] / self.lr_spp[passes].sum()).astype(np.float32))
-        mean = torch.einsum(
-            "p,phwc->hwc", weights.to(stored.device), repair(torch.stack([stored[p] for p in passes]))
-        ).clamp_max(clip)
+        images = repair(torch.stack([stored[p] for p in passes]))
+        mean = torch.einsum("p,phwc->hwc", weights.to(stored.device), images)
         if scale in self.lr:
             return mean
         if nearest:
@@ -181,6 +162,7 @@ class ViewTensors:
 
     @property
     def device(self) -> torch.device:
+        """Where the tensors lie."""
         return self.ref.device
 
     @property
@@ -192,17 +174,16 @@ class ViewTensors:
         """Draw the samples of a pair; its radiance is multiplied by ``light``, (3, 3)."""
         nearest = rng.random() < sampling.nearest
         n, lr_passes = _draw_spp(self.lr_spp, sampling, nearest, rng)
-        lrhs = self.lrhs(lr_passes, scale, sampling.clip, nearest=nearest)
+        lrhs = self.lrhs(lr_passes, scale, nearest=nearest)
         passes = [self.hr[p, *area] for p in rng.permutation(len(self.hr))[:n]]
         features = _split(repair(torch.stack(passes), signed=True))
         for name in RADIANCE_FEATURES:
-            features[name] = features[name].clamp(0.0, sampling.clip)
+            features[name] = features[name].clamp_min(0.0)
         variance = luminance(features[RGB] @ light).var(dim=0) / n if n > 1 else None
         features = {name: values.mean(dim=0) for name, values in features.items()}
         for name in RADIANCE_FEATURES:
             features[name] = features[name] @ light
-        target = repair(self.ref[area]).clamp_max(sampling.clip)
-        return Rendered(features, variance, lrhs @ light, target @ light)
+        return Rendered(features, variance, lrhs @ light, repair(self.ref[area]) @ light)
 
 
 @dataclass(frozen=True)
@@ -215,17 +196,18 @@ class SampleTensors:
 
     @classmethod
     def of(cls, view: SampleView, device: torch.device) -> SampleTensors:
-        """On a CPU the tensors share the file's mapped memory."""
+        """Open a view. On a CPU the tensors share the file's mapped memory."""
         arrays = {name: array for name, array in view.arrays.items() if name != "meta"}
         signed = {name: a.view(np.int32) if a.dtype == np.uint32 else a for name, a in arrays.items()}
         return cls({name: torch.from_numpy(array).to(device) for name, array in signed.items()})
 
     @property
     def device(self) -> torch.device:
+        """Where the tensors lie."""
         return self.arrays["ref"].device
 
     def noisy_reference(self) -> tuple[Tensor, Tensor, Tensor] | None:
-        """Colour, albedo and normal, (1, 3, R*H, R*W), of a reference that is to be denoised; else None."""
+        """Read colour, albedo and normal, (1, 3, R*H, R*W), of a reference that is to be denoised; else None."""
         if "ref_albedo" not in self.arrays:
             return None
         albedo, normal = (self.arrays[f"ref_{name}"].float().movedim(-1, 0)[None] for name in (ALBEDO, NORMAL))
@@ -237,7 +219,7 @@ class SampleTensors:
         return self.arrays["color"].shape[1], self.arrays["color"].shape[2]
 
     def read(self, name: str, samples: Tensor, rows: slice, columns: slice) -> Tensor:
-        """Some samples of an array in a crop: (k, C, h, w); places are (k, h, w, 2)."""
+        """Read some samples of an array in a crop: (k, C, h, w); places are (k, h, w, 2)."""
         stored = self.arrays[name][samples, rows, columns]
         layer = name.removeprefix("lr_")
         if layer == "place":
@@ -266,40 +248,34 @@ class SampleTensors:
             slice(max(side.start - pixel_filter.reach, 0), min(side.stop + pixel_filter.reach, size))
             for side, size in zip(area, (height, width), strict=True)
         ]
-        inner = (
-            slice(None),
-            *(slice(side.start - w.start, side.stop - w.start) for side, w in zip(area, wide, strict=True)),
-        )
+        crop = (slice(side.start - w.start, side.stop - w.start) for side, w in zip(area, wide, strict=True))
+        inner = (slice(None), *crop)
         names = {RGB: "color"} | {name: name for name in PASS_FEATURES if name != RGB}
 
-        def hrls(count: int) -> Filtered:
+        def hrls(count: int) -> Tensor:
             drawn = order[: pixel_filter.samples_for(count)]
             layers = {name: self.read(stored, drawn, *wide) for name, stored in names.items()}
             for name in RADIANCE_FEATURES:
                 layers[name] = _lit(layers[name], light)
             place = self.read("place", drawn, *wide)
-            measure = luminance(layers[RGB].movedim(1, -1))
-            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), measure, 1, count, generator)
+            return apply(pixel_filter, place, torch.cat(list(layers.values()), dim=1), 1, count, generator)[inner]
 
         whole = (slice(0, height // scale * scale), slice(0, width // scale * scale))
 
         def lrhs(samples: np.ndarray) -> Tensor:
             chosen = torch.from_numpy(samples).to(device)
             color = _lit(self.read("lr_color", chosen, *whole), light)
-            return apply(pixel_filter, self.read("lr_place", chosen, *whole), color, None, scale, None, generator).mean
+            return apply(pixel_filter, self.read("lr_place", chosen, *whole), color, scale, None, generator)
 
-        few = hrls(n)
-        features, variance, low = few.mean[inner], few.variance, lrhs(lr_samples)
-        has_variance = (n > 1 or pixel_filter.spreads_noise) and variance is not None
+        features, low = hrls(n), lrhs(lr_samples)
         if sampling.uneven and rng.random() < sampling.uneven:
             more = _random_parts(height, width, rng).to(device)
-            features = torch.where(more[area], hrls(len(order)).mean[inner], features)
+            features = torch.where(more[area], hrls(len(order)), features)
             coarse = more[::scale, ::scale][: low.shape[-2], : low.shape[-1]]
             low = torch.where(coarse, lrhs(np.arange(lr_count)), low)
-            has_variance = False  # which parts have more samples is not known
-        features = _split(features.movedim(0, -1))
+        layers = _split(features.movedim(0, -1))
         for name in RADIANCE_FEATURES:
-            features[name] = features[name].clamp(0.0, sampling.clip)
+            layers[name] = layers[name].clamp_min(0.0)
 
         cells = [slice(w.start * REF_CELLS, w.stop * REF_CELLS) for w in wide]
         if self.clean_reference is None:
@@ -307,17 +283,14 @@ class SampleTensors:
         else:
             ref = self.clean_reference[:, :, *cells]
         target = filter_reference(pixel_filter, _lit(ref, light)[0], REF_CELLS)[inner].movedim(0, -1)
-        return Rendered(
-            features,
-            variance[inner[1:]] if has_variance else None,
-            low.movedim(0, -1).clamp(0.0, sampling.clip),
-            target.clamp(0.0, sampling.clip),
-        )
+        return Rendered(layers, None, low.movedim(0, -1).clamp_min(0.0), target.clamp_min(0.0))
 
 
 def _random_parts(height: int, width: int, rng: np.random.Generator, cell: int = 8) -> Tensor:
-    """A random part of an image, (H, W) of bool: where smooth noise is above a random one of its values. Its edges lie
-    on a grid of ``cell`` pixels, so that it is the same in an LRHS of every scale."""
+    """Draw a part of an image, (H, W) of bool: where smooth noise is above a random one of its values.
+
+    Its edges lie on a grid of ``cell`` pixels, so that it is equal in an LRHS of every scale.
+    """
     noise = torch.from_numpy(rng.standard_normal((1, 1, 6, 6)).astype(np.float32))
     cells = F.interpolate(noise, (-(-height // cell), -(-width // cell)), mode="bilinear")[0, 0]
     chosen = cells > cells.flatten()[int(rng.integers(cells.numel()))]
@@ -325,25 +298,20 @@ def _random_parts(height: int, width: int, rng: np.random.Generator, cell: int =
 
 
 def _decode_radiance(stored: Tensor) -> Tensor:
-    """As :func:`research.datagen.samples.decode`, with the channels second: (k, h, w) to (k, 3, h, w)."""
+    """Decode :func:`research.datagen.samples.encode`: (k, h, w) to (k, 3, h, w)."""
     mantissas = torch.stack([stored >> shift & MANTISSA for shift in (0, 9, 18)], dim=1).float()
     return mantissas * torch.exp2((stored >> 27 & 31).float() + math.log2(STEP))[:, None]
 
 
 def _lit(radiance: Tensor, light: Tensor) -> Tensor:
-    """Radiance (k, 3, h, w) @ light."""
+    """Multiply radiance (k, 3, h, w) by a light (3, 3)."""
     return torch.einsum("kihw,ij->kjhw", radiance, light)
 
 
 def draw(
-    views: Sequence[ViewTensors | SampleTensors],
-    scale: int,
-    patch: int,
-    count: int,
-    rng: np.random.Generator,
-    sampling: Sampling,
-    prepare: Prepare | None = None,
-) -> Batch:
+    views: Sequence[ViewTensors | SampleTensors], scale: int, patch: int, count: int, rng: np.random.Generator,
+    sampling: Sampling, prepare: Prepare | None = None,
+) -> Batch:  # fmt: skip
     """Draw a batch of ``count`` pairs of ``patch`` x ``patch`` HRLS pixels.
 
     Views, crops, spp, pixel filter, light, exposure and missing features differ within a batch. Mirroring and rotation
@@ -403,19 +371,17 @@ def draw(
 
 
 def turned(pair: Batch, rng: np.random.Generator) -> Batch:
-    """Pictures (N, c, H, W) of one place, mirrored and transposed at random.
+    """Mirror and transpose the images (N, c, H, W) of a batch at random.
 
-    If the picture is mirrored, so are its normals: those in ``hrls``, which are channels 6 to 8 in [-1, 1], and the
-    picture ``normal``, in [0, 1]. They may be in any space, so it does not matter along which axis.
+    If images are mirrored, so are the normals in ``hrls``, channels 6 to 8 in [-1, 1]. They may be in any space, so it
+    does not matter along which axis.
     """
     flips = [axis for axis in (2, 3) if rng.random() < 0.5]
     swaps = rng.random() < 0.5
-    result = {name: (each.flip(flips).transpose(2, 3) if swaps else each.flip(flips)) for name, each in pair.items()}
+    result = {name: image.flip(flips).transpose(2, 3) if swaps else image.flip(flips) for name, image in pair.items()}
     if (len(flips) + swaps) % 2:
-        for name, channel, middle in (("hrls", 6, 0.0), ("normal", 0, 0.5)):
-            if name in result:
-                result[name][:, channel] = 2 * middle - result[name][:, channel]
-    return {name: each.contiguous(memory_format=torch.channels_last) for name, each in result.items()}
+        result["hrls"][:, 6] = -result["hrls"][:, 6]
+    return {name: image.contiguous(memory_format=torch.channels_last) for name, image in result.items()}
 
 
 def _per_channel(values: dict[str, Any]) -> np.ndarray:
@@ -436,14 +402,14 @@ def _normalised(weights: tuple[float, ...]) -> np.ndarray:
 
 
 def _random_light(rng: np.random.Generator, sampling: Sampling) -> np.ndarray:
-    """A 3x3 matrix L that changes the colour of the light: radiance @ L."""
+    """Draw a 3x3 matrix L that changes the colour of the light: radiance @ L."""
     if rng.random() < sampling.grey:
         return np.repeat(np.asarray(LUMINANCE_WEIGHTS)[:, None], 3, axis=1)
     return np.diag(2.0 ** rng.uniform(-sampling.gain_stops, sampling.gain_stops, 3))
 
 
 def _present(rng: np.random.Generator, sampling: Sampling, *, has_variance: bool) -> np.ndarray:
-    """1 for each HRLS channel whose feature is present, 0 for the others."""
+    """Draw 1 for each HRLS channel whose feature is present, 0 for the others."""
     absence = dict.fromkeys(OPTIONAL_FEATURES, sampling.drop_each) | {VARIANCE: sampling.drop_variance}
     present = {RGB: 1.0} | {name: float(rng.random() >= share) for name, share in absence.items()}
     if rng.random() < sampling.drop_lobes:
@@ -456,7 +422,7 @@ def _present(rng: np.random.Generator, sampling: Sampling, *, has_variance: bool
 
 
 def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
-    """Uniformly random 3x3 rotation (determinant 1) or rotation with a reflection (-1)."""
+    """Draw a uniformly random 3x3 rotation (determinant 1) or rotation with a reflection (-1)."""
     q, r = np.linalg.qr(rng.standard_normal((3, 3)))
     q *= np.sign(np.diag(r))  # makes the decomposition unique, and so q uniform
     if np.linalg.det(q) * determinant < 0:
@@ -467,87 +433,57 @@ def random_orthogonal(rng: np.random.Generator, determinant: int) -> Array:
 # All batches
 
 
+@dataclass(frozen=True, eq=False)
 class Batches(IterableDataset):
-    """Endless random batches of a folder's training views.
+    """Endless random batches of a folder's training views."""
 
-    Args:
-        scales: of each batch, one of these at random.
-        patch: width and height of a patch in HRLS pixels.
-        batch: pairs per batch.
-        prepare: returns the function that adds a network's further channels; called in the process that draws.
-        rescan_seconds: how often to look for new views on a CPU. A GPU keeps the views that it has loaded.
-    """
+    folder: Path
+    scales: tuple[int, ...]
+    """Of each batch, one of these at random."""
+    patch: int
+    """Width and height of a patch in HRLS pixels."""
+    batch: int
+    """Pairs per batch."""
+    sampling: Sampling
+    seed: int
+    device: torch.device
+    prepare: Prepare | None = None
 
-    def __init__(
-        self,
-        folder: Path,
-        scales: tuple[int, ...],
-        patch: int,
-        batch: int,
-        sampling: Sampling,
-        seed: int,
-        device: torch.device,
-        prepare: Callable[[], Prepare | None] | None = None,
-        rescan_seconds: float = 120,
-    ) -> None:
-        self.folder, self.scales, self.patch, self.batch, self.sampling = folder, scales, patch, batch, sampling
-        self.seed, self.device, self.prepare, self.rescan_seconds = seed, device, prepare, rescan_seconds
-
-    @torch.no_grad()
     def __iter__(self) -> Iterator[Batch]:
-        folder, prepare = Folder(self.folder), self.prepare and self.prepare()
-        rng = np.random.default_rng(self.seed)
-        while True:
-            views = view_tensors(folder, "train", self.device)
-            deadline = time.monotonic() + self.rescan_seconds
-            while self.device.type != "cpu" or time.monotonic() < deadline:
-                scale = int(rng.choice(self.scales))
-                yield draw(views, scale, self.patch, self.batch, rng, self.sampling, prepare)
-            folder.scan()
+        """Yield batches without end."""
+        drawn = self.folder, "train", self.scales, self.patch, self.batch, self.prepare, self.sampling
+        return fixed_batches(*drawn, seed=self.seed, device=self.device)
 
     def loader(self) -> DataLoader:
         """Load batches: on a CPU four ahead of training, in a process of their own."""
         if self.device.type != "cpu":
             return DataLoader(self, batch_size=None)
-        return DataLoader(
-            self,
-            batch_size=None,
-            num_workers=1,
-            prefetch_factor=4,
-            multiprocessing_context="spawn",  # a fork would copy locked locks of other threads
-            worker_init_fn=_ignore_interrupts,
-        )
+        # A fork would copy locked locks of other threads
+        workers: dict[str, Any] = {"num_workers": 1, "prefetch_factor": 4, "multiprocessing_context": "spawn"}
+        return DataLoader(self, batch_size=None, worker_init_fn=_ignore_interrupts, **workers)
 
 
 def _ignore_interrupts(_: int) -> None:
-    """Ctrl-C reaches all processes; training ends the worker after its last checkpoint."""
+    """Let training end the worker after its last checkpoint, because Ctrl-C reaches all processes."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
 def view_tensors(folder: Folder, split: str, device: torch.device) -> list[ViewTensors | SampleTensors]:
-    """The views of a split as tensors on a device, those with single samples too."""
+    """Open the views of a split as tensors on a device, those with single samples too."""
     passes = [ViewTensors.of(view, device) for view in folder.split(split)]
     return [*passes, *(SampleTensors.of(view, device) for view in folder.sample_views(split))]
 
 
 def fixed_batches(
-    views: Path,
-    split: str,
-    scales: Sequence[int],
-    patch: int,
-    batch: int,
-    prepare: Prepare | None = None,
-    rng: np.random.Generator | None = None,
-    sampling: Sampling = Sampling(),
-    *,
-    without_reference: bool = False,
-) -> Iterator[Batch]:
-    """Endless batches on the CPU that are the same in every call, for calibration, pruning and the like.
+    views: Path, split: str, scales: Sequence[int], patch: int, batch: int, prepare: Prepare | None = None,
+    sampling: Sampling = Sampling(), *, seed: int = 0, device: torch.device = CPU, without_reference: bool = False,
+) -> Iterator[Batch]:  # fmt: skip
+    """Yield endless batches of the views that a folder has now, the same for each seed.
 
     Args:
         without_reference: also of views that have none; their targets are not to be read.
     """
-    rng, folder, device = rng or np.random.default_rng(0), Folder(views), torch.device("cpu")
+    rng, folder = np.random.default_rng(seed), Folder(views)
     tensors = view_tensors(folder, split, device)
     if without_reference:
         tensors += view_tensors(folder, NO_REFERENCE, device)
@@ -558,5 +494,5 @@ def fixed_batches(
 
 
 def to_tensor(image: Array, device: torch.device) -> Tensor:
-    """(N, H, W, C) to (N, C, H, W) in channels-last memory, without a copy on the CPU."""
+    """Convert (N, H, W, C) to (N, C, H, W) in channels-last memory, without a copy on the CPU."""
     return torch.from_numpy(np.ascontiguousarray(image)).permute(0, 3, 1, 2).to(device, non_blocking=True)

@@ -1,10 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """Train the prediction of a joint network's own error.
 
-    python -m research.training.error RUN/best.pt --data VIEWS
+    python -m research.training.error AVERAGE.pt JOINT.pt --data VIEWS
 
-Only the convolution that predicts the error is trained, for some hundred batches; the rest of the network is final. The
-checkpoint is overwritten.
+Only the convolution that predicts the error is trained, for some hundred batches; the rest of the network is final.
 """
 
 from __future__ import annotations
@@ -17,9 +16,9 @@ import torch
 from torch.optim.lr_scheduler import LambdaLR
 
 from research.training import checkpoints, data, losses
+from research.training.denoisers import with_denoised_mean
 from research.training.export import denoiser_for
 from research.training.joint import JointFusion
-from research.training.mean_denoiser import with_denoised_mean
 from research.training.render_mean import with_mean
 from research.training.train import lr_factor
 
@@ -48,26 +47,26 @@ def fit(network: JointFusion, views: Path, scales: list[int], prepare: data.Prep
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
+    parser.add_argument("output", type=Path, help="checkpoint to write")
     parser.add_argument("--data", type=Path, required=True, help="folder of views")
     parser.add_argument("--steps", type=int, default=400, help="(default: %(default)s)")
     parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
-    network, state = checkpoints.load(args.checkpoint)
-    if not isinstance(network, JointFusion):
-        raise SystemExit(f"{args.checkpoint}: not a joint network; the paper's does not predict its error")
+    network, state = checkpoints.load_joint(args.checkpoint)
     network.reset_error()
     scales = [int(scale) for scale in state["training_spp"]]
-    prepare = with_mean
+    prepare: data.Prepare = with_mean
     if network.mean_denoiser is None:
         prepare = with_denoised_mean(denoiser_for(network, network.denoiser(scales[0])))
     loss = fit(network, args.data, scales, prepare, args.steps)
     # In the precision of the checkpoint: research.training.average stores half floats
     state["ema"] = {name: values.to(state["ema"][name].dtype) for name, values in network.state_dict().items()}
     state["provenance"]["error_steps"] = args.steps
-    checkpoints.save(state, args.checkpoint)
+    checkpoints.save(state, args.output)
     print(f"{args.steps} steps, loss {loss:.3f}")
 
 

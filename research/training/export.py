@@ -1,48 +1,50 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Export a checkpoint's averaged weights as an ONNX file: a whole model with its contract.
+r"""Export a checkpoint's averaged weights as an ONNX file: a whole model with its contract.
 
     python -m research.training.export RUN/checkpoint.pt --name paper-x4 -o paper-x4.onnx --half
-    python -m research.training.export RUN/checkpoint.pt --name paper-x4 --measure-overlap VIEWS
     python -m research.training.export JOINT.pt --scale 2 --name joint-x2 -o joint-x2.onnx --int8 VIEWS --overlap 48
-    python -m research.training.export LARGE.pt --scale 2 4 8 --name joint-large -o joint-large --int8 VIEWS --overlap
-    48 32 16
+    python -m research.training.export LARGE.pt --scale 2 4 8 --name joint-large -o joint-large --int8 VIEWS \
+        --overlap 48 32 16
 
 ``--half`` stores weights as half floats, which are cast to float32 when the file is loaded: half the size, the same
 computation. ``--int8`` computes convolutions in 8 bits (:mod:`research.training.quantise`). Files of several scales
-share their
-weights, in ``NAME.weights``. ``-x2`` and so on are then added to ``--name``, and ``-x2.onnx`` to the output.
+share their weights, in ``NAME.weights``. ``-x2`` and so on are then added to ``--name``, and ``-x2.onnx`` to the
+output.
 """
 
 from __future__ import annotations
 
 import argparse
+import collections
 import copy
 import datetime
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import onnx
+import onnxruntime
 import torch
 from onnx import helper, numpy_helper
 from onnxscript import opset18
 from torch import nn
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
-from oiio_msspl.model.contract import SCALES, SPREAD, Contract
-from research.datagen.views import Folder
-from research.training import export_checks
-from research.training.checkpoints import load
+from oiio_msspl.model.contract import NO_DENOISER, SCALES, SPREAD, Contract
+from oiio_msspl.model.runtime import load_network
+from research.training import CHECKPOINTS
+from research.training.checkpoints import Network, load, load_joint, run
+from research.training.denoisers import ALIGNMENT, MeanDenoiser, with_denoised_mean
+from research.training.encoding import log_encode
 from research.training.joint import FEATURES, SIZES, JointFusion
-from research.training.mean_denoiser import ALIGNMENT, MeanDenoiser, with_denoised_mean
-from research.training.networks import Network, denoiser_of
 from research.training.oidn import provenance
 from research.training.paper import MultiResolutionFusion
 from research.training.quantise import joint
 from research.training.quantise.layers import Networks, quantised, varied
-from research.training.tracing import IR_VERSION, shuffle, traced, unshuffle
-from research.training.whole_model import CHECKPOINTS, quantised_denoiser, save, whole_model
+from research.training.tracing import IR_VERSION, prepend, shuffle, traced, unshuffle
+from research.training.whole_model import InTorch, example, quantised_denoiser, save, whole_model
 
 #: Memory of a tile in bytes per HRLS pixel, by family of models: the peak of a process that fuses a frame, without the
 #: frame itself, and with room for the rows that are decoded for the next tiles.
@@ -56,43 +58,38 @@ Pair = tuple[torch.Tensor, torch.Tensor]
 
 
 def contract_of(network: Network, scale: int, name: str, overlap: int, state: dict[str, Any]) -> Contract:
-    """The contract of a checkpoint's network for one of its scales."""
-    denoiser = denoiser_of(network, scale)
+    """Return the contract of a checkpoint's network for one of its scales."""
+    denoiser = network.denoiser(scale) if isinstance(network, JointFusion) else NO_DENOISER
     # Tiles begin on the grid of the denoiser's lowest level, too, so that it divides a tile as it divides the frame.
     alignment = ALIGNMENT if denoiser else network.multiple // scale
-    features = {}
+    features: dict[str, Any] = {}
     if isinstance(network, JointFusion):
         # At x2 the average of four HRLS pixels still has noise, and the LRHS's AOVs halve it. At x4 and x8 the average
         # of 16 or 64 pixels has little, and the LRHS's AOVs differ from it where the pixel filter is not a box.
         features = {"lrhs": [RGB, *((ALBEDO, NORMAL) if scale == 2 else ())], "hrls": list(FEATURES)}
     return Contract(
-        **features,
-        denoiser=denoiser,
+        **features, name=name, scale=scale, denoiser=denoiser, alignment=alignment, overlap=overlap,
         bytes_per_pixel=MEMORY[name.rpartition("-x")[0].removesuffix(SPREAD)],
-        name=name,
-        scale=scale,
-        alignment=alignment,
-        overlap=overlap,
         training_spp=state["training_spp"][str(scale)],
         provenance=state["provenance"]
         | {"network": state["architecture"], **network.config, "date": datetime.date.today().isoformat()}
         | (provenance(SIZES[network.size][0]) if isinstance(network, JointFusion) else {}),
-    )
+    )  # fmt: skip
 
 
 def network_example(network: Network, scale: int, alignment: int) -> tuple[torch.Tensor, torch.Tensor]:
-    """Random ``lrhs`` and ``hrls``, as a network reads them."""
+    """Return random ``lrhs`` and ``hrls``, as a network reads them."""
     lrhs = torch.rand(1, network.lrhs_channels, 4 * alignment, 6 * alignment)
     return lrhs, torch.rand(1, network.hrls_channels, 4 * alignment * scale, 6 * alignment * scale)
 
 
 def denoiser_for(network: JointFusion, mode: str) -> MeanDenoiser:
-    """The denoiser of both renders' mean for a value of ``Contract.denoiser``. Where it is not the network's own, it is
-    that of `joint`, or of `joint-spread`."""
+    """Return the denoiser of both renders' mean for a value of ``Contract.denoiser``.
+
+    Where it is not the network's own, it is that of `joint`, or of `joint-spread`.
+    """
     if network.mean_denoiser is None or network.denoiser(SCALES[0]) != mode:
-        loaded, _ = load(CHECKPOINTS / ("joint_spread.pt" if network.spread else "joint.pt"))
-        assert isinstance(loaded, JointFusion)
-        network = loaded
+        network, _ = load_joint(CHECKPOINTS / ("joint_spread.pt" if network.spread else "joint.pt"))
     assert network.mean_denoiser is not None
     return network.mean_denoiser
 
@@ -111,6 +108,7 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
     inputs = network_example(network, scale, alignment)
     aten = torch.ops.aten
     module: nn.Module
+    translations: dict[Any, Any]
     if isinstance(network, MultiResolutionFusion):
         module, outputs = _with_onnx_channel_order(network), ["fused"]
         translations = {aten.pixel_unshuffle.default: _space_to_depth}
@@ -127,7 +125,7 @@ def to_onnx(network: Network, contract: Contract, *, half: bool = False) -> onnx
 
 @torch.inference_mode()
 def mixing_of(network: JointFusion, contract: Contract) -> onnx.ModelProto:
-    """The graph of :class:`research.training.quantise.joint.Blend` for a joint network."""
+    """Export :class:`research.training.quantise.joint.Blend` for a joint network."""
     scale, alignment = contract.scale, contract.alignment
     lrhs, hrls = network_example(network, scale, alignment)
     levels = range(scale.bit_length())
@@ -153,11 +151,11 @@ def joint_to_onnx(network: JointFusion, contracts: Sequence[Contract], pairs: Se
             for (lrhs, _), image, (albedo, normal) in zip(pairs, images, clean, strict=True)
         ]
     fit = joint.fitted(network, max(contract.scale for contract in contracts), pairs)
-    return [joint.to_onnx(fit, each.scale, mixing_of(network, each), layers) for each in contracts]
+    return [joint.to_onnx(fit, contract.scale, mixing_of(network, contract), layers) for contract in contracts]
 
 
-def _space_to_depth(x, downscale_factor: int):
-    """Pixel unshuffle as one operator instead of the exporter's dozen."""
+def _space_to_depth(x: Any, downscale_factor: int) -> Any:
+    """Unshuffle pixels by one operator instead of the exporter's dozen."""
     return opset18.SpaceToDepth(x, blocksize=downscale_factor)
 
 
@@ -166,7 +164,7 @@ def _with_onnx_channel_order(network: MultiResolutionFusion) -> MultiResolutionF
     network = copy.deepcopy(network)
     with torch.no_grad():
         for stage in network.deshuffle:
-            weight = stage.conv.weight  # (C', C * row * column, 3, 3)
+            weight: torch.Tensor = stage.conv.weight  # (C', C * row * column, 3, 3)
             outputs, inputs, *kernel = weight.shape
             reordered = weight.reshape(outputs, inputs // 4, 4, *kernel).transpose(1, 2).reshape_as(weight)
             weight.copy_(reordered.clone())
@@ -182,17 +180,53 @@ def _store_as_half(graph: onnx.GraphProto) -> None:
             values = numpy_helper.to_array(tensor).astype(np.float16)
             tensor.CopyFrom(numpy_helper.from_array(values, f"{name}.half"))
             casts.append(helper.make_node("Cast", [tensor.name], [name], to=onnx.TensorProto.FLOAT))
-    nodes = [*casts, *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)
+    prepend(graph, casts)
+
+
+# Checks
+
+
+@torch.inference_mode()
+def parity(network: Network, path: Path, denoise: MeanDenoiser | None = None) -> float:
+    """Return the largest difference of an exported file's output from the network's, log-encoded.
+
+    Args:
+        denoise: the denoiser of both renders' mean, if the file's contract has one.
+    """
+    session, contract = load_network(path), Contract.of_file(path)
+    fuse = network.fuse if isinstance(network, JointFusion) else partial(run, network)
+    model = InTorch(contract, fuse, denoise)
+    block = contract.alignment * -(-6 // contract.alignment)  # at least six pixels
+    worst = 0.0
+    for height, width in ((4 * block, 4 * block), (3 * block, 5 * block)):
+        inputs = example(contract, height, width, seed=height)
+        (fused,) = session.run(["fused"], {name: values.numpy() for name, values in inputs.items()})
+        worst = max(worst, float((log_encode(torch.from_numpy(fused)) - log_encode(model(inputs))).abs().max()))
+    return worst
+
+
+def check_casts(path: Path) -> None:
+    """Refuse a file whose weights ONNX Runtime would cast in every run."""
+    options = onnxruntime.SessionOptions()
+    optimised = path.with_suffix(".optimised")
+    options.optimized_model_filepath = str(optimised)
+    options.graph_optimization_level = onnxruntime.GraphOptimizationLevel.ORT_ENABLE_BASIC
+    onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    counts = collections.Counter(node.op_type for node in onnx.load(optimised).graph.node)
+    optimised.unlink()
+    if counts["Cast"]:
+        raise SystemExit(
+            f"{path}: {counts['Cast']} casts of weights are left after loading; they would slow every tile"
+        )
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("--scale", type=int, nargs="+", help="scales to export, of a network for several")
     parser.add_argument("--name", required=True, help="short name of the model, e.g. paper-x4")
-    parser.add_argument("-o", "--output", type=Path)
+    parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("--half", action="store_true", help="store weights as half floats")
     parser.add_argument(
         "--int8", type=Path, metavar="VIEWS", help="compute convolutions in 8 bits, calibrated on these views"
@@ -200,51 +234,43 @@ def main() -> None:
     parser.add_argument(
         "--overlap", type=int, nargs="+", default=[24], help="LRHS pixels that tiles share on each side, for each scale"
     )
-    parser.add_argument(
-        "--measure-overlap", type=Path, metavar="VIEWS", help="print the error by overlap, on these views"
-    )
+    parser.add_argument("--denoiser", type=Path, help="quantised denoiser of both renders' mean (default: the shipped)")
     args = parser.parse_args()
 
     network, state = load(args.checkpoint)
     scales = args.scale or ([network.scale] if isinstance(network, MultiResolutionFusion) else [])
     if not scales:
         raise SystemExit("this network serves several scales; choose some with --scale")
-    if args.measure_overlap:
-        views = Folder(args.measure_overlap).split("validation")[:8]
-        for overlap, difference in export_checks.measure_overlap(network, scales[0], views).items():
-            print(f"overlap {overlap}: {difference:.2g}")
-    if not args.output:
-        return
     names = {scale: f"-x{scale}" if len(scales) > 1 else "" for scale in scales}
     if len(args.overlap) not in (1, len(scales)):
         raise SystemExit("--overlap: give one number, or one for each scale")
     overlaps = args.overlap * (len(scales) // len(args.overlap))
     contracts = [
-        contract_of(network, each, args.name + end, overlap, state)
-        for (each, end), overlap in zip(names.items(), overlaps, strict=True)
+        contract_of(network, scale, args.name + end, overlap, state)
+        for (scale, end), overlap in zip(names.items(), overlaps, strict=True)
     ]
     files = [args.output.with_name(f"{args.output.name}{end}.onnx") if end else args.output for end in names.values()]
     denoiser: MeanDenoiser | None = None
     if isinstance(network, JointFusion):
         if not args.int8:
             raise SystemExit("a joint network can only be exported with --int8")
-        if len({each.denoiser for each in contracts}) > 1:
+        if len({contract.denoiser for contract in contracts}) > 1:
             raise SystemExit("--scale: these scales have other denoisers of both renders' mean; export each alone")
         denoiser = denoiser_for(network, contracts[0].denoiser)
         pairs = joint.calibration_pairs(args.int8, scales, with_denoised_mean(denoiser), spread=network.spread)
         graphs = joint_to_onnx(network, contracts, pairs)
     else:
-        graphs = [to_onnx(network, each, half=args.half) for each in contracts]
+        graphs = [to_onnx(network, contract, half=args.half) for contract in contracts]
     models = {
-        file: whole_model(graph, each, quantised_denoiser(each.denoiser))
-        for file, graph, each in zip(files, graphs, contracts, strict=True)
+        file: whole_model(graph, contract, quantised_denoiser(contract.denoiser, args.denoiser))
+        for file, graph, contract in zip(files, graphs, contracts, strict=True)
     }
     save(models, args.name if len(scales) > 1 else "")
     for file in files:
         if args.half:
-            export_checks.check_casts(file)
-        export_checks.describe(file)
-        print(f"largest difference from PyTorch: {export_checks.parity(network, file, denoiser):.2g}")
+            check_casts(file)
+        difference = parity(network, file, denoiser)
+        print(f"{file}: {file.stat().st_size / 1e6:.1f} MB, largest difference from PyTorch {difference:.2g}")
 
 
 if __name__ == "__main__":

@@ -30,12 +30,12 @@ from torch import Tensor, nn
 
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.devices import GPU_FOLDER
-from research.training.checkpoints import load
+from research.training.checkpoints import load_joint
+from research.training.denoisers import ALIGNMENT, MeanDenoiser
 from research.training.export import denoiser_for, network_example
 from research.training.joint import JointFusion
-from research.training.mean_denoiser import ALIGNMENT, MeanDenoiser
 from research.training.oidn import FineTunedUNet
-from research.training.tracing import traced
+from research.training.tracing import prepend, traced
 from research.training.whole_model import SMALL, save, whole_model
 
 #: What is added to the provenance of a file.
@@ -43,31 +43,31 @@ PRECISION = {"precision": "convolutions in half floats, their weights stored in 
 
 
 class Fuse(nn.Module):
-    """:meth:`JointFusion.fuse` as a module for the exporter; the size ``large`` also returns the denoised albedo and
-    normal, in [0, 1]."""
+    """A joint network as a module for the exporter. The denoised albedo and normal of ``large`` are in [0, 1]."""
 
     def __init__(self, network: JointFusion) -> None:
         super().__init__()
         self.network = network
 
     def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, ...]:
+        """Return the fused image, the logarithm of its expected error, and what the size ``large`` denoises."""
         prepared = self.network.prepared(hrls)
         fused = self.network.fuse_prepared(lrhs, prepared)
         return fused if self.network.layers is None else (*fused, prepared[:, 3:6], 0.5 * prepared[:, 6:9] + 0.5)
 
 
-P = TypeVar("P", JointFusion, FineTunedUNet)
+P = TypeVar("P", JointFusion, FineTunedUNet, MeanDenoiser)
 
 
 def in_half_floats(network: P) -> P:
-    """A copy whose convolutions compute in half floats, with one weight and one bias each."""
+    """Return a copy whose convolutions compute in half floats, with one weight and one bias each."""
     network = copy.deepcopy(network)
     network.convs = nn.ModuleDict({name: conv.merged() for name, conv in network.convs.items()}).half()
     return network.eval()
 
 
 def joint_in_half_floats(network: JointFusion) -> JointFusion:
-    """The same with the heads of a `joint` network."""
+    """Return a copy of a `joint` network whose convolutions and heads compute in half floats."""
     network = in_half_floats(network)
     network.heads.half()
     network.error.half()
@@ -79,7 +79,7 @@ def joint_in_half_floats(network: JointFusion) -> JointFusion:
 
 @torch.inference_mode()
 def to_onnx(network: JointFusion, contract: Contract, denoiser: MeanDenoiser) -> onnx.ModelProto:
-    """The whole model of a network in half floats, with a denoiser in half floats."""
+    """Return the whole model of a network in half floats, with a denoiser in half floats."""
     inputs = network_example(network, contract.scale, contract.alignment)
     outputs = ["fused", "log_error", *(["albedo", "normal"] if network.layers is not None else [])]
     graph = traced(Fuse(network), inputs, ["lrhs", "hrls"], outputs, contract.alignment)
@@ -91,7 +91,7 @@ def to_onnx(network: JointFusion, contract: Contract, denoiser: MeanDenoiser) ->
 
 
 def _denoiser_graph(network: MeanDenoiser) -> onnx.ModelProto:
-    """The graph of a denoiser, whose inputs are the images of :func:`research.training.render_mean.mean_of_renders`."""
+    """Export a denoiser, whose inputs are the images of :func:`research.training.render_mean.mean_of_renders`."""
     images = tuple(torch.rand(1, channels, 4 * ALIGNMENT, 6 * ALIGNMENT) for channels in (3, 1, 3, 3))
     model = traced(network, images, ["colour", "noise", "albedo", "normal"], ["denoised"], ALIGNMENT)
     _store_kernels_in_8_bits(model.graph)
@@ -99,8 +99,10 @@ def _denoiser_graph(network: MeanDenoiser) -> onnx.ModelProto:
 
 
 def _store_kernels_in_8_bits(graph: onnx.GraphProto) -> None:
-    """Replace the weights of convolutions by codes, scales and their product, which ONNX Runtime folds when it loads
-    the file. One scale for each output would cost 0.5 dB."""
+    """Replace the weights of convolutions by the product of codes and scales, which is folded when a file is loaded.
+
+    One scale for each output would cost 0.5 dB.
+    """
     products = []
     for tensor in list(graph.initializer):
         if tensor.data_type != TensorProto.FLOAT16 or len(tensor.dims) != 4 or len(tensor.raw_data) < SMALL:
@@ -117,26 +119,23 @@ def _store_kernels_in_8_bits(graph: onnx.GraphProto) -> None:
             helper.make_node("Mul", [f"{name}.codes.float", f"{name}.scales.float"], [f"{name}.float"]),
             helper.make_node("Cast", [f"{name}.float"], [name], to=TensorProto.FLOAT16),
         ]
-    nodes = [*products, *graph.node]
-    del graph.node[:]
-    graph.node.extend(nodes)
+    prepend(graph, products)
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("models", type=Path, nargs="+", help="the network's files for CPUs, one for each scale")
     args = parser.parse_args()
-    network, _ = load(args.checkpoint)
-    if not isinstance(network, JointFusion):
-        raise SystemExit(f"{args.checkpoint}: not a joint network")
+    network, _ = load_joint(args.checkpoint)
     modes = {Contract.of_file(path).denoiser for path in args.models}
     denoisers = {mode: in_half_floats(denoiser_for(network, mode)) for mode in modes}
     network = joint_in_half_floats(network)
     folder, family = args.models[0].parent / GPU_FOLDER, args.models[0].stem.rpartition("-x")[0]
     folder.mkdir(exist_ok=True)
     contracts = {folder / path.name: Contract.of_file(path) for path in args.models}
-    models = {path: to_onnx(network, each, denoisers[each.denoiser]) for path, each in contracts.items()}
+    models = {path: to_onnx(network, contract, denoisers[contract.denoiser]) for path, contract in contracts.items()}
     save(models, family)
     for path in sorted([*models, *folder.glob("*.weights")]):
         print(f"{path}: {path.stat().st_size / 1e6:.2f} MB")

@@ -6,10 +6,9 @@ one. ``small`` starts from small networks for both. ``large`` starts from the la
 albedo and normal that are denoised before, as Open Image Denoise's documentation recommends.
 
 1. Encode. At H the U-Net reads the HRLS's colour, albedo and normal, as in Open Image Denoise (OIDN). At H/2 it also
-   reads the LRHS and the denoised mean of both renders at the LRHS's resolution
-   (:mod:`research.training.mean_denoiser`). Their
-   weights start at zero, so that training starts from OIDN. All weights are trained. The parameters are differences
-   from OIDN's weights, so weight decay pulls towards OIDN.
+   reads the LRHS and the denoised mean of both renders at the LRHS's resolution (:mod:`research.training.denoisers`).
+   Their weights start at zero, so that training starts from OIDN. All weights are trained. The parameters are
+   differences from OIDN's weights, so weight decay pulls towards OIDN.
 2. The U-Net, :data:`research.training.oidn.BASE` or :data:`research.training.oidn.LARGE`, returns the denoised HRLS.
 3. Heads predict logits for every level of the result from the features that denoise.
 4. Blend. At the LRHS's resolution, the logits choose between the denoised mean of both renders, the downsampled
@@ -24,6 +23,7 @@ import functools
 import itertools
 import math
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -31,27 +31,20 @@ from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import ALBEDO, HRLS_FEATURES, NORMAL, RGB
 from oiio_msspl.model.contract import MEAN_DENOISER, SMALL_MEAN_DENOISER, SPREAD
+from research.training import oidn
+from research.training.denoisers import LayerDenoisers, MeanDenoiser, denoise_mean
 from research.training.encoding import LOG_SCALE, log_decode, log_encode, log_to_pu, pu_to_log
-from research.training.layer_denoisers import LayerDenoisers
-from research.training.mean_denoiser import MeanDenoiser, denoise_mean
-from research.training.oidn import (
-    BASE,
-    BASE_HDR,
-    LARGE,
-    LARGE_HDR,
-    SMALL_HDR,
-    FineTunedConv,
-    convolutions,
-    pretrained_weights,
-    run_unet_on_tensors,
-)
 from research.training.ops import highest_around, log2_scale, pyramid, upsample
 from research.training.paper import LRHS_CHANNELS
 
 #: Features of the HRLS that the network reads.
 FEATURES = (RGB, ALBEDO, NORMAL)
 #: By size: the network of Open Image Denoise from which the U-Net starts, and its shape.
-SIZES = {"small": (SMALL_HDR, BASE), "usual": (BASE_HDR, BASE), "large": (LARGE_HDR, LARGE)}
+SIZES = {
+    "small": (oidn.SMALL_HDR, oidn.BASE),
+    "usual": (oidn.BASE_HDR, oidn.BASE),
+    "large": (oidn.LARGE_HDR, oidn.LARGE),
+}
 #: Initial logits at the LRHS's resolution: the denoised mean of both renders, the denoised HRLS, the HRLS, the LRHS.
 COARSEST = (2.0, 0.0, -2.0, -2.0)
 #: Initial logits at finer levels: the denoised HRLS at the coarser level's brightness, the denoised HRLS, light times
@@ -77,12 +70,12 @@ DECODED = ("dec_conv1b", "dec_conv2b", "dec_conv3b", "dec_conv4b")
 OUTPUTS = (len(FINER) + 1, *[len(FINER) + len(COARSEST)] * 3)
 #: On the way up: the convolution whose outputs are the first inputs of a convolution.
 PREDECESSOR = {
-    name: before for before, name in itertools.pairwise([*(n for level in BASE.up for n in level), BASE.last])
+    name: before for before, name in itertools.pairwise([*(n for level in oidn.BASE.up for n in level), oidn.BASE.last])
 }
 
 
 class JointFusion(nn.Module):
-    """See the module's docstring. One set of weights serves every scale; the image sizes give the scale.
+    """The ``joint`` network. One set of weights serves every scale; the image sizes give the scale.
 
     Sizes must be multiples of ``multiple`` HRLS pixels.
 
@@ -99,38 +92,40 @@ class JointFusion(nn.Module):
     ) -> None:
         super().__init__()
         self.kept, self.size, self.spread = dict(kept or {}), size, spread
-        self.config = {"kept": self.kept, "size": size, "spread": spread}
+        self.config: dict[str, Any] = {"kept": self.kept, "size": size, "spread": spread}
         self.lrhs_channels, self.hrls_channels = 2 * LRHS_CHANNELS, sum(HRLS_FEATURES[name] for name in FEATURES)
         network, self.shape = SIZES[size]
-        self.pretrained = pretrained_weights(network)
+        self.pretrained = oidn.pretrained_weights(network)
         # The large size reads the mean that the usual one has denoised
         self.mean_denoiser = None if size == "large" else MeanDenoiser(size)
         self.layers = LayerDenoisers() if size == "large" else None
-        self.convs = nn.ModuleDict()
-        for name in convolutions(self.pretrained):
+        convs: dict[str, oidn.FineTunedConv] = {}
+        for name in oidn.convolutions(self.pretrained):
             rows, columns = self.pretrained_channels(name)
             weight, bias = self.pretrained[f"{name}.weight"][rows][:, columns], self.pretrained[f"{name}.bias"][rows]
-            self.convs[name] = FineTunedConv(weight, bias, EXTRA if name in READERS else 0)
-        self.heads = nn.ModuleList(
-            nn.Conv2d(len(self.convs[name].bias), size, 3, padding=1)
-            for name, size in zip(DECODED, OUTPUTS, strict=True)
-        )
-        self.error = nn.Conv2d(len(self.convs[DECODED[1]].bias), 4, 3, padding=1)
+            convs[name] = oidn.FineTunedConv(weight, bias, EXTRA if name in READERS else 0)
+        channels = [len(convs[name].pretrained_bias) for name in DECODED]
+        heads = [nn.Conv2d(*sizes, 3, padding=1) for sizes in zip(channels, OUTPUTS, strict=True)]
+        self.convs: Any = nn.ModuleDict(convs)
+        self.heads: Any = nn.ModuleList(heads)
+        self.error: Any = nn.Conv2d(channels[1], 4, 3, padding=1)
         with torch.no_grad():
-            for level, head in enumerate(self.heads):
+            for level, head in enumerate(heads):
                 nn.init.kaiming_normal_(head.weight)
                 head.weight.mul_(0.1)
-                head.bias.copy_(torch.tensor(FINER + COARSEST if level else (*FINER, 2.0)))
+                cast(Tensor, head.bias).copy_(torch.tensor(FINER + COARSEST if level else (*FINER, 2.0)))
         self.reset_error()
 
     def denoiser(self, scale: int) -> str:
-        """The value of ``Contract.denoiser``. At x4 and x8 the LRHS is so small that the large denoiser takes hardly
-        longer than the small one, and is better."""
+        """Return the value of ``Contract.denoiser``.
+
+        At x4 and x8 the LRHS is so small that the large denoiser takes hardly longer than the small one, and is better.
+        """
         kind = SMALL_MEAN_DENOISER if self.size == "small" and scale == 2 else MEAN_DENOISER
         return kind + SPREAD if self.spread else kind
 
     def pretrained_channels(self, name: str) -> tuple[list[int], list[int]]:
-        """Indices of the outputs and inputs of a pretrained convolution that this network has."""
+        """Return the indices of the outputs and inputs of a pretrained convolution that this network has."""
         count, inputs = self.pretrained[f"{name}.weight"].shape[:2]
         rows, columns = list(self.kept.get(name, range(count))), list(range(inputs))
         if before := PREDECESSOR.get(name):
@@ -139,13 +134,13 @@ class JointFusion(nn.Module):
         return rows, columns
 
     def differences(self) -> Iterator[nn.Parameter]:
-        """The parameters that are added to pretrained ones."""
+        """Yield the parameters that are added to pretrained ones."""
         for convs in (self.convs, *([self.mean_denoiser.convs] if self.mean_denoiser is not None else [])):
             for conv in convs.values():
                 yield from conv.differences()
 
     def initial_state(self) -> dict[str, Tensor]:
-        """The state of a new network without its random weights, and without the head of the expected error."""
+        """Return the state of a new network without its random weights, and without the head of the expected error."""
         return {
             name: value.clone() if name.startswith("heads") and name.endswith("bias") else torch.zeros_like(value)
             for name, value in self.state_dict().items()
@@ -159,21 +154,20 @@ class JointFusion(nn.Module):
         self.error.bias.fill_(math.log(0.05))
 
     def forward(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-        """
-        Args:
-            lrhs: (N, 7, h, w): the LRHS, the mean of both renders, its noise
-            (:func:`research.training.render_mean.with_mean`).
-            hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
+        """Fuse as :meth:`fuse`, after denoising the mean of both renders.
 
-        Returns:
-            As :meth:`fuse`. The size ``large`` has the arguments of :meth:`fuse_prepared`.
+        Args:
+            lrhs: (N, 7, h, w), see :func:`research.training.denoisers.denoise_mean`. The size ``large`` has the
+                arguments of :meth:`fuse_prepared`.
+            hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
         """
         if self.mean_denoiser is None:
             return self.fuse_prepared(lrhs, hrls)
         return self.fuse(denoise_mean(self.mean_denoiser, lrhs, hrls), hrls)
 
     def fuse(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-        """
+        """Fuse both renders.
+
         Args:
             lrhs: (N, 6, h, w), log-encoded: the LRHS and the denoised mean of both renders.
             hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
@@ -185,11 +179,11 @@ class JointFusion(nn.Module):
         return self.fuse_prepared(lrhs, self.prepared(hrls))
 
     def prepared(self, hrls: Tensor) -> Tensor:
-        """The HRLS (N, 9 or more, H, W) as the U-Net reads it: the size ``large`` denoises albedo and normal first."""
+        """Return the HRLS (N, 9 or more, H, W) as the U-Net reads it: ``large`` denoises albedo and normal first."""
         return hrls if self.layers is None else self.layers.applied(hrls)
 
     def fuse_prepared(self, lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-        """As :meth:`fuse`, for an HRLS of :meth:`prepared`."""
+        """Fuse as :meth:`fuse`, with an HRLS of :meth:`prepared`."""
         samples, albedo, normal = hrls[:, :3], hrls[:, 3:6], hrls[:, 6:9]
         full = torch.cat([log_to_pu(samples), albedo.clamp(0, 1), 0.5 * normal + 0.5], dim=1)
         half = log_to_pu(torch.cat([lrhs[:, LRHS_CHANNELS:], lrhs[:, :LRHS_CHANNELS]], dim=1))
@@ -201,7 +195,7 @@ class JointFusion(nn.Module):
             return features[name]
 
         inputs = [image.to(next(self.convs.parameters()).dtype) for image in (full, half)]
-        colour = run_unet_on_tensors(self.shape, inputs, conv)
+        colour = oidn.run_unet_on_tensors(self.shape, inputs, conv)
         logits = [head(features[name]).float() for head, name in zip(self.heads, DECODED, strict=True)]
         log_error = F.pixel_shuffle(self.error(features[DECODED[1]].detach()).float(), 2)
         denoised = pu_to_log(colour.float().clamp_max(1.0))
@@ -209,7 +203,7 @@ class JointFusion(nn.Module):
 
 
 def mixed(logits: Tensor, images: Sequence[Tensor]) -> Tensor:
-    """Mean of the images, weighted by the softmax of the logits (N, len(images), H, W)."""
+    """Average images, weighted by the softmax of the logits (N, len(images), H, W)."""
     # Plane by plane: ONNX Runtime's softmax over any axis but the last takes several times as long
     planes = [logits[:, i : i + 1] for i in range(len(images))]
     highest = functools.reduce(torch.maximum, planes).detach()
@@ -235,37 +229,28 @@ def blend(
         The fused image (N, 3, s*h, s*w), log-encoded.
     """
     first = log2_scale(lrhs, samples)
-    means = pyramid(log_decode(samples), 0, first + 1)
-    filtered = pyramid(log_decode(denoised), 0, first + 1)
+    means, filtered = pyramid(log_decode(samples), first + 1), pyramid(log_decode(denoised), first + 1)
     share = torch.sigmoid(logits[0][:, len(FINER) :])
-    tints = pyramid((share * albedo + (1 - share)).clamp_min(MIN_ALBEDO), 0, first + 1)
-    fused = mixed(
-        logits[first][:, len(FINER) :],
-        [
-            lrhs[:, LRHS_CHANNELS:],
-            log_encode(filtered[first]),
-            log_encode(means[first]),
-            lrhs[:, :LRHS_CHANNELS],
-        ],
-    )
+    tints = pyramid((share * albedo + (1 - share)).clamp_min(MIN_ALBEDO), first + 1)
+    fused = mixed(logits[first][:, len(FINER) :], [
+        lrhs[:, LRHS_CHANNELS:], log_encode(filtered[first]), log_encode(means[first]), lrhs[:, :LRHS_CHANNELS],
+    ])  # fmt: skip
     for level in reversed(range(first)):
         radiance, below = log_decode(fused), filtered[level + 1]
         light = upsample(radiance / tints[level + 1], 2, "bilinear")
         ratio = ((radiance + RATIO_FLOOR) / (below + RATIO_FLOOR)).clamp(1 / MAX_RATIO, MAX_RATIO)
-        fused = mixed(
-            logits[level],
-            [
-                log_encode(filtered[level] * upsample(ratio, 2, "bilinear")),
-                log_encode(filtered[level]) if level else denoised,
-                log_encode(light * tints[level]),
-                log_encode(means[level]) if level else samples,
-            ],
-        )
+        candidates = [
+            log_encode(filtered[level] * upsample(ratio, 2, "bilinear")),
+            log_encode(filtered[level]) if level else denoised,
+            log_encode(light * tints[level]),
+            log_encode(means[level]) if level else samples,
+        ]
+        fused = mixed(logits[level], candidates)
     return within_renders(fused, lrhs, samples, margin)
 
 
 def within_renders(fused: Tensor, lrhs: Tensor, samples: Tensor, margin: float) -> Tensor:
-    """Clamp a result to what the renders allow, see :func:`highest_allowed`; arguments as of :func:`blend`."""
+    """Clamp a result to what the renders allow, see :func:`highest_allowed`; the arguments are those of `blend`."""
     low, mean = lrhs.split(LRHS_CHANNELS, dim=1)
     lowest, highest = (
         upsample(sign * highest_allowed(sign * low, sign * mean + margin, sign * samples), 2) for sign in (-1.0, 1.0)
@@ -274,10 +259,10 @@ def within_renders(fused: Tensor, lrhs: Tensor, samples: Tensor, margin: float) 
 
 
 def highest_allowed(lrhs: Tensor, mean: Tensor, samples: Tensor) -> Tensor:
-    """The largest value that each 2x2 HRLS pixels may have.
+    """Return the largest value that each 2x2 HRLS pixels may have.
 
     It is the highest sample of either render close around. Where light is rare, all of these may be too dark. So the
-    denoised mean of both renders counts, too, as far as some sample within ``FAR`` LRHS pixels is as bright.
+    denoised mean of both renders counts, too, up to the brightest sample within ``FAR`` LRHS pixels.
 
     Args:
         lrhs, mean: (N, 3, h, w), the LRHS and the denoised mean of both renders, with the margin added.

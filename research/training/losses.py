@@ -17,7 +17,7 @@ RELATIVE_FLOOR, RELATIVE_LARGE = 0.01, 8.0
 
 
 def robust(output: Tensor, reference: Tensor, beta: float = BETA) -> Tensor:
-    """The paper's ``l_r = mean(|e| / (beta + |e|))``: ``|e| / beta`` for small errors, never above 1 for large ones.
+    """Return the paper's ``l_r = mean(|e| / (beta + |e|))``: ``|e| / beta`` for small errors, never above 1.
 
     Its gradient ``beta / (beta + |e|)^2`` is largest at zero error, ``1 / beta``.
     """
@@ -26,12 +26,12 @@ def robust(output: Tensor, reference: Tensor, beta: float = BETA) -> Tensor:
 
 
 def l1(output: Tensor, reference: Tensor) -> Tensor:
-    """Mean absolute error."""
+    """Return the mean absolute error."""
     return (output - reference).abs().mean()
 
 
 def display(output: Tensor, reference: Tensor) -> Tensor:
-    """Mean squared error of the sRGB images, as in PSNR, plus :func:`l1` for highlights above white.
+    """Return the mean squared error of the sRGB images, as in PSNR, plus :func:`l1` for highlights above white.
 
     If the samples leave a pixel uncertain, l1 is least at the median of its possible values, the squared error at their
     mean. The median is darker and hides noise; the mean is what PSNR and RelMSE score. The weights make both terms
@@ -42,7 +42,7 @@ def display(output: Tensor, reference: Tensor) -> Tensor:
 
 
 def relative(output: Tensor, reference: Tensor) -> Tensor:
-    """:func:`display`, plus the squared error relative to the reference, as in RelMSE.
+    """Return :func:`display`, plus the squared error relative to the reference, as in RelMSE.
 
     The relative error penalises fireflies in dark regions. Large values are compressed, otherwise the few errors that
     no network could avoid would dominate a batch.
@@ -53,7 +53,7 @@ def relative(output: Tensor, reference: Tensor) -> Tensor:
 
 
 def error_likelihood(log_error: Tensor, output: Tensor, reference: Tensor) -> Tensor:
-    """Loss of a predicted logarithm of the absolute error, (N, 1, H, W), mean of the channels.
+    """Return the loss of a predicted logarithm of the absolute error, (N, 1, H, W), mean of the channels.
 
     It is the negative log-likelihood of exponentially distributed errors, which is least if the prediction is their
     mean.

@@ -29,14 +29,15 @@ DENOISED, ENCODED, FUSED = "mean.denoised", "encoded.fused", "fused"
 
 
 def mean_model(path: Path) -> onnx.ModelProto:
-    """The model that is cut out of the file ``path`` of a `joint` model at x2."""
+    """Cut the model out of the file ``path`` of a `joint` model at x2."""
     model = onnx.load(path, load_external_data=False)
     graph, contract = model.graph, Contract.of_file(path)
     # Both renders have the same size, so nothing is averaged. The denoised mean takes the place of what is fused.
     same = {node.output[0]: node.input[0] for node in graph.node if node.op_type == "AveragePool"} | {ENCODED: DENOISED}
     for node in graph.node:
         node.input[:] = [same.get(name, name) for name in node.input]
-    needed, nodes = {FUSED}, []
+    needed = {FUSED}
+    nodes: list[onnx.NodeProto] = []
     for node in reversed(graph.node):
         if needed & set(node.output):
             needed |= set(node.input)
@@ -60,6 +61,7 @@ def mean_model(path: Path) -> onnx.ModelProto:
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("model", type=Path, help="file for CPUs of a joint model at x2 with a denoiser of its own")
     args = parser.parse_args()

@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -30,7 +30,7 @@ Weights = Mapping[str, Tensor]
 
 
 def pretrained_weights(network: str) -> dict[str, Tensor]:
-    """Weights of one of :data:`research.training.oidn_weights.NETWORKS`, by Open Image Denoise's names.
+    """Read the weights of one of :data:`research.training.oidn_weights.NETWORKS`, by Open Image Denoise's names.
 
     Raises:
         InputError: pyoidn is not installed, or has other weights.
@@ -39,12 +39,12 @@ def pretrained_weights(network: str) -> dict[str, Tensor]:
 
 
 def provenance(network: str) -> dict[str, str]:
-    """What a model's file says about the weights that its training began from."""
+    """Return what a model's file says about the weights that its training began from."""
     return {"initial_weights": f"Open Image Denoise 2.5.1, {network} (Apache-2.0)"}
 
 
 def convolutions(weights: Weights) -> list[str]:
-    """Names of the convolutions that ``weights`` has."""
+    """Return the names of the convolutions in ``weights``."""
     return [name.removesuffix(".weight") for name in weights if name.endswith(".weight")]
 
 
@@ -79,13 +79,9 @@ T = TypeVar("T")
 
 
 def run_unet(
-    shape: Shape,
-    inputs: Sequence[T],
-    conv: Callable[[str, T], T],
-    pool: Callable[[T], T],
-    upsample: Callable[[T], T],
-    concat: Callable[[T, T], T],
-) -> T:
+    shape: Shape, inputs: Sequence[T], conv: Callable[[str, T], T],
+    pool: Callable[[T], T], upsample: Callable[[T], T], concat: Callable[[T, T], T],
+) -> T:  # fmt: skip
     """Run a U-Net on any type of value: tensors, lists of tensors, names of a graph's tensors.
 
     Args:
@@ -112,13 +108,12 @@ def run_unet(
 
 def run_unet_on_tensors(shape: Shape, inputs: Sequence[Tensor], conv: Callable[[str, Tensor], Tensor]) -> Tensor:
     """Run a U-Net on images (N, C, H, W)."""
+
+    def concat(above: Tensor, skipped: Tensor) -> Tensor:
+        return torch.cat([above, skipped], dim=1)
+
     return run_unet(
-        shape,
-        inputs,
-        conv,
-        pool=lambda values: F.max_pool2d(values, 2),
-        upsample=lambda values: upsample(values, 2),
-        concat=lambda one, other: torch.cat([one, other], dim=1),
+        shape, inputs, conv, lambda values: F.max_pool2d(values, 2), lambda values: upsample(values, 2), concat
     )
 
 
@@ -131,6 +126,9 @@ class FineTunedConv(nn.Module):
         frozen: keep the pretrained parameters.
     """
 
+    pretrained_weight: Tensor
+    pretrained_bias: Tensor
+
     def __init__(self, weight: Tensor, bias: Tensor, extra: int = 0, *, frozen: bool = False) -> None:
         super().__init__()
         self.register_buffer("pretrained_weight", weight, persistent=False)
@@ -140,11 +138,11 @@ class FineTunedConv(nn.Module):
         self.extra = nn.Parameter(weight.new_zeros(len(weight), extra, 3, 3)) if extra else None
 
     def differences(self) -> list[nn.Parameter]:
-        """The parameters that are added to pretrained ones."""
+        """Return the parameters that are added to pretrained ones."""
         return [parameter for parameter in (self.weight, self.bias) if parameter is not None]
 
     def total(self) -> tuple[Tensor, Tensor]:
-        """Weight and bias of the convolution: pretrained parameters plus differences."""
+        """Return weight and bias of the convolution: pretrained parameters plus differences."""
         weight, bias = self.pretrained_weight, self.pretrained_bias
         if self.weight is not None and self.bias is not None:
             weight, bias = weight + self.weight, bias + self.bias
@@ -153,10 +151,11 @@ class FineTunedConv(nn.Module):
         return weight, bias
 
     def forward(self, image: Tensor) -> Tensor:
+        """Convolve an image (N, C, H, W)."""
         return F.conv2d(image, *self.total(), padding=1)
 
     def merged(self) -> nn.Conv2d:
-        """The same as a plain convolution, for the exporter."""
+        """Return a plain convolution with the same result, for the exporter."""
         weight, bias = self.total()
         result = nn.Conv2d(weight.shape[1], len(weight), 3, padding=1)
         result.load_state_dict({"weight": weight, "bias": bias})
@@ -178,6 +177,11 @@ class Start:
     """Convolutions that keep the pretrained weights."""
 
 
+def untouched(network: str, shape: Shape) -> Start:
+    """Return a network as it is in Open Image Denoise, to be run and not to be trained."""
+    return Start(network, shape, (), 0, tuple(convolutions(pretrained_weights(network))))
+
+
 class FineTunedUNet(nn.Module):
     """A network of Open Image Denoise, fine-tuned to read further channels after its own."""
 
@@ -185,17 +189,11 @@ class FineTunedUNet(nn.Module):
         super().__init__()
         self.start = start
         pretrained = pretrained_weights(start.network)
-        self.convs = nn.ModuleDict(
-            {
-                name: FineTunedConv(
-                    pretrained[f"{name}.weight"],
-                    pretrained[f"{name}.bias"],
-                    start.extra if name in start.readers else 0,
-                    frozen=name in start.frozen,
-                )
-                for name in convolutions(pretrained)
-            }
-        )
+        self.convs: Any = nn.ModuleDict()  # of FineTunedConv
+        for name in convolutions(pretrained):
+            weight, bias = pretrained[f"{name}.weight"], pretrained[f"{name}.bias"]
+            extra = start.extra if name in start.readers else 0
+            self.convs[name] = FineTunedConv(weight, bias, extra, frozen=name in start.frozen)
 
     def run(self, image: Tensor) -> Tensor:
         """Run the network on an image (N, C, H, W); H and W are multiples of 16."""
@@ -207,7 +205,7 @@ class FineTunedUNet(nn.Module):
         return run_unet_on_tensors(self.start.shape, [image.to(dtype)], conv).float()
 
     def weights(self) -> dict[str, Tensor]:
-        """Weights and biases of all convolutions, by Open Image Denoise's names."""
+        """Return the weights and biases of all convolutions, by Open Image Denoise's names."""
         pairs = {name: conv.total() for name, conv in self.convs.items()}
         return {
             f"{name}.{kind}": values.detach()

@@ -12,6 +12,7 @@ import hashlib
 import mmap
 import struct
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,40 +36,21 @@ _TZA_MAGIC = b"\xd7\x41\x02"
 Weights = dict[str, NDArray[np.float16]]
 
 
-def installed_library() -> Path | None:
-    """The library file of the installed pyoidn that holds the weights, or None.
-
-    Raises:
-        ImportError, OSError: pyoidn is not installed, or its library is missing.
-    """
-    import pyoidn
-
-    return next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
-
-
 @functools.cache
-def find_weights(network: str) -> Weights | None:
-    """Weights of a key of ``NETWORKS`` by tensor name, or None if the installed pyoidn has other ones.
-
-    Raises:
-        ImportError, OSError: pyoidn is not installed, or its library is missing.
-    """
-    library = installed_library()
-    return read_weights(network, library) if library else None
-
-
 def require_weights(network: str) -> Weights:
-    """Weights of a key of ``NETWORKS``.
+    """Read the weights of a key of ``NETWORKS`` by tensor name.
 
     Raises:
         InputError: pyoidn is not installed, or has other weights.
     """
     try:
-        weights = find_weights(network)
+        import pyoidn
     except (ImportError, OSError) as error:
         raise InputError(
             "the joint network begins from the weights of Open Image Denoise: pip install pyoidn==2.5.1"
         ) from error
+    library = next(Path(pyoidn.__file__).parent.rglob("*OpenImageDenoise_core*"), None)
+    weights = read_weights(network, library) if library else None
     if weights is None:
         raise InputError(
             "the joint network begins from the weights of Open Image Denoise 2.5, and the installed pyoidn has others: "
@@ -91,14 +73,14 @@ def read_weights(network: str, library: Path) -> Weights | None:
 
 
 def _read_tza(blob: bytes) -> Weights:
-    """Tensors of Open Image Denoise's TZA 2 format.
+    """Read tensors in Open Image Denoise's TZA 2 format.
 
     A header with the position of a table; the table has a name, a shape, a layout, a type and a position for each
     tensor.
     """
     position = 0
 
-    def take(form: str) -> tuple:
+    def take(form: str) -> tuple[Any, ...]:
         nonlocal position
         values = struct.unpack_from(f"<{form}", blob, position)
         position += struct.calcsize(f"<{form}")

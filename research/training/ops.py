@@ -4,47 +4,35 @@
 from __future__ import annotations
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn import functional as F
 
 
-def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
-    """3x3 convolution that keeps the image's size."""
-    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
-
-
-# Resampling
-
-
 def box_downsample(image: Tensor, factor: int) -> Tensor:
-    """Mean of factor x factor pixels: (N, C, H, W) to (N, C, H / factor, W / factor)."""
+    """Average factor x factor pixels: (N, C, H, W) to (N, C, H / factor, W / factor)."""
     return F.avg_pool2d(image, factor)
 
 
 def upsample(image: Tensor, factor: int, mode: str = "nearest") -> Tensor:
-    """(N, C, H, W) to (N, C, factor * H, factor * W); ``mode`` is nearest, bilinear or bicubic."""
+    """Resize (N, C, H, W) to (N, C, factor * H, factor * W); ``mode`` is nearest or bilinear."""
     return F.interpolate(image, scale_factor=factor, mode=mode)
 
 
 def log2_scale(lrhs: Tensor, hrls: Tensor) -> int:
-    """log2 of the upsampling factor: the pyramid level that has the LRHS's resolution."""
+    """Return log2 of the upsampling factor: the pyramid level that has the LRHS's resolution."""
     return (hrls.shape[-1] // lrhs.shape[-1]).bit_length() - 1
 
 
-#: An image by level: level 0 has the HRLS's resolution, each further level half of it.
-Pyramid = dict[int, Tensor]
-
-
-def pyramid(image: Tensor, first: int, levels: int) -> Pyramid:
-    """Box-filtered pyramid: the image is level ``first``, the coarsest level is ``levels - 1``."""
-    images = {first: image}
-    for level in range(first + 1, levels):
-        images[level] = box_downsample(images[level - 1], 2)
+def pyramid(image: Tensor, levels: int) -> list[Tensor]:
+    """Return a box-filtered pyramid: the image at full resolution, a half, a quarter, ..."""
+    images = [image]
+    for _ in range(levels - 1):
+        images.append(box_downsample(images[-1], 2))
     return images
 
 
 def highest_around(lrhs: Tensor, hrls: Tensor) -> Tensor:
-    """Per 2x2 HRLS pixels, the maximum of 10x10 HRLS pixels and of 3x3 LRHS pixels around them, per channel.
+    """Return the maximum of 10x10 HRLS pixels and of 3x3 LRHS pixels around each 2x2 HRLS pixels, per channel.
 
     Args:
         lrhs: (N, 3, h, w).

@@ -27,6 +27,7 @@ Decisions where the paper is silent or contradicts itself; they are taken in thi
 from __future__ import annotations
 
 import math
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -34,11 +35,15 @@ from torch.nn import functional as F
 
 from oiio_msspl.aovs.features import HRLS_FEATURES, RGB
 from oiio_msspl.model.contract import SCALES
-from research.training.ops import conv3x3
 
 #: The LRHS branch reads RGB alone.
 LRHS_CHANNELS = HRLS_FEATURES[RGB]
 HRLS_CHANNELS = sum(HRLS_FEATURES.values())
+
+
+def conv3x3(inputs: int, outputs: int) -> nn.Conv2d:
+    """Return a 3x3 convolution that keeps the image's size."""
+    return nn.Conv2d(inputs, outputs, kernel_size=3, padding=1)
 
 
 class Deshuffle(nn.Module):
@@ -49,13 +54,14 @@ class Deshuffle(nn.Module):
         self.conv = conv3x3(4 * channels, channels)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Fold 2x2 pixels into channels."""
         return F.relu(self.conv(F.pixel_unshuffle(x, 2)))
 
     @torch.no_grad()
     def reset_to_average(self) -> None:
         """Set the weights so that every channel is the mean of 2x2 pixels of the same channel."""
-        nn.init.zeros_(self.conv.weight)
-        nn.init.zeros_(self.conv.bias)
+        for parameter in self.conv.parameters():
+            nn.init.zeros_(parameter)
         for channel in range(self.conv.out_channels):
             self.conv.weight[channel, 4 * channel : 4 * channel + 4, 1, 1] = 0.25
 
@@ -68,6 +74,7 @@ class Shuffle(nn.Module):
         self.conv = conv3x3(channels, 4 * channels)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Unfold channels into 2x2 pixels."""
         return F.pixel_shuffle(F.relu(self.conv(x)), 2)
 
     @torch.no_grad()
@@ -79,7 +86,7 @@ class Shuffle(nn.Module):
             outputs = slice(4 * channel, 4 * channel + 4)
             self.conv.weight[outputs] = 0.0
             self.conv.weight[outputs, channel] = torch.einsum("ri,cj->rcij", taps, taps).flatten(0, 1)
-            self.conv.bias[outputs] = 0.0
+            cast(Tensor, self.conv.bias)[outputs] = 0.0
 
 
 class RDB(nn.Module):
@@ -91,10 +98,12 @@ class RDB(nn.Module):
         self.last = conv3x3(channels + dense * growth, channels)
 
     def forward(self, x: Tensor) -> Tensor:
+        """Add the block's residual to features (N, C, h, w)."""
         features = x
         for conv in self.dense:
             features = torch.cat([features, F.relu(conv(features))], dim=1)
-        return x + self.last(features)
+        residual: Tensor = self.last(features)
+        return x + residual
 
 
 class RDG(nn.Module):
@@ -105,7 +114,9 @@ class RDG(nn.Module):
         self.blocks = nn.Sequential(*(RDB(channels, growth, dense) for _ in range(blocks)))
 
     def forward(self, x: Tensor) -> Tensor:
-        return x + self.blocks(x)
+        """Add the group's residual to features (N, C, h, w)."""
+        residual: Tensor = self.blocks(x)
+        return x + residual
 
 
 class MultiResolutionFusion(nn.Module):
@@ -125,14 +136,9 @@ class MultiResolutionFusion(nn.Module):
         if scale not in SCALES:
             raise ValueError(f"scale must be one of {SCALES}, got {scale}")
         self.config = {
-            "scale": scale,
-            "channels": channels,
-            "growth": growth,
-            "groups": groups,
-            "blocks": blocks,
-            "dense": dense,
+            "scale": scale, "channels": channels, "growth": growth, "groups": groups, "blocks": blocks, "dense": dense,
             "lrhs_channels": lrhs_channels,
-        }
+        }  # fmt: skip
         self.lrhs_channels, self.hrls_channels = lrhs_channels, HRLS_CHANNELS
         self.scale = scale
         self.multiple = scale
@@ -140,15 +146,15 @@ class MultiResolutionFusion(nn.Module):
         stages = int(math.log2(scale))
         self.h_lrhs = conv3x3(lrhs_channels, channels)
         self.h_hrls = conv3x3(HRLS_CHANNELS, channels)
-        self.deshuffle = nn.Sequential(*(Deshuffle(channels) for _ in range(stages)))
+        self.deshuffle: Any = nn.Sequential(*(Deshuffle(channels) for _ in range(stages)))
         self.fuse = nn.Conv2d(2 * channels, channels, kernel_size=1)
         self.groups = nn.Sequential(*(RDG(channels, growth, dense, blocks) for _ in range(groups)))
-        self.upscale = nn.Sequential(*(Shuffle(channels) for _ in range(stages)))
+        self.upscale: Any = nn.Sequential(*(Shuffle(channels) for _ in range(stages)))
         self.h_rec = conv3x3(channels, 3)
         self.reset_parameters()
 
     def forward(self, lrhs: Tensor, hrls: Tensor) -> Tensor:
-        """(N, 3, h, w) and (N, 16, s*h, s*w) to (N, 3, s*h, s*w)."""
+        """Fuse an LRHS (N, 3, h, w) and an HRLS (N, 16, s*h, s*w) to (N, 3, s*h, s*w)."""
         # Shallow features
         f_lrhs = F.relu(self.h_lrhs(lrhs))
         f_hrls = F.relu(self.h_hrls(hrls))
@@ -161,7 +167,8 @@ class MultiResolutionFusion(nn.Module):
         f_df = self.groups(f_0) + f_lrhs
 
         # Unfold and reconstruct
-        return self.h_rec(self.upscale(f_df))
+        result: Tensor = self.h_rec(self.upscale(f_df))
+        return result
 
     def reset_parameters(self) -> None:
         """Start as a bilinear upsampling of the LRHS with small random corrections.
@@ -173,7 +180,7 @@ class MultiResolutionFusion(nn.Module):
         for module in self.modules():
             if isinstance(module, nn.Conv2d):
                 nn.init.kaiming_normal_(module.weight, nonlinearity="relu")
-                nn.init.zeros_(module.bias)
+                nn.init.zeros_(cast(Tensor, module.bias))
         with torch.no_grad():
             for module in self.modules():
                 if isinstance(module, RDB):

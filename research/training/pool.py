@@ -1,22 +1,19 @@
 # SPDX-License-Identifier: Apache-2.0
 """Training pairs that are drawn ahead and kept on a GPU.
 
-    python -m research.training.pool VIEWS POOL --draws 6
-    python -m research.training.train --network joint --spread --scale 2 4 8 --pool POOL --data VIEWS --out RUN
-    --minutes 10 python -m research.training.pool VIEWS POOL_LARGE --draws 6 --denoise
-    research/training/checkpoints/joint{,_spread}.pt
-    python -m research.training.pool VIEWS POOL_TAUGHT --denoise JOINT{,_SPREAD}.pt --teach FIRST{,_SPREAD}.pt
+    python -m research.training.pool VIEWS POOL --draws 8
+    python -m research.training.pool VIEWS POOL --denoise JOINT.pt JOINT_SPREAD.pt
+    python -m research.training.pool VIEWS POOL --denoise JOINT.pt JOINT_SPREAD.pt --teach LARGE.pt LARGE_SPREAD.pt
 
-A GPU takes a step in less time than :func:`research.training.data.draw` takes for one pair. So a process of its own
-draws whole
-views some times each: other samples, filters, light and missing layers at each draw. It writes the pairs of a view into
-a file of POOL, and goes on with the views that a renderer adds, until it is stopped. Training keeps all pairs on the
-GPU. Each batch has crops of some of them, mirrored, turned, and with permuted colours.
+A GPU takes a step in less time than :func:`research.training.data.draw` takes for one pair. So whole views are drawn
+ahead, some times each: with other samples, filters, light and missing layers at each draw. The pairs of a view lie in a
+file of POOL. The same command goes on with new views. Training keeps all pairs on the GPU, and looks for new ones. Each
+batch has crops of some of them, mirrored, turned, and with permuted colours.
 
 With ``--denoise``, pairs are those that the size ``large`` of `joint` reads: albedo, normal and the mean of both
 renders are denoised. Of views with single samples, every second pair then has noise that the pixel filter has spread.
 
-With ``--teach``, the target of a pair is no reference but what a :class:`Teacher` makes of both renders.
+With ``--teach``, the target of a pair is not the reference, but what a :class:`Teacher` makes of both renders.
 
 References that were stored with their noise (:mod:`research.datagen.mitsuba.render_samples`) become the mean of the
 rendered and of a denoised one: half of the noise is left, and half of what a denoiser gets wrong.
@@ -27,7 +24,6 @@ from __future__ import annotations
 import argparse
 import functools
 import logging
-import os
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -42,11 +38,10 @@ from oiio_msspl.aovs.features import HRLS_FEATURES
 from research.datagen.views import NO_REFERENCE, Folder, SampleView, View
 from research.training import checkpoints
 from research.training.data import Batch, SampleTensors, Sampling, ViewTensors, draw, turned
+from research.training.denoisers import LayerDenoisers, denoise_mean
 from research.training.encoding import compress, exposure_of, log_decode, log_encode, log_to_pu, pu_to_log
 from research.training.joint import FEATURES, JointFusion
-from research.training.layer_denoisers import LayerDenoisers, untouched
-from research.training.mean_denoiser import denoise_mean
-from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet
+from research.training.oidn import LARGE, LARGE_HDR, FineTunedUNet, untouched
 from research.training.render_mean import mean_and_noise
 
 log = logging.getLogger(__name__)
@@ -99,22 +94,23 @@ class Denoisers:
         return self.moved(FineTunedUNet(untouched(LARGE_HDR, LARGE)))
 
     def moved(self, network: M) -> M:
-        """A network without gradients, on the device."""
-        return network.requires_grad_(False).to(self.device, memory_format=torch.channels_last)
+        """Return a network without gradients, on the device."""
+        moved: M = network.requires_grad_(False).to(self.device).to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+        return moved
 
     def denoised(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-        """A log-encoded colour, denoised with an albedo and a normal in [0, 1] that are free of noise."""
+        """Denoise a log-encoded colour with an albedo and a normal in [0, 1] that are free of noise."""
         output = self.large.run(torch.cat([log_to_pu(colour), albedo, normal], dim=1))
         return pu_to_log(output.float().clamp(0, 1))
 
     def reference(self, colour: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-        """The mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
+        """Return the mean of a rendered reference and of a denoised one, all (1, 3, H, W)."""
         exposure = exposure_of(colour.movedim(1, -1))
         encoded = compress(colour.movedim(1, -1), exposure).movedim(-1, 1)
         return 0.5 * (colour + log_decode(self.denoised(encoded, *self.layers(albedo, normal))) / exposure)
 
     def prepared(self, lrhs: Tensor, hrls: Tensor, spread: bool) -> tuple[Tensor, Tensor]:
-        """The arguments of :meth:`JointFusion.fuse_prepared` for those of :meth:`JointFusion.forward`."""
+        """Convert the arguments of :meth:`JointFusion.forward` to those of :meth:`JointFusion.fuse_prepared`."""
         return denoise_mean(self.means[spread], lrhs, hrls), self.layers.applied(hrls)
 
 
@@ -139,8 +135,11 @@ class Teacher:
         self.denoisers, self.larges = denoisers, [denoisers.moved(large) for large in larges]
 
     def target(self, lrhs: Tensor, hrls: Tensor, prepared: Tensor, spread: bool) -> Tensor:
-        """The mean (1, 3, s*H, s*W), log-encoded; the arguments are those of :meth:`JointFusion.fuse_prepared`, and
-        ``hrls`` with its albedo and normal as rendered."""
+        """Return the mean (1, 3, s*H, s*W), log-encoded.
+
+        ``lrhs`` and ``prepared`` are the arguments of :meth:`JointFusion.fuse_prepared`. The albedo and normal of
+        ``hrls`` are as rendered.
+        """
         joint, _ = self.denoisers.joints[spread].fuse(lrhs, hrls)
         first, _ = self.larges[spread].fuse_prepared(lrhs, prepared)
         results = [joint, first, first]
@@ -151,19 +150,15 @@ class Teacher:
 
 @torch.no_grad()
 def draw_pairs(
-    view: View | SampleView,
-    scales: tuple[int, ...],
-    count: int,
-    device: torch.device,
-    denoisers: Denoisers | None = None,
-    teacher: Teacher | None = None,
-) -> list[Pair]:
+    view: View | SampleView, scales: tuple[int, ...], count: int, device: torch.device,
+    denoisers: Denoisers | None = None, teacher: Teacher | None = None,
+) -> list[Pair]:  # fmt: skip
     """Draw a view ``count`` times: ``lrhs`` (7, h, w), ``hrls`` (9, s*h, s*w), ``target`` (3, s*h, s*w), half floats.
 
     The LRHS has the mean of both renders and its noise, see :func:`research.training.render_mean.with_mean`. Or it is
-    (6, h, w),
-    with the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread. Without
-    ``denoisers``, references that were stored with their noise keep it. With a ``teacher``, targets are its own.
+    (6, h, w), with the denoised mean, see :meth:`Denoisers.prepared`; ``spread`` then says whether noise is spread.
+    Without ``denoisers``, references that were stored with their noise keep it. With a ``teacher``, targets are its
+    results.
     """
     rng = np.random.default_rng([*view.path.name.encode(), count])
     tensors: ViewTensors | SampleTensors
@@ -195,38 +190,18 @@ def draw_pairs(
 
 
 def fill(
-    views: Path,
-    pool: Path,
-    scales: tuple[int, ...],
-    draws: int,
-    part: int,
-    parts: int,
-    device: torch.device,
-    denoisers: Denoisers,
-    teacher: Teacher | None = None,
+    views: Path, pool: Path, scales: tuple[int, ...], draws: int, denoisers: Denoisers, teacher: Teacher | None = None
 ) -> None:
-    """Write the pairs of every ``parts``-th view of the training split, and wait for more.
-
-    Views without a reference are only drawn for a teacher.
-    """
+    """Write the pairs of all training views that have none yet. Views without a reference are only for a teacher."""
     folder = Folder(views)
     pool.mkdir(parents=True, exist_ok=True)
-    while True:
-        views_of_samples = folder.sample_views("train")
-        if teacher is not None:
-            views_of_samples += folder.sample_views(NO_REFERENCE)
-        todo = [
-            view
-            for view in (*folder.split("train"), *views_of_samples)
-            if sum(view.path.name.encode()) % parts == part and not (pool / f"{view.path.name}.pt").exists()
-        ]
-        for view in todo:
-            file = pool / f"{view.path.name}.pt"
-            torch.save(draw_pairs(view, scales, draws, device, denoisers, teacher), file.with_suffix(".partial"))
-            os.replace(file.with_suffix(".partial"), file)
+    todo: list[View | SampleView] = [*folder.split("train"), *folder.sample_views("train")]
+    todo += folder.sample_views(NO_REFERENCE) if teacher is not None else []
+    for view in todo:
+        file = pool / f"{view.path.name}.pt"
+        if not file.exists():
+            checkpoints.save(draw_pairs(view, scales, draws, denoisers.device, denoisers, teacher), file)
             log.info("%s", file.name)
-        time.sleep(0 if todo else 1)
-        folder.scan()
 
 
 # Batches
@@ -244,16 +219,9 @@ class PooledBatches:
     """
 
     def __init__(
-        self,
-        pool: Path,
-        scales: tuple[int, ...],
-        patch: int,
-        batch: int,
-        seed: int,
-        device: torch.device,
-        *,
+        self, pool: Path, scales: tuple[int, ...], patch: int, batch: int, seed: int, device: torch.device, *,
         spread: bool | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         self.spread = spread
         self.pool, self.scales, self.patch, self.batch, self.device = pool, scales, patch, batch, device
         self.rng = np.random.default_rng(seed)
@@ -276,7 +244,7 @@ class PooledBatches:
                     self.pairs[scale].append({name: image.to(self.device) for name, image in pair.items()})
 
     def loader(self) -> Iterator[Batch]:
-        """Endless batches, see :data:`research.training.data.Batch`. Waits until the pool has a pair."""
+        """Yield endless batches, see :data:`research.training.data.Batch`. Wait until the pool has a pair."""
         looked = -RESCAN_SECONDS
         while True:
             if time.monotonic() - looked > RESCAN_SECONDS:
@@ -290,7 +258,7 @@ class PooledBatches:
             yield self.draw(int(self.rng.choice(ready)))
 
     def draw(self, scale: int) -> Batch:
-        """A batch of one scale."""
+        """Draw a batch of one scale."""
         rng, pairs = self.rng, self.pairs[scale]
         parts: dict[str, list[Tensor]] = {"lrhs": [], "hrls": [], "target": []}
         for index in rng.integers(len(pairs), size=self.batch):
@@ -299,42 +267,22 @@ class PooledBatches:
             order = rng.permutation(3) if rng.random() < 0.5 else np.arange(3)
             channels = torch.from_numpy(np.concatenate([order, order + 3, [6, 7, 8]])).to(self.device)
             for name, image in pair.items():
-                step = 1 if name == "lrhs" else scale
-                crop = image[
-                    :, top * step : top * step + self.patch // (scale // step),
-                    left * step : left * step + self.patch // (scale // step),
-                ]  # fmt: skip
+                factor = 1 if name == "lrhs" else scale
+                side = self.patch * factor // scale
+                crop = image[:, top * factor : top * factor + side, left * factor : left * factor + side]
                 parts[name].append(crop[channels[: len(crop)]])
         return turned({name: torch.stack(crops).float() for name, crops in parts.items()}, rng)
 
 
-def joint_networks(paths: Sequence[Path]) -> list[JointFusion]:
-    """The networks of checkpoints.
-
-    Raises:
-        SystemExit: one is no ``joint`` network.
-    """
-    networks = []
-    for path in paths:
-        network, _ = checkpoints.load(path)
-        if not isinstance(network, JointFusion):
-            raise SystemExit(f"{path}: not a joint network")
-        networks.append(network)
-    return networks
-
-
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m research.training.pool",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("pool", type=Path, help="folder for the pairs")
     parser.add_argument("--scale", type=int, nargs="+", default=(2, 4, 2, 4, 8), help="drawn from these (2 4 2 4 8)")
     parser.add_argument("--draws", type=int, default=6, help="pairs per view (%(default)s)")
-    parser.add_argument("--part", type=int, nargs=2, default=(0, 1), metavar=("I", "N"), help="draw part I of N")
     parser.add_argument("--device", default="cuda")
+    parser.add_argument("--threads", type=int, default=1, help="CPU threads (default: %(default)s)")
     parser.add_argument(
         "--denoise", type=Path, nargs=2, default=(), metavar="JOINT", help="pairs for the size large, see above"
     )
@@ -342,10 +290,11 @@ def main() -> None:
         "--teach", type=Path, nargs=2, default=(), metavar="LARGE", help="targets by a teacher with these, see above"
     )
     args = parser.parse_args()
-    torch.set_num_threads(1)
-    denoisers = Denoisers(joint_networks(args.denoise), torch.device(args.device))
-    teacher = Teacher(denoisers, joint_networks(args.teach)) if args.teach else None
-    fill(args.views, args.pool, tuple(args.scale), args.draws, *args.part, denoisers.device, denoisers, teacher)
+    torch.set_num_threads(args.threads)
+    joints, larges = ([checkpoints.load_joint(path)[0] for path in paths] for paths in (args.denoise, args.teach))
+    denoisers = Denoisers(joints, torch.device(args.device))
+    teacher = Teacher(denoisers, larges) if larges else None
+    fill(args.views, args.pool, tuple(args.scale), args.draws, denoisers, teacher)
 
 
 if __name__ == "__main__":

@@ -24,7 +24,7 @@ PAIRS, PATCH = 24, 256
 
 
 def statistics(network: JointFusion, name: str, pairs: list[data.Batch]) -> tuple[Tensor, Tensor]:
-    """Mean and variance of each output channel of a convolution, (C,) each."""
+    """Return the mean and variance of each output channel of a convolution, (C,) each."""
     outputs: list[Tensor] = []
     hook = network.convs[name].register_forward_hook(
         lambda _, __, out: outputs.append(out.relu().transpose(0, 1).flatten(1))
@@ -46,20 +46,16 @@ def pruned(network: JointFusion, name: str, count: int, pairs: list[data.Batch])
     if name not in PREDECESSOR.values():
         prunable = ", ".join(PREDECESSOR.values())
         raise SystemExit(f"--keep {name}: only convolutions on the way up can be pruned: {prunable}")
-    reader = next(n for n, before in PREDECESSOR.items() if before == name)
-    readers: list[FineTunedConv | nn.Conv2d] = [network.convs[reader]]
-    readers += [
-        head
-        for head, source in zip((*network.heads, network.error), (*DECODED, DECODED[1]), strict=True)
-        if source == name
-    ]
+    following = network.convs[next(n for n, before in PREDECESSOR.items() if before == name)]
+    heads = zip((*network.heads, network.error), (*DECODED, DECODED[1]), strict=True)
+    readers: list[FineTunedConv | nn.Conv2d] = [following, *(head for head, source in heads if source == name)]
     mean, variance = statistics(network, name, pairs)
-    weight, _ = readers[0].total()
+    weight, _ = following.total()
     importance = variance * weight[:, : len(variance)].square().sum(dim=(0, 2, 3))
     kept = importance.argsort(descending=True)[:count].sort().values
     removed = torch.tensor(sorted(set(range(len(mean))) - set(kept.tolist())))
     rows, _ = network.pretrained_channels(name)
-    result = JointFusion(**network.config | {"kept": network.kept | {name: [rows[i] for i in kept]}})
+    result = JointFusion(network.kept | {name: [rows[i] for i in kept]}, network.size, spread=network.spread)
     weights = network.state_dict()
     prefixes = {id(module): prefix for prefix, module in network.named_modules()}
     for kind in ("weight", "bias", "extra"):
@@ -76,21 +72,21 @@ def pruned(network: JointFusion, name: str, count: int, pairs: list[data.Batch])
 
 
 def main() -> None:
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("checkpoint", type=Path)
     parser.add_argument("output", type=Path, help="checkpoint to write")
     parser.add_argument("--data", type=Path, required=True, help="folder of views")
     parser.add_argument("--keep", nargs="+", required=True, metavar="NAME=COUNT", help="best multiples of 16")
     args = parser.parse_args()
-    network, state = checkpoints.load(args.checkpoint)
-    if not isinstance(network, JointFusion) or network.size == "large":
+    network, state = checkpoints.load_joint(args.checkpoint)
+    if network.size == "large":
         raise SystemExit(f"{args.checkpoint}: not a joint network of the size usual or small")
     pairs = list(itertools.islice(data.fixed_batches(args.data, "train", [2], PATCH, 1, with_mean), PAIRS))
     for name, _, count in (part.partition("=") for part in args.keep):
         network = pruned(network, name, int(count), pairs)
-    state["ema"] = network.state_dict()
-    state["config"] = network.config
-    checkpoints.save({key: value for key, value in state.items() if key not in checkpoints.RUN_STATE}, args.output)
+    state |= {"ema": network.state_dict(), "config": network.config}
+    checkpoints.save(checkpoints.finished(state), args.output)
 
 
 if __name__ == "__main__":

@@ -27,9 +27,9 @@ def mean_of_renders(lrhs: Images, hrls: Images, shares: Images) -> tuple[Tensor,
     """Average both renders.
 
     Args:
-        lrhs: ``rgb`` (N, 3, h, w), exposed radiance in [0, MAX_RADIANCE]; ``albedo`` and ``normal``, encoded, as far as
-            they are averaged.
-        hrls: the same at s times the size, with ``albedo`` and ``normal``.
+        lrhs: ``rgb`` (N, 3, h, w), exposed radiance in [0, MAX_RADIANCE]; ``albedo`` and ``normal``, encoded, if they
+            are averaged, too.
+        hrls: all three features at s times the size.
         shares: of each feature of the LRHS, its weight in the mean, in [0, 1]: a number, or one for each pair.
 
     Returns:
@@ -51,12 +51,15 @@ def mean_of_renders(lrhs: Images, hrls: Images, shares: Images) -> tuple[Tensor,
 
 
 def mean_and_noise(lrhs: Tensor, hrls: Tensor) -> tuple[Tensor, Tensor]:
-    """The mean of an encoded LRHS (1, 3, h, w) and HRLS (1, 16, s*h, s*w), log-encoded (1, 3, h, w), and its noise
-    (1, 1, h, w)."""
+    """Average an encoded LRHS (1, 3, h, w) and HRLS (1, 16, s*h, s*w).
+
+    Returns:
+        The mean (1, 3, h, w), log-encoded, and its noise (1, 1, h, w).
+    """
     features = {RGB: log_decode(hrls[:, :3]), ALBEDO: hrls[:, 3:6], NORMAL: hrls[:, 6:9]}
     means = log_encode(box_downsample(features[RGB], 2 ** log2_scale(lrhs, hrls)))
-    images = (image[0].permute(1, 2, 0).cpu().numpy() for image in (lrhs, means))
-    share = torch.tensor(lrhs_share(*images), device=lrhs.device)
+    low, high = (image[0].permute(1, 2, 0).cpu().numpy() for image in (lrhs, means))
+    share = torch.tensor(lrhs_share(low, high), device=lrhs.device)
     colour, noise, *_ = mean_of_renders({RGB: log_decode(lrhs)}, features, {RGB: share})
     return colour, noise
 

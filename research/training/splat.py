@@ -25,31 +25,13 @@ from torch import Tensor
 # Filters
 
 
-def _box(t: Tensor) -> Tensor:
-    return torch.ones_like(t)
-
-
-def _tent(t: Tensor) -> Tensor:
-    return 1 - t
-
-
-def _gaussian(t: Tensor) -> Tensor:
-    """Standard deviation of a quarter of the radius, shifted to end at zero, as Mitsuba's."""
-    return torch.exp(-8 * t**2) - math.exp(-8)
-
-
-def _wide_gaussian(t: Tensor) -> Tensor:
-    """Standard deviation of half the radius, cut off there, as Arnold's."""
-    return torch.exp(-2 * t**2)
-
-
 def _blackman_harris(t: Tensor) -> Tensor:
     a = (0.35875, 0.48829, 0.14128, 0.01168)
     return torch.stack([value * torch.cos(math.pi * k * t) for k, value in enumerate(a)]).sum(dim=0)
 
 
 def _cubic(b: float, c: float) -> Callable[[Tensor], Tensor]:
-    """The cubics of Mitchell and Netravali, "Reconstruction Filters in Computer Graphics" (1988), equation 8."""
+    """Return a cubic of Mitchell and Netravali, "Reconstruction Filters in Computer Graphics" (1988), equation 8."""
 
     def weight(t: Tensor) -> Tensor:
         x = 2 * t
@@ -60,21 +42,17 @@ def _cubic(b: float, c: float) -> Callable[[Tensor], Tensor]:
     return weight
 
 
-def _lanczos(t: Tensor) -> Tensor:
-    """Two lobes."""
-    return torch.sinc(2 * t) * torch.sinc(t)
-
-
-#: Weight at the distance t = |x| / radius, between 0 and 1.
+#: Weight at the distance t = |x| / radius, between 0 and 1. The Gaussian of Mitsuba has a standard deviation of a
+#: quarter of the radius and is shifted to end at zero; Arnold's has half the radius and is cut off.
 KINDS: dict[str, Callable[[Tensor], Tensor]] = {
-    "box": _box,
-    "tent": _tent,
-    "gaussian": _gaussian,
-    "wide-gaussian": _wide_gaussian,
+    "box": torch.ones_like,
+    "tent": lambda t: 1 - t,
+    "gaussian": lambda t: torch.exp(-8 * t**2) - math.exp(-8),
+    "wide-gaussian": lambda t: torch.exp(-2 * t**2),
     "blackman-harris": _blackman_harris,
     "mitchell": _cubic(1 / 3, 1 / 3),
     "catmull-rom": _cubic(0, 1 / 2),
-    "lanczos": _lanczos,
+    "lanczos": lambda t: torch.sinc(2 * t) * torch.sinc(t),
 }
 
 
@@ -97,14 +75,16 @@ class PixelFilter:
         return self.splatted and self.reach > 0
 
     def samples_for(self, count: int) -> int:
-        """How many stored samples of a pixel give it ``count``. Importance sampling moves some to other pixels, so it
-        needs more to choose from."""
+        """Return how many stored samples of a pixel give it ``count``.
+
+        Importance sampling moves some to other pixels, so it needs more to choose from.
+        """
         return count if self.splatted else 2 * count + 4
 
     def weights(self, place: Tensor) -> Tensor:
-        """Weights of samples at ``place`` (0 to 1) in pixels -reach ... reach from their own: (2 * reach + 1, ...).
+        """Return the weights of samples at ``place`` (0 to 1) in pixels -reach ... reach: (2 * reach + 1, ...).
 
-        For importance sampling they are probabilities: divided by their sum.
+        For importance sampling they are divided by their sum, so that they are probabilities.
         """
         offsets = torch.arange(-self.reach, self.reach + 1, device=place.device, dtype=place.dtype)
         t = (place - 0.5 - offsets.reshape(-1, *[1] * place.ndim)).abs() / self.radius
@@ -134,9 +114,9 @@ SHARES: tuple[tuple[float, str, float, float, bool], ...] = (
 
 
 def draw_filter(rng: np.random.Generator, *, spread_noise: bool | None = None) -> PixelFilter:
-    """A filter in the shares of ``SHARES``: only those that spread noise, only the others, or any (None)."""
+    """Draw a filter in the shares of ``SHARES``: only those that spread noise, only the others, or any (None)."""
     filters = [(share, PixelFilter(kind, greatest, splatted)) for share, kind, _, greatest, splatted in SHARES]
-    shares = [share if spread_noise in (None, each.spreads_noise) else 0.0 for share, each in filters]
+    shares = [share if spread_noise in (None, kind.spreads_noise) else 0.0 for share, kind in filters]
     _, kind, least, greatest, splatted = SHARES[rng.choice(len(SHARES), p=np.divide(shares, sum(shares)))]
     return PixelFilter(kind, float(rng.uniform(least, greatest)), splatted)
 
@@ -144,40 +124,27 @@ def draw_filter(rng: np.random.Generator, *, spread_noise: bool | None = None) -
 # Samples to pixels
 
 
-@dataclass(frozen=True)
-class Filtered:
-    """What samples give for each pixel."""
-
-    mean: Tensor
-    """(C, h, w)"""
-    variance: Tensor | None
-    """(h, w), an estimate of the variance of the pixel's mean of ``measure``; 0 where one sample decides the pixel"""
-
-
 def apply(
-    pixel_filter: PixelFilter,
-    place: Tensor,
-    values: Tensor,
-    measure: Tensor | None = None,
-    scale: int = 1,
-    count: int | None = None,
-    generator: torch.Generator | None = None,
-) -> Filtered:
+    pixel_filter: PixelFilter, place: Tensor, values: Tensor, scale: int = 1,
+    count: int | None = None, generator: torch.Generator | None = None,
+) -> Tensor:  # fmt: skip
     """Filter samples into pixels of s x s of theirs. Samples outside the image are missing, as at the edge of a film.
 
     Args:
         place: (K, H, W, 2), x and y of the samples in their pixels, 0 to 1.
         values: (K, C, H, W).
-        measure: (K, H, W), what the variance is computed of, such as luminance; None for no variance.
         scale: s. H and W are multiples of it.
         count: for importance sampling, at most this many samples in each pixel; for a spread filter without meaning.
         generator: of the random numbers for importance sampling.
+
+    Returns:
+        (C, H / s, W / s)
     """
     k, _, height, width = values.shape
     low_height, low_width = height // scale, width // scale
 
     def blocks(samples: Tensor) -> Tensor:
-        """(K, ..., H, W) as (K * s * s, ..., h, w)."""
+        """Reorder (K, ..., H, W) to (K * s * s, ..., h, w)."""
         middle = samples.shape[1:-2]
         split = samples.reshape(k, *middle, low_height, scale, low_width, scale)
         n = split.ndim
@@ -187,54 +154,30 @@ def apply(
     rows, columns = (torch.arange(n, device=place.device) % scale for n in (height, width))
     x = blocks((place[..., 0] + columns) / scale)
     y = blocks((place[..., 1] + rows[:, None]) / scale)
-    # What is summed: 1, the values, the measure
     stacked = torch.cat([torch.ones_like(x)[:, None], blocks(values)], dim=1)
-    if measure is not None:
-        stacked = torch.cat([stacked, blocks(measure)[:, None]], dim=1)
-    has_measure = measure is not None
     if pixel_filter.splatted:
-        return _splat(pixel_filter, x, y, stacked, has_measure)
-    return _distribute(pixel_filter, x, y, stacked, has_measure, count, generator)
+        return _splat(pixel_filter, x, y, stacked)
+    return _distribute(pixel_filter, x, y, stacked, count, generator)
 
 
-def _splat(pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor, has_measure: bool) -> Filtered:
-    """A pixel is sum(w L) / sum(w)."""
+def _splat(pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor) -> Tensor:
+    """Compute each pixel as sum(w L) / sum(w); the first channel of the values is 1."""
     reach, (height, width) = pixel_filter.reach, x.shape[-2:]
-    shape = (height + 2 * reach, width + 2 * reach)
-    sums, squares = values.new_zeros(values.shape[1], *shape), values.new_zeros(3, *shape)
-    measured = values[:, -1]
-    moments = torch.stack([torch.ones_like(x), measured, measured**2], dim=1)
+    sums = values.new_zeros(values.shape[1], height + 2 * reach, width + 2 * reach)
     across, down = pixel_filter.weights(x), pixel_filter.weights(y)
     for i, w_y in enumerate(down):
         for j, w_x in enumerate(across):
-            area = (slice(None), slice(i, i + height), slice(j, j + width))
             for k, w in enumerate(w_x * w_y):
-                sums[area].addcmul_(w, values[k])
-                if has_measure:
-                    squares[area].addcmul_(w**2, moments[k])
-    inner = (slice(None), slice(reach, reach + height), slice(reach, reach + width))
-    weight, *rest = sums[inner]
-    weight = torch.where(weight.abs() > 1e-3, weight, 1e-3)  # negative lobes may leave nothing
-    mean = torch.stack(rest) / weight
-    if not has_measure:
-        return Filtered(mean, None)
-    # sum(w^2 (L - m)^2) / sum(w)^2, without bias where all weights are equal
-    m, (w2, w2l, w2ll) = mean[-1], squares[inner]
-    share = w2 / weight**2  # 1 / effective number of samples
-    variance = (w2ll - 2 * m * w2l + m**2 * w2).clamp_min(0) / weight**2
-    return Filtered(mean[:-1], torch.where(share < 0.95, variance / (1 - share).clamp_min(0.05), 0.0))
+                sums[:, i : i + height, j : j + width].addcmul_(w, values[k])
+    weight, *rest = sums[:, reach : reach + height, reach : reach + width]
+    return torch.stack(rest) / torch.where(weight.abs() > 1e-3, weight, 1e-3)  # negative lobes may leave nothing
 
 
 def _distribute(
-    pixel_filter: PixelFilter,
-    x: Tensor,
-    y: Tensor,
-    values: Tensor,
-    has_measure: bool,
-    count: int | None,
-    generator: torch.Generator | None,
-) -> Filtered:
-    """Count each sample in one pixel, drawn by the filter.
+    pixel_filter: PixelFilter, x: Tensor, y: Tensor, values: Tensor,
+    count: int | None, generator: torch.Generator | None,
+) -> Tensor:  # fmt: skip
+    """Count each sample in one pixel, drawn by the filter; the first channel of the values is 1.
 
     The samples of a pixel are then distributed as the filter divided by the sum of the filters of all pixels there,
     which is nearly the filter itself from a width of two pixels. Pixels that get fewer than ``count`` are the mean of
@@ -243,7 +186,7 @@ def _distribute(
     height, width = x.shape[-2:]
 
     def moved(position: Tensor) -> Tensor:
-        """A random pixel offset for every sample."""
+        """Draw a pixel offset for every sample."""
         cumulative = pixel_filter.weights(position).cumsum(dim=0)
         drawn = torch.rand(position.shape, generator=generator, device=position.device)
         return (drawn >= cumulative[:-1]).sum(dim=0) - pixel_filter.reach
@@ -253,36 +196,28 @@ def _distribute(
     kept = ((column >= 0) & (column < width) & (row >= 0) & (row < height)).flatten()
     target = (row * width + column).flatten()
     target = torch.where(kept, target, height * width)  # a pixel beyond the others, for samples that leave the image
+    chosen = torch.arange(len(target), device=x.device)
     if count is not None:
         # Samples in random order, grouped by their pixel: the first ones of each group count
         shuffled = torch.rand(target.shape, generator=generator, device=x.device, dtype=torch.float64)
         order = (target + shuffled).argsort()
         groups = target[order]
-        rank = torch.arange(len(order), device=x.device) - torch.searchsorted(groups, groups)
-        chosen = order[rank < count]
-    else:
-        chosen = torch.arange(len(target), device=x.device)
-
-    if has_measure:
-        values = torch.cat([values, values[:, -1:] ** 2], dim=1)
+        chosen = order[chosen - torch.searchsorted(groups, groups) < count]
     columns = values.movedim(1, -1)
     sums = values.new_zeros(height * width + 1, columns.shape[-1])
     sums.index_add_(0, target[chosen], columns.reshape(-1, columns.shape[-1])[chosen])
     sums = sums[:-1].reshape(height, width, -1).movedim(-1, 0)
     n, *rest = torch.where(sums[0] > 0, sums, columns[0].movedim(-1, 0))
-    if not has_measure:
-        return Filtered(torch.stack(rest) / n, None)
-    *rest, total, square = rest
-    squared_error = (square - total**2 / n).clamp_min(0)
-    return Filtered(torch.stack(rest) / n, squared_error / (n * (n - 1).clamp_min(1)))
+    return torch.stack(rest) / n
 
 
 # Reference
 
 
 def filter_reference(pixel_filter: PixelFilter, cells: Tensor, per_pixel: int) -> Tensor:
-    """The expected value of :func:`apply` at scale 1, from a reference of R x R cells a pixel: (C, R*H, R*W) to
-    (C, H, W). A cell has the mean weight of the positions in it.
+    """Filter a reference of R x R cells a pixel, (C, R*H, R*W) to (C, H, W): the expected value of :func:`apply`.
+
+    A cell has the mean weight of the positions in it.
     """
     points = 32  # positions per cell, along each side
     place = (torch.arange(per_pixel * points, device=cells.device) + 0.5) / (per_pixel * points)

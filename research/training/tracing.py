@@ -10,7 +10,7 @@ import onnx
 import torch
 from onnx import numpy_helper
 from onnxscript import opset18
-from torch import nn
+from torch import Tensor, nn
 from torch.utils._pytree import tree_leaves, tree_map
 
 #: Operators and file format of all models.
@@ -18,13 +18,9 @@ OPSET, IR_VERSION = 18, 9
 
 
 def traced(
-    module: nn.Module,
-    inputs: tuple[Any, ...],
-    names: list[str],
-    outputs: list[str],
-    alignment: int,
+    module: nn.Module, inputs: tuple[Any, ...], names: list[str], outputs: list[str], alignment: int,
     translations: dict[Any, Any] | None = None,
-) -> onnx.ModelProto:
+) -> onnx.ModelProto:  # fmt: skip
     """Export a module for images of any size, and for numbers.
 
     Sides of the first input are multiples of ``alignment``; the other images keep their size relative to the first.
@@ -32,30 +28,31 @@ def traced(
     first = tree_leaves(inputs)[0]
     height, width = torch.export.Dim("h", min=2), torch.export.Dim("w", min=2)
 
-    def dynamic(image: torch.Tensor) -> dict[int, Any]:
+    def dynamic(image: Tensor) -> dict[int, Any]:
         if not image.ndim:
             return {}
         size = alignment * image.shape[2] // first.shape[2]
         return {2: size * height, 3: size * width}
 
     program = torch.onnx.export(
-        module.eval(),
-        inputs,
-        input_names=names,
-        output_names=outputs,
-        opset_version=OPSET,
-        dynamo=True,
-        dynamic_shapes=tree_map(dynamic, inputs),
-        custom_translation_table=translations or {},
-        verbose=False,
-    )
+        module.eval(), inputs, input_names=names, output_names=outputs, opset_version=OPSET, dynamo=True, verbose=False,
+        dynamic_shapes=tree_map(dynamic, inputs), custom_translation_table=translations or {},
+    )  # fmt: skip
+    assert program is not None
     model = program.model_proto
     _strip_traces(model)
     return model
 
 
-def unshuffle(x, downscale_factor: int):
-    """Pixel unshuffle as a grouped convolution with kernels of a single tap, in PyTorch's channel order.
+def prepend(graph: onnx.GraphProto, nodes: list[onnx.NodeProto]) -> None:
+    """Put nodes before those of a graph."""
+    nodes = [*nodes, *graph.node]
+    del graph.node[:]
+    graph.node.extend(nodes)
+
+
+def unshuffle(x: Any, downscale_factor: int) -> Any:
+    """Unshuffle pixels by a grouped convolution with kernels of a single tap, in PyTorch's channel order.
 
     It runs on all cores. The exporter's own translation has a Transpose, which takes four times as long.
     """
@@ -63,14 +60,14 @@ def unshuffle(x, downscale_factor: int):
     return opset18.Conv(x, weight, group=x.shape[1], strides=[downscale_factor] * 2)
 
 
-def shuffle(x, upscale_factor: int):
-    """Pixel shuffle as a grouped transposed convolution, likewise."""
+def shuffle(x: Any, upscale_factor: int) -> Any:
+    """Shuffle pixels by a grouped transposed convolution, likewise."""
     planes = x.shape[1] // upscale_factor**2
     return opset18.ConvTranspose(x, _taps(planes, upscale_factor), group=planes, strides=[upscale_factor] * 2)
 
 
-def _taps(planes: int, size: int):
-    """Kernels (planes * size**2, 1, size, size), each with a single tap."""
+def _taps(planes: int, size: int) -> Any:
+    """Return kernels (planes * size**2, 1, size, size), each with a single tap."""
     taps = np.tile(np.eye(size**2, dtype=np.float32), (planes, 1)).reshape(-1, 1, size, size)
     return opset18.Constant(value=numpy_helper.from_array(taps))
 

@@ -13,10 +13,9 @@ import torch
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from research.datagen.views import Array, View, as_float32, mean_lrhs, read_hrls, split_features
+from research.training.checkpoints import Network, run
 from research.training.data import Prepare, to_tensor
 from research.training.encoding import packed
-from research.training.networks import Network, run
-from research.training.ops import upsample
 
 
 @dataclass(frozen=True)
@@ -24,7 +23,7 @@ class ValidationPair:
     """The middle of a view with 1 spp in the HRLS and s^2 spp in the LRHS, the paper's (s^2 - 1)."""
 
     lrhs: Array
-    """(h, w, 3), encoded, and the channels that :func:`research.training.networks.preparation` adds."""
+    """(h, w, 3), encoded, and the channels that :func:`research.training.checkpoints.preparation` adds."""
     hrls: Array
     """(s*h, s*w, 16), encoded, and the channels that are added. One sample has no variance, so that is missing."""
     reference: Array
@@ -44,33 +43,21 @@ class ValidationPair:
         lrhs = encode_radiance(lrhs, exposure)
         if prepare is not None:
             lrhs, hrls = prepare(lrhs, hrls)
-        return cls(
-            lrhs=lrhs,
-            hrls=hrls,
-            reference=as_float32(view.ref[rows, columns]),
-            exposure=exposure,
-        )
+        return cls(lrhs, hrls, as_float32(view.ref[rows, columns]), exposure)
 
 
 @torch.inference_mode()
 def evaluate(network: Network, pairs: Iterable[ValidationPair], device: torch.device) -> dict[str, float]:
-    """Mean sRGB PSNR and RelMSE of the network and of the bicubically upsampled LRHS over all pairs.
+    """Return the mean sRGB PSNR and RelMSE of a network over all pairs, and the PSNR of each scale.
 
     Images are exposed as for the network, because views have any brightness.
     """
     scores: dict[str, list[float]] = collections.defaultdict(list)
     for pair in pairs:
         fused, _ = run(network, to_tensor(pair.lrhs[None], device), to_tensor(pair.hrls[None], device))
-        output = decode_radiance(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure)
-        scale = pair.hrls.shape[0] // pair.lrhs.shape[0]
-        lrhs = decode_radiance(pair.lrhs[None, ..., :3], pair.exposure)
-        bicubic = upsample(to_tensor(lrhs, torch.device("cpu")), scale, "bicubic").clamp(min=0)
-        bicubic = bicubic[0].permute(1, 2, 0).numpy()
+        output = decode_radiance(fused[0].permute(1, 2, 0).cpu().numpy(), pair.exposure) * pair.exposure
         reference = pair.reference * pair.exposure
-        for prefix, image in (("", output), ("bicubic_", bicubic)):
-            score = psnr(image * pair.exposure, reference)
-            scores[prefix + "psnr"].append(score)
-            if not prefix:
-                scores[f"psnr_x{scale}"].append(score)
-            scores[prefix + "relmse"].append(relmse(image * pair.exposure, reference))
+        for name in ("psnr", f"psnr_x{pair.hrls.shape[0] // pair.lrhs.shape[0]}"):
+            scores[name].append(psnr(output, reference))
+        scores["relmse"].append(relmse(output, reference))
     return {name: float(np.mean(values)) for name, values in scores.items()}

@@ -27,6 +27,7 @@ from torch import Tensor, nn
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.model.contract import DENOISERS, METADATA_KEY, Contract
 from oiio_msspl.model.encoding import MAX_ENCODED
+from research.training import CHECKPOINTS
 from research.training.encoding import encoded_feature, exposed_feature, log_decode, log_encode
 from research.training.quantise.codes import INPUT_SLICES, OUTPUT_SLICES, log_encoded_of_code
 from research.training.quantise.graph import Nodes
@@ -35,37 +36,29 @@ from research.training.tracing import traced
 
 #: Prefixes of tensors in the graph of a model.
 NETWORK, DENOISER = "network.", "denoiser."
-CHECKPOINTS = Path(__file__).parent / "checkpoints"
 #: Tensors of fewer bytes, such as biases, stay in the graph.
 SMALL = 1024
 
 
 class Enter(nn.Module):
-    """What comes before the network, and before the denoiser.
-
-    Args:
-        contract: of the model.
-    """
+    """What comes before the network, and before the denoiser."""
 
     def __init__(self, contract: Contract) -> None:
         super().__init__()
         self.contract = contract
 
     def forward(self, inputs: Sequence[Tensor]) -> tuple[Tensor, ...]:
-        """
-        Args:
-            inputs: those of the contract, in its order.
+        """Encode the contract's inputs, which are in its order.
 
         Returns:
-            The encoded LRHS and HRLS, and with a denoiser the result of
-            :func:`research.training.render_mean.mean_of_renders`.
+            The LRHS and HRLS, and with a denoiser :func:`research.training.render_mean.mean_of_renders`.
         """
         given = dict(zip(self.contract.inputs, inputs, strict=True))
         lrhs, hrls = (
             {name: exposed_feature(name, given[f"{render}.{name}"], given["exposure"]) for name in names}
             for render, names in (("lrhs", self.contract.lrhs), ("hrls", self.contract.hrls))
         )
-        encoded = log_encode(lrhs[RGB]), torch.cat([encoded_feature(*each) for each in hrls.items()], dim=1)
+        encoded = log_encode(lrhs[RGB]), torch.cat([encoded_feature(*item) for item in hrls.items()], dim=1)
         if not self.contract.denoiser:
             return encoded
         shares: Images = {name: given[f"share.{name}"] for name in self.contract.lrhs}
@@ -76,14 +69,7 @@ class Leave(nn.Module):
     """What comes after the network."""
 
     def forward(self, encoded: Tensor, exposure: Tensor) -> Tensor:
-        """
-        Args:
-            encoded: the fused image (1, 3, H, W), log-encoded.
-            exposure: a number.
-
-        Returns:
-            The fused image, scene linear, finite and >= 0.
-        """
+        """Decode the fused image (1, 3, H, W), given its exposure, to scene-linear values, finite and >= 0."""
         return log_decode(encoded.clamp(0.0, MAX_ENCODED)) / exposure
 
 
@@ -97,20 +83,19 @@ class InTorch(nn.Module):
     """
 
     def __init__(
-        self,
-        contract: Contract,
-        fuse: Callable[[Tensor, Tensor], Sequence[Tensor]],
+        self, contract: Contract, fuse: Callable[[Tensor, Tensor], Sequence[Tensor | None]],
         denoise: Callable[..., Tensor] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         super().__init__()
         self.enter, self.fuse, self.denoise = Enter(contract), fuse, denoise
 
     def forward(self, inputs: Mapping[str, Tensor]) -> Tensor:
-        """The fused image (1, 3, s*h, s*w), scene linear, for the inputs of the contract."""
+        """Return the fused image (1, 3, s*h, s*w), scene linear, for the inputs of the contract."""
         lrhs, hrls, *mean = self.enter([inputs[name] for name in self.enter.contract.inputs])
         if self.denoise is not None:
             lrhs = torch.cat([lrhs, self.denoise(*mean)], dim=1)
-        return Leave()(self.fuse(lrhs, hrls)[0], inputs["exposure"])
+        fused: Tensor = Leave()(self.fuse(lrhs, hrls)[0], inputs["exposure"])
+        return fused
 
 
 class _Whole(Nodes):
@@ -131,7 +116,7 @@ class _Whole(Nodes):
         ends = inputs["hrls.rgb"], inputs["exposure"]
         leave = traced(Leave(), ends, ["encoded", "exposure"], ["fused"], contract.scale * contract.alignment)
         self.embed(leave, "leave.", {"encoded": "encoded.fused"})
-        self._results = {each.name: each.type.tensor_type.shape.dim[1].dim_value for each in network.graph.output}
+        self._results = {value.name: value.type.tensor_type.shape.dim[1].dim_value for value in network.graph.output}
 
     def _denoise(self, denoiser: onnx.ModelProto, images: list[str]) -> None:
         """Add the denoiser of both renders' mean, in 8 bits or not."""
@@ -153,6 +138,7 @@ class _Whole(Nodes):
         self.add("Transpose", [pixels], "mean.denoised", perm=[0, 3, 1, 2])
 
     def model(self) -> onnx.ModelProto:
+        """Return the model with its contract."""
         info, contract = helper.make_tensor_value_info, self._contract
         inputs = [
             info(name, TensorProto.FLOAT, [1, count, *("hw" if name.startswith("lrhs") else "HW")] if count else [])
@@ -181,7 +167,7 @@ def _share_equal_tensors(graph: onnx.GraphProto) -> None:
 
 
 def example(contract: Contract, height: int, width: int, seed: int = 0) -> dict[str, Tensor]:
-    """Random inputs of a contract, for an LRHS of height x width pixels."""
+    """Return random inputs of a contract, for an LRHS of height x width pixels."""
     generator = torch.Generator().manual_seed(seed)
     inputs = {}
     for name, count in contract.inputs.items():
@@ -192,7 +178,7 @@ def example(contract: Contract, height: int, width: int, seed: int = 0) -> dict[
 
 
 def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.ModelProto | None) -> onnx.ModelProto:
-    """The model of a network.
+    """Return the model of a network.
 
     Args:
         network: its inputs are ``lrhs`` and ``hrls``, encoded; outputs are ``fused``, log-encoded, and others, which
@@ -205,14 +191,13 @@ def whole_model(network: onnx.ModelProto, contract: Contract, denoiser: onnx.Mod
 
 
 def denoiser_file(mode: str) -> str:
-    """Name, without its ending, of the files of a denoiser, a value of ``Contract.denoiser``."""
+    """Return the name, without its ending, of the files of a value of ``Contract.denoiser``."""
     return mode.replace("mean", "mean_denoiser").replace("-", "_")
 
 
-def quantised_denoiser(mode: str) -> onnx.ModelProto | None:
-    """The denoiser in 8 bits for a value of ``Contract.denoiser``, as :mod:`research.training.quantise` has written
-    it."""
-    return onnx.load(CHECKPOINTS / f"{denoiser_file(mode)}.onnx") if mode else None
+def quantised_denoiser(mode: str, file: Path | None = None) -> onnx.ModelProto | None:
+    """Read the denoiser in 8 bits for a value of ``Contract.denoiser``: from a file, or the shipped one."""
+    return onnx.load(file or CHECKPOINTS / f"{denoiser_file(mode)}.onnx") if mode else None
 
 
 def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
@@ -236,7 +221,7 @@ def save(models: Mapping[Path, onnx.ModelProto], family: str = "") -> None:
 
 
 def _contract(model: onnx.ModelProto) -> Contract:
-    return Contract.from_json(next(each.value for each in model.metadata_props if each.key == METADATA_KEY), "model")
+    return Contract.from_json(next(item.value for item in model.metadata_props if item.key == METADATA_KEY), "model")
 
 
 def _share_weights(models: Sequence[onnx.ModelProto], file: Path, prefix: str) -> None:

@@ -11,6 +11,7 @@ from research.datagen import command_line, views
 
 
 def main() -> int:
+    """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.cycles", "Render training views with Blender's Cycles.", ref_spp=32)
     parser.add_argument(
         "--filter",

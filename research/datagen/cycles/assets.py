@@ -36,14 +36,14 @@ def licence_of(model: Path) -> str:
     """Name and licence of a model file for the record: the SPDX identifiers of its own data."""
     texts = [p for folder in (model.parent, model.parent.parent) for p in sorted(folder.glob("LICENSE*"))]
     text = texts[0].read_text(errors="replace").split("metadocumentation")[0] if texts else ""
-    found = sorted(set(re.findall(r'SPDX license identifier: "([^"]+)"', text)))
-    if not found and re.search("CC0|Creative Commons Zero", text):
-        found = ["CC0-1.0"]
-    return f"models/{model.stem} ({' AND '.join(found) or 'licence unknown'})"
+    licences = sorted(set(re.findall(r'SPDX license identifier: "([^"]+)"', text)))
+    if not licences and re.search("CC0|Creative Commons Zero", text):
+        licences = ["CC0-1.0"]
+    return f"models/{model.stem} ({' AND '.join(licences) or 'licence unknown'})"
 
 
 def load_model(path: Path) -> list[bpy.types.Object]:
-    """The meshes of an OBJ or glTF file, z up, centred in x and y, standing on z = 0, at most 1 m large.
+    """Import the meshes of an OBJ or glTF file, z up, centred in x and y, standing on z = 0, at most 1 m large.
 
     A model's lights and cameras are left out. Parts keep their materials.
     """
@@ -56,9 +56,9 @@ def load_model(path: Path) -> list[bpy.types.Object]:
     new = [o for o in bpy.data.objects if o not in before]
     meshes = [o for o in new if o.type == "MESH" and len(o.data.polygons)]
     world = {o: o.matrix_world.copy() for o in meshes}
-    for other in new:
-        if other not in world:
-            bpy.data.objects.remove(other)
+    for thing in new:
+        if thing not in world:
+            bpy.data.objects.remove(thing)
     corners = np.array([world[o] @ Vector(corner) for o in meshes for corner in o.bound_box])
     low, high = corners.min(0), corners.max(0)
     scale = 1 / max((high - low).max(), 1e-6)

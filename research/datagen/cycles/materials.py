@@ -4,7 +4,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from typing import Any, TypeAlias
 
 import bpy
 import numpy as np
@@ -12,8 +13,9 @@ import numpy as np
 from research.datagen import textures as tex
 
 Rng = np.random.Generator
-Material = bpy.types.Material
-Socket = bpy.types.NodeSocket
+Material: TypeAlias = bpy.types.Material
+Socket: TypeAlias = bpy.types.NodeSocket
+_SOCKET: type = bpy.types.NodeSocket  # mypy takes no alias in isinstance
 
 
 def rgba(color: np.ndarray | tuple[float, float, float]) -> tuple[float, float, float, float]:
@@ -25,7 +27,7 @@ def chance(rng: Rng, share: float) -> bool:
 
 
 def log_uniform(rng: Rng, low: float, high: float) -> float:
-    """A number between two positive ones, each scale as likely."""
+    """Draw a number between two positive ones, each scale as likely."""
     return float(math.exp(rng.uniform(math.log(low), math.log(high))))
 
 
@@ -39,14 +41,14 @@ class Graph:
         self.output = self.add("ShaderNodeOutputWorld" if isinstance(owner, bpy.types.World)
                                else "ShaderNodeOutputMaterial")  # fmt: skip
 
-    def add(self, kind: str, inputs: dict[str | int, object] | None = None, **attributes: object) -> bpy.types.Node:
-        """A node; `inputs` are sockets to link, colours (3,) or numbers, `attributes` the node's own."""
+    def add(self, kind: str, inputs: Mapping[Any, Any] | None = None, **attributes: Any) -> bpy.types.Node:
+        """Add a node; `inputs` are sockets to link, colours (3,) or numbers, `attributes` the node's own."""
         node = self.tree.nodes.new(kind)
         for name, value in attributes.items():
             setattr(node, name, value)
-        for name, value in (inputs or {}).items():
-            socket = node.inputs[name]
-            if isinstance(value, Socket):
+        for key, value in (inputs or {}).items():
+            socket = node.inputs[key]
+            if isinstance(value, _SOCKET):
                 self.tree.links.new(value, socket)
             elif np.ndim(value) == 1:
                 socket.default_value = rgba(value) if socket.type == "RGBA" else [float(v) for v in value]
@@ -57,12 +59,13 @@ class Graph:
     def surface(self, shader: bpy.types.Node, socket: str = "Surface") -> None:
         self.tree.links.new(shader.outputs[0], self.output.inputs[socket])
 
-    def mix(self, factor: Socket | float, a: object, b: object, blend: str = "MIX") -> Socket:
+    def mix(self, factor: Socket | float, a: Any, b: Any, blend: str = "MIX") -> Socket:
         """Mix two colours, (3,) or sockets."""
         node = self.tree.nodes.new("ShaderNodeMix")
         node.data_type, node.blend_type = "RGBA", blend
-        for index, value in ((0, factor), (6, a), (7, b)):  # the sockets of colours follow those of other types
-            if isinstance(value, Socket):
+        sockets: list[tuple[int, Any]] = [(0, factor), (6, a), (7, b)]  # those of colours follow those of other types
+        for index, value in sockets:
+            if isinstance(value, _SOCKET):
                 self.tree.links.new(value, node.inputs[index])
             else:
                 node.inputs[index].default_value = rgba(value) if np.ndim(value) == 1 else float(value)
@@ -73,7 +76,7 @@ class Graph:
         return self.add("ShaderNodeMapRange", {0: value, 3: low, 4: high}).outputs[0]
 
     def threshold(self, value: Socket, edge: float, width: float) -> Socket:
-        """A step of 0 to 1 about `edge`, `width` wide."""
+        """Return a step of 0 to 1 about `edge`, `width` wide."""
         return self.add("ShaderNodeMapRange", {0: value, 1: edge - width / 2, 2: edge + width / 2}).outputs[0]
 
     def coordinates(self, scale: np.ndarray | float = 1.0, name: str = "Object") -> Socket:
@@ -92,7 +95,7 @@ def new(name: str) -> tuple[Material, Graph]:
 
 
 def image_node(graph: Graph, image: np.ndarray, vector: Socket, nearest: bool = False) -> Socket:
-    """A bitmap of linear values (H, W, 3)."""
+    """Return a bitmap of linear values (H, W, 3)."""
     h, w, _ = image.shape
     data = bpy.data.images.new("bitmap", w, h, float_buffer=True)
     data.colorspace_settings.name = "Linear Rec.709"
@@ -210,14 +213,14 @@ PATTERNS: list[Callable[[Graph, Rng, float], Socket]] = [
 
 
 def color(graph: Graph, rng: Rng, plainness: float, frequency: float) -> Socket | np.ndarray:
-    """A plain colour with probability `plainness`, else a pattern with about `frequency` features a metre."""
+    """Draw a plain colour with probability `plainness`, else a pattern with about `frequency` features a metre."""
     if chance(rng, plainness):
         return tex.color(rng)
     return PATTERNS[rng.integers(len(PATTERNS))](graph, rng, frequency * 10 ** rng.uniform(-0.4, 0.4))
 
 
 def bump(graph: Graph, rng: Rng, frequency: float) -> Socket:
-    """A normal disturbed by noise or cells, at several times the frequency of the colour."""
+    """Return a normal disturbed by noise or cells, at several times the frequency of the colour."""
     vector = graph.coordinates(frequency * 10 ** rng.uniform(0.3, 1.3))
     if chance(rng, 0.7):
         height = graph.add("ShaderNodeTexNoise", {"Vector": vector, "Scale": 1, "Detail": rng.uniform(1, 8)}).outputs[0]
@@ -231,15 +234,15 @@ def bump(graph: Graph, rng: Rng, frequency: float) -> Socket:
 # Materials
 
 
-def principled(name: str, rng: Rng, inputs: dict[str, object], graph: Graph | None = None,
+def principled(name: str, rng: Rng, inputs: dict[str, Any], graph: Graph | None = None,
                material: Material | None = None, frequency: float = 4.0, bumpy: float = 0.25) -> Material:  # fmt: skip
-    """A Principled BSDF with some `inputs`, sometimes with a bumpy surface or a patchy roughness."""
+    """Return a Principled BSDF with some `inputs`, sometimes with a bumpy surface or a patchy roughness."""
     if graph is None:
         material, graph = new(name)
     if chance(rng, bumpy):
         inputs["Normal"] = bump(graph, rng, frequency)
     roughness = inputs.get("Roughness", 0.5)
-    if not isinstance(roughness, Socket) and chance(rng, 0.25):
+    if not isinstance(roughness, _SOCKET) and chance(rng, 0.25):
         patches = graph.add("ShaderNodeTexNoise", {"Vector": graph.coordinates(frequency), "Scale": 1, "Detail": 5})
         inputs["Roughness"] = graph.span(graph.threshold(patches.outputs[0], 0.5, 0.4), roughness * 0.4,
                                          min(roughness * 1.5 + 0.05, 1))  # fmt: skip
@@ -321,7 +324,7 @@ def glass(rng: Rng, tinted: float = 0.3) -> Material:
 
 
 def pane(rng: Rng) -> Material:
-    """A window pane that lets shadow rays through, as users build it: Cycles would find no light behind glass."""
+    """Return a pane that lets shadow rays through, as users build it: Cycles would find no light behind glass."""
     material, graph = new("pane")
     path = graph.add("ShaderNodeLightPath")
     clear = graph.add("ShaderNodeBsdfTransparent", {"Color": (0.92, 0.95, 0.93)})
@@ -359,7 +362,7 @@ def shade(rng: Rng) -> Material:
 
 
 def palette(rng: Rng) -> Material:
-    """A bitmap of unrelated colours, for meshes whose parts each take one."""
+    """Return a bitmap of unrelated colours, for meshes whose parts each take one."""
     material, graph = new("palette")
     base = image_node(graph, tex.palette(rng), graph.add("ShaderNodeTexCoord").outputs["UV"], nearest=True)
     return principled("palette", rng, {"Base Color": base, "Roughness": rng.uniform(0.2, 0.9)}, graph, material, 10.0)
@@ -377,7 +380,7 @@ def hair(rng: Rng) -> Material:
 
 
 def picture(image: np.ndarray, rng: Rng) -> Material:
-    """An image over the whole unit square of the texture coordinates."""
+    """Return an image over the whole unit square of the texture coordinates."""
     material, graph = new("picture")
     base = image_node(graph, image, graph.add("ShaderNodeTexCoord").outputs["UV"])
     return principled(
@@ -393,7 +396,7 @@ def lamp(radiance: np.ndarray) -> Material:
 
 
 def screen(rng: Rng, strength: float) -> Material:
-    """A display, neon sign or lit poster: an emitter with an image."""
+    """Return a display, neon sign or lit poster: an emitter with an image."""
     material, graph = new("screen")
     base = image_node(graph, tex.pattern(rng, 0.0), graph.add("ShaderNodeTexCoord").outputs["UV"])
     graph.surface(graph.add("ShaderNodeEmission", {"Color": base, "Strength": strength}))

@@ -2,7 +2,7 @@
 """Render a low-resolution-high-spp / high-resolution-low-spp pair of one frame with Cycles.
 
 The scene is built in code from a seed.  Writes hr.exr, lr.exr and (with --ref-spp) ref.exr as
-multilayer EXR into --out.  Works with bpy 4.5 and bpy 5.0; see datagen/README.md for the commands.
+multilayer EXR into --out.  Works with bpy 4.5 and bpy 5.0; research/datagen/README.md has the commands.
 """
 
 from __future__ import annotations
@@ -13,16 +13,20 @@ import random
 import sys
 import time
 from pathlib import Path
+from typing import Any, TypeAlias
 
 import bpy
 from mathutils import Vector
 
 V5 = bpy.app.version >= (5, 0, 0)
+Material: TypeAlias = bpy.types.Material
+Colour = tuple[float, float, float, float]
+Point = tuple[float, float, float]
 
 
 # ---------------------------------------------------------------- materials
-def new_material(name, **inputs):
-    """A Principled material; keyword `Base_Color` sets the input `Base Color`."""
+def new_material(name: str, **inputs: Any) -> tuple[Material, Any, Any]:
+    """Make a Principled material; keyword `Base_Color` sets the input `Base Color`."""
     mat = bpy.data.materials.new(name)
     mat.use_nodes = True
     bsdf = next(n for n in mat.node_tree.nodes if n.type == "BSDF_PRINCIPLED")
@@ -31,25 +35,25 @@ def new_material(name, **inputs):
     return mat, mat.node_tree, bsdf
 
 
-def rgb(r, g, b):
+def rgb(r: float, g: float, b: float) -> Colour:
     return (r, g, b, 1.0)
 
 
-def node(nt, kind, **inputs):
+def node(nt: Any, kind: str, **inputs: Any) -> Any:
     n = nt.nodes.new(kind)
     for key, value in inputs.items():
         n.inputs[key.replace("_", " ")].default_value = value
     return n
 
 
-def object_coords(nt, scale=(1, 1, 1), rotation=(0, 0, 0)):
+def object_coords(nt: Any, scale: Point = (1, 1, 1), rotation: Point = (0, 0, 0)) -> Any:
     coords = nt.nodes.new("ShaderNodeTexCoord")
     mapping = node(nt, "ShaderNodeMapping", Scale=scale, Rotation=rotation)
     nt.links.new(coords.outputs["Object"], mapping.inputs["Vector"])
     return mapping.outputs["Vector"]
 
 
-def mix_colors(nt, factor, a, b, blend="MIX"):
+def mix_colors(nt: Any, factor: Any, a: Any, b: Any, blend: str = "MIX") -> Any:
     """Mix two colours; each argument is a socket or a constant."""
     n = nt.nodes.new("ShaderNodeMix")
     n.data_type, n.blend_type = "RGBA", blend
@@ -63,19 +67,12 @@ def mix_colors(nt, factor, a, b, blend="MIX"):
     return next(s for s in n.outputs if s.type == "RGBA")
 
 
-def wood_floor():
+def wood_floor() -> Material:
     mat, nt, bsdf = new_material("Wood Floor", Roughness=0.32)
     planks = node(
-        nt,
-        "ShaderNodeTexBrick",
-        Color1=rgb(0.46, 0.25, 0.11),
-        Color2=rgb(0.27, 0.13, 0.055),
-        Mortar=rgb(0.03, 0.015, 0.008),
-        Scale=1.0,
-        Mortar_Size=0.005,
-        Brick_Width=1.3,
-        Row_Height=0.17,
-    )
+        nt, "ShaderNodeTexBrick", Color1=rgb(0.46, 0.25, 0.11), Color2=rgb(0.27, 0.13, 0.055),
+        Mortar=rgb(0.03, 0.015, 0.008), Scale=1.0, Mortar_Size=0.005, Brick_Width=1.3, Row_Height=0.17,
+    )  # fmt: skip
     nt.links.new(object_coords(nt, rotation=(0, 0, math.radians(90))), planks.inputs["Vector"])
     grain = node(nt, "ShaderNodeTexNoise", Scale=3.0, Detail=8.0, Roughness=0.65)
     nt.links.new(object_coords(nt, scale=(22, 1.6, 1)), grain.inputs["Vector"])
@@ -84,7 +81,7 @@ def wood_floor():
     return mat
 
 
-def wallpaper():
+def wallpaper() -> Material:
     mat, nt, bsdf = new_material("Wallpaper", Roughness=0.8)
     wave = node(nt, "ShaderNodeTexWave", Scale=2.1, Distortion=0.0)
     wave.bands_direction = "X"
@@ -98,7 +95,7 @@ def wallpaper():
     return mat
 
 
-def checker(name, a, b, scale, **inputs):
+def checker(name: str, a: Colour, b: Colour, scale: float, **inputs: Any) -> Material:
     mat, nt, bsdf = new_material(name, **inputs)
     tex = node(nt, "ShaderNodeTexChecker", Scale=scale, Color1=a, Color2=b)
     # a turn and an offset keep faces away from the boundaries of the 3-D pattern
@@ -109,8 +106,8 @@ def checker(name, a, b, scale, **inputs):
     return mat
 
 
-def tablecloth():
-    """A matte plaid from two crossed wave textures."""
+def tablecloth() -> Material:
+    """Make a matte plaid from two crossed wave textures."""
     mat, nt, bsdf = new_material("Cloth", Roughness=0.9, Sheen_Weight=0.4)
     color, flat = rgb(0.76, 0.71, 0.62), nt.nodes.new("ShaderNodeTexCoord").outputs["UV"]
     for direction, tint in (("X", rgb(0.55, 0.06, 0.05)), ("Y", rgb(0.10, 0.14, 0.34))):
@@ -127,7 +124,7 @@ def tablecloth():
     return mat
 
 
-def painting():
+def painting() -> Material:
     mat, nt, bsdf = new_material("Painting", Roughness=0.5)
     tex = node(nt, "ShaderNodeTexVoronoi", Scale=13.0)
     nt.links.new(object_coords(nt), tex.inputs["Vector"])
@@ -136,7 +133,7 @@ def painting():
     return mat
 
 
-def glass(caustics):
+def glass(caustics: bool) -> Material:
     """Plain glass, or glass whose shadow is clear so that path tracing it stays quiet."""
     mat = bpy.data.materials.new("Glass")
     mat.use_nodes = True
@@ -161,7 +158,7 @@ def glass(caustics):
 _index = [0]
 
 
-def finish(ob, mat=None, smooth=False):
+def finish(ob: Any, mat: Material | None = None, smooth: bool = False) -> Any:
     """Give an object its material, smoothness and a pass index of its own."""
     if mat is not None:
         ob.data.materials.append(mat)
@@ -172,7 +169,9 @@ def finish(ob, mat=None, smooth=False):
     return ob
 
 
-def mesh_object(name, verts, faces, mat, smooth=False, at=(0, 0, 0)):
+def mesh_object(
+    name: str, verts: list[Any], faces: list[Any], mat: Material, smooth: bool = False, at: Point = (0, 0, 0)
+) -> Any:
     mesh = bpy.data.meshes.new(name)
     mesh.from_pydata(verts, [], faces)
     mesh.validate()
@@ -182,16 +181,16 @@ def mesh_object(name, verts, faces, mat, smooth=False, at=(0, 0, 0)):
     return finish(ob, mat, smooth)
 
 
-def box(name, lo, hi, mat):
-    c = [(lo[i] + hi[i]) / 2 for i in range(3)]
+def box(name: str, lo: Point, hi: Point, mat: Material) -> Any:
+    c = ((lo[0] + hi[0]) / 2, (lo[1] + hi[1]) / 2, (lo[2] + hi[2]) / 2)
     h = [(hi[i] - lo[i]) / 2 for i in range(3)]
     verts = [(x * h[0], y * h[1], z * h[2]) for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
     faces = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
     return mesh_object(name, verts, faces, mat, at=c)
 
 
-def tube(name, points, radius, mat):
-    """A thin round wire through points."""
+def tube(name: str, points: list[Point], radius: float, mat: Material) -> Any:
+    """Make a thin round wire through points."""
     curve = bpy.data.curves.new(name, "CURVE")
     curve.dimensions, curve.bevel_depth, curve.bevel_resolution = "3D", radius, 2
     spline = curve.splines.new("POLY")
@@ -203,11 +202,12 @@ def tube(name, points, radius, mat):
     return finish(ob, mat)
 
 
-def cloth(name, mat, at, radius=0.56, drop=0.50):
-    """A round tablecloth: a flat top, a rounded edge and folds that grow towards the hem."""
+def cloth(name: str, mat: Material, at: Point, radius: float = 0.56, drop: float = 0.50) -> Any:
+    """Make a round tablecloth: a flat top, a rounded edge and folds that grow towards the hem."""
     n, rings = 220, 44
     total = radius + drop
-    verts, faces, flat = [(0, 0, 0)], [], [(0, 0)]  # flat: where the point lay before it was draped
+    verts: list[Point] = [(0, 0, 0)]
+    flat: list[tuple[float, float]] = [(0, 0)]  # where the point lay before it was draped
     for k in range(1, rings + 1):
         s = total * k / rings
         for j in range(n):
@@ -218,7 +218,7 @@ def cloth(name, mat, at, radius=0.56, drop=0.50):
             z = -hang * (1 - 0.03 * math.sin(5 * a)) - 0.012 * math.exp(-(((s - radius) / 0.03) ** 2))
             verts.append((r * math.cos(a), r * math.sin(a), z))
             flat.append((s * math.cos(a), s * math.sin(a)))
-    faces += [(0, 1 + j, 1 + (j + 1) % n) for j in range(n)]
+    faces: list[tuple[int, ...]] = [(0, 1 + j, 1 + (j + 1) % n) for j in range(n)]
     for k in range(rings - 1):
         for j in range(n):
             a, b = 1 + k * n + j, 1 + k * n + (j + 1) % n
@@ -230,8 +230,11 @@ def cloth(name, mat, at, radius=0.56, drop=0.50):
     return ob
 
 
-def grass(name, rng, mat, at, radius=0.13, count=260, height=0.52):
-    verts, faces = [], []
+def grass(
+    name: str, rng: random.Random, mat: Material, at: Point, radius: float, height: float, count: int = 260
+) -> Any:
+    verts: list[Any] = []
+    faces: list[Any] = []
     for _ in range(count):
         a, r = rng.uniform(0, 2 * math.pi), radius * math.sqrt(rng.random())
         base = Vector((r * math.cos(a), r * math.sin(a), 0))
@@ -247,21 +250,21 @@ def grass(name, rng, mat, at, radius=0.13, count=260, height=0.52):
     return mesh_object(name, verts, faces, mat, at=at)
 
 
-def sphere(name, radius, mat, at, segments=64):
+def sphere(name: str, radius: float, mat: Material, at: Point, segments: int = 64) -> Any:
     bpy.ops.mesh.primitive_uv_sphere_add(segments=segments, ring_count=segments // 2, radius=radius, location=at)
     ob = bpy.context.object
     ob.name = name
     return finish(ob, mat, smooth=True)
 
 
-def cone(name, r1, r2, depth, mat, at, cap="NGON"):
+def cone(name: str, r1: float, r2: float, depth: float, mat: Material, at: Point, cap: str = "NGON") -> Any:
     bpy.ops.mesh.primitive_cone_add(vertices=64, radius1=r1, radius2=r2, depth=depth, location=at, end_fill_type=cap)
     ob = bpy.context.object
     ob.name = name
     return finish(ob, mat)
 
 
-def label(text, size, mat, at, rotation=(90, 0, 0)):
+def label(text: str, size: float, mat: Material, at: Point, rotation: Point = (90, 0, 0)) -> Any:
     curve = bpy.data.curves.new("Text", "FONT")
     curve.body, curve.size, curve.align_x = text, size, "CENTER"
     ob = bpy.data.objects.new(f"Text {text}", curve)
@@ -271,7 +274,7 @@ def label(text, size, mat, at, rotation=(90, 0, 0)):
 
 
 # -------------------------------------------------------------------- scene
-def build_scene(seed, transparent=False, caustics=False):
+def build_scene(seed: int, transparent: bool = False, caustics: bool = False) -> Any:
     bpy.ops.wm.read_factory_settings(use_empty=True)
     _index[0] = 0
     rng = random.Random(seed)
@@ -288,14 +291,11 @@ def build_scene(seed, transparent=False, caustics=False):
         box("Back Wall", (-2.1, 2.2, 0), (4, 2.3, 3.4), wall)
         box("Skirting", (-4, 2.17, 0), (4, 2.2, 0.13), white)
     x0, x1, ya, yb, za, zb = -2.1, -2.0, 0.15, 1.75, 0.85, 2.35
-    for k, (lo, hi) in enumerate(
-        [
-            ((x0, -5, 0), (x1, ya, 3.4)),
-            ((x0, yb, 0), (x1, 2.2, 3.4)),
-            ((x0, ya, 0), (x1, yb, za)),
-            ((x0, ya, zb), (x1, yb, 3.4)),
-        ]
-    ):
+    parts = [
+        ((x0, -5, 0), (x1, ya, 3.4)), ((x0, yb, 0), (x1, 2.2, 3.4)),
+        ((x0, ya, 0), (x1, yb, za)), ((x0, ya, zb), (x1, yb, 3.4)),
+    ]  # fmt: skip
+    for k, (lo, hi) in enumerate(parts):
         if not (transparent and k == 0):
             box(f"Left Wall {k}", lo, hi, plaster)
     for k in range(1, 4):
@@ -307,18 +307,10 @@ def build_scene(seed, transparent=False, caustics=False):
     box("Sill", (x0, ya - 0.05, za - 0.04), (x1 + 0.14, yb + 0.05, za), white)
 
     # rug, pedestal with the head, table with cloth and glass ball
-    box(
-        "Rug",
-        (-1.45, -0.95, 0),
-        (0.55, 0.30, 0.012),
-        checker("Rug", rgb(0.60, 0.52, 0.40), rgb(0.13, 0.035, 0.04), 11.0, Roughness=0.95),
-    )
-    box(
-        "Pedestal",
-        (-1.02, 0.62, 0),
-        (-0.28, 1.30, 0.62),
-        checker("Marquetry", rgb(0.36, 0.20, 0.09), rgb(0.13, 0.06, 0.03), 9.0, Roughness=0.25),
-    )
+    rug = checker("Rug", rgb(0.60, 0.52, 0.40), rgb(0.13, 0.035, 0.04), 11.0, Roughness=0.95)
+    box("Rug", (-1.45, -0.95, 0), (0.55, 0.30, 0.012), rug)
+    marquetry = checker("Marquetry", rgb(0.36, 0.20, 0.09), rgb(0.13, 0.06, 0.03), 9.0, Roughness=0.25)
+    box("Pedestal", (-1.02, 0.62, 0), (-0.28, 1.30, 0.62), marquetry)
     gold = new_material("Gold", Base_Color=rgb(0.95, 0.56, 0.20), Metallic=1.0, Roughness=0.16)[0]
     bpy.ops.mesh.primitive_monkey_add(size=0.92, location=(-0.65, 0.93, 1.03))
     head = bpy.context.object
@@ -341,9 +333,8 @@ def build_scene(seed, transparent=False, caustics=False):
     cone("Pot", 0.13, 0.19, 0.30, pot, (1.62, 0.16, 0.15))
     blade, nt, bsdf = new_material("Grass", Base_Color=rgb(0.13, 0.36, 0.05), Roughness=0.5)
     tone = node(nt, "ShaderNodeTexNoise", Scale=9.0, Detail=2.0)
-    nt.links.new(
-        mix_colors(nt, tone.outputs[0], rgb(0.05, 0.20, 0.03), rgb(0.42, 0.50, 0.10)), bsdf.inputs["Base Color"]
-    )
+    green = mix_colors(nt, tone.outputs[0], rgb(0.05, 0.20, 0.03), rgb(0.42, 0.50, 0.10))
+    nt.links.new(green, bsdf.inputs["Base Color"])
     grass("Grass", rng, blade, (1.62, 0.16, 0.29), radius=0.16, height=0.60)
     bpy.ops.mesh.primitive_ico_sphere_add(subdivisions=3, radius=0.23, location=(-0.98, -0.30, 0.24))
     globe = bpy.context.object
@@ -355,15 +346,8 @@ def build_scene(seed, transparent=False, caustics=False):
     # pendant lamp: cable, shade, visible bulb, three stay wires
     lamp = Vector((0.10, 0.80, 1.98))
     tube("Cable", [(lamp.x, lamp.y, 3.4), (lamp.x, lamp.y, lamp.z + 0.16)], 0.006, dark)
-    cone(
-        "Shade",
-        0.26,
-        0.07,
-        0.20,
-        new_material("Shade", Base_Color=rgb(0.04, 0.20, 0.22), Roughness=0.3)[0],
-        lamp + Vector((0, 0, 0.06)),
-        cap="NOTHING",
-    )
+    shade = new_material("Shade", Base_Color=rgb(0.04, 0.20, 0.22), Roughness=0.3)[0]
+    cone("Shade", 0.26, 0.07, 0.20, shade, lamp + Vector((0, 0, 0.06)), cap="NOTHING")
     bulb, nt, bsdf = new_material("Bulb", Emission_Color=rgb(1.0, 0.72, 0.40), Emission_Strength=38.0)
     sphere("Bulb", 0.062, bulb, lamp - Vector((0, 0, 0.02)), segments=24)
     for k in range(3):
@@ -381,16 +365,10 @@ def build_scene(seed, transparent=False, caustics=False):
         x = 0.55
         while x < 1.86:
             w, h = rng.uniform(0.025, 0.065), rng.uniform(0.24, 0.40)
-            hue = rng.choice(
-                [
-                    (0.45, 0.08, 0.06),
-                    (0.08, 0.16, 0.34),
-                    (0.60, 0.47, 0.24),
-                    (0.10, 0.25, 0.14),
-                    (0.50, 0.50, 0.47),
-                    (0.62, 0.28, 0.06),
-                ]
-            )
+            hue = rng.choice([
+                (0.45, 0.08, 0.06), (0.08, 0.16, 0.34), (0.60, 0.47, 0.24),
+                (0.10, 0.25, 0.14), (0.50, 0.50, 0.47), (0.62, 0.28, 0.06),
+            ])  # fmt: skip
             mat = new_material("Book", Base_Color=rgb(*hue), Roughness=rng.uniform(0.25, 0.7))[0]
             book = box("Book", (x, 1.99 + rng.uniform(0, 0.03), 1.42), (x + w, 2.17, 1.42 + h), mat)
             bands = new_material("Band", Base_Color=rgb(0.75, 0.60, 0.25), Metallic=1.0, Roughness=0.3)[0]
@@ -400,7 +378,7 @@ def build_scene(seed, transparent=False, caustics=False):
             x += w + rng.uniform(0.002, 0.006)
 
     # light: a window-sized area light and the sun outside, a soft fill in front, the sky
-    def light(name, kind, energy, color, at, to, **attrs):
+    def light(name: str, kind: str, energy: float, color: Point, at: Point, to: Point, **attrs: Any) -> Any:
         data = bpy.data.lights.new(name, kind)
         data.energy, data.color = energy, color
         for key, value in attrs.items():
@@ -412,21 +390,10 @@ def build_scene(seed, transparent=False, caustics=False):
         ob.visible_camera = False
         return ob
 
-    light(
-        "Window",
-        "AREA",
-        85,
-        (0.82, 0.91, 1.0),
-        (-2.35, 0.95, 1.65),
-        (1, 0.2, 0.9),
-        shape="RECTANGLE",
-        size=1.5,
-        size_y=1.7,
-    )
+    window, fill = ({"shape": "RECTANGLE", "size": a, "size_y": b} for a, b in ((1.5, 1.7), (1.6, 1.2)))
+    light("Window", "AREA", 85, (0.82, 0.91, 1.0), (-2.35, 0.95, 1.65), (1, 0.2, 0.9), **window)
     light("Sun", "SUN", 11.0, (1.0, 0.84, 0.62), (-4, 1.85, 3.2), (0.2, -0.1, 0), angle=math.radians(0.8))
-    light(
-        "Fill", "AREA", 30, (1.0, 0.95, 0.88), (1.9, -3.4, 3.0), (0, 0.8, 0.7), shape="RECTANGLE", size=1.6, size_y=1.2
-    )
+    light("Fill", "AREA", 30, (1.0, 0.95, 0.88), (1.9, -3.4, 3.0), (0, 0.8, 0.7), **fill)
 
     world = bpy.data.worlds.new("Sky")
     scene.world = world
@@ -463,34 +430,18 @@ def build_scene(seed, transparent=False, caustics=False):
 
 
 # ------------------------------------------------------------------- render
-PASSES_LEAN = [
-    "z",
-    "normal",
-    "cryptomatte_object",
-    "diffuse_direct",
-    "diffuse_indirect",
-    "diffuse_color",
-    "glossy_direct",
-    "glossy_indirect",
-    "glossy_color",
-]
+def _components(*kinds: str) -> list[str]:
+    return [f"{kind}_{part}" for kind in kinds for part in ("direct", "indirect", "color")]
+
+
+PASSES_LEAN = ["z", "normal", "cryptomatte_object", *_components("diffuse", "glossy")]
 PASSES_ALL = [
-    *PASSES_LEAN,
-    "mist",
-    "vector",
-    "uv",
-    "position",
-    "object_index",
-    "material_index",
-    "transmission_direct",
-    "transmission_indirect",
-    "transmission_color",
-    "emit",
-    "environment",
-]
+    *PASSES_LEAN, "mist", "vector", "uv", "position", "object_index", "material_index", *_components("transmission"),
+    "emit", "environment",
+]  # fmt: skip
 
 
-def configure(scene, args):
+def configure(scene: Any, args: argparse.Namespace) -> None:
     scene.render.engine = "CYCLES"
     c = scene.cycles
     c.device = "CPU"
@@ -528,7 +479,9 @@ def configure(scene, args):
     layer.pass_cryptomatte_depth = 2 if args.lean else 4
 
 
-def render(scene, path, size, spp, seed, border=None, crop=False):
+def render(
+    scene: Any, path: Path, size: tuple[int, int], spp: int, seed: int, border: tuple[float, ...] | None, crop: bool
+) -> None:
     r = scene.render
     r.resolution_x, r.resolution_y = size
     r.use_border, r.use_crop_to_border = border is not None, crop
@@ -542,11 +495,11 @@ def render(scene, path, size, spp, seed, border=None, crop=False):
     print(f"{path.name}: {size[0]}x{size[1]}, {spp} spp, seed {seed}, {took:.1f} s", flush=True)
 
 
-def parse(argv):
-    def size(text):
+def parse(argv: list[str]) -> argparse.Namespace:
+    def size(text: str) -> tuple[int, ...]:
         return tuple(int(v) for v in text.lower().split("x"))
 
-    def border(text):
+    def border(text: str) -> tuple[float, ...]:
         return tuple(float(v) for v in text.split(","))
 
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -576,7 +529,7 @@ def parse(argv):
     return p.parse_args(argv)
 
 
-def main(argv):
+def main(argv: list[str]) -> None:
     args = parse(argv)
     args.out.mkdir(parents=True, exist_ok=True)
     scene = build_scene(args.seed, args.transparent, args.caustics)
@@ -589,15 +542,8 @@ def main(argv):
     jobs = [("hr", (w, h), args.hr_spp, 1), ("lr", low, args.lr_spp, 2), ("ref", (w, h), args.ref_spp, 3)]
     for name, size, spp, offset in jobs:
         if name in wanted and spp > 0:
-            render(
-                scene,
-                args.out.resolve() / f"{name}{args.suffix}.exr",
-                size,
-                spp,
-                1000 * args.seed + offset,
-                args.border,
-                args.crop,
-            )
+            path = args.out.resolve() / f"{name}{args.suffix}.exr"
+            render(scene, path, size, spp, 1000 * args.seed + offset, args.border, args.crop)
 
 
 if __name__ == "__main__":

@@ -23,14 +23,7 @@ _ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most ren
 # reference below the second PSNR is not used. Training references may be noisy: their noise has zero mean, and many
 # scenes help more than clean ones. Validation and test references must be clean.
 _REFERENCE = {"train": (24.0, 20.0, 2), "validation": (28.0, 20.0, 4), "test": (40.0, 30.0, 12)}
-_LIGHT_PASSES = (
-    "diffuse_direct",
-    "diffuse_indirect",
-    "diffuse_color",
-    "glossy_direct",
-    "glossy_indirect",
-    "glossy_color",
-)
+_LIGHT_PASSES = [f"{kind}_{part}" for kind in ("diffuse", "glossy") for part in ("direct", "indirect", "color")]
 _FILTERS = {"BOX": "box", "BLACKMAN_HARRIS": "blackman-harris"}
 
 
@@ -87,11 +80,11 @@ class Renderer:
         buffer = oiio.ImageBuf(str(self._file))
         if buffer.has_error:
             raise RuntimeError(f"Cycles wrote no image: {buffer.geterror()}")
-        pixels = np.nan_to_num(buffer.get_pixels(oiio.FLOAT), nan=0.0, posinf=0.0, neginf=0.0)
-        found: dict[str, list[int]] = {}
+        pixels = np.nan_to_num(np.asarray(buffer.get_pixels(oiio.FLOAT)), nan=0.0, posinf=0.0, neginf=0.0)
+        layers: dict[str, list[int]] = {}
         for i, channel in enumerate(buffer.spec().channelnames):
-            found.setdefault(channel.split(".")[-2], []).append(i)
-        return {name: pixels[..., channels] for name, channels in found.items()}
+            layers.setdefault(channel.split(".")[-2], []).append(i)
+        return {name: pixels[..., channels] for name, channels in layers.items()}
 
 
 def features(layers: dict[str, np.ndarray]) -> np.ndarray:
@@ -130,9 +123,8 @@ def _reference(
     halves, done = np.zeros((2, views.SIZE, views.SIZE, 3)), 0
     while True:
         for half in range(2):
-            halves[half] += (
-                spp / 2 * _color(renderer.render(views.SIZE, spp // 2, int(rng.integers(2**31)), pixel_filter))
-            )
+            layers = renderer.render(views.SIZE, spp // 2, int(rng.integers(2**31)), pixel_filter)
+            halves[half] += spp / 2 * _color(layers)
         done += spp
         psnr = quality.psnr_of_mean(*halves * (2 / done))
         if psnr > good or done >= steps * spp:
@@ -140,20 +132,15 @@ def _reference(
 
 
 def render_view(
-    renderer: Renderer,
-    stage: scenes.Stage,
-    camera: dict[str, object],
-    seed: int,
-    view: int,
-    ref_spp: int,
-    filter_name: str | None,
-) -> dict[str, np.ndarray] | None:
+    renderer: Renderer, stage: scenes.Stage, camera: dict[str, object],
+    seed: int, view: int, ref_spp: int, filter_name: str | None,
+) -> dict[str, np.ndarray] | None:  # fmt: skip
     """Render all arrays of one view, see :mod:`research.datagen.views`; None if the reference stays too noisy."""
     rng = np.random.default_rng([seed, view, 7])
     pixel_filter = "BLACKMAN_HARRIS" if seed % 4 == 3 else "BOX"
     lr_filter = "BOX"
     if filter_name is not None:
-        pixel_filter = lr_filter = next(each for each, name in _FILTERS.items() if name == filter_name)
+        pixel_filter = lr_filter = next(kind for kind, name in _FILTERS.items() if name == filter_name)
     # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
     scales = (1,) if lr_filter == "BOX" else SCALES
 
@@ -174,27 +161,18 @@ def render_view(
     samples = scales[0] ** 2 * sum(views.LR_SPP)
     if quality.psnr_of_mean(first, passes[-1]) + 10 * np.log10(steps * ref_spp / samples) < worst:
         return None
-    found = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
-    if found is None:
+    reference = _reference(renderer, rng, ref_spp, pixel_filter, good, worst, steps)
+    if reference is None:
         return None
-    ref, spent, psnr = found
+    ref, spent, psnr = reference
     renderer.layers(True)
     hr = np.stack([features(renderer.render(views.SIZE, 1, some_seed(), pixel_filter)) for _ in range(views.HR_PASSES)])
     meta = {
-        "seed": f"cycles-{seed}",
-        "view": view,
-        "split": views.split_of(seed),
-        "generator": scenes.VERSION,
-        "kind": stage.kind,
-        "renderer": f"Blender {bpy.app.version_string} Cycles",
-        **renderer.settings,
-        "filter": _FILTERS[pixel_filter],
-        "lr_filter": _FILTERS[lr_filter],
-        "ref_spp": spent,
-        "ref_psnr": psnr,
-        "assets": sorted(stage.sources),
-        "camera": camera,
-    }
+        "seed": f"cycles-{seed}", "view": view, "split": views.split_of(seed), "generator": scenes.VERSION,
+        "kind": stage.kind, "renderer": f"Blender {bpy.app.version_string} Cycles", **renderer.settings,
+        "filter": _FILTERS[pixel_filter], "lr_filter": _FILTERS[lr_filter], "ref_spp": spent, "ref_psnr": psnr,
+        "assets": sorted(stage.sources), "camera": camera,
+    }  # fmt: skip
     return views.pack(hr, lr, ref, rng, meta)
 
 

@@ -31,8 +31,12 @@ def _size(rng: Rng, low: float = 3.0, high: float = 7.0) -> tuple[float, float, 
     return rng.uniform(low, high), rng.uniform(low, high), rng.uniform(2.3, 3.6)
 
 
+def _glow(s: Stage, hue: float, low: float, high: float) -> mat.Material:
+    return mat.lamp(s.tint(hue) * log_uniform(s.rng, low, high))
+
+
 def daylight(s: Stage) -> None:
-    """A closed room lit by sun and sky through small openings."""
+    """Build a closed room lit by sun and sky through small openings."""
     rng = s.rng
     s.room(_size(rng), int(rng.integers(2, 8)), 0.75)
     s.sky(log_uniform(rng, 0.5, 3), 0.3, 0.7)
@@ -45,7 +49,7 @@ def daylight(s: Stage) -> None:
 
 
 def lamps(s: Stage) -> None:
-    """A room without daylight: one to three difficult lamps."""
+    """Build a room without daylight: one to three difficult lamps."""
     rng = s.rng
     s.room(_size(rng), 0)
     s.furnish(int(rng.integers(3, 9)))
@@ -84,7 +88,7 @@ def glassware(s: Stage) -> None:
 
 
 def corridor(s: Stage) -> None:
-    """A long room with columns, its only light at the far end, round a corner or through a slit."""
+    """Build a long room with columns, its only light at the far end, round a corner or through a slit."""
     rng = s.rng
     length, width = rng.uniform(6, 12), rng.uniform(1.6, 3.5)
     s.room((width, length, rng.uniform(2.4, 4)), int(rng.integers(0, 3)), 0.8)
@@ -93,14 +97,12 @@ def corridor(s: Stage) -> None:
     for y in np.arange(-length / 2 + 1, length / 2 - 0.5, rng.uniform(0.8, 2)):
         r = rng.uniform(0.06, 0.2)
         for x in (-width / 2 + 0.3, width / 2 - 0.3):
-            s.add(
-                geo.cylinder(r, s.bounds[1][2]) if chance(rng, 0.5) else geo.block(2 * r, 2 * r, s.bounds[1][2]),
-                material,
-                (x, y, 0),
-            )
+            high = s.corners[1][2]
+            column = geo.cylinder(r, high) if chance(rng, 0.5) else geo.block(2 * r, 2 * r, high)
+            s.add(column, material, (x, y, 0))
         s.focus.append(np.array([0, y, rng.uniform(0.3, 1.5)]))
     end = np.array([rng.uniform(-0.5, 0.5), (length / 2 - 0.4) * rng.choice([-1, 1]), rng.uniform(0.3, 2)])
-    wall = geo.box((-width * 0.35, -0.05, 0), (width * 0.35, 0.05, s.bounds[1][2] * rng.uniform(0.7, 1)))
+    wall = geo.box((-width * 0.35, -0.05, 0), (width * 0.35, 0.05, s.corners[1][2] * rng.uniform(0.7, 1)))
     s.add(wall, material, (rng.choice([-1, 1]) * width * 0.2, end[1] * 0.8, 0))
     s.lamp("POINT", end, log_uniform(rng, 60, 400), s.tint(), shadow_soft_size=log_uniform(rng, 0.01, 0.2))
     for _ in range(rng.integers(3, 9)):
@@ -117,28 +119,21 @@ def outdoors(s: Stage) -> None:
     s.sky(1.0, 0.45)
     n = 120
     x, y = np.meshgrid(np.linspace(-15, 15, n), np.linspace(-15, 15, n), indexing="ij")
-    height = (
-        0.25 * rng.random() * sum(np.sin(x * a + b) * np.sin(y * c + d) for a, b, c, d in rng.uniform(0.2, 2, (4, 4)))
-    )
+    low = 0.25 * rng.random()
+    height = low * sum(np.sin(x * a + b) * np.sin(y * c + d) for a, b, c, d in rng.uniform(0.2, 2, (4, 4)))
     s.add(geo.surface(np.stack([x, y, height], -1), np.stack([x, y], -1)), mat.paint(rng, 0.1, log_uniform(rng, 1, 10)))
 
     def ground(px: float, py: float) -> float:
-        return float(
-            height[int(np.clip((px + 15) / 30 * (n - 1), 0, n - 1)), int(np.clip((py + 15) / 30 * (n - 1), 0, n - 1))]
-        )
+        row, column = (int(np.clip((position + 15) / 30 * (n - 1), 0, n - 1)) for position in (px, py))
+        return float(height[row, column])
 
     if chance(rng, 0.65):
         roots = np.c_[rng.normal(size=(250, 2)) * 0.25, np.zeros(250)]
-        tuft = blender_mesh(
-            geo.blades(rng, roots, rng.uniform(0.08, 0.5), rng.uniform(0.004, 0.02), rng.uniform(0.1, 0.8))
-        )
-        material = mat.leaf(rng)
+        blades = geo.blades(rng, roots, rng.uniform(0.08, 0.5), rng.uniform(0.004, 0.02), rng.uniform(0.1, 0.8))
+        tuft, material = blender_mesh(blades), mat.leaf(rng)
         for px, py in rng.normal(size=(int(rng.integers(60, 250)), 2)) * rng.uniform(1, 3.5):
-            s.place(
-                tuft,
-                material,
-                Matrix.Translation((px, py, ground(px, py))) @ Matrix.Rotation(rng.uniform(0, 6.3), 4, "Z"),
-            )
+            turn = Matrix.Rotation(rng.uniform(0, 6.3), 4, "Z")
+            s.place(tuft, material, Matrix.Translation((px, py, ground(px, py))) @ turn)
     for _ in range(rng.integers(0, 3)):
         tall = rng.uniform(1.5, 5)
         trunk, tips = geo.branching(rng, tall, 0.03 * tall, 3)
@@ -147,11 +142,8 @@ def outdoors(s: Stage) -> None:
         centres = np.repeat(tips, 5, 0) + rng.normal(size=(5 * len(tips), 3)) * 0.15
         crown = blender_mesh(geo.leaves(rng, centres, rng.uniform(0.05, 0.25)))
         for px, py in rng.normal(size=(int(rng.integers(1, 5)), 2)) * 3.5:
-            spin = (
-                Matrix.Translation((px, py, ground(px, py)))
-                @ Matrix.Rotation(rng.uniform(0, 6.3), 4, "Z")
-                @ Matrix.Scale(rng.uniform(0.6, 1.2), 4)
-            )
+            turn = Matrix.Rotation(rng.uniform(0, 6.3), 4, "Z") @ Matrix.Scale(rng.uniform(0.6, 1.2), 4)
+            spin = Matrix.Translation((px, py, ground(px, py))) @ turn
             s.place(wood, bark, spin)
             s.place(crown, green, spin)
             s.focus.append(np.array([px, py, tall * rng.uniform(0.2, 0.7)]))
@@ -159,13 +151,8 @@ def outdoors(s: Stage) -> None:
         p, length, angle = rng.normal(size=2) * 3, rng.uniform(2, 6), rng.uniform(0, 6.3)
         at = (*p, ground(*p))
         if chance(rng, 0.6):
-            fence = geo.bars(
-                length,
-                rng.uniform(0.5, 1.5),
-                int(length / rng.uniform(0.04, 0.2)),
-                log_uniform(rng, 0.006, 0.03),
-                chance(rng, 0.3),
-            )
+            fence = geo.bars(length, rng.uniform(0.5, 1.5), int(length / rng.uniform(0.04, 0.2)),
+                             log_uniform(rng, 0.006, 0.03), chance(rng, 0.3))  # fmt: skip
             s.add(fence.moved(-length / 2, 0, 0).turned(angle), mat.thing(rng, 0.5, 0.4, 0.0), at)
         else:
             house = geo.wall(length, rng.uniform(1.8, 4), 0.25, [(length * 0.3, 0.6, length * 0.6, 1.5)])
@@ -196,26 +183,15 @@ def street(s: Stage) -> None:
             w, h, d = rng.uniform(2, 5), rng.uniform(3, 9), rng.uniform(2, 4)
             x = side * (rng.uniform(2.0, 3.5) + d / 2)
             s.add(geo.block(d, w, h), mat.paint(rng, 0.2, 1.2), (x, y + w / 2, 0))
-            glow = (
-                mat.screen(rng, log_uniform(rng, 0.5, 8))
-                if chance(rng, 0.3)
-                else mat.lamp(s.tint(0.2) * log_uniform(rng, 0.5, 8))
-            )
+            shows = chance(rng, 0.3)
+            glow = mat.screen(rng, log_uniform(rng, 0.5, 8)) if shows else _glow(s, 0.2, 0.5, 8)
             dark = mat.coated(rng, 3)
             face = x - side * (d / 2 + 0.01)
             for z in np.arange(0.5, h - 1, rng.uniform(1.2, 2.2)):
                 for k in np.arange(0.3, w - 0.8, rng.uniform(0.7, 1.5)):
-                    corners = np.array(
-                        [
-                            [
-                                [face, y + k, z],
-                                [face, y + k + 0.5, z],
-                                [face, y + k + 0.5, z + 0.8],
-                                [face, y + k, z + 0.8],
-                            ]
-                        ]
-                    )
-                    s.add(geo.quads(corners), glow if chance(rng, 0.3) else dark)
+                    a, b = y + k, y + k + 0.5
+                    corners = [[face, a, z], [face, b, z], [face, b, z + 0.8], [face, a, z + 0.8]]
+                    s.add(geo.quads(np.array([corners])), glow if chance(rng, 0.3) else dark)
             s.focus.append(np.array([face, y + w / 2, rng.uniform(0.5, 3)]))
             y += w + (rng.uniform(0.3, 2) if chance(rng, 0.4) else 0.02)
     for _ in range(rng.integers(1, 5)):
@@ -230,28 +206,17 @@ def street(s: Stage) -> None:
 
 
 def studio(s: Stage) -> None:
-    """An easy scene: objects on a ground under softboxes or an open environment."""
+    """Build an easy scene: objects on a ground under softboxes or an open environment."""
     rng = s.rng
     x, t = np.meshgrid(np.linspace(-8, 8, 20), np.linspace(0, 1, 60), indexing="ij")
-    profile_y, profile_z = (
-        np.interp(t, [0, 0.6, 0.75, 1], [-6, 3, 4, 4.2]),
-        np.interp(t, [0, 0.6, 0.75, 1], [0, 0, 0.8, 6]),
-    )
+    profile_y, profile_z = (np.interp(t, [0, 0.6, 0.75, 1], ends) for ends in ([-6, 3, 4, 4.2], [0, 0, 0.8, 6]))
     s.add(geo.surface(np.stack([x, profile_y, profile_z], -1), np.stack([x, t * 12], -1)), mat.paint(rng, 0.6, 1))
     s.sky(log_uniform(rng, 0.05, 1), 0.8, 0.3)
     for _ in range(rng.integers(1, 4)):
         a = rng.uniform(0, 6.3)
         at = np.array([math.cos(a) * 2.5, math.sin(a) * 2.5, rng.uniform(1.5, 3.5)])
-        s.lamp(
-            "AREA",
-            at,
-            log_uniform(rng, 50, 400),
-            s.tint(0.15),
-            np.array([0, 0, 0.3]),
-            shape="RECTANGLE",
-            size=rng.uniform(0.3, 2),
-            size_y=rng.uniform(0.3, 2),
-        )
+        s.lamp("AREA", at, log_uniform(rng, 50, 400), s.tint(0.15), np.array([0, 0, 0.3]),
+               shape="RECTANGLE", size=rng.uniform(0.3, 2), size_y=rng.uniform(0.3, 2))  # fmt: skip
     for _ in range(rng.integers(4, 14)):
         s.put(np.array([*rng.normal(size=2) * 0.6, 0]), rng.uniform(0.15, 0.7), 0.3, 0.12)
     if chance(rng, 0.5):
@@ -260,37 +225,33 @@ def studio(s: Stage) -> None:
 
 
 def abstract(s: Stage) -> None:
-    """A swarm of floating copies of a few shapes, as in motion graphics."""
+    """Build a swarm of floating copies of a few shapes, as in motion graphics."""
     rng = s.rng
     s.sky(log_uniform(rng, 0.02, 1), 0.7, 0.5)
     meshes = [
         geo.block(1, 1, 1),
         geo.sphere(0.5, 24),
         geo.torus(0.4, 0.1),
-        geo.knot(rng, 1.0),
+        geo.knot(rng, 1),
         geo.cylinder(0.1, 1.5, 12),
     ]
     for _ in range(rng.integers(2, 5)):
         data = blender_mesh(meshes[rng.integers(len(meshes))].fitted(1.0))
         kind = rng.random()
-        material = mat.lamp(s.tint(0.5) * log_uniform(rng, 1, 50)) if kind < 0.2 else mat.thing(rng, 0.2, 0.3, 0.2)
+        material = _glow(s, 0.5, 1, 50) if kind < 0.2 else mat.thing(rng, 0.2, 0.3, 0.2)
         spread, size = rng.uniform(0.3, 2, 3), log_uniform(rng, 0.04, 0.4)
         for i in range(int(rng.integers(20, 200))):
             p = rng.normal(size=3) * spread
             turn = Matrix(geo.random_rotation(rng).tolist()).to_4x4()
-            o = s.place(
-                data,
-                material,
-                Matrix.Translation(Vector(p + (0, 0, 1.2))) @ turn @ Matrix.Scale(size * rng.uniform(0.4, 1.3), 4),
-            )
+            turn = turn @ Matrix.Scale(size * rng.uniform(0.4, 1.3), 4)
+            o = s.place(data, material, Matrix.Translation(Vector(p + (0, 0, 1.2))) @ turn)
             if i < 15:
                 s.movers.append(o)
                 s.focus.append(p + (0, 0, 1.2))
     for _ in range(rng.integers(1, 4)):
         at = rng.normal(size=3) * 2 + (0, 0, 3)
-        s.lamp(
-            "AREA" if chance(rng, 0.5) else "POINT", at, log_uniform(rng, 50, 500), s.tint(0.4), np.array([0, 0, 1.2])
-        )
+        kind_of_lamp = "AREA" if chance(rng, 0.5) else "POINT"
+        s.lamp(kind_of_lamp, at, log_uniform(rng, 50, 500), s.tint(0.4), np.array([0, 0, 1.2]))
     if chance(rng, 0.6):
         s.add(geo.rectangle(30, 30), mat.paint(rng, 0.3, 1), (0, 0, -1.5 * rng.random()))
 
@@ -366,10 +327,8 @@ def aim(stage: Stage, rng: Rng) -> dict[str, object]:
     lens.dof.focus_distance = distance * rng.uniform(0.7, 1.3)
     lens.dof.aperture_fstop = lens.lens * 1e-3 / (2 * aperture)
     lens.dof.aperture_blades = int(rng.choice([0, 0, 5, 6, 8]))
+    aperture = aperture if lens.dof.use_dof else 0.0
+    focus = lens.dof.focus_distance
     return {
-        "origin": origin.tolist(),
-        "target": target.tolist(),
-        "fov": angle,
-        "aperture": aperture if lens.dof.use_dof else 0.0,
-        "focus": lens.dof.focus_distance,
-    }
+        "origin": origin.tolist(), "target": target.tolist(), "fov": angle, "aperture": aperture, "focus": focus
+    }  # fmt: skip

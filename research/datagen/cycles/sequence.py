@@ -16,9 +16,13 @@ import math
 import time
 import zlib
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import OpenImageIO as oiio
+
+if TYPE_CHECKING:
+    import bpy
 
 #: Width and height; multiples of every scale.
 SIZE = (320, 180)
@@ -29,8 +33,8 @@ TRUCK, SLIDE, TURN = 0.035, -0.05, 0.05
 
 def material(
     name: str, kind: str, scale: float, colours: tuple[tuple[float, ...], tuple[float, ...]], roughness: float
-):
-    """A procedural texture of two colours."""
+) -> Any:
+    """Make a procedural texture of two colours."""
     import bpy
 
     made = bpy.data.materials.new(name)
@@ -95,7 +99,7 @@ def build() -> None:
 
 
 def set_up(threads: int) -> None:
-    """Settings that all files share."""
+    """Set what all files share."""
     import bpy
 
     scene = bpy.context.scene

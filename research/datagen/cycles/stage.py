@@ -38,12 +38,18 @@ class Stage:
         self.caustics = chance(rng, 0.25)
         self.scene = bpy.context.scene
 
+    @property
+    def corners(self) -> tuple[np.ndarray, np.ndarray]:
+        """Lowest and highest corner (3,) of the room."""
+        assert self.bounds is not None
+        return self.bounds
+
     # -- building blocks ---------------------------------------------------------------------------
 
     def place(
         self, data: bpy.types.ID, material: Material | None = None, matrix: Matrix | None = None
     ) -> bpy.types.Object:
-        """An object of a mesh, curve or light; several objects may share the data."""
+        """Add an object of a mesh, curve or light; several objects may share the data."""
         o = bpy.data.objects.new(data.name, data)
         if material is not None and not data.materials:
             data.materials.append(material)
@@ -57,7 +63,7 @@ class Stage:
 
     def lamp(self, kind: str, at: np.ndarray, energy: float, color: np.ndarray, target: np.ndarray | None = None,
              **attributes: object) -> bpy.types.Object:  # fmt: skip
-        """A light of Blender's: POINT, SPOT and AREA in watts, SUN in watts a square metre."""
+        """Add a light of Blender's: POINT, SPOT and AREA in watts, SUN in watts a square metre."""
         data = bpy.data.lights.new(kind.lower(), kind)
         data.energy, data.color = float(energy), [float(c) for c in color]
         for name, value in attributes.items():
@@ -67,13 +73,13 @@ class Stage:
         return self.place(data, matrix=matrix)
 
     def emitter(self, mesh: Mesh, power: float, color: np.ndarray, at: np.ndarray | tuple = (0, 0, 0)) -> None:
-        """A glowing mesh; `power` spreads over its surface, so that small ones are bright."""
+        """Add a glowing mesh; `power` spreads over its surface, so that small ones are bright."""
         corners = mesh.v[mesh.f]
         area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
         self.add(mesh, mat.lamp(color * power / max(float(area), 1e-6)), at)
 
     def tint(self, hue: float = 0.2) -> np.ndarray:
-        """The colour of a light: warm or cold white, or any hue with probability `hue`."""
+        """Draw the colour of a light: warm or cold white, or any hue with probability `hue`."""
         rng = self.rng
         if chance(rng, hue):
             return tex.color(rng, 0.6, 1.0)
@@ -82,7 +88,7 @@ class Stage:
     # -- surroundings ------------------------------------------------------------------------------
 
     def sky(self, strength: float = 1.0, hdri: float = 0.4, sun: float = 0.75) -> None:
-        """A world: an HDRI, or Blender's sky or a gradient with a sun lamp."""
+        """Add a world: an HDRI, or Blender's sky or a gradient with a sun lamp."""
         rng = self.rng
         world = bpy.data.worlds.new("world")
         self.scene.world = world
@@ -136,16 +142,10 @@ class Stage:
         rng = self.rng
         self.focus.append(np.asarray(at, float) + (0, 0, size * 0.4))
         makers: dict[Callable[[np.ndarray, float], None], float] = {
-            self._fur: 0.06,
-            self._wires: 0.07,
-            self._cage: 0.06,
-            self._plant: 0.12,
-            self._heap: 0.06,
-            self._letters: 0.05,
-            self._chain: 0.04,
-            self._candle: 0.04,
+            self._fur: 0.06, self._wires: 0.07, self._cage: 0.06, self._plant: 0.12, self._heap: 0.06,
+            self._letters: 0.05, self._chain: 0.04, self._candle: 0.04,
             self._model: 0.14 if self.assets.models else 0,
-        }
+        }  # fmt: skip
         pick = rng.random()
         for make, share in makers.items():
             pick -= share
@@ -191,7 +191,7 @@ class Stage:
         self.movers.append(o)
 
     def _fur(self, at: np.ndarray, size: float) -> None:
-        """A ball with hair: curves, as Cycles has them."""
+        """Add a ball with hair: curves, as Cycles has them."""
         rng = self.rng
         count, steps = int(rng.integers(1500, 8000)), 6
         out = geo.unit(rng.normal(size=(count, 3)))
@@ -205,28 +205,28 @@ class Stage:
         self.add(geo.sphere(r).moved(0, 0, size / 2), mat.paint(rng, 0.8), at)
 
     def _wires(self, at: np.ndarray, size: float) -> None:
-        """A tangle of thin cable."""
+        """Add a tangle of thin cable."""
         rng = self.rng
         material = mat.thing(rng, size, 0.5, 0.0)
         radius = size * log_uniform(rng, 0.002, 0.015)
         parts = []
         for _ in range(rng.integers(3, 14)):
             t = np.linspace(0, 1, 60)[:, None]
-            path = sum(rng.normal(size=3) * np.sin(t * rng.uniform(1, 14) + rng.uniform(0, 6)) for _ in range(4)) * 0.14
+            waves = [rng.normal(size=3) * np.sin(t * rng.uniform(1, 14) + rng.uniform(0, 6)) for _ in range(4)]
+            path = np.sum(waves, axis=0) * 0.14
             path[:, 2] = np.abs(path[:, 2]) + radius / size
             parts.append(geo.tube(path * size, radius, 6))
         self.add(geo.merge(parts), material, at)
 
     def _cage(self, at: np.ndarray, size: float) -> None:
-        """A wire frame around something."""
+        """Add a wire frame around something."""
         rng = self.rng
         box = bmesh.new()
         if chance(rng, 0.5):
             bmesh.ops.create_icosphere(box, subdivisions=int(rng.integers(2, 4)), radius=0.5)
         else:
-            bmesh.ops.create_uvsphere(
-                box, u_segments=int(rng.integers(8, 32)), v_segments=int(rng.integers(5, 20)), radius=0.5
-            )
+            segments = {"u_segments": int(rng.integers(8, 32)), "v_segments": int(rng.integers(5, 20))}
+            bmesh.ops.create_uvsphere(box, radius=0.5, **segments)
         o = self.place(from_bmesh(box, False), mat.thing(rng, size, 0.6, 0.0))
         o.modifiers.new("wires", "WIREFRAME").thickness = log_uniform(rng, 0.006, 0.03)
         o.matrix_world = Matrix.Translation(Vector(at + (0, 0, size / 2))) @ Matrix.Scale(size, 4)
@@ -261,23 +261,18 @@ class Stage:
             spread = rng.normal(size=2) * size * 0.3
             height = max(0.0, size * 0.3 - np.hypot(*spread) * 0.7) * rng.random()
             turn = Matrix(geo.random_rotation(rng).tolist()).to_4x4()
-            o = self.place(
-                data, material, Matrix.Translation(Vector((*(at[:2] + spread), at[2] + height + small * 0.45))) @ turn
-            )
+            lift = Matrix.Translation(Vector((*(at[:2] + spread), at[2] + height + small * 0.45)))
+            o = self.place(data, material, lift @ turn)
             if i < 3:
                 self.movers.append(o)
 
     def _letters(self, at: np.ndarray, size: float) -> None:
         rng = self.rng
         curve = bpy.data.curves.new("letters", "FONT")
-        curve.body = "".join(
-            rng.choice(list("ABCDEFGHKLMNOPRSTUXYZabdefghkmrstxz23456789&?!"), int(rng.integers(1, 7)))
-        )
-        curve.size, curve.extrude, curve.bevel_depth = (
-            size * rng.uniform(0.5, 1.2),
-            size * rng.uniform(0.02, 0.15),
-            size * 0.01,
-        )
+        letters = list("ABCDEFGHKLMNOPRSTUXYZabdefghkmrstxz23456789&?!")
+        curve.body = "".join(rng.choice(letters, int(rng.integers(1, 7))))
+        curve.size, curve.extrude = size * rng.uniform(0.5, 1.2), size * rng.uniform(0.02, 0.15)
+        curve.bevel_depth = size * 0.01
         turn = Matrix.Rotation(rng.uniform(0, 6.3), 4, "Z") @ Matrix.Rotation(math.pi / 2, 4, "X")
         self.place(curve, mat.thing(rng, size, 0.35, 0.05), Matrix.Translation(Vector(at)) @ turn)
 
@@ -373,7 +368,7 @@ class Stage:
             self.tops.append((at + (0, 0, h), w * 0.35, d * 0.35))
 
     def _seat(self, spin: Matrix) -> None:
-        """A sofa or chair of soft blocks on thin legs."""
+        """Add a sofa or chair of soft blocks on thin legs."""
         rng = self.rng
         w, material = rng.uniform(0.5, 2.0), mat.cloth(rng, 6)
         blocks = [((0, 0, 0.4), (w, 0.7, 0.25)), ((0, 0.3, 0.65), (w, 0.2, 0.6)), ((-w / 2, 0, 0.5), (0.15, 0.7, 0.4)),
@@ -404,7 +399,7 @@ class Stage:
     # -- rooms -------------------------------------------------------------------------------------
 
     def room(self, size: tuple[float, float, float], openings: int, light_paint: float = 0.65) -> None:
-        """A closed box of walls around the origin; `openings` are cut out at random."""
+        """Add a closed box of walls around the origin; `openings` are cut out at random."""
         rng, t = self.rng, 0.2
         w, d, h = size
         self.bounds = np.array([-w / 2, -d / 2, 0]), np.array([w / 2, d / 2, h])
@@ -447,7 +442,7 @@ class Stage:
             self.add(geo.box((-w / 2, -d / 2, 0), (-w / 2 + 0.02, d / 2, 0.12)), material)
 
     def _dress(self, spin: Matrix, w: float, h: float, material: Material) -> None:
-        """What hangs in a window: blinds, bars, a pane, a curtain."""
+        """Hang something in a window: blinds, bars, a pane, a curtain."""
         rng, kind = self.rng, self.rng.random()
         if kind < 0.25:
             tilt = geo.rotation((1, 0, 0), rng.uniform(-1.2, 1.2))
@@ -473,20 +468,19 @@ class Stage:
             data.shape, data.size, data.size_y = "RECTANGLE", w, h
             data.cycles.is_portal = True
             # Area lights face -z; the room lies in the wall's +y.
-            self.place(
-                data, None, corner @ Matrix.Translation((w / 2, -0.05, h / 2)) @ Matrix.Rotation(math.pi / 2, 4, "X")
-            )
+            turn = Matrix.Rotation(math.pi / 2, 4, "X")
+            self.place(data, None, corner @ Matrix.Translation((w / 2, -0.05, h / 2)) @ turn)
 
     def spot(self, low: float = 0.0, high: float = 0.0, margin: float = 0.12) -> np.ndarray:
-        """A point in the room, its height between two shares of the room's."""
-        a, b = self.bounds
+        """Draw a point in the room, its height between two shares of the room's."""
+        a, b = self.corners
         p = self.rng.uniform(a + (b - a) * margin, b - (b - a) * margin)
         p[2] = b[2] * self.rng.uniform(low, high)
         return p
 
     def furnish(self, pieces: int) -> None:
         rng = self.rng
-        a, b = self.bounds
+        a, b = self.corners
         taken: list[np.ndarray] = []
         for _ in range(pieces * 5):
             if len(taken) == pieces:
@@ -506,20 +500,15 @@ class Stage:
         if chance(rng, 0.3):
             self._rug()
         if chance(rng, 0.25):
-            rail = geo.bars(
-                rng.uniform(1, 2.5),
-                rng.uniform(0.6, 1.2),
-                int(rng.integers(8, 50)),
-                log_uniform(rng, 0.005, 0.02),
-                chance(rng, 0.3),
-            )
+            rail = geo.bars(rng.uniform(1, 2.5), rng.uniform(0.6, 1.2), int(rng.integers(8, 50)),
+                            log_uniform(rng, 0.005, 0.02), chance(rng, 0.3))  # fmt: skip
             self.add(rail.turned(rng.uniform(0, 6.3)), mat.thing(rng, 0.3, 0.6, 0.0), self.spot())
         if chance(rng, 0.2):
             column = geo.cylinder(rng.uniform(0.08, 0.25), b[2], 40)
             self.add(column, mat.paint(rng, 0.3, 2), self.spot())
 
     def _rug(self) -> None:
-        """A rug with a pile of hair."""
+        """Add a rug with a pile of hair."""
         rng = self.rng
         w, d = rng.uniform(0.8, 2.2, 2)
         at, count = self.spot() + (0, 0, 0.004), 9000
@@ -532,7 +521,7 @@ class Stage:
 
     def hang_picture(self) -> None:
         rng = self.rng
-        low, high = self.bounds
+        low, high = self.corners
         a, b = rng.uniform(0.25, 1.1, 2)
         side = int(rng.integers(4))
         length, depth = ((high - low)[0], (high - low)[1]) if side % 2 == 0 else ((high - low)[1], (high - low)[0])
@@ -543,20 +532,19 @@ class Stage:
         face = geo.quads(np.array([[[-a, 0.028, -b], [-a, 0.028, b], [a, 0.028, b], [a, 0.028, -b]]]) / (2, 1, 2),
                          np.array([[[0, 0], [0, 1], [1, 1], [1, 0]]], float))  # fmt: skip
         kind = rng.random()
-        material = (
-            mat.metal(rng)
-            if kind < 0.15
-            else mat.screen(rng, log_uniform(rng, 0.3, 5))
-            if kind < 0.22
-            else mat.picture(tex.pattern(rng, 0.0), rng)
-        )
+        if kind < 0.15:
+            material = mat.metal(rng)
+        elif kind < 0.22:
+            material = mat.screen(rng, log_uniform(rng, 0.3, 5))
+        else:
+            material = mat.picture(tex.pattern(rng, 0.0), rng)
         self.place(blender_mesh(face), material, spin)
         self.focus.append(np.array(spin.translation))
 
     # -- lamps of rooms ----------------------------------------------------------------------------
 
     def bulb(self) -> None:
-        """A tiny bright ball, seen or unseen."""
+        """Add a tiny bright ball, seen or unseen."""
         rng, at = self.rng, self.spot(0.3, 0.95)
         if chance(rng, 0.4):
             self.lamp(
@@ -566,7 +554,7 @@ class Stage:
             self.emitter(geo.sphere(log_uniform(rng, 0.008, 0.06), 16), log_uniform(rng, 5, 40), self.tint(), at)
 
     def shaded(self) -> None:
-        """A bulb in a shade, on a stand or hanging: opaque, of cloth or of glass."""
+        """Add a bulb in a shade, on a stand or hanging: opaque, of cloth or of glass."""
         rng, hanging = self.rng, chance(self.rng, 0.5)
         at = self.spot(0.55, 0.85) if hanging else self.spot(0.35, 0.55)
         r, h = rng.uniform(0.08, 0.28), rng.uniform(0.12, 0.4)
@@ -577,14 +565,14 @@ class Stage:
         self.emitter(
             geo.sphere(log_uniform(rng, 0.012, 0.05), 16), log_uniform(rng, 8, 40), self.tint(0.1), at + (0, 0, h * 0.5)
         )
-        low, high = (at[2] + h, self.bounds[1][2]) if hanging else (0.0, at[2] + h * 0.3)
+        low, high = (at[2] + h, self.corners[1][2]) if hanging else (0.0, at[2] + h * 0.3)
         self.add(geo.cylinder(0.006, high - low, 12), mat.metal(rng), (at[0], at[1], low))
         self.focus.append(at)
 
     def cove(self) -> None:
-        """An area light a hand's breadth from the ceiling or a wall, facing it."""
+        """Add an area light a hand's breadth from the ceiling or a wall, facing it."""
         rng = self.rng
-        _, b = self.bounds
+        _, b = self.corners
         at, size = self.spot(0.8, 0.9), rng.uniform(0.15, 1.5)
         target = at + (0, 0, 1)
         if chance(rng, 0.5):
@@ -592,25 +580,17 @@ class Stage:
         else:
             at[1], at[2] = b[1] - rng.uniform(0.05, 0.3), b[2] * rng.uniform(0.3, 0.9)
             target = at + (0, 1, 0)
-        self.lamp(
-            "AREA",
-            at,
-            log_uniform(rng, 20, 150),
-            self.tint(),
-            target,
-            shape="RECTANGLE",
-            size=size,
-            size_y=rng.uniform(0.03, 0.3),
-        )
+        self.lamp("AREA", at, log_uniform(rng, 20, 150), self.tint(), target,
+                  shape="RECTANGLE", size=size, size_y=rng.uniform(0.03, 0.3))  # fmt: skip
         back = geo.box((-size / 2, -0.16, -0.02), (size / 2, 0.16, -0.005))
         turn = Vector(target - at).to_track_quat("Z", "Y").to_matrix().to_4x4()
         self.place(blender_mesh(back), mat.paint(rng, 0.8), Matrix.Translation(Vector(at)) @ turn)
 
     def behind(self) -> None:
-        """A light behind a partition."""
+        """Add a light behind a partition."""
         rng = self.rng
         at, angle = self.spot(), rng.choice([0, math.pi / 2])
-        screen = geo.box((-0.9, -0.03, 0), (0.9, 0.03, rng.uniform(0.5, 0.95) * self.bounds[1][2])).turned(angle)
+        screen = geo.box((-0.9, -0.03, 0), (0.9, 0.03, rng.uniform(0.5, 0.95) * self.corners[1][2])).turned(angle)
         self.add(screen, mat.paint(rng, 0.4, 2), at)
         offset = geo.rotation((0, 0, 1), angle) @ np.array([rng.uniform(-0.6, 0.6), 0.3, rng.uniform(0.2, 1.8)])
         self.lamp(
@@ -619,19 +599,12 @@ class Stage:
 
     def beam(self) -> None:
         rng = self.rng
-        self.lamp(
-            "SPOT",
-            self.spot(0.7, 0.95),
-            log_uniform(rng, 50, 400),
-            self.tint(),
-            self.spot(0, 0.4),
-            spot_size=math.radians(rng.uniform(12, 70)),
-            spot_blend=rng.random(),
-            shadow_soft_size=log_uniform(rng, 0.005, 0.1),
-        )
+        self.lamp("SPOT", self.spot(0.7, 0.95), log_uniform(rng, 50, 400), self.tint(), self.spot(0, 0.4),
+                  spot_size=math.radians(rng.uniform(12, 70)), spot_blend=rng.random(),
+                  shadow_soft_size=log_uniform(rng, 0.005, 0.1))  # fmt: skip
 
     def tube(self) -> None:
-        """A neon tube, bent."""
+        """Add a neon tube, bent."""
         rng = self.rng
         start = self.spot(0.4, 0.9)
         t = np.linspace(0, 1, 40)[:, None]
@@ -641,14 +614,8 @@ class Stage:
 
     def panel(self) -> None:
         rng, at = self.rng, self.spot(0.97, 0.98)
-        self.lamp(
-            "AREA",
-            at,
-            log_uniform(rng, 40, 150),
-            self.tint(0.1),
-            shape=str(rng.choice(["SQUARE", "DISK"])),
-            size=rng.uniform(0.3, 1.4),
-        )
+        self.lamp("AREA", at, log_uniform(rng, 40, 150), self.tint(0.1),
+                  shape=str(rng.choice(["SQUARE", "DISK"])), size=rng.uniform(0.3, 1.4))  # fmt: skip
 
     def string(self, count: int) -> None:
         """Many small coloured lights along a wire or scattered."""

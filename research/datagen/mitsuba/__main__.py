@@ -11,6 +11,7 @@ from . import start
 
 
 def main() -> int:
+    """Run the command line and return the exit code."""
     parser = command_line.parser("research.datagen.mitsuba", "Render training views with Mitsuba 3.", ref_spp=96)
     parser.add_argument("--variant", default=start.VARIANT, help="of Mitsuba (default: %(default)s)")
     parser.add_argument(

@@ -27,18 +27,18 @@ def _linear(image: np.ndarray) -> np.ndarray:
 
 @cache
 def read_image(path: str, limit: int = 512) -> np.ndarray:
-    """An 8-bit image as linear float32 (H, W, 3), no larger than `limit`."""
+    """Read an 8-bit image as linear float32 (H, W, 3), no larger than `limit`."""
     from PIL import Image
 
-    with Image.open(path) as image:
-        image = image.convert("RGB")
+    with Image.open(path) as file:
+        image = file.convert("RGB")
         image.thumbnail((limit, limit))
         return np.clip(_linear(np.asarray(image, np.float32) / 255), 0.003, 0.95)
 
 
 @cache
 def read_obj(path: str) -> Mesh:
-    """An OBJ file, turned z up."""
+    """Read an OBJ file and turn it z up."""
     params = mi.traverse(mi.load_dict({"type": "obj", "filename": path}))
     v = np.array(params["vertex_positions"]).reshape(-1, 3)
     f = np.array(params["faces"]).reshape(-1, 3).astype(int)
@@ -49,8 +49,8 @@ def read_obj(path: str) -> Mesh:
 
 
 @cache
-def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray | None]]:
-    """The parts of a glTF file by material, z up, each with its linear base-colour image or colour (H, W, 3).
+def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray]]:
+    """Read the parts of a glTF file by material, z up, each with its linear base-colour image or colour (H, W, 3).
 
     Only what these scenes need: node transforms, positions, normals, one set of texture coordinates.
     """
@@ -69,7 +69,7 @@ def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray | None]]:
         )
         return np.ascontiguousarray(raw).view(dtype).reshape(a["count"], width)
 
-    def base_color(index: int | None) -> np.ndarray | None:
+    def base_color(index: int | None) -> np.ndarray:
         pbr = {} if index is None else doc["materials"][index].get("pbrMetallicRoughness", {})
         factor = np.asarray(pbr.get("baseColorFactor", [0.8, 0.8, 0.8, 1])[:3], np.float32)
         if "baseColorTexture" in pbr:
@@ -78,7 +78,7 @@ def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray | None]]:
                 return read_image(str(folder / uri))
         return np.clip(np.broadcast_to(factor, (2, 2, 3)), 0.003, 0.95)
 
-    found: dict[int | None, list[Mesh]] = {}
+    by_material: dict[int | None, list[Mesh]] = {}
 
     def visit(node: dict, matrix: np.ndarray) -> None:
         local = np.eye(4)
@@ -100,13 +100,13 @@ def read_gltf(path: str) -> list[tuple[Mesh, np.ndarray | None]]:
             if n is not None:
                 n = n / np.maximum(np.linalg.norm(n, axis=1, keepdims=True), 1e-9)
             uv = np.asarray(uv, float) * (1, -1) + (0, 1)
-            found.setdefault(p.get("material"), []).append(Mesh(v, f, uv, n).rotated(_TO_Z_UP))
+            by_material.setdefault(p.get("material"), []).append(Mesh(v, f, uv, n).rotated(_TO_Z_UP))
         for child in node.get("children", []):
             visit(doc["nodes"][child], matrix)
 
     for root in doc["scenes"][doc.get("scene", 0)]["nodes"]:
         visit(doc["nodes"][root], np.eye(4))
-    return [(merge(parts), base_color(material)) for material, parts in found.items()]
+    return [(merge(parts), base_color(material)) for material, parts in by_material.items()]
 
 
 class Assets:
@@ -119,12 +119,12 @@ class Assets:
         self.models = sorted(root.glob("models/*/glTF/*.gltf")) if root else []
 
     def hdri(self, rng: np.random.Generator) -> tuple[np.ndarray, str]:
-        """A random HDRI, float32 (H, W, 3), and its file name."""
+        """Pick a random HDRI, float32 (H, W, 3), and its file name."""
         path = self.hdris[rng.integers(len(self.hdris))]
         return _hdri(str(path)), path.name
 
     def picture(self, rng: np.random.Generator) -> np.ndarray:
-        """A crop of an HDRI, exposed like a photograph: what hangs in the frames."""
+        """Cut a crop out of an HDRI, exposed like a photograph: what hangs in the frames."""
         image, _ = self.hdri(rng)
         h, w, _ = image.shape
         n = int(rng.integers(128, 384))

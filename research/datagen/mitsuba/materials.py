@@ -19,7 +19,7 @@ _METALS = ["Au", "Cu", "Al", "Cr", "Ag", "W", "none"]
 
 
 def bitmap(image: np.ndarray, nearest: bool = False) -> dict:
-    """A texture of linear values; (H, W) or (H, W, C)."""
+    """Return a texture of linear values; (H, W) or (H, W, C)."""
     image = np.ascontiguousarray(np.atleast_3d(image), np.float32)
     if min(image.shape[:2]) < 2:
         image = image.repeat(2, 0).repeat(2, 1)

@@ -20,10 +20,7 @@ from .trace import MAX_DEPTH, Camera, PixelFilter, blackman_harris, box, render_
 _ATTEMPTS, _RENDERS = 12, 2  # per view: cameras that are tried, and at most rendered in full
 _GOOD_REFERENCE, _WORST_REFERENCE = 27.0, 21.0  # dB, of the reference's own noise
 _BATCH = 16  # samples a pixel per wavefront: bounds the memory
-_WIDTHS = (
-    1.0,
-    3.2,
-)  # width of the Blackman-Harris filter in pixels; Blender's default is 1.5, other renderers use up to 3
+_WIDTHS = (1.0, 3.2)  # of the Blackman-Harris filter in pixels; Blender's default is 1.5, other renderers use up to 3
 
 
 def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int, lit_share: float = 0.6) -> Iterator[Camera]:
@@ -40,7 +37,7 @@ def find_cameras(scene: mi.Scene, plan: scenes.Scene, seed: int, view: int, lit_
 
 
 def _distance(scene: mi.Scene, camera: Camera) -> float:
-    """The 10th percentile of the depths of a 16 x 16 grid of pixels, in metres."""
+    """Return the 10th percentile of the depths of a 16 x 16 grid of pixels, in metres."""
     y, x = np.mgrid[0:16, 0:16].reshape(2, -1) / 16
     rays = camera.rays(mi.Float(x), mi.Float(y), mi.Point2f(0.5))
     t = scene.ray_intersect(rays).t.numpy()
@@ -76,8 +73,10 @@ def _reference(
 
 def _lrhs(scene: mi.Scene, camera: Camera, scale: int, seed: int, pixel_filter: PixelFilter) -> np.ndarray:
     """Render the `lr` passes at 1/scale of the resolution with scale² times the samples: (Q, H/s, W/s, 3)."""
-    size, more = views.SIZE // scale, {"layers": False, "pixel_filter": pixel_filter}
-    renders = (render_passes(scene, camera, size, scale**2 * n, seed + i, **more) for i, n in enumerate(views.LR_SPP))
+    renders = (
+        render_passes(scene, camera, views.SIZE // scale, scale**2 * n, seed + i, False, pixel_filter=pixel_filter)
+        for i, n in enumerate(views.LR_SPP)
+    )
     return np.stack([passes.mean(0) for passes in renders])
 
 
@@ -90,10 +89,10 @@ def render_view(
     base = [int(s) * 1000 for s in rng.choice(4_000_000, 3, replace=False)]
     width = float(np.random.default_rng([seed, 8]).uniform(*_WIDTHS))  # the same for all views of a scene
     pixel_filter = box if filter_name == "box" else blackman_harris(width)
-    found = _reference(scene, camera, ref_spp, base[0], pixel_filter)
-    if found is None:
+    reference = _reference(scene, camera, ref_spp, base[0], pixel_filter)
+    if reference is None:
         return None
-    ref, ref_spp, psnr = found
+    ref, ref_spp, psnr = reference
     hr = render_passes(scene, camera, views.SIZE, views.HR_PASSES, base[1], pixel_filter=pixel_filter)
     # Box-filtered passes at full resolution give the LRHS of every scale. A wider filter needs a render per scale.
     scales = (1,) if pixel_filter is box else SCALES

@@ -4,11 +4,10 @@
     python -m research.datagen.mitsuba.render_samples --out VIEWS --seeds 0:400 --assets ASSETS --rooms ROOMS
 
 Scenes are those of :mod:`research.datagen.mitsuba.scenes`; with ``--rooms``, every third is a variation of a room that
-somebody
-else built (:mod:`research.datagen.mitsuba.rooms`). References for training and validation are denoised at once, at the
-resolution of their cells. With ``--keep-noise``, they stay as rendered, with their albedo and normal, and
-:mod:`research.training.pool` denoises them on a GPU. References for testing always stay as rendered, because a
-denoiser must not be scored against its own results.
+somebody else built (:mod:`research.datagen.mitsuba.rooms`). References for training and validation are denoised at
+once, at the resolution of their cells. With ``--keep-noise``, they stay as rendered, with their albedo and normal, and
+:mod:`research.training.pool` denoises them. References for testing always stay as rendered, because a denoiser must not
+be scored against its own results.
 
 With ``--ref-spp 0``, no reference is rendered, and a view takes a few seconds. Such views are only for the teacher of
 :mod:`research.training.pool`.
@@ -20,6 +19,7 @@ import argparse
 import sys
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,13 +27,20 @@ from oiio_msspl.image.filters import box_downsample
 from research.datagen import command_line, quality, samples, views
 from research.datagen.mitsuba.start import VARIANT, start
 
+if TYPE_CHECKING:  # Mitsuba's types exist only after a variant is set
+    import mitsuba as mi
+
+    from research.datagen.mitsuba.assets import Assets
+    from research.datagen.mitsuba.scenes import Scene
+    from research.datagen.mitsuba.trace import Camera
+
 _RENDERS = 2  # cameras that are rendered, at most, until a reference is clean enough
 _LIT = 0.3  # share of pixels that have light at 16 spp: less than for other views, because light may be rare
 _GOOD_REFERENCE, _WORST_REFERENCE = 26.0, 18.0  # dB, of the rendered reference's own noise
 _BATCH = 4  # samples a reference cell per wavefront: bounds the memory
 
 
-def _reference(scene, camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray], int, float] | None:
+def _reference(scene: mi.Scene, camera: Camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray], int, float] | None:
     """Render colour, albedo and normal of the reference's cells, (R*H, R*W, 3), at `spp` a pixel or twice as many.
 
     Returns:
@@ -53,7 +60,7 @@ def _reference(scene, camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray
                 halves[name][half] += sums
         done += per_step
         pixels = [box_downsample(half.astype(np.float32), cells) * (2 * cells**2 / done) for half in halves["color"]]
-        psnr = quality.psnr_of_mean(*pixels)
+        psnr = quality.psnr_of_mean(pixels[0], pixels[1])
         if done == per_step and psnr + 10 * np.log10(2 * spp / done) < _WORST_REFERENCE:
             return None
         if done >= 2 * spp or (done >= spp and psnr > _GOOD_REFERENCE):
@@ -61,7 +68,7 @@ def _reference(scene, camera, spp: int, seed: int) -> tuple[dict[str, np.ndarray
 
 
 def _denoised(images: dict[str, np.ndarray]) -> np.ndarray:
-    """The reference's cells without noise, by Open Image Denoise."""
+    """Denoise the reference's cells by Open Image Denoise."""
     import pyoidn
 
     color, albedo, normal = (np.ascontiguousarray(images[n], np.float32) for n in ("color", "albedo", "normal"))
@@ -69,7 +76,7 @@ def _denoised(images: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def render_view(
-    scene, plan, camera, seed: int, view: int, split: str, ref_spp: int, *, keep_noise: bool
+    scene: mi.Scene, plan: Scene, camera: Camera, seed: int, view: int, split: str, ref_spp: int, *, keep_noise: bool
 ) -> dict[str, np.ndarray] | None:
     """Render all arrays of one view; None if the reference stays too noisy."""
     import mitsuba as mi
@@ -80,10 +87,10 @@ def render_view(
     rng = np.random.default_rng([seed, view, 7])
     # The reference, the samples of the HRLS and those of the LRHS are independent
     base = [int(s) * 1000 for s in rng.choice(4_000_000, 3, replace=False)]
-    found = _reference(scene, camera, ref_spp, base[0]) if ref_spp else ({}, 0, 0.0)
-    if found is None:
+    reference = _reference(scene, camera, ref_spp, base[0]) if ref_spp else ({}, 0, 0.0)
+    if reference is None:
         return None
-    images, ref_spp, psnr = found
+    images, ref_spp, psnr = reference
 
     def drawn(count: int, seed: int, names: tuple[str, ...]) -> dict[str, np.ndarray]:
         parts = [render_samples(scene, camera, samples.SIZE, 4, seed + i, names) for i in range(count // 4)]
@@ -109,13 +116,13 @@ def render_view(
 
 
 def _stored_split(split: str, ref_spp: int) -> str:
-    """The split that a view's file names."""
+    """Return the split that a view's file names."""
     if not ref_spp:
         return views.NO_REFERENCE
     return "train" if split == "room" else split
 
 
-def render_scene(args: argparse.Namespace, assets, seed: int) -> tuple[int, str]:
+def render_scene(args: argparse.Namespace, assets: Assets, seed: int) -> tuple[int, str]:
     """Render the missing ones of a scene's views; return how many were written and the kind of scene."""
     from research.datagen.mitsuba import rooms, scenes
     from research.datagen.mitsuba.render import find_cameras
@@ -145,6 +152,7 @@ def render_scene(args: argparse.Namespace, assets, seed: int) -> tuple[int, str]
 
 
 def main() -> int:
+    """Run the command line and return the exit code."""
     parser = command_line.parser(
         "research.datagen.mitsuba.render_samples", "Render training views that keep their samples.", ref_spp=48
     )

@@ -34,7 +34,7 @@ ROOMS = (
 
 
 def build(folder: Path, seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
-    """The Mitsuba scene of a seed, and its plan: one of the rooms with its light and contents changed.
+    """Build the Mitsuba scene of a seed, and its plan: one of the rooms with its light and contents changed.
 
     The room is turned z up, in metres, its floor centred on the origin as those of
     :mod:`research.datagen.mitsuba.scenes`.
@@ -76,7 +76,7 @@ def build(folder: Path, seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
 
 
 def _shapes(path: Path, room: Room, light: str, rng: Rng) -> list[mi.Shape]:
-    """The shapes of a scene file, in metres and z up, with some materials and the emitters changed."""
+    """Read the shapes of a scene file, in metres and z up, with some materials and the emitters changed."""
     root = ET.parse(path).getroot()
     for sensor in root.findall("sensor"):
         root.remove(sensor)
@@ -99,12 +99,12 @@ def _shapes(path: Path, room: Room, light: str, rng: Rng) -> list[mi.Shape]:
         if transform is None:
             transform = ET.SubElement(shape, "transform", name="toWorld")
         if emitter is not None:
-            radiance = emitter.find("rgb")
-            values = np.array([float(v) for v in radiance.get("value").split(",")]) * dim * tint
-            radiance.set("value", ", ".join(map(str, values)))
+            for radiance in emitter.findall("rgb"):
+                values = np.array([float(v) for v in radiance.get("value", "").split(",")]) * dim * tint
+                radiance.set("value", ", ".join(map(str, values)))
             if light == "moved":
                 shift = rng.uniform(-0.25, 0.25, 3) * (high - low)
-                ET.SubElement(transform, "translate", **dict(zip("xyz", map(str, shift), strict=True)))
+                ET.SubElement(transform, "translate", dict(zip("xyz", map(str, shift), strict=True)))
         ET.SubElement(transform, "matrix", value=" ".join(str(v) for row in place for v in row))
     return mi.load_string(ET.tostring(root, encoding="unicode")).shapes()
 

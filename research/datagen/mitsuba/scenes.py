@@ -3,7 +3,7 @@
 """Random scenes. A seed and the asset files determine a scene.
 
 Most scenes are hard for a path tracer: rooms lit through small openings, lamps in shades or facing walls, many lights
-of which each sample picks one, glass between light and floor, thin geometry. About one scene in four is easy (large
+where each sample picks one, glass between light and floor, thin geometry. About one scene in four is easy (large
 lights, open sky), so that a network also learns to keep a good image.
 """
 
@@ -40,6 +40,12 @@ class Scene:
         self.room: np.ndarray | None = None  # (3,) inner size, the floor centred on the origin
         self._parts: dict[str, object] = {}
 
+    @property
+    def size(self) -> np.ndarray:
+        """Inner size (3,) of the room."""
+        assert self.room is not None
+        return self.room
+
     # -- building blocks ---------------------------------------------------------------------------
 
     def add(self, mesh: Mesh, bsdf: mat.Bsdf, radiance: np.ndarray | None = None, weight: float = 1.0) -> None:
@@ -54,13 +60,9 @@ class Scene:
         name = f"mesh{len(self._parts)}"
         n = mesh.n
         shape = mi.Mesh(
-            name,
-            vertex_count=len(mesh.v),
-            face_count=len(mesh.f),
-            has_vertex_normals=n is not None,
-            has_vertex_texcoords=True,
-            props=props,
-        )
+            name, vertex_count=len(mesh.v), face_count=len(mesh.f),
+            has_vertex_normals=n is not None, has_vertex_texcoords=True, props=props,
+        )  # fmt: skip
         params = mi.traverse(shape)
         params["vertex_positions"] = np.ascontiguousarray(mesh.v, np.float32).ravel()
         params["faces"] = np.ascontiguousarray(mesh.f, np.uint32).ravel()
@@ -78,7 +80,7 @@ class Scene:
         self.add(mesh, mat.diffuse(np.full((2, 2, 3), 0.2)), radiance, weight)
 
     def environment(self, scale: float, prefer_hdri: float = 0.6) -> None:
-        """An HDRI or a procedural sky, turned at random."""
+        """Add an HDRI or a procedural sky, turned at random."""
         rng = self.rng
         if self.assets.hdris and rng.random() < prefer_hdri:
             image, name = self.assets.hdri(rng)
@@ -108,20 +110,20 @@ class Scene:
         })  # fmt: skip
 
     def finish(self) -> mi.Scene:
-        """The scene as Mitsuba has it."""
+        """Return the scene as Mitsuba has it."""
         return mi.load_dict({"type": "scene", **self._parts})
 
     # -- things ------------------------------------------------------------------------------------
 
     def tinted_light(self, power: float, tint: float = 0.3) -> np.ndarray:
-        """A radiance: warm or cold white, or with `tint` towards 1 any hue."""
+        """Draw a radiance: warm or cold white, or with `tint` towards 1 any hue."""
         rng = self.rng
         warm = np.array([1.0, rng.uniform(0.5, 1.0), rng.uniform(0.2, 1.2)])
         hue = tex.color(rng, 0.5, 1.0)
         return power * (hue if rng.random() < tint else warm)
 
     def shape(self, size: float) -> Mesh:
-        """A single procedural object of the given largest extent, standing on z = 0."""
+        """Return a single procedural object of the given largest extent, standing on z = 0."""
         rng = self.rng
         makers: list[Callable[[], Mesh]] = [
             lambda: geo.block(*rng.uniform(0.3, 1, 3)),
@@ -178,7 +180,6 @@ class Scene:
         self.add(leaf, mat.glossy(tex.foliage(rng), 0.3) if rng.random() < 0.5 else mat.diffuse(tex.foliage(rng)))
 
     def _model(self, at: np.ndarray, size: float) -> None:
-
         rng = self.rng
         path = self.assets.models[rng.integers(len(self.assets.models))]
         if "Spheres" in path.name and rng.random() < 0.8:  # a test chart: recognisable, so rarely
@@ -254,21 +255,11 @@ class Scene:
         w, d = rng.uniform(*size, 2)
         h = rng.uniform(2.3, 3.6)
         self.room = np.array([w, d, h])
-        lengths = [w, w, d + 2 * t, d + 2 * t, w]
-        heights = [h, h, h, h, d]
-        holes: list[list] = [[] for _ in range(5)]
+        lengths, heights = [w, w, d + 2 * t, d + 2 * t, w], [h, h, h, h, d]
+        holes: list[list[tuple[float, float, float, float]]] = [[] for _ in range(5)]
         for _ in range(openings):
             side = int(rng.choice(5, p=[0.23, 0.23, 0.23, 0.23, 0.08]))
-            kind = rng.random()
-            if kind < 0.15 and side < 4:  # a door left ajar
-                x = rng.uniform(0.2, lengths[side] - 1)
-                hole = (x, 0.01, x + rng.uniform(0.04, 0.4), 2.0)
-            else:
-                a, b = rng.uniform(*_WINDOW, 2)
-                x = rng.uniform(0.2, max(lengths[side] - a - 0.2, 0.25))
-                z = rng.uniform(0.3 * heights[side], max(heights[side] - b - 0.1, 0.31 * heights[side]))
-                hole = (x, z, min(x + a, lengths[side] - 0.2), min(z + b, heights[side] - 0.05))
-            holes[side].append(hole)
+            holes[side].append(self._hole(side, lengths[side], heights[side]))
         if gap:
             door = rng.uniform(0.4, w - 1.4)
             holes[0].append((door, 0.01, door + gap, 2.0))
@@ -320,8 +311,19 @@ class Scene:
             mat.structure(rng, tex.pattern(rng, 0.12) ** rng.choice([0.6, 1.0])),
         )
 
+    def _hole(self, side: int, length: float, height: float) -> tuple[float, float, float, float]:
+        """Draw a window, a door gap or a skylight: its corners (x0, z0, x1, z1) in its wall."""
+        rng = self.rng
+        if rng.random() < 0.15 and side < 4:  # a door left ajar
+            x = rng.uniform(0.2, length - 1)
+            return x, 0.01, x + rng.uniform(0.04, 0.4), 2.0
+        a, b = rng.uniform(*_WINDOW, 2)
+        x = rng.uniform(0.2, max(length - a - 0.2, 0.25))
+        z = rng.uniform(0.3 * height, max(height - b - 0.1, 0.31 * height))
+        return x, z, min(x + a, length - 0.2), min(z + b, height - 0.05)
+
     def _hall(self, x0: float, x1: float, place: Callable[[Mesh], Mesh]) -> None:
-        """A closed space outside the gap from x0 to x1 of the front wall; its lamp is seldom seen from the room."""
+        """Add a closed space outside the gap from x0 to x1 of the front wall; its lamp is seldom seen from the room."""
         rng = self.rng
         low, high = np.array([x0 - rng.uniform(0.5, 1.5), -rng.uniform(1.0, 2.0), 0]), np.array([x1 + 1.0, 0, 2.3])
         (a, b, c), (d, e, f) = low, high
@@ -348,7 +350,7 @@ class Scene:
     def furnish(self, pieces: int) -> None:
         """Furniture along walls and about the floor, pictures and mirrors, things on the floor."""
         rng = self.rng
-        w, d, _ = self.room
+        w, d, _ = self.size
         taken: list[np.ndarray] = []
         for _ in range(pieces * 4):
             if len(taken) == pieces:
@@ -381,7 +383,7 @@ class Scene:
 
     def _rug(self) -> None:
         rng = self.rng
-        w, d, _ = self.room
+        w, d, _ = self.size
         a, b = rng.uniform(0.8, 2.0, 2)
         at = np.array([rng.uniform(-w / 4, w / 4), rng.uniform(-d / 4, d / 4), 0.004])
         roots = np.c_[rng.uniform(-a / 2, a / 2, 12000), rng.uniform(-b / 2, b / 2, 12000), np.zeros(12000)] + at
@@ -391,7 +393,7 @@ class Scene:
 
     def _picture(self) -> None:
         rng = self.rng
-        w, d, h = self.room
+        w, d, h = self.size
         a, b = rng.uniform(0.25, 1.1, 2)
         side, z = rng.integers(4), rng.uniform(0.9, h - 0.7)
         frame = geo.box((-a / 2 - 0.03, 0, -b / 2 - 0.03), (a / 2 + 0.03, 0.02, b / 2 + 0.03))
@@ -412,15 +414,15 @@ class Scene:
         self.focus.append(at)
 
     def inside(self, low: float, high: float) -> np.ndarray:
-        """A point in the room with its height between two shares of the room's."""
-        w, d, h = self.room
+        """Draw a point in the room with its height between two shares of the room's."""
+        w, d, h = self.size
         rng = self.rng
         return np.array([rng.uniform(-0.42, 0.42) * w, rng.uniform(-0.42, 0.42) * d, rng.uniform(low, high) * h])
 
     # -- lamps of rooms ----------------------------------------------------------------------------
 
     def lamp_tiny(self) -> None:
-        """A small bright ball, or a point that no ray can hit."""
+        """Add a small bright ball, or a point that no ray can hit."""
         if self.rng.random() < 0.2:
             self.point(self.inside(0.3, 0.95), self.tinted_light(1.0))
             return
@@ -428,7 +430,7 @@ class Scene:
         self.light(geo.sphere(r, 16).moved(*self.inside(0.3, 0.95)), self.tinted_light(0.3 / r**2))
 
     def lamp_shade(self) -> None:
-        """A bulb in an opaque shade, open above and below: on a stand or hanging."""
+        """Add a bulb in an opaque shade, open above and below: on a stand or hanging."""
         rng = self.rng
         r, h = rng.uniform(0.1, 0.25), rng.uniform(0.15, 0.35)
         hanging = rng.random() < 0.5
@@ -438,15 +440,15 @@ class Scene:
         self.add(shade.moved(*at), mat.thing(rng, None, 0.2, 0.0))
         bulb = rng.uniform(0.015, 0.05)
         self.light(geo.sphere(bulb, 16).moved(*(at + (0, 0, h * 0.5))), self.tinted_light(0.4 / bulb**2))
-        rod = (at[2], self.room[2]) if hanging else (0, at[2] + h * 0.4)
+        rod = (at[2], self.size[2]) if hanging else (0, at[2] + h * 0.4)
         rod_mesh = geo.cylinder(0.008, rod[1] - rod[0] - (0.0 if not hanging else h)).moved(*at[:2], rod[0])
         self.add(rod_mesh if not hanging else rod_mesh.moved(0, 0, h), mat.metal(rng))
         self.focus.append(at)
 
     def lamp_indirect(self) -> None:
-        """A panel a hand's breadth from a wall or the ceiling, facing it."""
+        """Add a panel a hand's breadth from a wall or the ceiling, facing it."""
         rng = self.rng
-        w, d, h = self.room
+        w, d, h = self.size
         a, b, gap = rng.uniform(0.2, 1.2), rng.uniform(0.1, 0.4), rng.uniform(0.05, 0.25)
         panel = geo.rectangle(a, b)
         back = geo.box((-a / 2 - 0.02, -b / 2 - 0.02, -0.03), (a / 2 + 0.02, b / 2 + 0.02, -0.005))
@@ -456,11 +458,8 @@ class Scene:
             def place(m: Mesh) -> Mesh:
                 return m.moved(x, y, h - gap)
         else:
-            turn, x, z = (
-                geo.rotation((1, 0, 0), np.pi / 2),
-                rng.uniform(-0.35, 0.35) * w,
-                rng.uniform(0.3, 0.9) * h,
-            )
+            turn = geo.rotation((1, 0, 0), np.pi / 2)
+            x, z = rng.uniform(-0.35, 0.35) * w, rng.uniform(0.3, 0.9) * h
 
             def place(m: Mesh) -> Mesh:
                 return m.rotated(turn).moved(x, -d / 2 + gap, z)
@@ -469,11 +468,11 @@ class Scene:
         self.add(place(back), mat.thing(rng, tex.plain(rng)))
 
     def lamp_hidden(self) -> None:
-        """A light behind a partition."""
+        """Add a light behind a partition."""
         rng = self.rng
         at = self.inside(0.0, 0.0) * (0.8, 0.8, 1)
         angle = rng.choice([0, np.pi / 2])
-        partition = geo.box((-1, -0.04, 0), (1, 0.04, rng.uniform(0.6, 0.95) * self.room[2]))
+        partition = geo.box((-1, -0.04, 0), (1, 0.04, rng.uniform(0.6, 0.95) * self.size[2]))
         self.add(partition.turned(angle).moved(*at), mat.structure(rng))
         r = rng.uniform(0.02, 0.12)
         offset = geo.rotation((0, 0, 1), angle) @ np.array([rng.uniform(-0.6, 0.6), 0.35, rng.uniform(0.3, 1.6)])
@@ -487,8 +486,8 @@ class Scene:
         rng = self.rng
         a, b = rng.uniform(0.2, 1.0, 2)
         panel = geo.rectangle(a, b).rotated(geo.rotation((1, 0, 0), np.pi))
-        x, y = rng.uniform(-0.3, 0.3, 2) * self.room[:2]
-        self.light(panel.moved(x, y, self.room[2] - 0.02), self.tinted_light(1.5 / (a * b)))
+        x, y = rng.uniform(-0.3, 0.3, 2) * self.size[:2]
+        self.light(panel.moved(x, y, self.size[2] - 0.02), self.tinted_light(1.5 / (a * b)))
 
     def lamp_string(self, count: int) -> None:
         """Many small coloured lights along a wire or scattered."""
@@ -508,7 +507,7 @@ class Scene:
 
 
 def window_room(s: Scene) -> None:
-    """A closed room lit through small openings only."""
+    """Build a closed room lit through small openings only."""
     panels = 10 ** s.rng.uniform(0.3, 1.5) if s.rng.random() < 0.85 else 0.0
     # By the sky alone it takes more openings, or nothing arrives.
     s.shell(int(s.rng.integers(1, 4) if panels else s.rng.integers(4, 9)), daylight=panels)
@@ -521,7 +520,7 @@ def window_room(s: Scene) -> None:
 
 
 def lamp_room(s: Scene) -> None:
-    """A room without daylight: one to three difficult lamps."""
+    """Build a room without daylight: one to three difficult lamps."""
     s.shell(0)
     s.furnish(int(s.rng.integers(3, 9)))
     s.clutter((1, 6))
@@ -534,7 +533,7 @@ def lamp_room(s: Scene) -> None:
 
 
 def ajar_room(s: Scene) -> None:
-    """A room where light is rare: it comes through a door ajar, and perhaps from a weak small lamp."""
+    """Build a room where light is rare: it comes through a door ajar, and perhaps from a weak small lamp."""
     s.shell(0, (2.5, 5.0), gap=float(10 ** s.rng.uniform(-1.2, -0.4)))
     s.furnish(int(s.rng.integers(2, 7)))
     s.clutter((1, 5), clear=0.3)
@@ -543,7 +542,7 @@ def ajar_room(s: Scene) -> None:
 
 
 def many_lights(s: Scene) -> None:
-    """Dozens of small lights, of which a sample picks one."""
+    """Build a room with dozens of small lights. A sample picks one of them."""
     s.shell(int(s.rng.random() < 0.3))
     s.environment(10 ** s.rng.uniform(-1.5, -0.5))
     s.furnish(int(s.rng.integers(2, 7)))
@@ -592,17 +591,14 @@ def outdoors(s: Scene) -> None:
         else:
             hole = (length * 0.3, 0.6, length * 0.6, 1.5)
             house = geo.wall(length, rng.uniform(1.8, 4), 0.25, [hole])
-            s.add(
-                house.moved(-length / 2, 0, 0).turned(angle).moved(*p),
-                mat.structure(rng, tex.pattern(rng, 0.1)),
-            )
+            s.add(house.moved(-length / 2, 0, 0).turned(angle).moved(*p), mat.structure(rng, tex.pattern(rng, 0.1)))
         s.focus.append(p + (0, 0, 0.6))
     for _ in range(rng.integers(3, 12)):
         s.put(np.array([*rng.normal(size=2) * 1.5, 0]), 10 ** rng.uniform(-0.9, 0.2), 0.3, 0.1)
 
 
 def studio(s: Scene) -> None:
-    """An easy scene: objects on a ground under large lights or an open environment."""
+    """Build an easy scene: objects on a ground under large lights or an open environment."""
     rng = s.rng
     s.add(geo.rectangle(20, 20).tiled(rng.uniform(0.3, 2)), mat.structure(rng))
     if rng.random() < 0.5:
@@ -621,7 +617,7 @@ def studio(s: Scene) -> None:
 
 
 def lit_room(s: Scene) -> None:
-    """A room under large panels: easier than a real one."""
+    """Build a room under large panels: easier than a real one."""
     s.shell(int(s.rng.integers(0, 3)))
     s.environment(10 ** s.rng.uniform(-0.7, 0.3))
     s.furnish(int(s.rng.integers(2, 8)))
@@ -637,18 +633,18 @@ KINDS: dict[Callable[[Scene], None], float] = {
 
 
 def _drawn(seed: int) -> tuple[Callable[[Scene], None], Rng]:
-    """The kind of a seed's scene, and the random numbers that follow."""
+    """Return the kind of a seed's scene, and the random numbers that follow."""
     rng = np.random.default_rng([seed, VERSION])
     return list(KINDS)[rng.choice(len(KINDS), p=np.array(list(KINDS.values())) / sum(KINDS.values()))], rng
 
 
 def kind_of(seed: int) -> str:
-    """The name of the kind of a seed's scene, one of ``KINDS``."""
+    """Return the name of the kind of a seed's scene, one of ``KINDS``."""
     return _drawn(seed)[0].__name__
 
 
 def build(seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
-    """The Mitsuba scene of a seed, and its plan."""
+    """Build the Mitsuba scene of a seed, and its plan."""
     kind, rng = _drawn(seed)
     plan = Scene(rng, assets)
     plan.kind = kind.__name__
@@ -657,7 +653,7 @@ def build(seed: int, assets: Assets) -> tuple[mi.Scene, Scene]:
 
 
 def camera(plan: Scene, rng: Rng) -> Camera:
-    """A random camera. The caller checks that it shows something."""
+    """Draw a random camera. The caller checks that it shows something."""
     target = plan.focus[rng.integers(len(plan.focus))] + rng.normal(size=3) * 0.15
     if plan.room is not None:
         w, d, h = plan.room
@@ -674,8 +670,10 @@ def camera(plan: Scene, rng: Rng) -> Camera:
         fov = rng.uniform(25, 70)
     distance = float(np.linalg.norm(target - origin))
     blurred = rng.random() < 0.25
+    x, y, z = map(float, origin)
+    to_x, to_y, to_z = map(float, target)
     return Camera(
-        tuple(map(float, origin)), tuple(map(float, target)), float(fov),
+        (x, y, z), (to_x, to_y, to_z), float(fov),
         aperture=float(distance * 10 ** rng.uniform(-2.2, -1.3)) if blurred else 0.0,
         focus=distance * float(rng.uniform(0.7, 1.3)) if blurred else 1.0,
         roll=float(rng.normal() * 0.06),

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import drjit as dr
 import mitsuba as mi
@@ -81,7 +82,7 @@ class Camera:
 
 
 def _balance(pdf_a: mi.Float, pdf_b: mi.Float) -> mi.Float:
-    """The power heuristic of Mitsuba's own path integrator."""
+    """Return the power heuristic of Mitsuba's path integrator."""
     a, b = dr.square(pdf_a), dr.square(pdf_b)
     return dr.detach(dr.select(pdf_a > 0, a / (a + b), 0), True)
 
@@ -91,7 +92,7 @@ def _share(part: mi.Spectrum, whole: mi.Spectrum) -> mi.Spectrum:
 
 
 @dr.syntax
-def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f):
+def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f) -> Any:
     """Trace one path a lane; return colour, albedo, normal, diffuse, specular (five 3-vectors), and the depth.
 
     The estimator is that of Mitsuba's `path` (next-event estimation and BSDF sampling, power heuristic).
@@ -156,9 +157,7 @@ def sample_layers(scene: mi.Scene, sampler: mi.Sampler, ray: mi.Ray3f):
         mirrored = mi.has_flag(bs.sampled_type, mi.BSDFFlags.DeltaReflection)
         to_diffuse = dr.select(first, dr.select(delta, 0, _share(part_d, whole)), to_diffuse)
         to_specular = dr.select(
-            first,
-            dr.select(delta, dr.select(mirrored, mi.Spectrum(1), 0), _share(part_g, whole)),
-            to_specular,
+            first, dr.select(delta, dr.select(mirrored, mi.Spectrum(1), 0), _share(part_g, whole)), to_specular
         )
 
         throughput *= weight
@@ -191,7 +190,7 @@ def render_samples(
     spp: int,
     seed: int,
     layers: tuple[str, ...] = LAYERS,
-    integrator=None,
+    integrator: mi.Integrator | None = None,
     pixel_filter: PixelFilter = box,
 ) -> dict[str, np.ndarray]:
     """Render `spp` samples for every pixel, each with its place: float32 (spp, height, width, C) by name.
@@ -226,21 +225,14 @@ def render_sum(
         finite &= dr.isfinite(channel)
     sums = [dr.block_sum(dr.select(finite, channel, 0), spp) for channel in channels]
     dr.eval(sums)
-    images = iter(each.numpy().reshape(size, size) for each in sums)
+    images = iter(plane.numpy().reshape(size, size) for plane in sums)
     return {name: np.stack([next(images) for _ in traced[name]], axis=-1) for name in layers}
 
 
 def _trace(
-    scene: mi.Scene,
-    camera: Camera,
-    columns: int,
-    rows: int,
-    pixel: mi.UInt32,
-    seed: int,
-    layers: tuple[str, ...],
-    integrator,
-    pixel_filter: PixelFilter,
-) -> dict[str, list[mi.Float]]:
+    scene: mi.Scene, camera: Camera, columns: int, rows: int, pixel: mi.UInt32, seed: int,
+    layers: tuple[str, ...], integrator: mi.Integrator | None, pixel_filter: PixelFilter,
+) -> dict[str, list[mi.Float]]:  # fmt: skip
     """Trace one sample of each of these pixels, not evaluated yet: its channels by name, see :func:`render_samples`."""
     sampler = mi.load_dict({"type": "independent"})
     sampler.seed(seed, len(pixel))
@@ -266,7 +258,7 @@ def render_passes(
     spp: int,
     seed: int,
     layers: bool = True,
-    integrator=None,
+    integrator: mi.Integrator | None = None,
     pixel_filter: PixelFilter = box,
 ) -> np.ndarray:
     """Render `spp` independent 1-spp passes: float32 (spp, height, width, C), as `render_samples` without places.

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Write the denoiser of both renders' mean in 8 bits, which is part of the models that ship.
 
-    python -m research.training.quantise VIEWS
+    python -m research.training.quantise VIEWS --checkpoint JOINT.pt --output mean_denoiser.onnx
 
 Prints how close it is to the network in 32 bits.
 """
@@ -22,16 +22,16 @@ from torch import Tensor
 
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.runtime import load_network
-from research.training.checkpoints import load
+from research.training import CHECKPOINTS
+from research.training.checkpoints import load_joint
 from research.training.data import fixed_batches
-from research.training.joint import JointFusion
 from research.training.oidn import provenance
 from research.training.ops import box_downsample
 from research.training.quantise.codes import OUTPUT_SLICES, denoiser_codes, log_encoded_of_code
 from research.training.quantise.gptq import quantise_mean_denoiser
 from research.training.quantise.graph import Graph
 from research.training.render_mean import with_mean
-from research.training.whole_model import CHECKPOINTS, denoiser_file
+from research.training.whole_model import denoiser_file
 
 CHECKPOINT = CHECKPOINTS / "joint.pt"
 #: Calibration images, and their width.
@@ -39,7 +39,7 @@ IMAGES, PATCH = 96, 256
 
 
 def means(views: Path, split: str) -> Iterator[tuple[Tensor, ...]]:
-    """Colour, noise, albedo and normal of both renders' mean, from views as training draws them."""
+    """Yield colour, noise, albedo and normal of both renders' mean, from views as training draws them."""
     for batch in fixed_batches(views, split, SCALES, PATCH, 1, with_mean):
         lrhs, hrls = batch["lrhs"], batch["hrls"]
         scale = hrls.shape[-1] // lrhs.shape[-1]
@@ -48,18 +48,16 @@ def means(views: Path, split: str) -> Iterator[tuple[Tensor, ...]]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        prog="python -m research.training.quantise",
-        description=__doc__,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    """Run the command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("views", type=Path, help="folder of training views")
     parser.add_argument("--checkpoint", type=Path, default=CHECKPOINT, help="of a joint network (default: the shipped)")
+    parser.add_argument("-o", "--output", type=Path, help="file to write (default: the shipped)")
     args = parser.parse_args()
-    joint, _ = load(args.checkpoint)
-    if not isinstance(joint, JointFusion):
-        raise SystemExit(f"{args.checkpoint}: not a joint network")
-    exact, path = joint.mean_denoiser, CHECKPOINTS / f"{denoiser_file(joint.denoiser(SCALES[0]))}.onnx"
+    joint, _ = load_joint(args.checkpoint)
+    exact, path = joint.mean_denoiser, args.output or CHECKPOINTS / f"{denoiser_file(joint.denoiser(SCALES[0]))}.onnx"
+    if exact is None:
+        raise SystemExit(f"{args.checkpoint}: the size large has no denoiser of both renders' mean of its own")
     codes = [denoiser_codes(*images) for images in islice(means(args.views, "train"), IMAGES)]
     model = Graph(quantise_mean_denoiser(exact.start.shape, exact.weights(), codes)).model()
     helper.set_model_props(model, {"provenance": json.dumps(provenance(exact.start.network))})
@@ -73,8 +71,7 @@ def main() -> None:
 
 
 def run_denoiser(path: Path, codes: Tensor) -> np.ndarray:
-    """The result of a quantised denoiser, log-encoded (h, w, 3), for
-    :func:`research.training.quantise.codes.denoiser_codes`."""
+    """Run a quantised denoiser on :func:`research.training.quantise.codes.denoiser_codes`: log-encoded (h, w, 3)."""
     layers = codes.permute(0, 2, 3, 1).to(torch.uint8).contiguous().numpy()
     (sums,) = load_network(path).run(["codes"], {"layers": layers})
     return log_encoded_of_code(OUTPUT_SLICES)[sums[0]]

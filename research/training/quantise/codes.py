@@ -9,14 +9,12 @@ from __future__ import annotations
 
 import functools
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.model.encoding import encode_radiance
-from research.training.encoding import log_to_pu
-from research.training.pu_curve import pu_decode
+from research.training.encoding import log_to_pu, pu_decode
 
 #: Slices of a colour channel at the input and at the output of the denoiser of both renders' mean.
 INPUT_SLICES, OUTPUT_SLICES = 3, 10
@@ -31,8 +29,10 @@ def sliced(values: Tensor, count: int) -> Tensor:
 
 
 def denoiser_codes(colour: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
-    """The input of the denoiser of both renders' mean, (N, INPUT_CHANNELS, h, w), see
-    :func:`research.training.render_mean.mean_of_renders`. The slices of each colour lie side by side."""
+    """Quantise the images of :func:`research.training.render_mean.mean_of_renders` to (N, INPUT_CHANNELS, h, w).
+
+    The slices of each colour lie side by side.
+    """
     slices = sliced(log_to_pu(colour), INPUT_SLICES).unflatten(1, (INPUT_SLICES, 3)).transpose(1, 2).flatten(1, 2)
     rest = torch.cat([albedo, 0.5 * normal + 0.5, noise], dim=1)
     return torch.cat([slices, rest.mul(255).round().clamp(0, 255)], dim=1)
@@ -40,5 +40,6 @@ def denoiser_codes(colour: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor
 
 @functools.cache
 def log_encoded_of_code(slices: int) -> Array:
-    """Log-encoded colours by the sum of the codes of all their slices: (255 * slices + 1,)."""
-    return encode_radiance(pu_decode(np.linspace(0, 1, 255 * slices + 1)).astype(np.float32), 1.0)
+    """Return the log-encoded colour for each sum of the codes of all slices: (255 * slices + 1,)."""
+    sums = torch.linspace(0, 1, 255 * slices + 1, dtype=torch.double)
+    return encode_radiance(pu_decode(sums).float().numpy(), 1.0)

@@ -12,6 +12,7 @@ row compensate for the error (Frantar et al. 2023, "GPTQ", after Hassibi and Sto
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
@@ -65,7 +66,7 @@ class CodeLayout:
     source_channel: Tensor
 
     def dequantise(self, codes: Tensor) -> Tensor:
-        """Codes (K, H, W) to values (C, H, W)."""
+        """Convert codes (K, H, W) to values (C, H, W)."""
         result = torch.zeros(int(self.source_channel.max()) + 1, *codes.shape[1:])
         return result.index_add_(0, self.source_channel, codes * self.scale[:, None, None])
 
@@ -99,6 +100,7 @@ class QuantisedConv:
     offset: Tensor
 
     def __call__(self, codes: Tensor) -> Tensor:
+        """Return the output codes."""
         weights = self.weights * self.step[:, None, None, None]
         values = F.conv2d(codes, weights, self.bias, padding=1)[:, self.outputs.source_channel]
         in_codes = (values - self.offset[:, None, None]) / self.outputs.scale[:, None, None]
@@ -109,7 +111,7 @@ class QuantisedConv:
 
 
 def sliced_layout(count: int, first: int) -> CodeLayout:
-    """The layout of :func:`sliced` colours, which are the value channels from ``first`` on."""
+    """Return the layout of sliced colours, which are the value channels from ``first`` on."""
     return CodeLayout(torch.full((3 * count,), 1 / count / 255), torch.arange(first, first + 3).repeat(count))
 
 
@@ -128,15 +130,10 @@ def concatenated(*parts: CodeLayout) -> CodeLayout:
 
 
 def denoiser_inputs(codes: Sequence[Tensor]) -> Activations:
-    """Codes of :func:`research.training.quantise.codes.denoiser_codes` with the values that they stand for."""
-    layout = denoiser_layout()
-    return Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
-
-
-def denoiser_layout() -> CodeLayout:
-    """The layout of :func:`research.training.quantise.codes.denoiser_codes`."""
+    """Dequantise the codes of :func:`research.training.quantise.codes.denoiser_codes`, and keep them beside."""
     scale = [1 / INPUT_SLICES / 255] * (3 * INPUT_SLICES) + [1 / 255] * 7
-    return CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
+    layout = CodeLayout(torch.tensor(scale), torch.tensor([*np.repeat(range(3), INPUT_SLICES), *range(3, 10)]))
+    return Activations([layout.dequantise(image[0])[None] for image in codes], list(codes), layout)
 
 
 # The fit
@@ -188,7 +185,7 @@ class Fit:
         return COLOURS if name == self.shape.last else count
 
     def _noise_gain(self, name: str) -> Tensor:
-        """Power of the noise in the colours per power of noise in each channel of a layer of the last level.
+        """Return the power of noise in the colours per power of noise in each channel of a last-level layer.
 
         ReLUs are ignored.
         """
@@ -200,7 +197,7 @@ class Fit:
         return result
 
     def _output_layout(self, name: str, exact: list[Tensor], rectified: int) -> tuple[CodeLayout, Tensor]:
-        """The layout of a layer's output codes, and the value at which each code channel's slice starts."""
+        """Return the layout of a layer's output codes, and the value at which each code channel's slice starts."""
         count = len(exact[0][0])
         if name == self.shape.last or rectified < count:
             tops, slices = torch.ones(rectified), torch.full((rectified,), self.slices_out)
@@ -225,7 +222,7 @@ class Fit:
         scale = torch.cat([scale, torch.full(signed.shape, 2 * SIGNED_RANGE / 255)])
         offset = torch.cat([offset, torch.full(signed.shape, -SIGNED_ZERO * 2 * SIGNED_RANGE / 255)])
         if name == self.shape.last or rectified < count:
-            source, scale, offset = (F.pad(x, (0, -len(x) % 16), value=x[0]) for x in (source, scale, offset))
+            source, scale, offset = (F.pad(x, (0, -len(x) % 16), value=float(x[0])) for x in (source, scale, offset))
         return CodeLayout(scale, source), offset
 
 
@@ -242,12 +239,12 @@ def slices_per_channel(noise: Tensor, extra: int) -> Tensor:
 
 
 def _quantile(values: Tensor, share: float) -> Tensor:
-    """Quantile of each row."""
+    """Return the quantile of each row."""
     return values.kthvalue(max(round(share * values.shape[1]), 1), dim=1).values
 
 
 def _patches(image: Tensor, pixels: Tensor) -> Tensor:
-    """The 3 x 3 neighbourhoods of some pixels of an image (1, C, H, W): (P, 9 C), ordered as a kernel's weights."""
+    """Return the 3 x 3 neighbourhoods of pixels of an image (1, C, H, W): (P, 9 C), ordered as a kernel's weights."""
     width = image.shape[3]
     padded, rows, columns = F.pad(image[0], (1, 1, 1, 1)), pixels // width, pixels % width
     parts = [padded[:, rows + y, columns + x] for y in range(3) for x in range(3)]
@@ -287,9 +284,9 @@ def gptq(inputs: Tensor, outputs: Tensor, weights: Tensor) -> tuple[Tensor, Tens
     channel, pixel = torch.arange(count) // 9, torch.arange(count) % 9
     beside = (channel ^ 1) * 9 + pixel
     for i in range(count):
-        other = chosen[:, beside[order[i]]]
-        largest = (MAX_PAIR - other.clamp_min(0)).clamp_max(MAX_WEIGHT)
-        smallest = (-MAX_PAIR - other.clamp_max(0)).clamp_min(-MAX_WEIGHT)
+        partner = chosen[:, beside[order[i]]]
+        largest = (MAX_PAIR - partner.clamp_min(0)).clamp_max(MAX_WEIGHT)
+        smallest = (-MAX_PAIR - partner.clamp_max(0)).clamp_min(-MAX_WEIGHT)
         chosen[:, order[i]] = (rest[:, i] / step).round().clamp(smallest, largest)
         error = (rest[:, i] - chosen[:, order[i]] * step) / upper[i, i]
         rest[:, i:] -= error[:, None] * upper[i, i:]
@@ -301,26 +298,20 @@ def run_unet_on_activations(
 ) -> Activations:
     """Run a U-Net on exact values and codes alike."""
 
-    def each(change: Callable[[Tensor], Tensor], values: Activations) -> Activations:
+    def changed(change: Callable[[Tensor], Tensor], values: Activations) -> Activations:
         return Activations([change(i) for i in values.exact], [change(i) for i in values.codes], values.layout)
 
-    def concat(one: Activations, other: Activations) -> Activations:
+    def concat(above: Activations, skipped: Activations) -> Activations:
         exact, codes = (
             [torch.cat(pair, dim=1) for pair in zip(*images, strict=True)]
-            for images in ((one.exact, other.exact), (one.codes, other.codes))
+            for images in ((above.exact, skipped.exact), (above.codes, skipped.codes))
         )
-        source = torch.cat([one.layout.source_channel, other.layout.source_channel + one.exact[0].shape[1]])
-        return Activations(exact, codes, CodeLayout(torch.cat([one.layout.scale, other.layout.scale]), source))
+        source = torch.cat([above.layout.source_channel, skipped.layout.source_channel + above.exact[0].shape[1]])
+        return Activations(exact, codes, CodeLayout(torch.cat([above.layout.scale, skipped.layout.scale]), source))
 
     with torch.no_grad():
-        return run_unet(
-            shape,
-            inputs,
-            conv,
-            pool=lambda values: each(lambda image: F.max_pool2d(image, 2), values),
-            upsample=lambda values: each(lambda image: upsample(image, 2), values),
-            concat=concat,
-        )
+        pool = functools.partial(changed, functools.partial(F.max_pool2d, kernel_size=2))
+        return run_unet(shape, inputs, conv, pool, functools.partial(changed, lambda image: upsample(image, 2)), concat)
 
 
 def quantise_mean_denoiser(shape: Shape, weights: Weights, codes: Sequence[Tensor]) -> Fit:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Builds ONNX graphs with quantised U-Nets. Tensor names are those of the files that ship.
+"""Build ONNX graphs with quantised U-Nets. Tensor names are those of the files that ship.
 
 Only standard operators are used. ONNX Runtime's own ones read pixels with their channels side by side, but transposes
 around the standard ones, which it removes, are as fast.
@@ -7,18 +7,24 @@ around the standard ones, which it removes, are as fast.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import onnx
+import torch
 from onnx import TensorProto, compose, helper, numpy_helper
 
+from oiio_msspl.model.encoding import MAX_RADIANCE
+from research.training.encoding import log_decode, log_encode, pu_encode
 from research.training.oidn import run_unet
-from research.training.pu_curve import largest_log_encoded, pu_encode_log
 from research.training.quantise.codes import INPUT_CHANNELS
 from research.training.quantise.gptq import COLOURS, Fit
 from research.training.tracing import IR_VERSION, OPSET
 
 #: Entries of the table from log-encoded to PU-encoded radiance.
 ENTRIES = 1 << 16
+#: Log-encoded ``MAX_RADIANCE``, the last entry.
+LARGEST = float(log_encode(torch.tensor(MAX_RADIANCE, dtype=torch.double)))
 #: Rows into which entries of a table are divided. The number of pixels of a tile is a multiple of it.
 COPIES = 16
 
@@ -29,11 +35,12 @@ class Nodes:
     def __init__(self) -> None:
         self.nodes: list[onnx.NodeProto] = []
         self.embedded: list[onnx.TensorProto] = []
-        self.initializers: dict[str, np.ndarray] = {"zero": np.uint8(0)}
+        self.initializers: dict[str, np.ndarray | np.generic] = {"zero": np.uint8(0)}
 
     def finished(
         self, name: str, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
+        """Return the model."""
         values = (numpy_helper.from_array(np.asarray(v), k) for k, v in self.initializers.items())
         graph = helper.make_graph(self.nodes, name, inputs, outputs, [*values, *self.embedded])
         return helper.make_model(graph, opset_imports=[helper.make_opsetid("", OPSET)], ir_version=IR_VERSION)
@@ -42,7 +49,7 @@ class Nodes:
         """Add the graph of a model.
 
         Args:
-            prefix: of its tensors, but for its inputs and outputs.
+            prefix: of its tensors, except its inputs and outputs.
             names: other names for inputs and outputs.
         """
         outside = {value.name for value in (*model.graph.input, *model.graph.output)}
@@ -50,21 +57,24 @@ class Nodes:
         for node in graph.node:
             for tensors in (node.input, node.output):
                 for i, name in enumerate(tensors):
-                    own = name.removeprefix(prefix)
-                    tensors[i] = names.get(own, own) if own in outside else name
+                    original = name.removeprefix(prefix)
+                    tensors[i] = names.get(original, original) if original in outside else name
         self.nodes += graph.node
         self.embedded += graph.initializer
 
-    def add(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
+    def add(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
+        """Add an operator and return the name of its output."""
         self.nodes.append(helper.make_node(kind, inputs, [output], name=output, **attributes))
         return output
 
-    def constant(self, name: str, values: np.ndarray) -> str:
+    def constant(self, name: str, values: np.ndarray | np.generic) -> str:
+        """Add a constant and return its name."""
         self.initializers[name] = values
         return name
 
-    def cut(self, values: str, start: int, stop: int, output: str, axis: int = 1) -> str:
-        bounds = [self.constant(f"at{n}", np.array([n])) for n in (start, stop, axis)]
+    def cut(self, values: str, start: int, stop: int, output: str) -> str:
+        """Cut channels ``start`` to ``stop`` out of an image."""
+        bounds = [self.constant(f"at{n}", np.array([n])) for n in (start, stop, 1)]
         return self.add("Slice", [values, *bounds], output)
 
     def split(self, image: str, names: dict[str, int]) -> list[str]:
@@ -96,13 +106,13 @@ class Nodes:
         # When the file is loaded, the copies are computed once.
         tables = self.add("Expand", [table, one], f"{output}.tables")
         flat = self.add("Reshape", [entries, rows], f"{output}.rows")
-        found = self.add("GatherElements", [tables, flat], f"{output}.found", axis=1)
-        return self.add("Reshape", [found, self.add("Shape", [entries], f"{output}.shape")], output)
+        results = self.add("GatherElements", [tables, flat], f"{output}.found", axis=1)
+        return self.add("Reshape", [results, self.add("Shape", [entries], f"{output}.shape")], output)
 
     def log_to_pu(self, values: str) -> str:
-        """Log-encoded to PU-encoded radiance, by a table."""
-        self.constant("pu", pu_encode_log(ENTRIES).astype(np.float32))
-        return self.table(values, largest_log_encoded(), "pu")
+        """Convert log-encoded to PU-encoded radiance, by a table."""
+        self.constant("pu", pu_encoded_table())
+        return self.table(values, LARGEST, "pu")
 
     def slices(self, values: str, count: int) -> list[str]:
         """Quantise values in [0, 1] to the codes of slices, see :func:`research.training.quantise.codes.sliced`."""
@@ -115,16 +125,19 @@ class Nodes:
         return parts
 
     def zeros(self, image: str) -> str:
-        """A plane of zeros."""
-        return self.add(
-            "QuantizeLinear",
-            [self.cut(image, 0, 1, f"{image}.any"), self.constant("vast", np.float32(1e30)), "zero"],
-            f"{image}.none",
-        )
+        """Add a plane of zeros of an image's size."""
+        plane, vast = self.cut(image, 0, 1, f"{image}.any"), self.constant("vast", np.float32(1e30))
+        return self.add("QuantizeLinear", [plane, vast, "zero"], f"{image}.none")
 
     def packed(self, planes: list[str], name: str) -> str:
         """Concatenate images and order them as a U-Net reads them, (1, H, W, C)."""
         return self.add("Transpose", [self.add("Concat", planes, f"{name}.planes", axis=1)], name, perm=[0, 2, 3, 1])
+
+
+def pu_encoded_table() -> np.ndarray:
+    """Return the PU-encoded values of ``ENTRIES`` evenly spaced log-encoded ones, from 0 to the largest: float32."""
+    radiance = log_decode(torch.linspace(0, LARGEST, ENTRIES, dtype=torch.double))
+    return pu_encode(radiance.clamp_max(MAX_RADIANCE)).float().numpy()
 
 
 class Graph(Nodes):
@@ -136,7 +149,7 @@ class Graph(Nodes):
         self.initializers |= {"one": np.float32(1), "no_offset": np.int8(0)}
 
     def model(self) -> onnx.ModelProto:
-        """The graph of a network that denoises."""
+        """Return the graph of a network that denoises."""
         self.colours(["layers"], "codes")
         return self.finished(
             "oidn",
@@ -154,7 +167,7 @@ class Graph(Nodes):
         self.initializers["all_slices"] = all_slices
         return self.add("MatMulInteger", [last, "all_slices", "zero", "no_offset"], output)
 
-    def _add_on_planes(self, kind: str, inputs: list[str], output: str, **attributes: object) -> str:
+    def _add_on_planes(self, kind: str, inputs: list[str], output: str, **attributes: Any) -> str:
         """Add an operator that reads and writes (1, C, H, W), where the rest of the U-Net has (1, H, W, C)."""
         planes = self.add("Transpose", inputs[:1], f"{output}.in", perm=[0, 3, 1, 2])
         result = self.add(kind, [planes, *inputs[1:]], f"{output}.out", **attributes)
@@ -167,23 +180,13 @@ class Graph(Nodes):
         weights, bias = layer.weights.numpy().astype(np.int8), np.round(layer.bias.numpy() / steps).astype(np.int32)
         steps = steps[source]
         offset = np.round(layer.offset.numpy() / steps).astype(np.int32)
-        return self._add_on_planes(
-            "QLinearConv",
-            [
-                values,
-                "one",
-                "zero",
-                self.constant(f"{name}.weight", weights[source]),
-                self.constant(f"{name}.scale", steps / layer.outputs.scale.numpy()),
-                self.constant(f"{name}.offset", np.zeros(len(steps), np.int8)),
-                "one",
-                "zero",
-                self.constant(f"{name}.bias", bias[source] - offset),
-            ],
-            name,
-            kernel_shape=[3, 3],
-            pads=[1, 1, 1, 1],
-        )
+        constants = {
+            "weight": weights[source], "scale": steps / layer.outputs.scale.numpy(),
+            "offset": np.zeros(len(steps), np.int8), "bias": bias[source] - offset,
+        }  # fmt: skip
+        *kernel, bias_name = (self.constant(f"{name}.{kind}", array) for kind, array in constants.items())
+        inputs = [values, "one", "zero", *kernel, "one", "zero", bias_name]
+        return self._add_on_planes("QLinearConv", inputs, name, kernel_shape=[3, 3], pads=[1, 1, 1, 1])
 
     def _pool(self, values: str) -> str:
         return self._add_on_planes("MaxPool", [values], f"{values}.halved", kernel_shape=[2, 2], strides=[2, 2])
@@ -197,17 +200,12 @@ class Graph(Nodes):
         height_width = self.add("Shape", [values], f"{values}.small", start=1, end=3)
         factors, one = self.constant(f"by{factor}", np.array([factor, factor])), self.constant("only", np.array([1]))
         count = self.constant(f"{values}.channels", np.array([channels]))
-        large = self.add(
-            "Concat",
-            [one, self.add("Mul", [height_width, factors], f"{values}.times"), count],
-            f"{values}.shape",
-            axis=0,
-        )
+        larger = self.add("Mul", [height_width, factors], f"{values}.times")
+        large = self.add("Concat", [one, larger, count], f"{values}.shape", axis=0)
         apart = self.add("Unsqueeze", [values, self.constant("apart", np.array([2, 4]))], f"{values}.apart")
         squares = self.constant(f"squares{factor}", np.array([1, 1, factor, 1, factor, 1]))
-        return self.add(
-            "Reshape", [self.add("Expand", [apart, squares], f"{values}.squares"), large], f"{values}.large"
-        )
+        repeated = self.add("Expand", [apart, squares], f"{values}.squares")
+        return self.add("Reshape", [repeated, large], f"{values}.large")
 
-    def _concat(self, one: str, other: str) -> str:
-        return self.add("Concat", [one, other], f"{one}+{other}", axis=3)
+    def _concat(self, above: str, skipped: str) -> str:
+        return self.add("Concat", [above, skipped], f"{above}+{skipped}", axis=3)

@@ -20,18 +20,8 @@ from research.training.encoding import log_to_pu
 from research.training.joint import DECODED, FEATURES, MARGIN, OUTPUTS, JointFusion, blend
 from research.training.ops import log2_scale, upsample
 from research.training.paper import LRHS_CHANNELS
+from research.training.quantise import gptq
 from research.training.quantise.codes import log_encoded_of_code, sliced
-from research.training.quantise.gptq import (
-    COLOURS,
-    SIGNED_RANGE,
-    SIGNED_ZERO,
-    Activations,
-    CodeLayout,
-    Fit,
-    concatenated,
-    run_unet_on_activations,
-    sliced_layout,
-)
 from research.training.quantise.graph import Graph
 from research.training.quantise.layers import Networks, add_layers
 
@@ -54,22 +44,23 @@ class Blend(nn.Module):
     def forward(
         self, lrhs: Tensor, samples: Tensor, albedo: Tensor, denoised: Tensor, logits: Sequence[Tensor]
     ) -> Tensor:
+        """Blend as :func:`research.training.joint.blend`."""
         return blend(lrhs, samples, albedo, denoised, logits, self.margin)
 
 
 # The U-Net's inputs as codes
 
 
-def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
-    """The U-Net's inputs at H and at H/2, for pairs of the network's inputs."""
-    plain = CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
+def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[gptq.Activations]:
+    """Return the U-Net's inputs at H and at H/2, for pairs of the network's inputs."""
+    plain = gptq.CodeLayout(torch.full((6,), 1 / 255), torch.arange(3, 9))
     layouts = [
-        concatenated(sliced_layout(HRLS_SLICES, 0), plain),
-        concatenated(sliced_layout(MEAN_SLICES, 0), sliced_layout(LRHS_SLICES, 3)),
+        gptq.concatenated(gptq.sliced_layout(HRLS_SLICES, 0), plain),
+        gptq.concatenated(gptq.sliced_layout(MEAN_SLICES, 0), gptq.sliced_layout(LRHS_SLICES, 3)),
     ]
     codes: list[list[Tensor]] = [[], []]
     for lrhs, hrls in pairs:
-        albedo, normal = hrls[:, 3:6].clamp(0, 1) * 255, hrls[:, 6:9] * 127.5 + SIGNED_ZERO
+        albedo, normal = hrls[:, 3:6].clamp(0, 1) * 255, hrls[:, 6:9] * 127.5 + gptq.SIGNED_ZERO
         full = torch.cat(
             [sliced(log_to_pu(hrls[:, :3]), HRLS_SLICES), albedo.round(), normal.round().clamp(0, 255)], dim=1
         )
@@ -82,7 +73,7 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
             images.append(F.pad(image, (0, 0, 0, 0, 0, 1)))
 
     return [
-        Activations([layout.dequantise(image[0])[None] for image in images], images, layout)
+        gptq.Activations([layout.dequantise(image[0])[None] for image in images], images, layout)
         for images, layout in zip(codes, layouts, strict=True)
     ]
 
@@ -90,11 +81,11 @@ def unet_inputs(pairs: Sequence[tuple[Tensor, Tensor]]) -> list[Activations]:
 def calibration_pairs(
     views: Path, scales: Sequence[int], prepare: Prepare | None, count: int = PAIRS, *, spread: bool = False
 ) -> list[tuple[Tensor, Tensor]]:
-    """Inputs of the network, from views as training draws them.
+    """Draw inputs of the network from views, as training does.
 
     Args:
         scales: of each pair, one of these at random.
-        prepare: see :func:`research.training.mean_denoiser.with_denoised_mean`.
+        prepare: see :func:`research.training.denoisers.with_denoised_mean`.
         spread: of views with single samples, only pixel filters that spread noise; otherwise only others.
     """
     sampling = Sampling(spread_noise=spread)
@@ -105,11 +96,11 @@ def calibration_pairs(
 # The fit
 
 
-def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> Fit:
+def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tensor]]) -> gptq.Fit:
     """Quantise the U-Net and its heads, those that ``scale`` and smaller ones need."""
     weights = {}
-    for name, conv in network.convs.items():
-        weights[f"{name}.weight"], weights[f"{name}.bias"] = conv.total()
+    for name, layer in network.convs.items():
+        weights[f"{name}.weight"], weights[f"{name}.bias"] = layer.total()
     for kind in ("weight", "bias"):
         heads = [getattr(head, kind) for head in network.heads]
         last = f"{network.shape.last}.{kind}"
@@ -120,17 +111,17 @@ def fitted(network: JointFusion, scale: int, pairs: Sequence[tuple[Tensor, Tenso
     weights = {name: value.detach() for name, value in weights.items()}
     # Without further slices, the small network's finest level reads a third fewer channels. 8 bits cost it 0.05 to
     # 0.07 dB at x2
-    fit = Fit(network.shape, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
+    fit = gptq.Fit(network.shape, weights, SLICES_OUT, extra_slices=0 if network.size == "small" else None)
     level_of_layer = {name: level for level, name in enumerate(DECODED)}
 
-    def conv(name: str, values: Activations) -> Activations:
+    def conv(name: str, values: gptq.Activations) -> gptq.Activations:
         result = fit.conv(name, values)
         if 0 < level_of_layer.get(name, 0) < scale.bit_length():
             fit.conv(f"head{level_of_layer[name]}", result)
         return result
 
     with torch.no_grad():
-        run_unet_on_activations(network.shape, unet_inputs(pairs), conv)
+        gptq.run_unet_on_activations(network.shape, unet_inputs(pairs), conv)
     return fit
 
 
@@ -146,7 +137,7 @@ class JointGraph(Graph):
         layers: denoise albedo and normal first, see :mod:`research.training.quantise.layers`.
     """
 
-    def __init__(self, fit: Fit, scale: int, layers: Networks | None = None) -> None:
+    def __init__(self, fit: gptq.Fit, scale: int, layers: Networks | None = None) -> None:
         super().__init__(fit)
         self._scale, self._layers = scale, layers
         self.initializers["unseen"] = log_encoded_of_code(SLICES_OUT)
@@ -154,7 +145,7 @@ class JointGraph(Graph):
     def whole(
         self, mixing: onnx.ModelProto, inputs: list[onnx.ValueInfoProto], outputs: list[onnx.ValueInfoProto]
     ) -> onnx.ModelProto:
-        """The model with the graph of :class:`Blend`, whose inputs have the names of tensors that are made here."""
+        """Return the model with the graph of :class:`Blend`, whose inputs have the names of tensors made here."""
         colour, albedo, normal = self.split("hrls", {"colour": 3, "albedo": 3, "normal": 3})
         step, half_step = self.constant("step", np.float32(1 / 255)), self.constant("half_step", np.float32(1 / 127.5))
         zeros = self.zeros(albedo)
@@ -163,28 +154,22 @@ class JointGraph(Graph):
             albedo = "albedo"
             normal_codes = self.add("QuantizeLinear", ["normal", step, "zero"], "normal.rounded")
         else:
-            middle = self.constant("middle", np.uint8(SIGNED_ZERO))
+            middle = self.constant("middle", np.uint8(gptq.SIGNED_ZERO))
             normal_codes = self.add("QuantizeLinear", [normal, half_step, middle], "normal.rounded")
         albedo_codes = self.add("QuantizeLinear", [albedo, step, "zero"], "albedo.rounded")
         colours = self.slices(self.log_to_pu(colour), HRLS_SLICES)
         full = self.packed([*colours, albedo_codes, normal_codes, zeros], "full")
         low, mean = self.split("lrhs", {"colour": LRHS_CHANNELS, "mean": LRHS_CHANNELS})
-        half = self.packed(
-            [
-                *self.slices(self.log_to_pu(mean), MEAN_SLICES),
-                *self.slices(self.log_to_pu(low), LRHS_SLICES),
-                self.zeros(low),
-            ],
-            "half",
-        )
+        means = self.slices(self.log_to_pu(mean), MEAN_SLICES)
+        half = self.packed([*means, *self.slices(self.log_to_pu(low), LRHS_SLICES), self.zeros(low)], "half")
         if self._scale > 2:
             half = self.repeat(half, 16, self._scale // 2)
         sums = self.colours([full, half], "sums")
         pixels = self.look_up("unseen", sums, "denoised.pixels")
         self.add("Transpose", [pixels], "denoised", perm=[0, 3, 1, 2])
         last = self.fit.shape.last
-        count = len(self.fit.layers[last].step) - COLOURS
-        self.add("Identity", [self._planes(last, COLOURS * SLICES_OUT, count)], "logits0")
+        count = len(self.fit.layers[last].step) - gptq.COLOURS
+        self.add("Identity", [self._planes(last, gptq.COLOURS * SLICES_OUT, count)], "logits0")
         for level in range(1, self._scale.bit_length()):
             name = self.conv(f"head{level}", DECODED[level])
             planes = self._planes(name, 0, len(self.fit.layers[name].step))
@@ -200,14 +185,15 @@ class JointGraph(Graph):
         # To transpose all channels and cut them then takes half of the time of the other order.
         planes = self.add("Transpose", [layer], f"{layer}.planes", perm=[0, 3, 1, 2])
         part = self.cut(planes, start, start + count, f"{layer}.beside")
-        step = self.constant("signed_step", np.float32(2 * SIGNED_RANGE / 255))
-        middle = self.constant("middle", np.uint8(SIGNED_ZERO))
+        step = self.constant("signed_step", np.float32(2 * gptq.SIGNED_RANGE / 255))
+        middle = self.constant("middle", np.uint8(gptq.SIGNED_ZERO))
         return self.add("DequantizeLinear", [part, step, middle], f"{layer}.values")
 
 
-def to_onnx(fit: Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
-    """Graph with inputs ``lrhs`` and ``hrls``, outputs ``fused`` and ``log_error``, and with ``layers`` the denoised
-    ``albedo`` and ``normal``.
+def to_onnx(fit: gptq.Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | None = None) -> onnx.ModelProto:
+    """Return the graph with inputs ``lrhs`` and ``hrls`` and outputs ``fused`` and ``log_error``.
+
+    With ``layers``, it also returns the denoised ``albedo`` and ``normal``.
 
     Args:
         fit: see :func:`fitted`.
@@ -218,6 +204,6 @@ def to_onnx(fit: Fit, scale: int, mixing: onnx.ModelProto, layers: Networks | No
     info, kind = helper.make_tensor_value_info, TensorProto.FLOAT
     channels = sum(HRLS_FEATURES[name] for name in FEATURES)
     inputs = [info("lrhs", kind, [1, 2 * LRHS_CHANNELS, "h", "w"]), info("hrls", kind, [1, channels, "H", "W"])]
-    results = {"fused": COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
+    results = {"fused": gptq.COLOURS, "log_error": 1} | ({"albedo": 3, "normal": 3} if layers else {})
     outputs = [info(name, kind, [1, count, "H", "W"]) for name, count in results.items()]
     return JointGraph(fit, scale, layers).whole(mixing, inputs, outputs)

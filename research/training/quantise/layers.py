@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional as F
 
+from research.training.denoisers import LayerDenoisers
 from research.training.encoding import from_srgb, srgb
-from research.training.layer_denoisers import LayerDenoisers
 from research.training.oidn import FineTunedUNet
 from research.training.quantise.codes import sliced
 from research.training.quantise.gptq import Activations, Fit, concatenated, run_unet_on_activations, sliced_layout
@@ -28,7 +28,7 @@ Networks = dict[str, onnx.ModelProto]
 
 
 def varied(images: Sequence[Tensor]) -> list[Tensor]:
-    """Encoded HRLS, some with another albedo than training views have.
+    """Give some encoded HRLS an albedo that training views lack.
 
     Weights and codes only suit what calibration has seen; the rest becomes darker. So every second image gets a
     brighter albedo, up to white, in some channels, as bright walls have. Every fourth one gets a black albedo, as
@@ -54,7 +54,7 @@ def fitted(network: FineTunedUNet, slices_out: int, images: Sequence[Activations
 
 
 def layer_codes(image: Tensor) -> Activations:
-    """An albedo, sRGB-encoded, or a normal, both (1, 3, H, W) in [0, 1], as the network's input."""
+    """Convert an sRGB-encoded albedo or a normal, (1, 3, H, W) in [0, 1], to the network's input."""
     layout = concatenated(sliced_layout(SLICES, 0))
     codes = F.pad(sliced(image, SLICES), (0, 0, 0, 0, 0, 1))
     return Activations([layout.dequantise(codes[0])[None]], [codes], layout)

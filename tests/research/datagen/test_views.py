@@ -1,13 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
 """What the renderers of training views share: files that training reads back, cameras worth rendering."""
 
-import json
-
 import numpy as np
 import pytest
 
 from oiio_msspl.image.colour import luminance
-from research.datagen import command_line, quality, shards, views
+from research.datagen import command_line, quality, views
 
 
 def _write(folder, seed=20, brightness=1.0):
@@ -63,45 +61,6 @@ def test_bare_and_black_views_show_nothing():
     sky[:24, :, 6:9] = 0
     assert quality.shows_something(busy)
     assert not any(quality.shows_something(probe) for probe in (bare, black, sky))
-
-
-def test_shards_bring_every_view_back(tmp_path):
-    """None larger than asked for, no split mixed with another, nothing that is there written anew."""
-    source, packed, target = (tmp_path / name for name in ("views", "shards", "again"))
-    source.mkdir()
-    for seed in (19, 20, 21, 22, 23):
-        _write(source, seed)
-    one = max(path.stat().st_size for path in source.iterdir())
-    shards.pack(source, packed, limit=2 * one + 1)
-    entries = json.loads((packed / shards.MANIFEST).read_text())["views"]
-    assert sorted(entry["file"] for entry in entries) == sorted(path.name for path in source.iterdir())
-    splits = {name: {e["split"] for e in entries if e["shard"] == name} for name in {e["shard"] for e in entries}}
-    assert all(len(found) == 1 for found in splits.values())
-    assert len(splits) == 4  # of train, which is 19, 22 and 23, two
-    shards.pack(source, packed, limit=10 * one)
-    assert len(list(packed.glob("*.zip"))) == len(views.SPLITS)  # none is left of the smaller ones
-    shards.pack(source, packed, limit=2 * one + 1)
-    assert entries[0]["spp"] == {"hrls": views.HR_PASSES, "lrhs_average": sum(views.LR_SPP), "reference": None}
-
-    target.mkdir()
-    kept = target / entries[0]["file"]
-    kept.write_bytes(b"mine")
-    shards.unpack(packed, target)
-    assert kept.read_bytes() == b"mine"
-    for entry in entries[1:]:
-        assert (target / entry["file"]).read_bytes() == (source / entry["file"]).read_bytes()
-
-
-def test_shards_that_cannot_be_made_or_read_are_named(tmp_path):
-    _write(tmp_path)
-    with pytest.raises(SystemExit, match=r"cycles-000020-0.npz: has .* bytes, a shard holds 100"):
-        shards.pack(tmp_path, tmp_path / "shards", limit=100)
-    with pytest.raises(SystemExit, match=r"has no manifest.json; make one with `pack`"):
-        shards.unpack(tmp_path, tmp_path / "again")
-    shards.pack(tmp_path, tmp_path / "shards")
-    (tmp_path / "shards" / "views-000.zip").unlink()
-    with pytest.raises(SystemExit, match=r"views-000.zip: is missing; cycles-000020-0.npz is in it"):
-        shards.unpack(tmp_path / "shards", tmp_path / "again")
 
 
 def test_seeds_are_ranges():

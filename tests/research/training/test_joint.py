@@ -20,14 +20,14 @@ onnx = pytest.importorskip("onnx")
 pytest.importorskip("onnxscript")
 
 from research.benchmarks.oidn import run_filter  # noqa: E402
-from research.training import average, checkpoints, export, prune  # noqa: E402
+from research.training import CHECKPOINTS, average, checkpoints, export, prune  # noqa: E402
+from research.training.denoisers import STARTS, MeanDenoiser, with_denoised_mean  # noqa: E402
 from research.training.joint import JointFusion  # noqa: E402
-from research.training.mean_denoiser import STARTS, MeanDenoiser, with_denoised_mean  # noqa: E402
 from research.training.oidn import BASE  # noqa: E402
 from research.training.quantise.__main__ import CHECKPOINT, run_denoiser  # noqa: E402
 from research.training.quantise.codes import denoiser_codes  # noqa: E402
 from research.training.render_mean import with_mean  # noqa: E402
-from research.training.whole_model import CHECKPOINTS, denoiser_file  # noqa: E402
+from research.training.whole_model import denoiser_file  # noqa: E402
 from tests.research.training.extracted import network_of  # noqa: E402
 
 #: Open Image Denoise's quality whose networks each size starts from.
@@ -162,6 +162,8 @@ def test_the_mean_may_include_the_initial_state():
     assert (mean["ema"]["mean_denoiser.convs.enc_conv1a.extra"] == 0.125).all()
     torch.testing.assert_close(mean["ema"]["heads.0.bias"].float(), bias + 0.375)
     torch.testing.assert_close(mean["ema"]["error.bias"], network.error.bias.half())
+    spread = state | {"config": network.config | {"spread": True}, "provenance": {}}
+    assert average.mean([state | {"provenance": {}}, spread])["config"]["spread"]
     with pytest.raises(SystemExit, match="only a joint network"):
         average.mean([state | {"architecture": "paper", "config": {}, "provenance": {}}], initial=(0.25, 0))
 

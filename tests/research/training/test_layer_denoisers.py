@@ -11,8 +11,8 @@ from tests.conftest import noisy, picture
 pyoidn = pytest.importorskip("pyoidn")
 torch = pytest.importorskip("torch")
 
+from research.training.denoisers import LayerDenoisers  # noqa: E402
 from research.training.encoding import from_srgb, srgb  # noqa: E402
-from research.training.layer_denoisers import LayerDenoisers  # noqa: E402
 
 
 def test_srgb_and_its_inverse():

@@ -333,8 +333,8 @@ def test_the_loader_draws_what_the_data_set_does(views: Path) -> None:
 
 def test_the_schedule_follows_the_clock() -> None:
     """Warm-up from 0, the peak, the end of the cosine; a group's share scales it."""
-    run = Mock(spec_set=["optimizer", "peak_lr", "args", "recipe", "elapsed"], peak_lr=1e-3, elapsed=0.0)
-    run.args.minutes, run.args.final_lr, run.recipe = 1, 0.2, train.RECIPES["ours"]
+    run = Mock(spec_set=["optimizer", "peak_lr", "args", "elapsed"], peak_lr=1e-3, elapsed=0.0)
+    run.args.minutes, run.args.final_lr = 1, 0.2
     run.optimizer = torch.optim.SGD([{"params": [torch.zeros(1)], "share": 0.5}], lr=1.0)
     schedule = train.Run.new_schedule(run)
     for elapsed, share in ((0.0, 1e-3), (0.9, 0.5), (1.8, 1.0), (60.0, 0.2)):
@@ -378,7 +378,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     pytest.importorskip("onnxscript")
     onnx = pytest.importorskip("onnx")
     onnxruntime = pytest.importorskip("onnxruntime")
-    from research.training import export, export_checks
+    from research.training import export
     from research.training.whole_model import whole_model
 
     path = tmp_path / "tiny.onnx"
@@ -386,7 +386,7 @@ def test_onnx_file_agrees_with_the_network(tiny_network: MultiResolutionFusion, 
     network = export.to_onnx(tiny_network, contract, half=half)
     onnx.save(whole_model(network, contract, None), path)
 
-    assert export_checks.parity(tiny_network, path) < (5e-3 if half else 1e-5)
+    assert export.parity(tiny_network, path) < (5e-3 if half else 1e-5)
     kinds = {node.op_type for node in network.graph.node}
     assert kinds - {"Cast"} == {"Conv", "Relu", "Concat", "Add", "SpaceToDepth", "DepthToSpace"}
     assert str(Path(__file__).parents[3]).encode() not in path.read_bytes()

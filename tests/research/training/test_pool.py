@@ -12,13 +12,12 @@ torch = pytest.importorskip("torch", reason="training is an extra")
 
 from research.datagen.samples import SIZE, encode  # noqa: E402
 from research.datagen.views import NO_REFERENCE, REF_CELLS, Folder  # noqa: E402
-from research.training import checkpoints  # noqa: E402
+from research.training import CHECKPOINTS, checkpoints  # noqa: E402
 from research.training.data import SampleTensors, Sampling  # noqa: E402
 from research.training.encoding import log_encode  # noqa: E402
 from research.training.joint import JointFusion  # noqa: E402
-from research.training.pool import Denoisers, PooledBatches, Teacher, draw_pairs  # noqa: E402
+from research.training.pool import Denoisers, PooledBatches, Teacher, draw_pairs, fill  # noqa: E402
 from research.training.quantise.joint import calibration_pairs  # noqa: E402
-from research.training.whole_model import CHECKPOINTS  # noqa: E402
 from tests.research.training.conftest import write_wall  # noqa: E402
 
 CPU = torch.device("cpu")
@@ -36,6 +35,19 @@ def test_views_are_drawn_whole(sample_folder: Path) -> None:
     for image in (pair["hrls"][:3], pair["lrhs"][:3], pair["lrhs"][3:6]):
         torch.testing.assert_close(image.mean(dim=(1, 2)), colours, atol=0.01, rtol=0)
     assert pair["lrhs"][6].max() < 0.01
+
+
+def test_views_that_come_later_are_drawn_by_the_same_command(sample_folder: Path, tmp_path: Path) -> None:
+    """Views that have pairs are not drawn again; those without a reference are only for a teacher."""
+    pool = tmp_path / "pool"
+    for _ in range(2):
+        fill(sample_folder, pool, (8,), 1, Denoisers([], CPU))
+        (file,) = pool.iterdir()
+        assert file.name == "mitsuba-000003-0.samples.npz.pt"
+    written = file.stat().st_mtime_ns
+    write_wall(sample_folder, split=NO_REFERENCE)
+    fill(sample_folder, pool, (8,), 1, Denoisers([], CPU))
+    assert [path.stat().st_mtime_ns for path in pool.iterdir()] == [written]
 
 
 def test_parts_of_both_renders_may_have_all_samples(sample_folder: Path) -> None:

@@ -15,8 +15,8 @@ from tests.conftest import noisy, picture
 torch = pytest.importorskip("torch")
 onnx = pytest.importorskip("onnx")
 
+from research.training.encoding import pu_encode  # noqa: E402
 from research.training.oidn import LARGE, run_unet  # noqa: E402
-from research.training.pu_curve import pu_encode  # noqa: E402
 from research.training.quantise import gptq  # noqa: E402
 from research.training.quantise.codes import INPUT_CHANNELS, OUTPUT_SLICES, denoiser_codes  # noqa: E402
 from research.training.quantise.graph import COPIES, Graph, Nodes  # noqa: E402
@@ -39,7 +39,7 @@ def test_the_slices_of_a_value_add_up_to_it():
     codes = codes_of(clean, noise=0.25)
     assert codes.shape == (1, INPUT_CHANNELS, 16, 32) and codes.min() >= 0 and codes.max() <= 255
     slices = codes[0, :9].unflatten(0, (3, 3)).sum(dim=1).permute(1, 2, 0).numpy() / (3 * 255)
-    np.testing.assert_allclose(slices, pu_encode(clean.astype(np.float64)), atol=0.6 / (3 * 255))
+    np.testing.assert_allclose(slices, pu_encode(torch.from_numpy(clean).double()).numpy(), atol=0.6 / (3 * 255))
     rest = codes[0, 9:].permute(1, 2, 0).numpy() / 255
     np.testing.assert_allclose(rest[..., :3], clean.clip(0, 1), atol=0.6 / 255)
     np.testing.assert_allclose(rest[..., 3:6] * 2 - 1, np.broadcast_to([0.6, -0.8, 0], clean.shape), atol=1.01 / 255)

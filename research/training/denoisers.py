@@ -1,0 +1,97 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What `joint` denoises before it fuses: the mean of both renders, and for its size ``large`` albedo and normal.
+
+A network of Open Image Denoise is fine-tuned to denoise the mean at the LRHS's resolution. The given network expects a
+noise-free albedo and normal, and estimates the noise of the colour itself. Here albedo and normal are means of s x s
+HRLS pixels, which are noisy at x2, and the difference of the two renders gives an estimate of the colour's noise. The
+fine-tuned network reads all of these. Albedo and normal are denoised by Open Image Denoise's base networks as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import torch
+from torch import Tensor, nn
+
+from oiio_msspl.image.arrays import Array
+from research.training import oidn
+from research.training.encoding import from_srgb, log_to_pu, pu_to_log, srgb
+from research.training.ops import box_downsample, log2_scale
+from research.training.paper import LRHS_CHANNELS
+from research.training.render_mean import with_mean
+
+#: Height and width of the mean are multiples of this.
+ALIGNMENT = 16
+#: The extra input channel is the noise.
+EXTRA = 1
+#: The convolutions of the large network's two lowest levels.
+LOWEST = ("enc_conv4a", "enc_conv4b", "enc_conv5a", "enc_conv5b", "dec_conv4a", "dec_conv4b")
+#: By the size of :class:`research.training.joint.JointFusion`. Of the large network, only the outer levels are
+#: trained: the two lowest ones have two thirds of all weights.
+STARTS = {
+    "small": oidn.Start(oidn.SMALL_CLEAN_HDR, oidn.BASE, ("enc_conv0", "dec_conv1a"), EXTRA),
+    "usual": oidn.Start(oidn.LARGE_HDR, oidn.LARGE, ("enc_conv1a", "dec_conv1a"), EXTRA, frozen=LOWEST),
+}
+
+
+class MeanDenoiser(oidn.FineTunedUNet):
+    """The denoiser of both renders' mean. Its size is a key of ``STARTS``."""
+
+    def __init__(self, size: str = "usual") -> None:
+        super().__init__(STARTS[size])
+
+    def forward(self, mean: Tensor, noise: Tensor, albedo: Tensor, normal: Tensor) -> Tensor:
+        """Denoise the mean (N, 3, h, w) of both renders, log-encoded.
+
+        The arguments are those that :func:`research.training.render_mean.mean_of_renders` returns.
+        """
+        colour = self.run(torch.cat([log_to_pu(mean), albedo.clamp(0.0, 1.0), 0.5 * normal + 0.5, noise], dim=1))
+        return pu_to_log(colour.clamp_max(1.0))
+
+
+def denoise_mean(denoiser: MeanDenoiser, lrhs: Tensor, hrls: Tensor) -> Tensor:
+    """Replace a mean of both renders by the denoised one.
+
+    Args:
+        lrhs: (N, 7, h, w): the LRHS, the mean of both renders, its noise, see
+            :func:`research.training.render_mean.with_mean`.
+        hrls: (N, 9 or more, s*h, s*w): the HRLS's encoded colour, albedo and normal.
+
+    Returns:
+        (N, 6, h, w), log-encoded: the LRHS and the denoised mean.
+    """
+    low, mean, noise = lrhs.split([LRHS_CHANNELS, LRHS_CHANNELS, 1], dim=1)
+    scale = 2 ** log2_scale(lrhs, hrls)
+    albedo, normal = (box_downsample(image, scale) for image in (hrls[:, 3:6].clamp(0, 1), hrls[:, 6:9]))
+    return torch.cat([low, denoiser(mean, noise, albedo, normal)], dim=1)
+
+
+def with_denoised_mean(denoiser: MeanDenoiser) -> Callable[[Array, Array], tuple[Array, Array]]:
+    """Return a function that appends the denoised mean of both renders to an encoded LRHS (h, w, 3), given an HRLS."""
+
+    @torch.inference_mode()
+    def prepare(lrhs: Array, hrls: Array) -> tuple[Array, Array]:
+        low, high = (torch.from_numpy(image).permute(2, 0, 1)[None] for image in with_mean(lrhs, hrls))
+        return denoise_mean(denoiser, low, high)[0].permute(1, 2, 0).numpy(), hrls
+
+    return prepare
+
+
+class LayerDenoisers(nn.Module):
+    """Open Image Denoise's base networks for albedo and normal."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.albedo, self.normal = (
+            oidn.FineTunedUNet(oidn.untouched(name, oidn.BASE)) for name in (oidn.ALBEDO_BASE, oidn.NORMAL_BASE)
+        )
+
+    def forward(self, albedo: Tensor, normal: Tensor) -> tuple[Tensor, Tensor]:
+        """Denoise an albedo in [0, 1] and a normal in [-1, 1], (N, 3, H, W) each; both results are in [0, 1]."""
+        return from_srgb(self.albedo.run(srgb(albedo)).clamp(0, 1)), self.normal.run(0.5 * normal + 0.5).clamp(0, 1)
+
+    def applied(self, hrls: Tensor) -> Tensor:
+        """Denoise the albedo and normal of an encoded HRLS (N, 9 or more, H, W): (N, 9, H, W)."""
+        albedo, normal = self(hrls[:, 3:6], hrls[:, 6:9])
+        return torch.cat([hrls[:, :3], albedo, 2 * normal - 1], dim=1)

@@ -38,12 +38,12 @@ def beside(output: Path, suffix: str) -> Path:
 
 
 def _cycles_sets(names: Sequence[str]) -> list[AdditiveSet]:
-    """The additive sets that a file of Cycles with these passes has."""
+    """Return the additive sets that a file of Cycles with these passes has."""
     layers = [
         Layer(name, "", {c: Channel(Path(), 0, 3 * i + j, f"{name}.{c}", "float") for j, c in enumerate("RGB")})
         for i, name in enumerate(names)
     ]
-    cycles = next(each for each in renderers() if each["name"] == "Cycles")
+    cycles = next(renderer for renderer in renderers() if renderer["name"] == "Cycles")
     return find_additive_sets(cycles, layers, Beauty("", "", Layer("Combined", "")))
 
 
@@ -96,11 +96,12 @@ class RenderedShot:
     @property
     def order(self) -> list[FrameFiles]:
         """The frames to render: those that are to be written, and their neighbours."""
-        return ShotRun(self._settings, self._plan, self._wanted).order
+        shot = {files.number: files for files in self._shot}
+        return [shot[number] for number in self._plan.timeline(self._wanted).order]
 
     @property
     def averages(self) -> bool:
-        """Whether frames are averaged with their neighbours."""
+        """True if frames are averaged with their neighbours."""
         return self._plan.count > 0
 
     @property
@@ -143,10 +144,12 @@ class RenderedShot:
         if layers is None or write.passes in ((), ("none",)):
             return
         sets = _cycles_sets(layers)
-        if not any(each.matches(pattern) for each in sets for pattern in write.passes):
-            known = ", ".join(f"'{each.name}'" for each in sets) or "none (turn on light groups, or pass --components)"
+        if not any(group.matches(pattern) for group in sets for pattern in write.passes):
+            listed = (
+                ", ".join(f"'{group.name}'" for group in sets) or "none (turn on light groups, or pass --components)"
+            )
             raise InputError(
-                f"--passes {', '.join(write.passes)}: the scene renders no such set of layers; it has {known}"
+                f"--passes {', '.join(write.passes)}: the scene renders no such set of layers; it has {listed}"
             )
 
     def fuse(self, lr: Path, hr: Path) -> None:
@@ -230,11 +233,11 @@ class RenderedShot:
         return f"{said}; both renders are kept for msspl-fuse: {', '.join(map(str, kept.values()))}"
 
     def waits(self, output: Path) -> bool:
-        """Whether a frame is rendered, and waits for its neighbours."""
+        """Return whether a frame is rendered, and waits for its neighbours."""
         return output not in self._warnings and any(frame.output == output for frame in self._renders.values())
 
     def warnings(self, output: Path) -> list[str]:
-        """Warnings about a frame that is written."""
+        """Return the warnings about a frame that is written."""
         return self._warnings.get(output, [])
 
     def _discard(self) -> None:

@@ -25,12 +25,13 @@ from oiio_msspl.model.session import Session
 
 
 def sets_to_fuse(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
-    """The additive sets of a view that are asked for and of which a layer is written."""
-    return [each for each in _written_sets(hr, write) if not write.passes or any(each.matches(p) for p in write.passes)]
+    """Return the additive sets of a view that are asked for and have a layer that is written."""
+    sets = _written_sets(hr, write)
+    return [layers for layers in sets if not write.passes or any(layers.matches(p) for p in write.passes)]
 
 
 def uses_clean_aovs(hr: MappedRender, write: WriteOptions) -> bool:
-    """Whether albedo and normal without noise are of use: as layers, or to fuse passes."""
+    """Return whether albedo and normal without noise are of use: as layers, or to fuse passes."""
     return write.data_passes or bool(sets_to_fuse(hr, write))
 
 
@@ -48,24 +49,25 @@ def check_passes(views: Sequence[MappedRender], write: WriteOptions) -> None:
     hr = views[0]
     if write.data_passes and hr.features.keys().isdisjoint((ALBEDO, NORMAL)):
         raise InputError(f"--data-passes: {hr.name} has neither an albedo nor a normal; name them with --map")
-    if write.passes == ("none",) and any(each.by_user for each in hr.additive_sets):
+    if write.passes == ("none",) and any(layers.by_user for layers in hr.additive_sets):
         raise InputError("--sum and --passes none exclude each other: fuse the layers of the sum, or leave it out")
     if write.passes and write.passes != ("none",) and not any(sets_to_fuse(view, write) for view in views):
-        if any(each.matches(p) for view in views for each in view.additive_sets for p in write.passes):
+        if any(layers.matches(p) for view in views for layers in view.additive_sets for p in write.passes):
             raise InputError(
                 f"--passes {', '.join(write.passes)}: --layers {', '.join(write.layers)} leaves these layers out; "
                 "name them there, too"
             )
-        names = dict.fromkeys(f"'{each.name}'" for view in views for each in _written_sets(view, write))
-        known = ", ".join(names) or "none"
-        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {known}")
+        names = dict.fromkeys(f"'{layers.name}'" for view in views for layers in _written_sets(view, write))
+        listed = ", ".join(names) or "none"
+        raise InputError(f"--passes {', '.join(write.passes)}: {hr.name} has no such set of layers; it has {listed}")
 
 
 def _written_sets(hr: MappedRender, write: WriteOptions) -> list[AdditiveSet]:
     if write.passes == ("none",):
         return []
     dropped = dropped_channels(hr.file, hr.beauty_channels, write.layers)
-    return [each for each in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in each.layers)]
+    written = (layers for layers in hr.additive_sets if any(not dropped.issuperset(x.channels) for x in layers.layers))
+    return list(written)
 
 
 def fuse_frame_passes(
@@ -123,15 +125,14 @@ class Progress:
         self._tell, self._steps, self._before = tell, steps, 0
 
     def __call__(self, done: int, count: int) -> None:
-        """A part has done so many of its steps. It ends with all of them."""
+        """Take the steps that a part has done. A part ends with all of its steps."""
         self._tell(self._before + done, self._steps)
         if done == count:
             self._before += count
 
 
 def steps_of(views: Sequence[tuple[MappedRender, MappedRender]], session: Session, write: WriteOptions) -> int:
-    """The steps in which the pairs of some views are fused: a tile is one, and so is each set of passes in each band of
-    rows."""
+    """Return the steps in which views are fused: a tile is one, and so is each set of passes in each band of rows."""
     steps = 0
     for lr, hr in views:
         alignment = align(lr, hr)

@@ -136,7 +136,7 @@ def _write_exr(
 
 
 def _layers_about(fused: FusedFrame, options: WriteOptions) -> dict[str, NDArray[Any]]:
-    """The layers about the fused beauty that are asked for."""
+    """Return the layers about the fused beauty that are asked for."""
     layers: dict[str, NDArray[Any]] = {} if fused.error is None else {ERROR_LAYER: fused.error}
     if options.frames_layer:
         layers[FRAMES_LAYER] = np.ones_like(fused.rgb[..., :1]) if fused.frames is None else fused.frames

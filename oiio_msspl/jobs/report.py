@@ -130,7 +130,7 @@ def report_on(
     """The report of a frame that is fused and not yet written: ``seconds`` is still empty."""
     return FrameReport(
         lr=lr,
-        hr=hr,
+        hr=hr.for_model(session.contract.hrls),
         scale=fused.alignment.scale,
         model=session.name,
         provider=session.provider,

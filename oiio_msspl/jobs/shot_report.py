@@ -146,8 +146,10 @@ def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotRe
 def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     """What differs between the reports of two fused frames: "WHAT is X here and Y" for each feature, the scale, the
     model, the number of neighbours, the layers, the views and the sets of passes."""
-    there = {row["feature"]: row["status"] for row in first["aovs"]}
-    changes = {row["feature"]: (row["status"], there[row["feature"]]) for row in here["aovs"]}
+    statuses = {row["feature"]: row["status"] for row in first["aovs"]}
+    changes = {
+        row["feature"]: (row["status"], statuses[row["feature"]]) for row in here["aovs"] if row["feature"] in statuses
+    }
     changes["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         changes["the model"] = here["model"], first["model"]

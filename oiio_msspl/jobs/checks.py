@@ -30,12 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targets: Iterable[Path]) -> None:
-    """Check that results can be written. The output folder may be missing, see :func:`make_output`.
-
-    Args:
-        shot: the shot.
-        inputs, model: they name the files that all frames are made from.
-        more_targets: files that are written beside the frames.
+    """Check that the frames and ``more_targets`` can be written. The output folder may be missing.
 
     Raises:
         InputError: the folder can't be written to, or a result would replace an input.
@@ -126,9 +121,8 @@ def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
 def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list[str]:
     """Check the first frame that has both renders, before a farm or cluster is asked to fuse all of them.
 
-    Returns:
-        Doubts about it, one sentence each. A pair that can't be read here is a doubt and not an error, because files
-        that an option names may exist on the workers only.
+    Return doubts about it, one sentence each. A pair that can't be read here is a doubt and not an error, because files
+    that an option names may exist on the workers only.
     """
     for frame in frames:
         if frame.lr is not None and frame.hr is not None:

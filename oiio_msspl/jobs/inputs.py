@@ -218,5 +218,5 @@ def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, 
 
 def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
     """Return the files that a frame is made from: the pair, its siblings, the mapping's files and the user's model."""
-    named = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
-    return {*named, *lr.file.siblings, *hr.file.siblings}
+    paths = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
+    return {*paths, *lr.file.siblings, *hr.file.siblings}

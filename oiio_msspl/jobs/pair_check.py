@@ -34,14 +34,8 @@ class PairCheck:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the check as JSON values."""
-        return {
-            "lrhs": str(self.lr),
-            "hrls": str(self.hr),
-            "fits": self.fits,
-            "problem": self.problem,
-            "warnings": self.warnings,
-            "passed_on": self.passed_on,
-        }
+        findings = {"problem": self.problem, "warnings": self.warnings, "passed_on": self.passed_on}
+        return {"lrhs": str(self.lr), "hrls": str(self.hr), "fits": self.fits, **findings}
 
 
 def check_files(lr: str | Path, hr: str | Path, inputs: InputOptions = InputOptions()) -> PairCheck:

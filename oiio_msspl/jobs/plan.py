@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decides which neighbours the frames of a shot are averaged with, and how their motion is known.
 
-A frame depends on the frames up to ``count`` before and after it, and on nothing else. So a shot that is cut into
-chunks, or resumed, has the same pixels as one run: the neighbours of a chunk are fused again, and not written.
+A frame depends only on the frames up to ``count`` before and after it. So a shot that is cut into chunks, or resumed,
+has the pixels of one run: the neighbours of a chunk are fused again, and not written.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ log = logging.getLogger(__name__)
 #: LRHS and HRLS.
 Pair = tuple[MappedRender, MappedRender]
 
-#: What ``--temporal`` takes beside a number.
+#: Words that ``--temporal`` takes in place of a number.
 AUTO, OFF = "auto", "off"
 #: Frames before and after a frame that it depends on, where motion is known. The second number is for the quality
 #: `best`, which takes so long that averaging more renders adds little.
@@ -177,7 +177,7 @@ def plan_temporal(
 
 
 def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model: str | None) -> str | None:
-    """Return the family of models that suits the first pair's layers; ``model`` itself if it is no family."""
+    """Return the family of models that suits the first pair's layers; ``model`` itself if it names no family."""
     family = family_of(model)
     if family is None:
         return model
@@ -224,7 +224,7 @@ def _motion_of(
     *,
     required: bool,
 ) -> MotionSource:
-    """Return how the motion of a view is known; None stands for each file's first view."""
+    """Return the source of the motion of a view; None stands for each file's first view."""
 
     def render(number: int) -> MappedRender:
         hr = mapped(number)[1]
@@ -244,7 +244,7 @@ def _motion_of(
 
 
 class _JudgedPairs:
-    """What pairs of successive frames tell of the motion of a view.
+    """Findings on the motion of a view, collected from pairs of successive frames.
 
     The camera may stand still at one end, or move in one direction only, so several pairs are judged until they tell
     how vectors are stored. What one pair shows has to hold for the pairs before. A frame that can't be read is passed

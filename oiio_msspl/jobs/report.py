@@ -26,7 +26,7 @@ LEAST_SHARE = 1 / 8
 
 @dataclass
 class FrameReport:
-    """What was done with one pair, for people and, as :meth:`as_dict`, for programs."""
+    """The account of a fused pair, for people and, as :meth:`as_dict`, for programs."""
 
     lr: MappedRender
     hr: MappedRender
@@ -56,7 +56,7 @@ class FrameReport:
     lrhs_aovs: tuple[str, ...] = ()
     """Features that the model reads of an LRHS that has them, beside colour."""
     passes: dict[str, str] = field(default_factory=dict)
-    """What was done with each additive set, by its name."""
+    """A sentence on each additive set, by name: fused or passed on."""
     network_seconds: float = 0.0
     """``seconds["network"]``, known before the others."""
     other_views: list[FrameReport] = field(default_factory=list)
@@ -151,12 +151,8 @@ def report_on(
 
 
 def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on: Sequence[str]) -> None:
-    """Add the reports of other ``views`` to that of the first one, and why further views are ``passed_on`` as they are.
-
-    ``passed_on`` has one sentence for each.
-    """
-    warnings = merged({view.hr.view: view.warnings for view in (report, *views)})
-    report.warnings = [*warnings, *passed_on]
+    """Add the reports of other views to that of the first one, and sentences on why further views are passed on."""
+    report.warnings = [*merged({view.hr.view: view.warnings for view in (report, *views)}), *passed_on]
     report.other_views = list(views)
     for view in views:
         name = name_of(view.hr.view)

@@ -341,7 +341,7 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
         f"{path} has {', '.join(sequence.pattern.name for sequence in sequences[:6])}"
         for path, sequences in ((lr, lows), (hr, highs))
     )
-    # Both may be the same folder. A sequence is no partner of itself.
+    # If both are one folder, a sequence may not be paired with itself.
     pairs = [(low, high) for low, high in pairs if str(low.pattern) != str(high.pattern)]
     why = f"{len(pairs)} sequences go by the same name in both" if pairs else "none has the same name in both"
     if lr == hr:

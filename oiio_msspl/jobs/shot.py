@@ -114,8 +114,8 @@ def fuse_shot(
     report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
     earlier = read_earlier(report, path, overwrite, settings.skip_existing)
     make_output(shot)
-    record = _Record(report, path, progress, start)
-    to_fuse = record.add_known(ExistingResults(settings, plan), earlier)
+    running = _RunningReport(report, path, progress, start)
+    to_fuse = running.add_known(ExistingResults(settings, plan), earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
@@ -123,28 +123,27 @@ def fuse_shot(
     remove_leftovers([*targets, *([] if path is None else [path])])
     try:
         if client is None:
-            run_pipeline(ShotRun(settings, plan, to_fuse), record.add_outcome, record.save)
+            run_pipeline(ShotRun(settings, plan, to_fuse), running.add_outcome, running.save)
         else:
             for doubt in check_first_pair(to_fuse, inputs):
                 log.warning("%s", doubt)
             for frame, outcome in fuse_frames(client, settings, plan, to_fuse):
-                record.add_outcome(frame, outcome)
-                record.save()
+                running.add_outcome(frame, outcome)
+                running.save()
             remove_leftovers(targets)  # of workers that died
     finally:
-        record.close()
+        running.close()
     return report
 
 
 def _with_previews(shot: Shot, view_transform: str | None) -> Shot:
     if view_transform is not None:
         check_view(view_transform)
-    frames = [replace(frame, preview=frame.output.with_suffix(".png")) for frame in shot.frames]
-    return replace(shot, frames=frames)
+    return replace(shot, frames=[replace(files, preview=files.output.with_suffix(".png")) for files in shot.frames])
 
 
 @dataclass
-class _Record:
+class _RunningReport:
     """The report of a shot that runs, and who is told of it."""
 
     report: ShotReport
@@ -180,7 +179,7 @@ class _Record:
         return to_fuse
 
     def add_outcome(self, frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
-        """Add what became of a frame: its report, the reason for its failure, or None if its EXR existed."""
+        """Add the result of a frame: from its report, the reason for its failure, or None if its EXR existed."""
         if isinstance(outcome, Exception):
             log.debug("frame %d", frame.number, exc_info=outcome)
             self.add(result_of(frame, FAILED, *explain(outcome)))

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports what became of a shot and of each of its frames, in memory and as a JSON file."""
+"""Reports on a shot and on each of its frames, in memory and as a JSON file."""
 
 from __future__ import annotations
 
@@ -17,8 +17,9 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 
-#: The keys of ``first_fused`` that are read from an earlier report. A report of another version may lack some of them.
-FIRST_FUSED = {"frame", "renderer", "view", "scale", "model", "aovs", "notes", "passes"}
+#: The keys that are read of ``first_fused`` in an earlier report. If a report of another version lacks some of them,
+#: frames are compared with the first one that this run fuses.
+FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "scale", "model", "aovs", "layers", "notes", "passes"}
 
 #: The most layers that a warning names.
 MOST_NAMES = 6
@@ -34,7 +35,7 @@ FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "mis
 
 @dataclass
 class FrameResult:
-    """What became of one frame."""
+    """The result of a frame."""
 
     frame: int
     status: str
@@ -55,7 +56,7 @@ class FrameResult:
 
 @dataclass
 class ShotReport:
-    """What became of a shot."""
+    """The results of a shot's frames."""
 
     shot: Shot
     results: dict[int, FrameResult] = field(default_factory=dict)
@@ -161,15 +162,12 @@ def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     pairs["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
     if here["scale"] == first["scale"]:  # each scale has models of its own
         pairs["the model"] = here["model"], first["model"]
-    if "neighbours" in first:  # reports of earlier versions lack it
-        pairs["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
+    pairs["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
     return [f"{what} is {state} here and {earlier}" for what, (state, earlier) in pairs.items() if state != earlier]
 
 
 def _changed_layers(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
     """Compare the layers that are written. Those that are features are told as such."""
-    if "layers" not in first:
-        return []  # of an earlier version
     features = {row["source"] for report in (here, first) for row in report["aovs"] if row["status"] == "found"}
     texts = []
     for has, lacks, states in ((first, here, "missing here and present"), (here, first, "present here and missing")):
@@ -230,11 +228,8 @@ def read_earlier(
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {
-            entry["frame"]: {
-                "repaired": entry["repaired"],
-                "seconds": entry["seconds"],
-                "warnings": [text for text in entry["warnings"] if not _OLDER.fullmatch(text)],
-            }
+            entry["frame"]: {name: entry[name] for name in ("repaired", "seconds")}
+            | {"warnings": [text for text in entry["warnings"] if not _OLDER.fullmatch(text)]}
             for entry in data["frames"]
         }
         output = data.get("output")

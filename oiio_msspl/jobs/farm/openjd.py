@@ -164,7 +164,7 @@ def _describe(
         file = add(name, str(path.absolute()), f"{option} of msspl-fuse", type="PATH", objectType="FILE", dataFlow="IN")
         arguments += [option, file]
     arguments += ["--frames", "{{Task.Param.Frame}}", "--skip-existing", "--progress", "openjd"]
-    arguments += [_literal(option) for option in options]
+    arguments += map(_literal, options)
     task_frames = {
         "name": "Frame",
         "type": "CHUNK[INT]",

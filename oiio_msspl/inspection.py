@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
-from oiio_msspl.aovs.features import PAPER_FEATURES, RADIANCE_FEATURES, RGB
+from oiio_msspl.aovs.features import RADIANCE_FEATURES, RGB
 from oiio_msspl.aovs.mapped_render import ROWS_PER_LOAD, MappedRender
 from oiio_msspl.aovs.motion import user_fields
 from oiio_msspl.aovs.views import name_of
@@ -60,14 +60,14 @@ class Inspection:
         return self.contract.name.removesuffix(f"-x{self.contract.scale}") if self.contract else ""
 
     def aovs(self, view: MappedRender | None = None) -> list[dict[str, str]]:
-        """List the layers that the model would read: rows of ``MappedRender.table``, and of unread mapped features.
+        """List the layers that the model would read: rows of ``MappedRender.table``.
 
         Args:
             view: one of ``other_views``; None for ``render``.
         """
         render = view or self.render
         assert render is not None and self.contract is not None
-        return [row for row in render.table(self.contract.hrls) if row["status"] != "unused" or row["source"]]
+        return render.table(self.contract.hrls)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the inspection as JSON values."""
@@ -134,20 +134,17 @@ def inspect_file(
     """
     contract = Contract.of_file(find_model(SCALES[0], model))
     result = Inspection(path, contract=contract)
-    unread = PAPER_FEATURES.difference(contract.hrls, inputs.mapping)  # a feature that the user maps is listed
     try:
         if is_sequence(path) and not path.is_dir():
             raise InputError(f"{path}: is a pattern; name one of its files, and the next frame is found beside it")
         file = result.file = open_exr(path)
         result.facts = _facts(file)
-        render = result.render = map_hrls(file, inputs)
-        render.drop_features(unread)
+        render = result.render = map_hrls(file, inputs).for_model(contract.hrls)
         result.facts.append(_renderer_fact(render))
         result.facts += [*_pixel_facts(render), *_look_at_sets(result, render)]
         for label in render.other_views if inputs.view is None else ():
             try:
-                view = map_other_hrls(render, label, inputs)
-                view.drop_features(unread)
+                view = map_other_hrls(render, label, inputs).for_model(contract.hrls)
                 facts = [*_pixel_facts(view), *_look_at_sets(result, view)]
                 result.other_views.append(view)
             except InputError as error:

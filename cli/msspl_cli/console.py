@@ -8,7 +8,7 @@ bar is drawn on a terminal only. Results go to standard output, messages and pro
 from __future__ import annotations
 
 import sys
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 from oiio_msspl.errors import printable
@@ -51,21 +51,17 @@ def table(rows: Sequence[Sequence[str]], *, header: bool = False, indent: int = 
         print(line.rstrip())
 
 
-def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str], mapped: Collection[str] = ()) -> None:
+def aov_table(rows: Sequence[Mapping[str, str]], notes: Sequence[str]) -> None:
     """Print which layer each feature is read from.
-
-    A feature that the model does not read is left out, unless the user may wonder why.
 
     Args:
         rows: of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` or
             :meth:`oiio_msspl.jobs.report.FrameReport.aovs`.
         notes: sentences printed below.
-        mapped: features that the user has mapped.
     """
     from oiio_msspl.aovs.mapped_render import origin
 
-    shown = [row for row in rows if row["status"] != "unused" or (row["source"] and row["feature"] in mapped)]
-    table([(row["feature"], origin(row)) for row in shown])
+    table([(row["feature"], origin(row)) for row in rows])
     for note in notes:
         say(f"  note: {note}")
 

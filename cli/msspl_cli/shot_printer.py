@@ -11,8 +11,6 @@ from msspl_cli import console
 from oiio_msspl.errors import InputError
 
 if TYPE_CHECKING:
-    from collections.abc import Collection
-
     from oiio_msspl.jobs.shot_report import FrameResult, ShotReport
 
 #: The forms of ``--progress``, which prints to standard output after each frame.
@@ -28,13 +26,12 @@ class ShotPrinter:
         InputError: an unknown form of progress, or one that would mix with ``--json``.
     """
 
-    def __init__(self, verbose: int, quiet: bool, as_json: bool, progress: str | None, mapped: Collection[str]) -> None:
+    def __init__(self, verbose: int, quiet: bool, as_json: bool, progress: str | None) -> None:
         if progress is not None and progress not in PROGRESS:
             raise InputError(f"--progress {progress!r}: use one of {', '.join(PROGRESS)}")
         if progress is not None and as_json:
             raise InputError("--json and --progress both print to standard output; use --report FILE for the report")
         self._verbose, self._quiet, self._as_json, self._progress = verbose, quiet, as_json, progress
-        self._mapped = mapped
         self._bar = console.ProgressBar(shown=not verbose and not quiet and progress is None)
         self._report: ShotReport | None = None
         self._printed: set[str] = set()
@@ -65,7 +62,7 @@ class ShotPrinter:
         if self._as_json:
             print(json.dumps(self._report.as_dict(), indent=2))
         elif not self._quiet and self._progress != "json":
-            _print_table(self._report, self._mapped)
+            _print_table(self._report)
 
     def _print_once(self, kind: str, frame: int, text: str) -> None:
         if (key := _without_numbers(text)) not in self._printed:
@@ -93,7 +90,7 @@ def _print_json(result: FrameResult, report: ShotReport) -> None:
     print(json.dumps({**line, "done": len(report.results), "count": len(report.shot.frames)}), flush=True)
 
 
-def _print_table(report: ShotReport, mapped: Collection[str]) -> None:
+def _print_table(report: ShotReport) -> None:
     """Print which layers were read, and which frames ended in which way and why."""
     from oiio_msspl.aovs.views import name_of
     from oiio_msspl.jobs.sequence import format_frames
@@ -102,7 +99,7 @@ def _print_table(report: ShotReport, mapped: Collection[str]) -> None:
         views = console.views_in_words([name_of(entry["view"]) for entry in first.get("fused_views", ())])
         pairs = f"{first['renderer']} pairs at x{first['scale']}, {first['model']}"
         console.say(f"{pairs}{views}; layers of frame {first['frame']}:")
-        console.aov_table(first["aovs"], first["notes"], mapped)
+        console.aov_table(first["aovs"], first["notes"])
         for name, outcome in first["passes"].items():
             console.say(f"  {name}: {outcome}")
     if report.temporal and any(result.status == "fused" for result in report.results.values()):

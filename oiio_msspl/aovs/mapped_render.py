@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from oiio_msspl.aovs.additive_sets import AdditiveSet
-from oiio_msspl.aovs.features import ALBEDO, FEATURES, RGB, VARIANCE
+from oiio_msspl.aovs.features import ALBEDO, FEATURES, PAPER_FEATURES, RGB, VARIANCE
 from oiio_msspl.aovs.formula import FeatureFormula
 from oiio_msspl.aovs.motion import MotionLayers
 from oiio_msspl.exr.layers import layers_of
@@ -49,6 +49,8 @@ class MappedRender:
     """Motion vectors, position and depth."""
     notes: list[str] = field(default_factory=list)
     """Sentences for the user about the mapping, which begin with the feature."""
+    mapped: frozenset[str] = frozenset()
+    """Features that the user has mapped."""
 
     @property
     def name(self) -> str:
@@ -83,11 +85,11 @@ class MappedRender:
 
         Returns:
             Rows with the keys ``feature``, ``status``, ``source`` (the layers; empty if there is none) and ``note``.
-            The status is ``found``, ``computed``, ``default`` (a missing feature), ``unused`` (the model does not read
-            it) or, for alpha, ``absent``.
+            The status is ``found``, ``computed``, ``default`` (a missing feature), ``unused`` (the file has it, and the
+            model does not read it) or, for alpha, ``absent``.
         """
         rows = []
-        for feature in FEATURES:
+        for feature in (name for name in FEATURES if name in self.features or name in read):
             formula = self.features.get(feature)
             status = "default" if formula is None else "computed" if formula.is_computed else "found"
             text, note = (formula.text, formula.note) if formula else ("", "")
@@ -95,10 +97,15 @@ class MappedRender:
         rows.append(("alpha", "found", self.alpha.name, "") if self.alpha else ("alpha", "absent", "", ""))
         return [dict(zip(("feature", "status", "source", "note"), row, strict=True)) for row in rows]
 
-    def drop_features(self, unread: Collection[str]) -> None:
-        """Forget features that the model does not read, and the notes about them."""
-        self.features = {name: formula for name, formula in self.features.items() if name not in unread}
-        self.notes = [note for note in self.notes if note.partition(":")[0] not in unread]
+    def for_model(self, read: Collection[str]) -> MappedRender:
+        """Return the render without the features that only the paper's network reads, and without notes about them.
+
+        A feature that the model reads (``read``) or that the user has mapped is kept.
+        """
+        unread = PAPER_FEATURES.difference(read, self.mapped)
+        features = {name: formula for name, formula in self.features.items() if name not in unread}
+        notes = [note for note in self.notes if note.partition(":")[0] not in unread]
+        return replace(self, features=features, notes=notes)
 
     def unused_layers(self, views: Sequence[MappedRender], fused: Iterable[AdditiveSet]) -> list[str]:
         """Name the flat layers that are neither read as features nor fused.
@@ -224,5 +231,5 @@ def origin(row: Mapping[str, str]) -> str:
         hint = "none: expect blur, render an albedo (or name it with --map albedo=LAYER)"
         return hint if row["feature"] == ALBEDO else "none (optional)"
     if status == "unused":
-        return f"found: {source}; this model does not read it" if source else "none; this model does not read it"
+        return f"found: {source}; this model does not read it"
     return "none" if status == "absent" else f"{status}: {source}"

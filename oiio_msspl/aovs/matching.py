@@ -96,6 +96,7 @@ def map_render(
         additive_sets=find_additive_sets(renderer, layers, beauty, sums, str(file.path)),
         motion=find_motion_layers(renderer, layers, beauty),
         notes=notes,
+        mapped=frozenset(mapping),
     )
     _drop_unusable_variance(render)
     _decide_normal_encoding(render)

@@ -30,12 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def check_output(shot: Shot, inputs: InputOptions, model: str | None, more_targets: Iterable[Path]) -> None:
-    """Check that results can be written. The output folder itself may be missing, see :func:`make_output`.
-
-    Args:
-        shot: the shot.
-        inputs, model: what all frames are made from, beside their pairs.
-        more_targets: what is written beside the frames.
+    """Check that the frames and ``more_targets`` can be written. The output folder may be missing.
 
     Raises:
         InputError: the folder can't be written to, or a result would replace an input.
@@ -58,39 +53,40 @@ def make_output(shot: Shot) -> None:
 
 def check_no_file(folder: Path) -> None:
     """Raise InputError if an output folder, or the one that it is to be made in, is a file."""
-    for each in (folder, folder.parent):
-        if each.exists() and not each.is_dir():
-            raise InputError(f"{each}: is a file, and the results of a shot need a folder; name another output")
+    for path in (folder, folder.parent):
+        if path.exists() and not path.is_dir():
+            raise InputError(f"{path}: is a file, and the results of a shot need a folder; name another output")
 
 
 def model_of_shot(shot: Shot, inputs: InputOptions, model: str | None) -> str:
-    """The model of all frames: a quality, ``auto`` and None are a family that suits the shot's first pair. A warning is
-    logged if a model that is named does not suit its noise.
+    """Return the model of all frames. A quality, ``auto`` and None are a family that suits the shot's first pair.
 
-    All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, and
-    not of the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its
-    turn comes. So is one without noise, such as a black frame.
+    A warning is logged if a model that is named does not suit the noise.
+
+    All frames need the same model, also those of other runs and machines. So the first pair is that of the shot, not of
+    the frames that are to be fused. A pair that can't be used is passed over, because the run says so when its turn
+    comes. So is a pair without noise, such as a black frame.
     """
     family = family_of(model)
     if family is None:
         assert model is not None
         family = model
         if for_spread_noise(model) is None:
-            return model  # it suits any noise, or is no model of ours
+            return model  # it suits any noise, or is the user's own
     without_noise: str | None = None
     for number in sorted(shot.lr.files.keys() & shot.hr.files.keys()):
         try:
             lr, hr = map_pair(shot.lr.files[number], shot.hr.files[number], inputs)
-            known = len(hr.notes)
-            suitable, told = choose_model(lr, hr, model)
-            if not told:
-                without_noise = without_noise or suitable
-                continue
-            for note in hr.notes[known:]:
-                log.warning("frame %d: %s", number, note)
-            return suitable
+            count = len(hr.notes)
+            suitable, has_noise = choose_model(lr, hr, model)
         except MssplError as error:
             log.debug("frame %d: %s", number, error)
+            continue
+        if has_noise:
+            for note in hr.notes[count:]:
+                log.warning("frame %d: %s", number, note)
+            return suitable
+        without_noise = without_noise or suitable
     return without_noise or family
 
 
@@ -99,8 +95,8 @@ def check_no_input(
 ) -> None:
     """Raise InputError if a file that is written is one of the shot's inputs, or is written twice.
 
-    All files of both sequences are inputs, whichever frames are to be fused: their neighbours and the plan over time
-    are read from others, and no run may replace the render of another frame.
+    All files of both sequences are inputs, whichever frames are to be fused: neighbours and the plan over time are read
+    from other frames, and no run may replace the render of a frame.
     """
     pairs = {*shot.lr.files.values(), *shot.hr.files.values()}
     others = [inputs.files(path, model) for path in shot.hr.files.values()]
@@ -108,7 +104,7 @@ def check_no_input(
 
 
 def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
-    """Check by the headers that the layers that are asked for are there, and that one file can hold them all.
+    """Check by the headers that the layers that are asked for exist, and that one file can hold them all.
 
     Raises:
         InputError: a pattern of ``write`` matches nothing, or the layout can't hold the layers.
@@ -125,14 +121,13 @@ def check_written_layers(hr: MappedRender, write: WriteOptions) -> None:
 def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list[str]:
     """Check the first frame that has both renders, before a farm or cluster is asked to fuse all of them.
 
-    Returns:
-        Doubts about it, one sentence each. A pair that can't be read here is one of them, and no error, because files
-        that an option names may exist on the workers only.
+    Return doubts about it, one sentence each. A pair that can't be read here is a doubt and not an error, because files
+    that an option names may exist on the workers only.
     """
     for frame in frames:
         if frame.lr is not None and frame.hr is not None:
             check = check_files(frame.lr, frame.hr, inputs)
-            problems = [] if check.problem is None else [f"can't be checked here: {check.problem}"]
+            problems = [f"can't be checked here: {check.problem}"] if check.problem else []
             return [f"frame {frame.number}: {text}" for text in [*problems, *check.warnings, *check.passed_on]]
     return []
 
@@ -140,12 +135,12 @@ def check_first_pair(frames: Sequence[FrameFiles], inputs: InputOptions) -> list
 def check_wanted_outputs(
     frames: Sequence[FrameFiles], inputs: InputOptions, write: WriteOptions, model: str | None, max_memory: int
 ) -> None:
-    """Check on the first pair that can be read whether what is to be written can be, before a farm is asked for it.
+    """Check on the first pair that can be read that the outputs can be written, before a farm is asked for them.
 
     Raises:
-        InputError: no pair can be read, a layer or a set of passes that an option names is not there, the layout can't
-            hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are too
-            few.
+        InputError: no pair can be read, a layer or a set of passes that an option names does not exist, the layout
+            can't hold the layers, the model is for another scale or does not make a layer, or ``max_memory`` bytes are
+            too few.
     """
     problem: InputError | None = None
     for frame in frames:
@@ -156,7 +151,7 @@ def check_wanted_outputs(
             scale = align(lr, hr).scale
             others = find_other_views(lr, hr, inputs, write)
         except InputError as error:
-            if all(path.exists() for path in inputs.files(frame.hr, None)):  # or they may exist on the workers only
+            if all(path.exists() for path in inputs.files(frame.hr, None)):  # others may exist on the workers only
                 problem = problem or error
             continue
         check_written_layers(hr, write)
@@ -172,9 +167,9 @@ def check_wanted_outputs(
 def check_temporal(
     shot: Shot, inputs: InputOptions, options: TemporalOptions, model: str | None, write: WriteOptions
 ) -> None:
-    """Check whether the shot can be averaged over time as the user asks, before a farm is asked for it.
+    """Check that the shot can be averaged over time as the user asks, before a farm is asked for it.
 
-    If files of the mapping are not here, nothing is checked: they may exist on the workers only.
+    If files of the mapping are missing, nothing is checked: they may exist on the workers only.
 
     Raises:
         InputError: see :func:`oiio_msspl.jobs.plan.plan_temporal`.

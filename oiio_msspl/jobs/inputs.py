@@ -23,7 +23,7 @@ from oiio_msspl.image.colour import REC709, SPACES, ColourSpace, encoding_of, na
 
 @dataclass(frozen=True)
 class InputOptions:
-    """What the caller knows of the two files that they do not say themselves."""
+    """Facts about the two files that they do not say themselves."""
 
     mapping: Mapping[str, Any] = field(default_factory=dict)
     """The user's own layer for each feature, see :func:`oiio_msspl.aovs.matching.map_render`."""
@@ -49,11 +49,11 @@ class InputOptions:
                 raise InputError(f"{option} {spp:g}: give the samples per pixel, a number above 0")
 
     def absolute(self) -> InputOptions:
-        """The same with an absolute path, for workers with other working directories. Paths in ``mapping`` are full."""
+        """Make ``map_file`` absolute, for workers with other working directories. Paths in ``mapping`` are full."""
         return replace(self, map_file=None if self.map_file is None else self.map_file.absolute())
 
     def files(self, hr_path: Path, model: str | None) -> set[Path]:
-        """The files that a frame is made from beside the pair: of the mapping, and a model that is no shipped one."""
+        """Return the files that a frame is made from beside the pair: those of the mapping, and a user's model."""
         named = [self.map_file, None if model is None else Path(model)]
         return mapped_files(self.mapping, hr_path) | {path for path in named if path is not None}
 
@@ -67,11 +67,11 @@ def map_pair(lr_path: str | Path, hr_path: str | Path, inputs: InputOptions) -> 
 
     Returns:
         LRHS and HRLS. The LRHS has albedo and normal only if its file does. It is mapped for the view of the HRLS, or
-        for its own first one if it lacks that.
+        for its own first view if it lacks that one.
 
     Raises:
         InputError: one of the files can't be used, both are the same, the LRHS lacks the first view of the HRLS and
-            has another one of it, or their headers declare two colour spaces.
+            has another one, or their headers declare two colour spaces.
     """
     lr_path, hr_path = Path(lr_path), Path(hr_path)
     if lr_path.exists() and hr_path.exists() and lr_path.samefile(hr_path):
@@ -102,8 +102,7 @@ def map_other_view(
     Raises:
         InputError: one of the files has no such view, or can't be used for it.
     """
-    high = map_other_hrls(hr, view, inputs)
-    low = _map_lrhs(lr.file, replace(inputs, view=view))
+    high, low = map_other_hrls(hr, view, inputs), _map_lrhs(lr.file, replace(inputs, view=view))
     if low.view != view:
         raise InputError(f"{lr.name}: has no view or view layer {view!r}")
     low.space = high.space = hr.space
@@ -111,20 +110,19 @@ def map_other_view(
 
 
 def map_other_hrls(hr: MappedRender, view: str, inputs: InputOptions) -> MappedRender:
-    """The HRLS of :func:`map_other_view`."""
+    """Map the HRLS for another view, see :func:`map_other_view`."""
     inputs = replace(inputs, view=view)
-    sums = inputs.sums
     try:
-        other = _map_hrls(hr.file, inputs)
+        render = _map_hrls(hr.file, inputs)
     except InputError:
-        sums = ()  # the other views need not have the layers of the user's sums
-        other = _map_hrls(hr.file, replace(inputs, sums=sums))
-    firsts = {name for name, each in other.features.items() if name in hr.features and each == hr.features[name]}
-    return _without_entries(other, replace(inputs, sums=sums), firsts | _features_of_others(other))
+        inputs = replace(inputs, sums=())  # the other views need not have the layers of the user's sums
+        render = _map_hrls(hr.file, inputs)
+    of_first_view = {name for name, formula in render.features.items() if hr.features.get(name) == formula}
+    return _without_entries(render, inputs, of_first_view | _features_of_others(render))
 
 
 def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> ColourSpace:
-    """The linear RGB space of a pair. ``name``: see :attr:`InputOptions.colourspace`."""
+    """Return the linear RGB space of a pair; ``name`` is :attr:`InputOptions.colourspace`."""
     if name is not None:
         space = named_space(name)
         if space is None:
@@ -146,76 +144,79 @@ def _common_space(lr: MappedRender, hr: MappedRender, name: str | None) -> Colou
 
 
 def map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
-    """Map the HRLS for its first view, or for the one that is asked for. Unless one is, an entry of the mapping that
-    means a layer of another view layer by its full name does not apply.
+    """Map the HRLS for the view that is asked for, or for its first one.
+
+    If no view is asked for, an entry of the mapping that means a layer of another view layer by its full name does not
+    apply.
 
     Raises:
         InputError: see :func:`oiio_msspl.aovs.matching.map_render`.
     """
     render = _map_hrls(file, inputs)
-    if inputs.view is not None and not render.view:
+    if inputs.view is None:
+        return _without_entries(render, inputs, _features_of_others(render))
+    if not render.view:
         raise InputError(
             f"{file.path}: no view or view layer {inputs.view!r}; the file names none, so leave --view-layer out"
         )
-    return _without_entries(render, inputs, _features_of_others(render)) if inputs.view is None else render
+    return render
 
 
 def _map_hrls(file: ExrFile, inputs: InputOptions) -> MappedRender:
-    """All that the user says applies to the HRLS."""
     return map_render(file, inputs.mapping, view=inputs.view, spp=inputs.hr_spp, sums=inputs.sums)
 
 
 def _features_of_others(render: MappedRender) -> set[str]:
-    """The features that are read from layers of another view layer."""
+    """Name the features that are read from layers of another view layer."""
     names = {channel: layer.name for channel, layer in layer_by_channel(render.file).items()}
-    own, *others = (f"{label.rpartition('/')[2]}." for label in (render.view, *render.other_views))
-    others = [each for each in others if each not in (own, ".")]
+    prefix, *prefixes = (f"{label.rpartition('/')[2]}." for label in (render.view, *render.other_views))
+    others = tuple(name for name in prefixes if name not in (prefix, "."))
     return {
         feature
         for feature, formula in render.features.items()
-        if feature != RGB and all(names.get(channel, "").startswith(tuple(others)) for channel in formula.channels)
+        if feature != RGB and all(names.get(channel, "").startswith(others) for channel in formula.channels)
     }
 
 
 def _without_entries(render: MappedRender, inputs: InputOptions, features: set[str]) -> MappedRender:
-    """The render, mapped again without the user's entries for some features if there are any."""
+    """Map a render again without the user's entries for some features, if there are any."""
     if features.isdisjoint(inputs.mapping):
         return render
-    mapping = {name: each for name, each in inputs.mapping.items() if name not in features}
+    mapping = {name: layer for name, layer in inputs.mapping.items() if name not in features}
     return _map_hrls(render.file, replace(inputs, mapping=mapping))
 
 
 def _map_lrhs(file: ExrFile, inputs: InputOptions) -> MappedRender:
-    """Map the LRHS: its beauty, and albedo and normal where it has them.
-
-    The user's mapping is written for the HRLS. Of its entries only the beauty's applies here: the LRHS need not have
-    the other layers, and an entry may name an EXR of the HRLS's size.
-    """
+    """Map the beauty of the LRHS, and albedo and normal where it has them."""
+    # The user's mapping is written for the HRLS, and only its entry for the beauty applies here: the LRHS need not have
+    # the other layers, and an entry may name an EXR of the HRLS's size. Nor need it have the layers of the user's sums.
     features = [name for name in (ALBEDO, NORMAL) if name not in inputs.mapping]
-    rgb_only = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
+    mapping = {name: layer for name, layer in inputs.mapping.items() if name == RGB}
+
+    def map_with(sums: Sequence[str]) -> MappedRender:
+        return map_render(file, mapping, view=inputs.view, spp=inputs.lr_spp, features=features, sums=sums)
+
     if inputs.sums:
-        # The LRHS need not have the layers of the user's sums either.
         with contextlib.suppress(InputError):
-            return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features, sums=inputs.sums)
-    return map_render(file, rgb_only, view=inputs.view, spp=inputs.lr_spp, features=features)
+            return map_with(inputs.sums)
+    return map_with(())
 
 
 def files_by_name(renders: Sequence[Path], hr_path: Path, inputs: InputOptions, model: str | None) -> list[Path]:
-    """The files that a frame is made from, as far as names tell: :func:`files_read` without opening any.
+    """Return the files that a frame is made from without opening any, see :func:`files_read`.
 
     Args:
-        renders: its pair, and the pairs of neighbours that it depends on.
-        hr_path: its own HRLS.
-        inputs, model: what else it is made from.
+        renders: the frame's pair, and the pairs of neighbours that it depends on.
+        hr_path: the frame's HRLS.
+        inputs, model: they name further files.
 
     Returns:
-        The renders, in their order, and then the others. Those of the mapping need not exist.
+        The renders, in their order, and then the further files. Those of the mapping need not exist.
     """
-    others = inputs.files(hr_path, model).union(*map(aov_files, renders))
-    return [*renders, *sorted(others)]
+    return [*renders, *sorted(inputs.files(hr_path, model).union(*map(aov_files, renders)))]
 
 
 def files_read(lr: MappedRender, hr: MappedRender, inputs: InputOptions, model: str | None) -> set[Path]:
-    """All files that a frame is made from: the pair, what lies beside it, the mapping's files and the model."""
-    named = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
-    return {*named, *lr.file.siblings, *hr.file.siblings}
+    """Return the files that a frame is made from: the pair, its siblings, the mapping's files and the user's model."""
+    paths = files_by_name([lr.file.path, hr.file.path], hr.file.path, inputs, model)
+    return {*paths, *lr.file.siblings, *hr.file.siblings}

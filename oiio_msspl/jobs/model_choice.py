@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Which family of models suits a pair: by its layers, and by how its noise is correlated."""
+"""Chooses the family of models that suits a pair, by its layers and by the correlation of its noise."""
 
 from __future__ import annotations
 
@@ -12,18 +12,16 @@ from oiio_msspl.model.contract import SPREAD
 
 
 def resolve_auto(lr: MappedRender, hr: MappedRender, model: str | None) -> str:
-    """The model of :func:`choose_model`."""
+    """Return the model of :func:`choose_model`."""
     return choose_model(lr, hr, model)[0]
 
 
 def choose_model(lr: MappedRender, hr: MappedRender, model: str | None) -> tuple[str, bool]:
-    """The model that is meant, and whether the pair has noise that tells it: a black frame has none.
+    """Return the model to use, and whether the pair has noise that decides it: a black frame has none.
 
-    A quality, ``auto`` and None are a family that suits the pair.
-
-    ``best`` gains nothing without an albedo and a normal, so it is the default quality then. Noise that the pixel
-    filter has spread needs the family that was trained for it. Notes of the HRLS tell, also if a model that is named
-    does not suit the noise.
+    For a quality, ``auto`` and None, the model is a family that suits the pair. ``best`` gains nothing without an
+    albedo and a normal, and the default quality replaces it. Noise that the pixel filter has spread needs the family
+    that was trained for it. Notes of the HRLS say so, and if a model that is named does not suit the noise.
 
     Raises:
         InputError: the pair does not fit together.
@@ -51,7 +49,6 @@ def choose_model(lr: MappedRender, hr: MappedRender, model: str | None) -> tuple
 
 
 def family_for_layers(hr: MappedRender, family: str) -> str:
-    """A family of models, or the default quality's in place of that of ``best`` for an HRLS without the layers that
-    this one needs."""
+    """Return the family; the default quality's in place of that of ``best`` for an HRLS without albedo and normal."""
     lacks = family == QUALITIES["best"] and hr.features.keys().isdisjoint((ALBEDO, NORMAL))
     return QUALITIES[DEFAULT_QUALITY] if lacks else family

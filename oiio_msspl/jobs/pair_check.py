@@ -16,32 +16,26 @@ from oiio_msspl.jobs.views import find_other_views
 
 @dataclass(frozen=True)
 class PairCheck:
-    """What was found about one pair."""
+    """The result of :func:`check_files`."""
 
     lr: Path
     hr: Path
     problem: str | None = None
     """Why the pair can't be fused; None if it can."""
     warnings: list[str] = field(default_factory=list)
-    """Why the renders may not show the same frame, one sentence each. One about some of several views names them."""
+    """Why the renders may not show the same frame, one sentence each. A sentence about some views names them."""
     passed_on: tuple[str, ...] = ()
     """Why views beside the first one can't be fused, one sentence each."""
 
     @property
     def fits(self) -> bool:
-        """Whether the pair can be fused and nothing speaks against it."""
+        """True if the pair can be fused and nothing speaks against it."""
         return self.problem is None and all(warning.endswith(BOTH_BLACK) for warning in self.warnings)
 
     def as_dict(self) -> dict[str, Any]:
-        """The check as JSON values."""
-        return {
-            "lrhs": str(self.lr),
-            "hrls": str(self.hr),
-            "fits": self.fits,
-            "problem": self.problem,
-            "warnings": self.warnings,
-            "passed_on": self.passed_on,
-        }
+        """Return the check as JSON values."""
+        findings = {"problem": self.problem, "warnings": self.warnings, "passed_on": self.passed_on}
+        return {"lrhs": str(self.lr), "hrls": str(self.hr), "fits": self.fits, **findings}
 
 
 def check_files(lr: str | Path, hr: str | Path, inputs: InputOptions = InputOptions()) -> PairCheck:
@@ -52,7 +46,7 @@ def check_files(lr: str | Path, hr: str | Path, inputs: InputOptions = InputOpti
         inputs: mapping, view and colour space of the two files. If it names no view, all are checked.
 
     Returns:
-        What was found. A pair that can't be fused is described in ``problem``; nothing is raised for it.
+        The check. If the pair can't be fused, ``problem`` says why, and nothing is raised.
     """
     lr, hr = Path(lr), Path(hr)
     try:

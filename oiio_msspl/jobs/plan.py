@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """Decides which neighbours the frames of a shot are averaged with, and how their motion is known.
 
-A frame depends on the frames up to ``count`` before and after it, and on nothing else. So a shot that is cut into
-chunks, or resumed, has the same pixels as one run: the neighbours of a chunk are fused again, and not written.
+A frame depends only on the frames up to ``count`` before and after it. So a shot that is cut into chunks, or resumed,
+has the pixels of one run: the neighbours of a chunk are fused again, and not written.
 """
 
 from __future__ import annotations
@@ -32,17 +32,17 @@ log = logging.getLogger(__name__)
 #: LRHS and HRLS.
 Pair = tuple[MappedRender, MappedRender]
 
-#: What ``--temporal`` takes beside a number.
+#: Words that ``--temporal`` takes in place of a number.
 AUTO, OFF = "auto", "off"
-#: Frames before and after a frame that it depends on, where motion is known; and the same for the quality `best`, which
-#: takes so long that averaging more renders adds little.
+#: Frames before and after a frame that it depends on, where motion is known. The second number is for the quality
+#: `best`, which takes so long that averaging more renders adds little.
 AUTO_COUNT, AUTO_COUNT_SLOW = 4, 6
 #: The most fused frames on each side that are averaged. More of them gain less than more renders.
 MOST_RESULTS = 2
-#: The most that can be asked for.
+#: The most frames on each side that can be asked for.
 MOST = 8
-#: Pairs of frames that are looked at to find out how motion is stored.
-LOOKED_AT = 3
+#: Pairs of frames that are judged to find out how motion is stored.
+PAIRS_JUDGED = 3
 
 
 @dataclass(frozen=True)
@@ -54,7 +54,7 @@ class TemporalOptions:
     """
 
     frames: str | int = AUTO
-    """``auto``, ``off``, or the number of frames before and after each frame that it may depend on."""
+    """``auto``, ``off``, or the number of frames before and after a frame that it may depend on."""
     motion_format: str | None = None
     """How motion vectors are stored, see :func:`oiio_msspl.aovs.motion.user_fields`; None to find it out."""
 
@@ -65,11 +65,7 @@ class TemporalOptions:
             read_format(self.motion_format)
 
     def count(self, model: str | None = None) -> int:
-        """Frames before and after each frame, if their motion is known.
-
-        Args:
-            model: what is used, or its family.
-        """
+        """Return how many frames before and after a frame it depends on, for a model or family, if motion is known."""
         if self.frames == AUTO:
             return AUTO_COUNT_SLOW if _is_slow(model) else AUTO_COUNT
         return 0 if self.frames == OFF else int(self.frames)
@@ -95,7 +91,7 @@ class ShotPlan:
     text: str = ""
     """One sentence for the user; empty if the user has switched it off."""
     looked_at: frozenset[str] = frozenset()
-    """All views beside the first one that the plan is about. ``text`` says why some are fused frame by frame."""
+    """All views beside the first one that were planned. ``text`` says why some are fused frame by frame."""
 
     @property
     def count(self) -> int:
@@ -128,7 +124,7 @@ class ShotPlan:
 
 
 def _is_slow(model: str | None) -> bool:
-    """Whether a name stands for a model of the quality `best`, at any scale. The path of a file does not."""
+    """Return whether a name stands for a model of the quality `best`. The path of a file does not."""
     name = family_of(model) or model or ""
     return name.startswith(QUALITIES["best"]) and Path(name).suffix != ".onnx"
 
@@ -161,17 +157,17 @@ def plan_temporal(
         if asked:
             raise InputError(f"--temporal {options.frames}: {shot.hr.pattern} has no two frames that follow each other")
         return ShotPlan(text="frame by frame: no two frames follow each other")
-    # Others come last: they are looked at if some of these can't be read.
-    looked_at = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1], *pairs)))
-    mapped = functools.cache(lambda number: _map_frame(frames[number], inputs))
+    # The first, middle and last pair are judged, and others in place of those that can't be read.
+    numbers = list(dict.fromkeys((pairs[0], pairs[len(pairs) // 2], pairs[-1], *pairs)))
+    mapped = functools.cache(lambda number: map_pair(low[number], high[number], inputs))
     count = options.count(_family_of_shot(mapped, frames, model))
-    plan, text = _plan_view(_motion_of(mapped, looked_at, inputs, options, required=asked), count, asked=asked)
+    plan, text = _plan_view(_motion_of(mapped, numbers, inputs, options, required=asked), count, asked=asked)
     if plan is None:
         return ShotPlan(text=text)
     views: dict[str | None, ViewPlan] = {None: plan}
-    labels = _other_views(mapped, looked_at[:LOOKED_AT], inputs, write)
+    labels = _other_views(mapped, numbers[:PAIRS_JUDGED], inputs, write)
     for label in labels:
-        source = _motion_of(mapped, looked_at, inputs, options, label, required=False)
+        source = _motion_of(mapped, numbers, inputs, options, label, required=False)
         plan, reason = _plan_view(source, count, asked=asked)
         if plan is None:
             text += f"; {name_of(label)} {reason}"
@@ -181,7 +177,7 @@ def plan_temporal(
 
 
 def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model: str | None) -> str | None:
-    """The family of models that the first pair's layers are enough for; ``model`` itself if it is none."""
+    """Return the family of models that suits the first pair's layers; ``model`` itself if it names no family."""
     family = family_of(model)
     if family is None:
         return model
@@ -192,7 +188,7 @@ def _family_of_shot(mapped: Callable[[int], Pair], numbers: Iterable[int], model
 
 
 def _plan_view(source: MotionSource, count: int, *, asked: bool) -> tuple[ViewPlan | None, str]:
-    """Return the plan of one view, None if it is fused frame by frame, and a sentence about it."""
+    """Return the plan of a view, None if it is fused frame by frame, and a sentence about it."""
     if source.kind == NONE or (source.kind == FLOW and not asked):
         hint = "; --temporal 2 uses it all the same" if source.kind == FLOW else ""
         return None, f"frame by frame: {source.text}{hint}"
@@ -203,7 +199,7 @@ def _plan_view(source: MotionSource, count: int, *, asked: bool) -> tuple[ViewPl
 def _other_views(
     mapped: Callable[[int], Pair], numbers: Sequence[int], inputs: InputOptions, write: WriteOptions
 ) -> list[str]:
-    """The views beside the first one that are fused in some of these frames."""
+    """Return the views beside the first one that are fused in some of these frames."""
     views: dict[str, None] = {}
     for number in numbers:
         with suppress(InputError):  # the run says so when the turn of this frame has come
@@ -213,12 +209,7 @@ def _other_views(
 
 
 def reach_of(count: int, kind: str) -> Reach:
-    """Return how many neighbours on each side are averaged as renders, and how many as fused pictures.
-
-    Args:
-        count: neighbours of both kinds together.
-        kind: of the source of motion.
-    """
+    """Divide ``count`` neighbours into renders and fused pictures, by the kind of the source of motion."""
     # Optical flow is computed on fused pictures, so renders can't be averaged before.
     results = count if kind == FLOW else min(MOST_RESULTS, count - count // 2)
     return Reach(count - results, results)
@@ -226,89 +217,106 @@ def reach_of(count: int, kind: str) -> Reach:
 
 def _motion_of(
     mapped: Callable[[int], Pair],
-    numbers: Sequence[int],
+    numbers: Iterable[int],
     inputs: InputOptions,
     options: TemporalOptions,
     view: str | None = None,
     *,
     required: bool,
 ) -> MotionSource:
-    """How the motion of a shot is known, by some of its frames and the frames after these.
-
-    The camera may stand still at one end, or move in one direction only, so several frames are looked at, until they
-    tell how vectors are stored. What one shows has to hold for those before. A frame that can't be read is passed over,
-    because the run says so when its turn comes.
-
-    Args:
-        mapped: opens and maps a frame.
-        view: the view or view layer; None for each file's first one.
-    """
+    """Return the source of the motion of a view; None stands for each file's first view."""
 
     def render(number: int) -> MappedRender:
         hr = mapped(number)[1]
         return hr if view is None else map_other_hrls(hr, view, inputs)
 
-    def look(number: int, verified: Sequence[MotionField] = ()) -> MotionSource:
-        return find_motion(render(number), render(number + 1), options.motion_format, verified, required=required)
-
-    found: dict[int, MotionSource] = {}
-    vectors: MotionSource | None = None
-    problem: InputError | None = None
+    pairs = _JudgedPairs(render, options.motion_format, required)
     for number in numbers:
-        if len(found) == LOOKED_AT or (vectors and not vectors.silent):
+        pairs.judge(number)
+        if pairs.suffice:
             break
-        try:
-            if vectors and not vectors.tells_more(render(number)):
-                found[number] = vectors
-                continue
-            found[number] = look(number, vectors.fields if vectors else ())
-        except InputError as error:
-            problem = problem or error
-            log.debug("frames %d and %d: %s", number, number + 1, error)
-            continue
-        if found[number].kind != VECTORS:
-            continue
-        latest, silent = found[number], found[number].silent & (vectors or found[number]).silent
-        candidates = [latest]
-        if vectors and _agree(latest, vectors):
-            candidates = [vectors, latest]
-        elif vectors:
-            for before, source in found.items():
-                if source.kind == VECTORS and before != number:
-                    candidates.append(look(before, latest.fields))
-                    if not _agree(candidates[-1], latest):
-                        return _contradiction(found, before, number, required=required)
-        # The pair that tells of most layers.
-        vectors = replace(max(candidates, key=lambda source: len(source.fields)), silent=silent)
-    if vectors:
-        return vectors
-    for kind in (CAMERA, STATIC, FLOW):
-        for source in found.values():
-            if source.kind == kind:
-                return source
-    if found:
-        return next(iter(found.values()))
-    assert problem is not None
+    if pairs.sources:
+        return pairs.verdict()
+    assert pairs.problem is not None
     if required or (options.motion_format is not None and view is None):
-        raise problem
-    return MotionSource(NONE, str(problem))
+        raise pairs.problem
+    return MotionSource(NONE, str(pairs.problem))
+
+
+class _JudgedPairs:
+    """Findings on the motion of a view, collected from pairs of successive frames.
+
+    The camera may stand still at one end, or move in one direction only, so several pairs are judged until they tell
+    how vectors are stored. What one pair shows has to hold for the pairs before. A frame that can't be read is passed
+    over, because the run says so when its turn comes.
+    """
+
+    def __init__(self, render: Callable[[int], MappedRender], motion_format: str | None, required: bool) -> None:
+        self._render, self._format, self._required = render, motion_format, required
+        self.sources: dict[int, MotionSource] = {}
+        """By the number of a pair's first frame."""
+        self.problem: InputError | None = None
+        """Why the first of the pairs that can't be judged can't be."""
+        self._vectors: MotionSource | None = None
+        self._contradiction = ""
+
+    @property
+    def suffice(self) -> bool:
+        """True if no further pair needs to be judged."""
+        settled = self._vectors is not None and not self._vectors.silent
+        return settled or len(self.sources) == PAIRS_JUDGED or bool(self._contradiction)
+
+    def judge(self, number: int) -> None:
+        """Judge a frame and the next one."""
+        vectors = self._vectors
+        try:
+            if vectors and not vectors.tells_more(self._render(number)):
+                self.sources[number] = vectors
+                return
+            source = self._find(number, vectors.fields if vectors else ())
+        except InputError as error:
+            self.problem = self.problem or error
+            log.debug("frames %d and %d: %s", number, number + 1, error)
+            return
+        self.sources[number] = source
+        if source.kind == VECTORS:
+            self._add_vectors(number, source)
+
+    def _find(self, number: int, verified: Sequence[MotionField]) -> MotionSource:
+        pair = self._render(number), self._render(number + 1)
+        return find_motion(*pair, self._format, verified, required=self._required)
+
+    def _add_vectors(self, number: int, latest: MotionSource) -> None:
+        """Bring vectors and those of the pairs before into agreement, and keep the pair that tells of most layers."""
+        vectors = self._vectors or latest
+        candidates = [vectors, latest]
+        if not _agree(latest, vectors):
+            candidates = [latest]
+            for before in [n for n, source in self.sources.items() if source.kind == VECTORS and n != number]:
+                candidates.append(self._find(before, latest.fields))
+                if not _agree(candidates[-1], latest):
+                    texts = "; ".join(f"frames {n} and {n + 1}: {self.sources[n].text}" for n in (before, number))
+                    self._contradiction = f"the frames contradict each other on how motion vectors are stored ({texts})"
+                    return
+        best = max(candidates, key=lambda source: len(source.fields))
+        self._vectors = replace(best, silent=latest.silent & vectors.silent)
+
+    def verdict(self) -> MotionSource:
+        """Return the source that the pairs tell of.
+
+        Raises:
+            InputError: they contradict each other, and the user asks for neighbours.
+        """
+        if self._contradiction and self._required:
+            hint = "describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels"
+            raise InputError(f"{self._contradiction}; {hint}")
+        if self._contradiction:
+            return MotionSource(NONE, self._contradiction)
+        preference = (CAMERA, STATIC, FLOW, NONE)
+        return self._vectors or min(self.sources.values(), key=lambda source: preference.index(source.kind))
 
 
 def _agree(one: MotionSource, other: MotionSource) -> bool:
-    """Whether two pairs of frames tell the same of each layer of vectors that both tell something of."""
-    formats = {each.name: each.format for each in one.fields}
-    return all(formats.get(each.name, each.format) == each.format for each in other.fields)
-
-
-def _contradiction(found: Mapping[int, MotionSource], before: int, number: int, *, required: bool) -> MotionSource:
-    """What is known of vectors that are stored in one way in some frames, and in another way in others."""
-    texts = "; ".join(f"frames {n} and {n + 1}: {found[n].text}" for n in (before, number))
-    text = f"the frames contradict each other on how motion vectors are stored ({texts})"
-    if required:
-        raise InputError(f"{text}; describe them with --motion-format layer=NAME,to=next,x=right,y=up,unit=pixels")
-    return MotionSource(NONE, text)
-
-
-def _map_frame(files: FrameFiles, inputs: InputOptions) -> Pair:
-    assert files.lr is not None and files.hr is not None
-    return map_pair(files.lr, files.hr, inputs)
+    """Return whether two pairs of frames tell alike of each layer of vectors that both tell of."""
+    formats = {vectors.name: vectors.format for vectors in one.fields}
+    return all(formats.get(vectors.name, vectors.format) == vectors.format for vectors in other.fields)

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from oiio_msspl._version import __version__
-from oiio_msspl.aovs.additive_sets import AdditiveSet
+from oiio_msspl.aovs.additive_sets import AdditiveLayer, AdditiveSet
 from oiio_msspl.aovs.mapped_render import MappedRender, origin
 from oiio_msspl.aovs.views import name_of
 from oiio_msspl.exr.contents import dropped_channels
@@ -26,7 +26,7 @@ LEAST_SHARE = 1 / 8
 
 @dataclass
 class FrameReport:
-    """What was done with one pair, for people and, as :meth:`as_dict`, for programs."""
+    """The account of a fused pair, for people and, as :meth:`as_dict`, for programs."""
 
     lr: MappedRender
     hr: MappedRender
@@ -42,10 +42,10 @@ class FrameReport:
     repaired: dict[str, int]
     """Number of values that were NaN or infinite, by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
     negative: dict[str, int]
-    """The same of values that were negative and set to 0."""
+    """Number of values that were negative and set to 0, by layer."""
     warnings: list[str]
     tiles: int
-    """Of all views that were fused."""
+    """Tiles of all views that were fused."""
     seconds: dict[str, float]
     """Wall time in seconds: ``read`` opens both files and loads the model, ``fuse`` reads pixels and fuses them,
     ``network`` is the part of ``fuse`` that the model's network took, and ``write`` writes EXR and preview."""
@@ -54,18 +54,18 @@ class FrameReport:
     clipped: int = 0
     """Number of fused values that half could not hold; 0 if the beauty is stored as float."""
     lrhs_aovs: tuple[str, ...] = ()
-    """Features of the LRHS that the model reads beside colour, where the LRHS has them."""
+    """Features that the model reads of an LRHS that has them, beside colour."""
     passes: dict[str, str] = field(default_factory=dict)
-    """What was done with each additive set, by its name."""
+    """A sentence on each additive set, by name: fused or passed on."""
     network_seconds: float = 0.0
     """``seconds["network"]``, known before the others."""
     other_views: list[FrameReport] = field(default_factory=list)
-    """The views and view layers that were fused beside the first one. What this report counts, warns of and says of
-    passes is about all of them, with the view in front where it is not the first one's."""
+    """The views and view layers that were fused beside the first one. Counts, warnings and passes of this report are
+    about all views; those of another view than the first have its name in front."""
     fused_sets: list[AdditiveSet] = field(default_factory=list)
     """The additive sets that were fused."""
     layers: list[str] = field(default_factory=list)
-    """The layers of the HRLS that are written beside the beauty, or their channels if they have no name, of all views.
+    """The layers of the HRLS that are written beside the beauty, of all views, or their channels if they have no name.
     In a file with views (``left``) they are ``VIEW: LAYER``."""
 
     @property
@@ -76,25 +76,25 @@ class FrameReport:
         return self.lr.spp / self.scale**2 + self.hr.spp
 
     def aovs(self) -> list[dict[str, str]]:
-        """The rows of :meth:`oiio_msspl.aovs.mapped_render.MappedRender.table` for the HRLS."""
+        """List what the features of the HRLS are read from, see :meth:`.MappedRender.table`."""
         return self.hr.table(self.features)
 
     def fused_views(self) -> list[FrameReport]:
-        """The reports of all views that were fused, the first one in front; empty for a file with only one view."""
+        """Return the reports of all views that were fused, the first one in front; none for a file with one view."""
         return [self, *self.other_views] if self.hr.other_views else []
 
     @property
     def tiles_of_views(self) -> list[int]:
         """Tiles of each view that was fused, the first one in front."""
-        others = [each.tiles for each in self.other_views]
+        others = [view.tiles for view in self.other_views]
         return [self.tiles - sum(others), *others]
 
     def found_lrhs_aovs(self) -> dict[str, str]:
-        """The features of ``lrhs_aovs`` that the LRHS has, with the layer of each."""
+        """Return the features of ``lrhs_aovs`` that the LRHS has, with their layers."""
         return {name: self.lr.features[name].text for name in self.lrhs_aovs if name in self.lr.features}
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as JSON values."""
+        """Return the report as JSON values."""
         return {
             "lrhs": self.lr.name,
             "hrls": self.hr.name,
@@ -103,7 +103,7 @@ class FrameReport:
             "renderer": self.hr.renderer,
             "view": self.hr.view or None,
             "other_views": self.hr.other_views,
-            "fused_views": [{"view": each.hr.view or None, "aovs": each.aovs()} for each in self.fused_views()],
+            "fused_views": [{"view": view.hr.view or None, "aovs": view.aovs()} for view in self.fused_views()],
             "scale": self.scale,
             "spp": {"lrhs": self.lr.spp, "hrls": self.hr.spp, "average": self.spp_avg},
             "model": self.model,
@@ -127,10 +127,10 @@ class FrameReport:
 def report_on(
     lr: MappedRender, hr: MappedRender, session: Session, fused: FusedFrame, output: Path, preview_path: Path | None
 ) -> FrameReport:
-    """The report of a frame that is fused and not yet written: ``seconds`` is still empty."""
+    """Report on a frame that is fused and not yet written: ``seconds`` is still empty."""
     return FrameReport(
         lr=lr,
-        hr=hr,
+        hr=hr.for_model(session.contract.hrls),
         scale=fused.alignment.scale,
         model=session.name,
         provider=session.provider,
@@ -151,15 +151,8 @@ def report_on(
 
 
 def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on: Sequence[str]) -> None:
-    """Add other views of a frame to the report of its first one.
-
-    Args:
-        report: of the first view.
-        views: those that were fused, too.
-        passed_on: why others were not, one sentence each.
-    """
-    warnings = merged({each.hr.view: each.warnings for each in (report, *views)})
-    report.warnings = [*warnings, *passed_on]
+    """Add the reports of other views to that of the first one, and sentences on why further views are passed on."""
+    report.warnings = [*merged({view.hr.view: view.warnings for view in (report, *views)}), *passed_on]
     report.other_views = list(views)
     for view in views:
         name = name_of(view.hr.view)
@@ -171,7 +164,7 @@ def add_other_views(report: FrameReport, views: Sequence[FrameReport], passed_on
 
 
 def merged(sentences: Mapping[str, Sequence[str]]) -> list[str]:
-    """Sentences about several views, by view. One that not all views share begins with those that do."""
+    """Merge the sentences about several views. One that only some views share begins with the names of these."""
     views: dict[str, list[str]] = {}
     for view, texts in sentences.items():
         for text in texts:
@@ -180,28 +173,30 @@ def merged(sentences: Mapping[str, Sequence[str]]) -> list[str]:
 
 
 def _pass_warnings(hr: MappedRender, fused: FusedFrame) -> list[str]:
-    """Sentences for layers that the LRHS lacks, and for sets that the user has named and that could not be fused."""
+    """Warn of layers that the LRHS lacks, and of sets that the user has named and that could not be fused."""
     if fused.passes is None:
         return []
     refused = fused.passes.refused
-    named = [each.name for each in hr.additive_sets if each.by_user and each.name in refused]
+    named = [additive.name for additive in hr.additive_sets if additive.by_user and additive.name in refused]
     passed_on = [f"--sum {name}: {refused[name]}; its layers of {hr.name} are passed on as they are" for name in named]
     return [*fused.passes.warnings, *passed_on]
 
 
 def _passes(fused: FusedFrame) -> dict[str, str]:
-    """What was done with each additive set."""
+    """Say what was done with each additive set."""
     if fused.passes is None:
         return {}
-    done = {each.name: f"fused: {each.layer_names}" for each in fused.passes.sets}
-    done |= {name: f"{done[name]} ({layers} from the HRLS alone)" for name, layers in fused.passes.hrls_alone.items()}
-    for name, share in fused.passes.lacking.items():
-        done[name] += f"; {share:.1%} of the beauty's light is in none of them"
-    return done | {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in done}
+    texts = {additive.name: f"fused: {additive.layer_names}" for additive in fused.passes.sets}
+    for name, layers in fused.passes.hrls_alone.items():
+        texts[name] += f" ({layers} from the HRLS alone)"
+    for name, fraction in fused.passes.lacking.items():
+        texts[name] += f"; {fraction:.1%} of the beauty's light is in none of them"
+    refused = {name: f"passed on: {reason}" for name, reason in fused.passes.refused.items() if name not in texts}
+    return texts | refused
 
 
 def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list[str]:
-    """Warn of spp that the method or the model was not made for."""
+    """Warn of samples per pixel that the method or the model was not made for."""
     warnings = []
     if lr.spp is not None and hr.spp is not None and lr.spp / contract.scale**2 < LEAST_SHARE * hr.spp:
         warnings.append(
@@ -215,7 +210,7 @@ def spp_warnings(lr: MappedRender, hr: MappedRender, contract: Contract) -> list
 
 
 def written_layers(hr: MappedRender, write: WriteOptions) -> list[str]:
-    """What is written beside the beauty, sorted by name, see :attr:`FrameReport.layers`."""
+    """Name what is written beside the beauty, sorted, see :attr:`FrameReport.layers`."""
     left_out = {*dropped_channels(hr.file, hr.beauty_channels, write.layers), *hr.beauty_channels}
     names = {
         (f"{layer.view}: " if layer.view else "") + (layer.name or component)
@@ -227,37 +222,35 @@ def written_layers(hr: MappedRender, write: WriteOptions) -> list[str]:
 
 
 def provenance(report: FrameReport) -> dict[str, str]:
-    """Attributes of the fused part: model, inputs, spp and layers that the frame was made from.
+    """Return attributes of the fused part: model, inputs, spp and layers that the frame was made from.
 
     ``msspl/passes`` is JSON, the fused sets: ``[{"name": NAME, "layers": [[LAYER], [LIGHT, COLOUR], ...]}, ...]``. The
     sum of the layers, and of the products of light and colour, is the fused beauty. The names are those of the HRLS.
     """
-    spp = report.spp_avg
-    views = {"msspl/views": ", ".join(name_of(each.hr.view) for each in report.fused_views())}
+    views = {"msspl/views": ", ".join(name_of(view.hr.view) for view in report.fused_views())}
     return (views if report.other_views else {}) | {
         "msspl/version": __version__,
         "msspl/model": report.model,
         "msspl/scale": str(report.scale),
         "msspl/lrhs": report.lr.name,
         "msspl/hrls": report.hr.name,
-        "msspl/spp_lrhs": "unknown" if report.lr.spp is None else f"{report.lr.spp:g}",
-        "msspl/spp_hrls": "unknown" if report.hr.spp is None else f"{report.hr.spp:g}",
-        "msspl/spp_average": "unknown" if spp is None else f"{spp:g}",
+        "msspl/spp_lrhs": _spp(report.lr.spp),
+        "msspl/spp_hrls": _spp(report.hr.spp),
+        "msspl/spp_average": _spp(report.spp_avg),
         "msspl/aovs": "; ".join(f"{row['feature']}: {origin(row)}" for row in report.aovs()),
         "msspl/passes": json.dumps(_fused_layers(report)),
     }
 
 
+def _spp(spp: float | None) -> str:
+    return "unknown" if spp is None else f"{spp:g}"
+
+
 def _fused_layers(report: FrameReport) -> list[dict[str, Any]]:
-    """The fused sets, with the layers' full names, as :func:`provenance` describes them."""
+    """List the fused sets, with the layers' full names, as :func:`provenance` describes them."""
     layer_of = layer_by_channel(report.hr.file)
-    return [
-        {
-            "name": each.name,
-            "layers": [
-                [layer_of[channels[0]].name for channels in (layer.channels, layer.factor) if channels]
-                for layer in each.layers
-            ],
-        }
-        for each in report.fused_sets
-    ]
+
+    def names(layer: AdditiveLayer) -> list[str]:
+        return [layer_of[channels[0]].name for channels in (layer.channels, layer.factor) if channels]
+
+    return [{"name": additive.name, "layers": [*map(names, additive.layers)]} for additive in report.fused_sets]

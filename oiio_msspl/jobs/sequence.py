@@ -20,26 +20,27 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.reader import open_exr
 from oiio_msspl.model.contract import SCALES
 
-#: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq understands each of these, but
-#: it splits the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no
-#: number in ``a.####_v2.exr``, it takes ``a.#.##.exr`` for subframes, and it refuses a folder named ``lr#1``.
+#: The frame number in a pattern, as Nuke, Katana, Python and Houdini write it. fileseq reads all of these, but splits
+#: the name around them differently: it takes the digits of ``v2####.exr`` for a frame range, it finds no number in
+#: ``a.####_v2.exr``, it takes ``a.#.##.exr`` for subframes, and it refuses a folder named ``lr#1``.
 _NUMBER_FIELD = re.compile(r"#+|@@+|%\d+d|\$F\d*")
 
-#: The same in its shortest forms, if there is no longer one. They also occur in ordinary names (``still@2x.exr``,
-#: ``100%done.exr``), so ``@`` counts only between separators, and ``%d`` only if no letter or digit follows.
+#: The shortest forms of a frame number, for names without a longer one. They also occur in ordinary names
+#: (``still@2x.exr``, ``100%done.exr``), so ``@`` counts only between separators, and ``%d`` only if no letter or digit
+#: follows.
 _SHORT_FIELD = re.compile(r"(?<![^._ -])@(?![^._ -])|%d(?![^\W_])")
 
-#: A name whose number is not at its end, such as ``anim.0001_lr.exr``: head, number, tail. A number that follows a
-#: letter is none: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
+#: A name whose number is not at its end, such as ``anim.0001_lr.exr``: head, number, tail. A number after a letter does
+#: not count: it may be a version or a size (``v002``, ``x2``). In ``a_v2.0001_lr.exr``, fileseq finds frame 2.
 _NUMBER_INSIDE = re.compile(r"(|.*[._ -])(\d+)([_ -]\D*\.exr)", re.IGNORECASE)
 
-#: A name whose number is at its end. Here it may follow a letter (``hr0001.exr``), but not a ``v``: that is a version.
+#: A name whose number is at its end. It may follow a letter (``hr0001.exr``), but not a ``v``, which marks a version.
 _NUMBER_LAST = re.compile(r"(|.*?[^vV\d])(\d+)(\.exr)", re.IGNORECASE)
 
-#: What stands before the number of a version.
+#: The end of a name before the number of a version.
 _VERSION = re.compile(r"(?<![^\W_])v$", re.IGNORECASE)
 
-#: One digit for each ``#``, as in Nuke, Katana and RV. fileseq's default is four digits for each.
+#: One digit for a ``#``, as in Nuke, Katana and RV. fileseq's default is four digits.
 _PAD_STYLE = fileseq.constants.PAD_STYLE_HASH1
 
 
@@ -55,16 +56,15 @@ class Pattern:
 
     @classmethod
     def padded(cls, folder: Path, head: str, width: int, tail: str) -> Pattern:
-        """A pattern whose numbers have at least ``width`` digits."""
+        """Make a pattern whose numbers have at least ``width`` digits."""
         return cls(folder, head, fileseq.FileSequence("#" * width, pad_style=_PAD_STYLE), tail)
 
     def path(self, number: int) -> Path:
-        """The file of one frame."""
+        """Return the file of a frame."""
         return self.folder / f"{self.head}{self.number.frame(number)}{self.tail}"
 
     def spellings(self, number: int) -> set[str]:
-        """How names may spell a number. Some programs count the sign of a negative one as a digit (-003), others do not
-        (-0003)."""
+        """Return the spellings of a number: the sign of a negative one may count as a digit (-003) or not (-0003)."""
         digits = self.number.frame(abs(number))
         return {self.number.frame(number), digits if number >= 0 else f"-{digits}"}
 
@@ -107,7 +107,7 @@ class FrameFiles:
         return [path for path in (self.output, self.preview) if path is not None]
 
     def absolute(self) -> FrameFiles:
-        """The same with absolute paths, for workers with other working directories."""
+        """Return the files with absolute paths, for workers with other working directories."""
         lr, hr, preview = (None if path is None else path.absolute() for path in (self.lr, self.hr, self.preview))
         return FrameFiles(self.number, lr, hr, self.output.absolute(), preview)
 
@@ -122,12 +122,12 @@ class Shot:
     frames: list[FrameFiles]
 
     def target(self, number: int) -> Path:
-        """The fused frame."""
+        """Return the file of a fused frame."""
         return _target(self.output, self.hr, number)
 
 
 def is_sequence(path: Path) -> bool:
-    """Whether this is a folder or a pattern, and not a single file."""
+    """Return whether a path is a folder or a pattern, and not a single file."""
     return path.is_dir() or (bool(_number_fields(path.name)) and not path.exists())
 
 
@@ -139,7 +139,7 @@ def check_exists(path: Path) -> None:
 
 
 def _number_fields(name: str) -> list[re.Match[str]]:
-    """Where a name marks the frame number; empty if it is no pattern."""
+    """Find where a name marks the frame number; nowhere if it is not a pattern."""
     return list(_NUMBER_FIELD.finditer(name)) or list(_SHORT_FIELD.finditer(name))
 
 
@@ -161,42 +161,42 @@ def find_shot(lr: str | Path, hr: str | Path, output: str | Path, frames: str | 
     low, high = _choose(lows, highs, Path(lr), Path(hr))
     numbers = sorted(low.files.keys() | high.files.keys()) if frames is None else parse_frames(frames)
     pattern = _output_pattern(Path(output), high.pattern)
-    each = [FrameFiles(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
-    return Shot(low, high, pattern, each)
+    files = [FrameFiles(n, low.files.get(n), high.files.get(n), _target(pattern, high, n)) for n in numbers]
+    return Shot(low, high, pattern, files)
 
 
 def _target(output: Pattern, hr: Sequence, number: int) -> Path:
-    """The file of a fused frame. In a folder it is named as the HRLS, whose frames may differ in their padding."""
+    """Return the file of a fused frame. In a folder it is named as the HRLS, whose frames may differ in padding."""
     in_folder = output.number is hr.pattern.number
     return output.folder / _with_exr(hr.files[number].name) if in_folder and number in hr.files else output.path(number)
 
 
 def _with_exr(name: str) -> str:
-    """The HRLS may be named hr.exr.####. Programs know an EXR by its extension, so the result gets one."""
+    """Append .exr to a name such as hr.exr.####, because programs know an EXR by its extension."""
     return name if name.lower().endswith(".exr") else f"{name}.exr"
 
 
 def _not_written(sequences: list[Sequence], output: Path) -> list[Sequence]:
-    """Sequences but for the results that a run that resumes finds beside its renders."""
+    """Leave out the results that a run that resumes finds beside its renders."""
     if output.is_dir() or not output.parent.is_dir() or not _number_fields(output.name):
         return sequences
-    # Files are compared, because a pattern may have fewer digits than its numbers: name.#.exr means name.1001.exr, too
+    # Names are compared, because a pattern may have fewer digits than its numbers: name.#.exr means name.1001.exr, too.
     written = {path.name for path in _files_of(parse_pattern(output)).values()}
-    others = (
-        each
-        for each in sequences
-        if not (each.pattern.folder.samefile(output.parent) and written.issuperset(p.name for p in each.files.values()))
-    )
-    return list(others) or sequences
+
+    def is_result(sequence: Sequence) -> bool:
+        in_folder = sequence.pattern.folder.samefile(output.parent)
+        return in_folder and written.issuperset(path.name for path in sequence.files.values())
+
+    return [sequence for sequence in sequences if not is_result(sequence)] or sequences
 
 
 def format_frames(numbers: Iterable[int]) -> str:
-    """Frame numbers as a range: ``1001-1010,1020-1030x2``."""
+    """Write frame numbers as a range: ``1001-1010,1020-1030x2``."""
     return str(fileseq.framesToFrameRange(numbers))
 
 
 def parse_frames(frames: str | Iterable[int]) -> list[int]:
-    """Frame numbers, each once, in the order given.
+    """Return frame numbers, each once, in the order given.
 
     Args:
         frames: numbers, or a range such as ``1001-1100x2,1200``.
@@ -236,7 +236,7 @@ def parse_pattern(path: Path) -> Pattern:
 
 
 def frame_in_name(path: Path) -> tuple[Pattern, int] | None:
-    """The pattern and the frame number of a file that stands for itself; None if its name has no frame number."""
+    """Return the pattern and the frame number of a file; None if its name has no frame number."""
     match = _NUMBER_INSIDE.fullmatch(path.name) or _NUMBER_LAST.fullmatch(path.name)
     if match is None:
         return None
@@ -245,20 +245,20 @@ def frame_in_name(path: Path) -> tuple[Pattern, int] | None:
 
 
 def next_file(path: Path) -> Path | None:
-    """The file beside this one whose frame number is one higher, if it has a number and there is such a file."""
-    found = frame_in_name(path)
-    if found is None:
+    """Return the file of the next frame, which lies beside that of a frame; None if there is none."""
+    numbered = frame_in_name(path)
+    if numbered is None:
         return None
-    pattern, number = found
+    pattern, number = numbered
     width = pattern.number.zfill()
     # The sign of a negative number may count as a digit.
     widths = (width, width + 1) if number < 0 else (width,)
-    every = (_files_of(Pattern.padded(pattern.folder, pattern.head, each, pattern.tail)) for each in widths)
-    return next((files[number + 1] for files in every if number + 1 in files), None)
+    files = (_files_of(Pattern.padded(pattern.folder, pattern.head, digits, pattern.tail)) for digits in widths)
+    return next((by_number[number + 1] for by_number in files if number + 1 in by_number), None)
 
 
 def _numbered(match: re.Match[str]) -> tuple[str, int, int, str]:
-    """Head, number, digits of the number, and tail of a name."""
+    """Return head, number, digits of the number, and tail of a name."""
     head, digits, tail = match.groups()
     # A hyphen after a letter or digit is a separator. Otherwise it is a sign.
     if head.endswith("-") and not head[-2:-1].isalnum():
@@ -267,14 +267,11 @@ def _numbered(match: re.Match[str]) -> tuple[str, int, int, str]:
 
 
 def _sequences(path: Path) -> list[Sequence]:
-    """The sequence that a pattern names, or all sequences of a folder."""
+    """Find the sequence that a pattern names, or all sequences of a folder."""
     if path.is_dir():
-        found = _sequences_in(path)
-        if not found:
-            raise InputError(
-                f"{path}: no numbered EXRs in this folder (a pattern such as name####_lr.exr finds others)"
-            )
-        return found
+        if sequences := _sequences_in(path):
+            return sequences
+        raise InputError(f"{path}: no numbered EXRs in this folder (a pattern such as name####_lr.exr finds others)")
     check_exists(path)
     if not is_sequence(path):
         raise InputError(f"{path}: is a single file, the other one is a folder or a pattern; give two of a kind")
@@ -283,17 +280,15 @@ def _sequences(path: Path) -> list[Sequence]:
         raise InputError(f"{path}: there is no folder {pattern.folder}")
     files = _files_of(pattern)
     if not files:
-        there = ", ".join(str(s.pattern) for s in _sequences_in(pattern.folder)[:6]) or "no numbered EXRs"
-        raise InputError(f"{path}: no file has such a name; the folder has {there}")
+        names = ", ".join(str(s.pattern) for s in _sequences_in(pattern.folder)[:6]) or "no numbered EXRs"
+        raise InputError(f"{path}: no file has such a name; the folder has {names}")
     return [Sequence(pattern, files)]
 
 
 def _files_of(pattern: Pattern) -> dict[int, Path]:
-    """The files that a pattern names: ``lr.####.exr`` means lr.0007.exr and not lr.7.exr.
-
-    fileseq's ``findSequenceOnDisk`` is not used: it takes ``[`` in a name for a wildcard, finds nothing where the
-    number comes last (``hr.exr.####``), and fails where another padding is there as well.
-    """
+    """Find the files that a pattern names: ``lr.####.exr`` means lr.0007.exr and not lr.7.exr."""
+    # fileseq's findSequenceOnDisk takes [ in a name for a wildcard, finds nothing where the number comes last
+    # (hr.exr.####), and fails if names with another padding lie there as well.
     files = {}
     for name in os.listdir(pattern.folder):
         if not (name.startswith(pattern.head) and name.endswith(pattern.tail)):
@@ -305,26 +300,23 @@ def _files_of(pattern: Pattern) -> dict[int, Path]:
 
 
 def _sequences_in(folder: Path) -> list[Sequence]:
-    """The sequences of EXRs in a folder, by name. Hidden files are left out because they may be half written.
-
-    Versions (``still_v001.exr``) are no frames: two of them would be averaged. Numbers inside of names
-    (``anim.0001_lr.exr``) count only if no name ends with its number: such files may lie beside the frames that they
-    belong to.
-    """
-    every = [n for n in os.listdir(folder) if n.lower().endswith(".exr") and not n.startswith(".")]
-    inside = [match for match in map(_NUMBER_INSIDE.fullmatch, every) if match]
-    names = sorted({*every}.difference(match[0] for match in inside))
+    """Find the sequences of EXRs in a folder, by name. Versions (``still_v001.exr``) are not frames."""
+    # Hidden files may be half written.
+    names = sorted(name for name in os.listdir(folder) if name.lower().endswith(".exr") and not name.startswith("."))
+    inside = [match for match in map(_NUMBER_INSIDE.fullmatch, names) if match]
+    others = [name for name in names if not _NUMBER_INSIDE.fullmatch(name)]
     by_name: dict[tuple[str, str], list[tuple[int, int, str]]] = {}
-    for found in fileseq.FileSequence.findSequencesInList(names, pad_style=_PAD_STYLE):
-        if found.frameSet() is None or _VERSION.search(found.basename()):
+    for sequence in fileseq.FileSequence.findSequencesInList(others, pad_style=_PAD_STYLE):
+        if sequence.frameSet() is None or _VERSION.search(sequence.basename()):
             continue
-        for number, name in zip(map(int, found.frameSet() or ()), map(str, found), strict=True):
-            head, width = found.basename(), found.zfill()
+        for number, name in zip(map(int, sequence.frameSet() or ()), map(str, sequence), strict=True):
+            head, width = sequence.basename(), sequence.zfill()
             # fileseq reads shot-0001.exr as frame -1. After a letter or digit the hyphen is a separator.
             if number < 0 and head and head[-1].isalnum():
                 head, number, width = f"{head}-", -number, width - 1
             # fileseq gives a sequence for each padding. One name with two paddings is refused below.
-            by_name.setdefault((head, found.extension()), []).append((number, width, name))
+            by_name.setdefault((head, sequence.extension()), []).append((number, width, name))
+    # Names with the number inside (anim.0001_lr.exr) may be files that belong to frames whose names end with it.
     for match in [] if by_name else inside:
         head, number, width, tail = _numbered(match)
         by_name.setdefault((head, tail), []).append((number, width, match[0]))
@@ -339,17 +331,17 @@ def _sequences_in(folder: Path) -> list[Sequence]:
 
 
 def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> tuple[Sequence, Sequence]:
-    """The two sequences that belong together: the only ones, or the only ones with the same name."""
+    """Choose the two sequences that belong together: the only ones, or the only ones with equal names."""
     pairs = [(low, high) for low in lows for high in highs]
     if len(pairs) > 1:
         pairs = [(low, high) for low, high in pairs if low.pattern.base == high.pattern.base]
     if len(pairs) == 1:
         return pairs[0]
     seen = "; ".join(
-        f"{path} has {', '.join(sequence.pattern.name for sequence in found[:6])}"
-        for path, found in ((lr, lows), (hr, highs))
+        f"{path} has {', '.join(sequence.pattern.name for sequence in sequences[:6])}"
+        for path, sequences in ((lr, lows), (hr, highs))
     )
-    # Both may be the same folder. A sequence is no partner of itself.
+    # If both are one folder, a sequence may not be paired with itself.
     pairs = [(low, high) for low, high in pairs if str(low.pattern) != str(high.pattern)]
     why = f"{len(pairs)} sequences go by the same name in both" if pairs else "none has the same name in both"
     if lr == hr:
@@ -361,17 +353,17 @@ def _choose(lows: list[Sequence], highs: list[Sequence], lr: Path, hr: Path) -> 
 
 
 def _example(pairs: list[tuple[Sequence, Sequence]]) -> str:
-    """The end of that message: the first two whose sizes fit, those with short names first, because layers in files of
-    their own have longer names. Empty if none fit."""
-    for low, high in sorted(pairs, key=lambda pair: sum(len(each.pattern.name) for each in pair)):
-        widths = [_width(next(iter(each.files.values()))) for each in (low, high)]
+    """Write the end of that message: the first two whose sizes fit; empty if none do."""
+    # Short names come first, because single layers in files of their own have longer ones.
+    for low, high in sorted(pairs, key=lambda pair: sum(len(sequence.pattern.name) for sequence in pair)):
+        widths = [_width(next(iter(sequence.files.values()))) for sequence in (low, high)]
         if all(widths) and any(abs(widths[1] - scale * widths[0]) < scale for scale in SCALES):
             return f", such as {low.pattern} {high.pattern}"
     return ""
 
 
 def _width(path: Path) -> int:
-    """Of a render, in pixels; 0 for a file that can't be read and for a fused one."""
+    """Return the width of a render in pixels; 0 for a file that can't be read and for a fused one."""
     try:
         file = open_exr(path)
     except InputError:
@@ -381,7 +373,7 @@ def _width(path: Path) -> int:
 
 
 def _output_pattern(output: Path, hr: Pattern) -> Pattern:
-    """The names of the fused frames."""
+    """Return the names of the fused frames."""
     if _number_fields(output.name) and not output.is_dir():
         pattern = parse_pattern(output)
         if not pattern.tail.lower().endswith(".exr"):

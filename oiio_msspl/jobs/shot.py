@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot: the main job on every frame of two sequences, in this process or on a Dask cluster.
+"""Fuses a shot: every frame of two sequences, in this process or on a Dask cluster.
 
-A bad frame is reported and does not stop the others. A new EXR gets its name last, after its preview: an EXR that
-exists is a frame that is complete, whenever a run was ended. An EXR that is replaced comes before its preview, so a run
-that is killed between the two leaves the new frame without one.
+A bad frame is reported and does not stop the others. A new EXR gets its name last, after its preview, so an EXR that
+exists is a complete frame. An EXR that is replaced comes before its preview, so a run that is killed between the two
+leaves the new frame without a preview.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -28,7 +28,7 @@ from oiio_msspl.jobs.inputs import InputOptions
 from oiio_msspl.jobs.pipeline import run_pipeline
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions, plan_temporal
 from oiio_msspl.jobs.run import ShotRun
-from oiio_msspl.jobs.sequence import FrameFiles, find_shot
+from oiio_msspl.jobs.sequence import FrameFiles, Shot, find_shot
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot_report import FAILED, SKIPPED, FrameResult, ShotReport, fused_result, read_earlier, result_of
 from oiio_msspl.model.devices import require_device
@@ -38,6 +38,9 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
+
+#: Called after each frame with its result and the report so far.
+ShotProgress = Callable[[FrameResult, ShotReport], None]
 
 
 def fuse_shot(
@@ -59,7 +62,7 @@ def fuse_shot(
     skip_existing: bool = False,
     update: bool = False,
     report_path: str | Path | None = None,
-    progress: Callable[[FrameResult, ShotReport], None] | None = None,
+    progress: ShotProgress | None = None,
     client: Client | None = None,
 ) -> ShotReport:
     """Fuse two sequences. A frame that can't be fused is reported, and the others go on.
@@ -74,7 +77,7 @@ def fuse_shot(
         previews: write a PNG beside each EXR.
         overwrite: replace existing files.
         skip_existing: skip frames whose EXR exists. This resumes a run that was ended.
-        update: the same, but fuse a frame again if one of its inputs is newer than its EXR, as ``make`` does.
+        update: as ``skip_existing``, but fuse a frame again if an input is newer than its EXR, as ``make`` does.
         report_path: JSON file that is kept up to date frame by frame. With ``skip_existing``, skipped frames keep
             their entries of an earlier report.
         progress: called after each frame with its result and the report so far. Frames that are skipped, missing or
@@ -97,85 +100,108 @@ def fuse_shot(
     if not isinstance(temporal, TemporalOptions):
         temporal = TemporalOptions(temporal)
     shot = find_shot(lr, hr, output, frames)
-    if previews and view_transform is not None:
-        check_view(view_transform)
-    report_path = None if report_path is None else Path(report_path)
     if previews:
-        shot = replace(shot, frames=[replace(each, preview=each.output.with_suffix(".png")) for each in shot.frames])
+        shot = _with_previews(shot, view_transform)
     if client is None:  # workers of a cluster may have other devices
         require_device(device)
-    check_output(shot, inputs, model, [] if report_path is None else [report_path])
+    path = None if report_path is None else Path(report_path)
+    check_output(shot, inputs, model, [] if path is None else [path])
     with limit_threads(threads):
         plan = plan_temporal(shot, inputs, temporal, model, write)
-    report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
-    earlier = read_earlier(report, report_path, overwrite, skip_existing or update)
-    make_output(shot)
-
-    def finish(result: FrameResult) -> None:
-        report.results[result.frame] = result
-        report.seconds = time.perf_counter() - start
-        if progress is not None:
-            progress(result, report)
-
-    def record(frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
-        if isinstance(outcome, Exception):
-            log.debug("frame %d", frame.number, exc_info=outcome)
-            finish(result_of(frame, FAILED, *explain(outcome)))
-        elif outcome is None:
-            finish(result_of(frame, SKIPPED))
-        else:
-            finish(fused_result(frame, outcome, report))
-
-    def save() -> None:
-        # A disk that is full now may have room later, so a failure becomes an error only at the end.
-        try:
-            if report_path is not None:
-                report.save(report_path)
-        except MssplError as error:
-            log.warning("%s", error)
-
     settings = Settings(
-        inputs,
-        write,
-        model,
-        device,
-        threads,
-        max_memory,
-        view_transform,
-        overwrite,
-        skip_existing=skip_existing or update,
-        update=update,
+        inputs, write, model, device, threads, max_memory, view_transform, overwrite, skip_existing or update, update
     )
-    existing = ExistingResults(settings, plan)
-    to_fuse = []
-    for frame in shot.frames:
-        result = existing.known_result(frame, shot)
-        if result is None:
-            to_fuse.append(frame)
-            continue
-        if result.status == SKIPPED and (entry := earlier.get(frame.number)):
-            warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
-            result = replace(result, **entry | {"warnings": warnings})
-        finish(result)
-    if report.first is not None and report.first["frame"] in {frame.number for frame in to_fuse}:
-        report.first = None  # the report of a result that is replaced
+    report = ShotReport(shot, temporal=plan.text, neighbours=plan.count)
+    earlier = read_earlier(report, path, overwrite, settings.skip_existing)
+    make_output(shot)
+    running = _RunningReport(report, path, progress, start)
+    to_fuse = running.add_known(ExistingResults(settings, plan), earlier)
     if to_fuse:
         with limit_threads(threads):
             settings = replace(settings, model=model_of_shot(shot, inputs, model))
-    targets = [path for frame in shot.frames for path in (frame.output, frame.output.with_suffix(".png"))]
-    remove_leftovers([*targets, report_path] if report_path else targets)
+    targets = [file for frame in shot.frames for file in (frame.output, frame.output.with_suffix(".png"))]
+    remove_leftovers([*targets, *([] if path is None else [path])])
     try:
         if client is None:
-            run_pipeline(ShotRun(settings, plan, to_fuse), record, save)
+            run_pipeline(ShotRun(settings, plan, to_fuse), running.add_outcome, running.save)
         else:
             for doubt in check_first_pair(to_fuse, inputs):
                 log.warning("%s", doubt)
             for frame, outcome in fuse_frames(client, settings, plan, to_fuse):
-                record(frame, outcome)
-                save()
+                running.add_outcome(frame, outcome)
+                running.save()
             remove_leftovers(targets)  # of workers that died
     finally:
-        report.seconds = time.perf_counter() - start
-        if report_path is not None:
-            report.save(report_path)
+        running.close()
     return report
+
+
+def _with_previews(shot: Shot, view_transform: str | None) -> Shot:
+    if view_transform is not None:
+        check_view(view_transform)
+    return replace(shot, frames=[replace(files, preview=files.output.with_suffix(".png")) for files in shot.frames])
+
+
+@dataclass
+class _RunningReport:
+    """The report of a shot that runs, and who is told of it."""
+
+    report: ShotReport
+    path: Path | None
+    progress: ShotProgress | None
+    start: float
+
+    def add(self, result: FrameResult) -> None:
+        """Add the result of a frame."""
+        self.report.results[result.frame] = result
+        self.report.seconds = time.perf_counter() - self.start
+        if self.progress is not None:
+            self.progress(result, self.report)
+
+    def add_known(self, existing: ExistingResults, earlier: dict[int, dict[str, Any]]) -> list[FrameFiles]:
+        """Add the frames that are skipped, missing or blocked by an existing file, and return those to fuse.
+
+        A skipped frame keeps its entry of an ``earlier`` report.
+        """
+        to_fuse = []
+        for frame in self.report.shot.frames:
+            result = existing.known_result(frame, self.report.shot)
+            if result is None:
+                to_fuse.append(frame)
+                continue
+            if result.status == SKIPPED and (entry := earlier.get(frame.number)):
+                warnings = list(dict.fromkeys([*entry["warnings"], *result.warnings]))
+                result = replace(result, **entry | {"warnings": warnings})
+            self.add(result)
+        first = self.report.first
+        if first is not None and first["frame"] in {frame.number for frame in to_fuse}:
+            self.report.first = None  # its result is replaced
+        return to_fuse
+
+    def add_outcome(self, frame: FrameFiles, outcome: dict[str, Any] | Exception | None) -> None:
+        """Add the result of a frame: from its report, the reason for its failure, or None if its EXR existed."""
+        if isinstance(outcome, Exception):
+            log.debug("frame %d", frame.number, exc_info=outcome)
+            self.add(result_of(frame, FAILED, *explain(outcome)))
+        elif outcome is None:
+            self.add(result_of(frame, SKIPPED))
+        else:
+            self.add(fused_result(frame, outcome, self.report))
+
+    def save(self) -> None:
+        """Save the report after a frame. A failure is only logged, because a full disk may have room later."""
+        try:
+            if self.path is not None:
+                self.report.save(self.path)
+        except MssplError as error:
+            log.warning("%s", error)
+
+    def close(self) -> None:
+        """Save the report at the end of the run.
+
+        Raises:
+            MssplError: the file system refused.
+        """
+        self.report.seconds = time.perf_counter() - self.start
+        if self.path is not None:
+            self.report.save(self.path)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Reports what became of a shot and of each of its frames, in memory and as a JSON file."""
+"""Reports on a shot and on each of its frames, in memory and as a JSON file."""
 
 from __future__ import annotations
 
@@ -17,16 +17,17 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.exr.atomic import check_target, replacing
 from oiio_msspl.jobs.sequence import FrameFiles, Shot
 
-#: What is read of ``first_fused`` in an earlier report. A report of another version may lack some of it.
-FIRST_FUSED = {"frame", "renderer", "view", "scale", "model", "aovs", "notes", "passes"}
+#: The keys that are read of ``first_fused`` in an earlier report. If a report of another version lacks some of them,
+#: frames are compared with the first one that this run fuses.
+FIRST_FUSED = {"frame", "neighbours", "renderer", "view", "scale", "model", "aovs", "layers", "notes", "passes"}
 
-#: A warning about layers names so many of them.
+#: The most layers that a warning names.
 MOST_NAMES = 6
 
 #: Bytes of the largest file that is read as an earlier report. A frame takes one or two thousand.
 LARGEST_REPORT = 128 << 20
 
-#: What :func:`older_than` returns.
+#: The warning of :func:`older_than`.
 _OLDER = re.compile(r"is older than .*; --update fuses such frames again", re.DOTALL)
 
 FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "missing")
@@ -34,20 +35,20 @@ FUSED, SKIPPED, FAILED, MISSING = STATUSES = ("fused", "skipped", "failed", "mis
 
 @dataclass
 class FrameResult:
-    """What became of one frame."""
+    """The result of a frame."""
 
     frame: int
     status: str
     """``fused``; ``skipped``: its EXR existed; ``failed``; ``missing``: its LRHS or HRLS does not exist."""
     message: str = ""
-    """Why it was not fused."""
+    """Why the frame was not fused."""
     exit_code: int = 0
     """0, 2 for the caller's mistake, or 1 for any other failure."""
     warnings: list[str] = field(default_factory=list)
     repaired: dict[str, int] = field(default_factory=dict)
-    """Number of values that were NaN or infinite, by layer, see :class:`oiio_msspl.fusion.fuse.FusedFrame`."""
+    """Number of values that were NaN or infinite, by layer."""
     seconds: dict[str, float] = field(default_factory=dict)
-    """As in :class:`oiio_msspl.jobs.report.FrameReport`. Neighbouring frames overlap in time."""
+    """Seconds by stage, as in :class:`oiio_msspl.jobs.report.FrameReport`. Neighbouring frames overlap in time."""
     lrhs: str | None = None
     hrls: str | None = None
     output: str = ""
@@ -55,11 +56,11 @@ class FrameResult:
 
 @dataclass
 class ShotReport:
-    """What became of a shot."""
+    """The results of a shot's frames."""
 
     shot: Shot
     results: dict[int, FrameResult] = field(default_factory=dict)
-    """By frame number. A frame that the run has not reached has no entry."""
+    """Results by frame number. A frame that the run has not reached has no entry."""
     others: list[dict[str, Any]] = field(default_factory=list)
     """Entries of an earlier report about frames that are not in this run."""
     first: dict[str, Any] | None = None
@@ -67,9 +68,9 @@ class ShotReport:
     seconds: float = 0.0
     """Wall time."""
     temporal: str = ""
-    """Which neighbours frames are averaged with, and how motion is known; empty if that is switched off."""
+    """A sentence on the neighbours that frames are averaged with, and how motion is known; empty if switched off."""
     neighbours: int = 0
-    """Frames before and after each that it is averaged with."""
+    """Frames before and after a frame that it is averaged with."""
 
     @property
     def exit_code(self) -> int:
@@ -87,9 +88,9 @@ class ShotReport:
         return dict(total)
 
     def as_dict(self) -> dict[str, Any]:
-        """The report as JSON values."""
-        entries = [asdict(self.results[f.number]) for f in self.shot.frames if f.number in self.results]
-        entries = [*self.others, *entries]
+        """Return the report as JSON values."""
+        results = [self.results[files.number] for files in self.shot.frames if files.number in self.results]
+        entries = [*self.others, *map(asdict, results)]
         count = len(self.shot.frames) + len(self.others)
         counts = Counter(entry.get("status") for entry in entries)
         finished = len(self.results) == len(self.shot.frames)
@@ -118,94 +119,85 @@ class ShotReport:
 
 
 def result_of(frame: FrameFiles, status: str, message: str = "", exit_code: int = 0, **more: Any) -> FrameResult:
-    """The result of a frame with its three paths filled in; ``more`` are other fields of :class:`FrameResult`."""
+    """Return the result of a frame with its three paths; ``more`` are other fields of :class:`FrameResult`."""
     lrhs, hrls = (None if path is None else str(path) for path in (frame.lr, frame.hr))
     return FrameResult(frame.number, status, message, exit_code, lrhs=lrhs, hrls=hrls, output=str(frame.output), **more)
 
 
 def fused_result(frame: FrameFiles, frame_report: dict[str, Any], report: ShotReport) -> FrameResult:
-    """The result of a fused frame. The first one becomes ``report.first``.
+    """Return the result of a fused frame, which becomes ``report.first`` if it is the first one.
 
     Args:
         frame: the frame.
         frame_report: its :meth:`oiio_msspl.jobs.report.FrameReport.as_dict`.
-        report: of the shot. What differs from the first fused frame and may flicker gives a warning, see
-            :func:`_differences`.
+        report: of the shot. A difference to its first fused frame that may flicker gives a warning.
     """
     here = {"frame": frame.number, "neighbours": report.neighbours, **frame_report}
     first = report.first = report.first or here
-    warnings = list(frame_report["warnings"])
-    if frame_report["repaired"]:
-        warnings.append(f"repaired values that were NaN or infinite in {', '.join(frame_report['repaired'])}")
+    warnings, repaired = list(frame_report["warnings"]), frame_report["repaired"]
+    if repaired:
+        warnings.append(f"repaired values that were NaN or infinite in {', '.join(repaired)}")
     warnings += [f"{text} in frame {first['frame']}: it may flicker" for text in _differences(here, first)]
-    return result_of(
-        frame, FUSED, warnings=warnings, repaired=frame_report["repaired"], seconds=frame_report["seconds"]
-    )
+    return result_of(frame, FUSED, warnings=warnings, repaired=repaired, seconds=frame_report["seconds"])
 
 
 def _differences(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """What differs between the reports of two fused frames: "WHAT is X here and Y" for each feature, the scale, the
-    model, the number of neighbours, the layers, the views and the sets of passes."""
-    there = {row["feature"]: row["status"] for row in first["aovs"]}
-    changes = {row["feature"]: (row["status"], there[row["feature"]]) for row in here["aovs"]}
-    changes["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
-    if here["scale"] == first["scale"]:  # each scale has models of its own
-        changes["the model"] = here["model"], first["model"]
-    if "neighbours" in first:  # those of earlier versions lack it
-        changes["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
-    words = {"default": "not found", "absent": "not found"}
-    found = []
-    for what, states in changes.items():
-        own, its = (words.get(state, state) for state in states)
-        if states[0] != states[1] and "unused" not in states:  # another model reads other features
-            found.append(f"{what} is {own} here and {its}")
+    """Compare the reports of two fused frames: "WHAT is X here and Y" for each difference."""
     return [
-        *found,
+        *_changed_settings(here, first),
         *_changed_layers(here, first),
         *_changed_views(here, first),
         *_changed_sets(here["passes"], first["passes"]),
     ]
 
 
+def _changed_settings(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
+    """Compare the features, the scale, the model and the number of neighbours."""
+    words = {"default": "not found", "absent": "not found"}
+    before, now = (
+        {row["feature"]: words.get(row["status"], row["status"]) for row in report["aovs"] if row["status"] != "unused"}
+        for report in (first, here)
+    )
+    pairs = {feature: (now[feature], before[feature]) for feature in now if feature in before}
+    pairs["the scale"] = f"x{here['scale']}", f"x{first['scale']}"
+    if here["scale"] == first["scale"]:  # each scale has models of its own
+        pairs["the model"] = here["model"], first["model"]
+    pairs["--temporal"] = str(here["neighbours"] or "off"), str(first["neighbours"] or "off")
+    return [f"{what} is {state} here and {earlier}" for what, (state, earlier) in pairs.items() if state != earlier]
+
+
 def _changed_layers(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """The same for the layers that are written, but for those that are told as features."""
-    if "layers" not in first:
-        return []  # of an earlier version
+    """Compare the layers that are written. Those that are features are told as such."""
     features = {row["source"] for report in (here, first) for row in report["aovs"] if row["status"] == "found"}
-    found = []
-    for own, its, states in ((first, here, "missing here and present"), (here, first, "present here and missing")):
-        names = [name for name in own["layers"] if name not in its["layers"] and name not in features]
+    texts = []
+    for has, lacks, states in ((first, here, "missing here and present"), (here, first, "present here and missing")):
+        names = [name for name in has["layers"] if name not in lacks["layers"] and name not in features]
         if names:
             listed = ", ".join(names[:MOST_NAMES]) + (", ..." if len(names) > MOST_NAMES else "")
-            found.append(f"the layer{'s' * (len(names) > 1)} {listed} {'are' if len(names) > 1 else 'is'} {states}")
-    return found
+            texts.append(f"the layer{'s' * (len(names) > 1)} {listed} {'are' if len(names) > 1 else 'is'} {states}")
+    return texts
 
 
 def _changed_views(here: dict[str, Any], first: dict[str, Any]) -> list[str]:
-    """The same for the views that are fused."""
+    """Compare the views that are fused."""
     # The report on a file with only one view has an empty list.
-    own, its = (
-        [name_of(each["view"] or "") for each in report.get("fused_views") or [report]] for report in (here, first)
-    )
-    if max(len(own), len(its)) == 1:
+    entries = [report.get("fused_views") or [report] for report in (here, first)]
+    now, before = ([name_of(entry["view"] or "") for entry in views] for views in entries)
+    if max(len(now), len(before)) == 1:
         return []
-    lacking = [f"{view} is not fused here and fused" for view in its if view not in own]
-    return lacking + [f"{view} is fused here and not fused" for view in own if view not in its]
+    lacking = [f"{view} is not fused here and fused" for view in before if view not in now]
+    return lacking + [f"{view} is fused here and not fused" for view in now if view not in before]
 
 
 def _changed_sets(here: dict[str, str], first: dict[str, str]) -> list[str]:
-    """The same for the sets of passes, with the reason if one is not fused.
-
-    Args:
-        here, first: what was done with each set, by its name.
-    """
-    found = []
+    """Compare what was done with each set of passes, by name; with the reason if one is not fused."""
+    texts = []
     for name in dict.fromkeys([*first, *here]):
-        (own, reason), (its, _) = (each.get(name, "missing").partition(": ")[::2] for each in (here, first))
-        if own != its:
-            because = f" ({reason})" if reason and own != "fused" else ""
-            found.append(f"{name}: {own} here{because} and {its}")
-    return found
+        (state, reason), (before, _) = (sets.get(name, "missing").partition(": ")[::2] for sets in (here, first))
+        if state != before:
+            because = f" ({reason})" if reason and state != "fused" else ""
+            texts.append(f"{name}: {state} here{because} and {before}")
+    return texts
 
 
 def read_earlier(
@@ -219,12 +211,12 @@ def read_earlier(
         overwrite, skip_existing: whether the file may exist.
 
     Returns:
-        ``warnings``, ``repaired`` and ``seconds`` of each frame in the earlier report, without warnings that each run
-        makes anew.
+        ``warnings``, ``repaired`` and ``seconds`` of the frames in the earlier report, without the warning of
+        :func:`older_than`, which each run finds out anew.
 
     Raises:
-        InputError: the file exists and may not be replaced, or it is no report of this shot. An option that names the
-            wrong file must not turn a render into a report, with ``--overwrite`` neither.
+        InputError: the file exists and may not be replaced, or it is not a report of this shot. Not even with
+            ``--overwrite`` is a render replaced by a report.
     """
     if path is None:
         return {}
@@ -236,7 +228,8 @@ def read_earlier(
     try:
         data = json.loads(path.read_text(encoding="utf-8"))
         entries = {
-            entry["frame"]: {k: entry[k] for k in ("repaired", "seconds")} | {"warnings": _lasting(entry["warnings"])}
+            entry["frame"]: {name: entry[name] for name in ("repaired", "seconds")}
+            | {"warnings": [text for text in entry["warnings"] if not _OLDER.fullmatch(text)]}
             for entry in data["frames"]
         }
         output = data.get("output")
@@ -256,10 +249,5 @@ def read_earlier(
 
 
 def older_than(path: Path) -> str:
-    """The warning that a result is older than a file that it is made from."""
+    """Return the warning that a result is older than a file that it is made from."""
     return f"is older than {path}; --update fuses such frames again"
-
-
-def _lasting(warnings: list[str]) -> list[str]:
-    """Those of an earlier report that are still true: whether an input is newer is found out in each run."""
-    return [text for text in warnings if not _OLDER.fullmatch(text)]

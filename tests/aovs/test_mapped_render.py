@@ -66,7 +66,6 @@ def test_the_table_says_what_each_feature_is_read_from(tmp_path):
         "normal": ("default", ""),
         "diffuse": ("computed", "diffuse_direct + diffuse_indirect"),
         "specular": ("default", ""),
-        "variance": ("unused", ""),
         "alpha": ("found", "A"),
     }
 

@@ -58,15 +58,8 @@ def test_a_closed_stream_is_no_fault(tmp_path, bilinear_models, closed):
 def test_where_a_feature_comes_from_is_said_in_words(capsys, row, text):
     feature, status, source = row
     note = "scaled" if status == "computed" else ""
-    console.aov_table([{"feature": feature, "status": status, "source": source, "note": note}], ["n"], {feature})
+    console.aov_table([{"feature": feature, "status": status, "source": source, "note": note}], ["n"])
     assert capsys.readouterr().out == f"  {feature}  {text}\n  note: n\n"
-
-
-def test_features_that_the_model_does_not_read_are_told_only_if_the_user_has_mapped_them(capsys):
-    rows = [("rgb", "found", "C"), ("diffuse", "unused", "d"), ("specular", "unused", "s"), ("variance", "unused", "")]
-    table = [dict(zip(("feature", "status", "source", "note"), (*row, ""), strict=True)) for row in rows]
-    console.aov_table(table, [], {"rgb", "diffuse", "variance"})
-    assert capsys.readouterr().out == "  rgb      found: C\n  diffuse  found: d; this model does not read it\n"
 
 
 def test_the_library_s_log_is_printed_like_all_other_messages(capsys, monkeypatch):

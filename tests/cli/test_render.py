@@ -26,7 +26,7 @@ from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.shot import fuse_shot
 from tests.conftest import EXAMPLES
-from tests.jobs.test_temporal import make_moving_shot
+from tests.jobs.test_over_time import make_moving_shot
 from tests.programs import leave_temporary, start
 from tests.shots import pixels
 

@@ -126,16 +126,24 @@ def test_layers_that_it_does_not_read_are_not_read():
     assert not any(features is None or DIFFUSE in features for features in asked)
 
 
-def test_what_it_does_not_read_is_said_to_be_unused(tmp_path):
+def test_what_only_the_paper_reads_is_reported_if_the_user_has_mapped_it(tmp_path):
     clean = picture(64, 64)
     write_exr(tmp_path / "lr.exr", rgb(box_downsample(noisy(clean, 4, seed=1), 2)))
     layers = rgb(clean, "albedo.") | rgb(0.5 * clean, "diffuse.")
     write_exr(tmp_path / "hr.exr", rgb(noisy(clean, 4)) | layers)
-    report = fuse_files(tmp_path / "lr.exr", tmp_path / "hr.exr", tmp_path / "out.exr", model="joint")
-    rows = {row["feature"]: (row["status"], row["source"]) for row in report.aovs()}
+    files = tmp_path / "lr.exr", tmp_path / "hr.exr", tmp_path / "out.exr"
+
+    def rows_of(**options):
+        report = fuse_files(*files, model="joint", overwrite=True, **options)
+        assert [row["feature"] for row in report.as_dict()["aovs"]] == [row["feature"] for row in report.aovs()]
+        assert "variance" not in open_exr(files[2]).metadata["msspl/aovs"]
+        return {row["feature"]: (row["status"], row["source"]) for row in report.aovs()}
+
+    rows = rows_of()
     assert rows["albedo"][0] == "found" and rows["normal"][0] == "default"
-    assert rows["diffuse"] == ("unused", "diffuse")
-    assert rows["variance"] == ("unused", "")
+    assert list(rows) == ["rgb", "albedo", "normal", "alpha"]
+    rows = rows_of(inputs=InputOptions(mapping={"specular": "diffuse"}))
+    assert rows["specular"] == ("unused", "diffuse") and "diffuse" not in rows
 
 
 @pytest.mark.parametrize("scale", [2, 4])

@@ -9,7 +9,7 @@ import pytest
 
 from oiio_msspl.exr.reader import open_exr
 from tests.conftest import EXAMPLES
-from tests.jobs.test_temporal import make_moving_shot
+from tests.jobs.test_over_time import make_moving_shot
 from tests.nuke_gizmo.conftest import FOLDER
 from tests.nuke_gizmo.fake_nuke import Node
 from tests.shots import contents

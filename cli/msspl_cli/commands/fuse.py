@@ -19,7 +19,7 @@ from oiio_msspl.errors import InputError
 from oiio_msspl.image.parallel import MOST_THREADS
 
 if TYPE_CHECKING:
-    from collections.abc import Collection, Sequence
+    from collections.abc import Sequence
     from contextlib import AbstractContextManager
 
     from dask.distributed import Client
@@ -155,7 +155,7 @@ def fuse(
     if is_sequence(lr) or is_sequence(hr):
         if debug:
             logging.getLogger("oiio_msspl.jobs.shot").setLevel(logging.DEBUG)  # the traceback of each failed frame
-        printer = ShotPrinter(verbose, quiet, as_json, progress, common["inputs"].mapping)
+        printer = ShotPrinter(verbose, quiet, as_json, progress)
         shot = {"frames": frames, "temporal": over_time, "previews": preview, "report_path": report_file}
         skipping = {"skip_existing": skip_existing, "update": update}
         _fuse_shot((lr, hr, output), scheduler, printer, **shot, **skipping, **common)
@@ -208,12 +208,12 @@ def _fuse_pair(files: tuple[Path, Path, Path], verbose: int, quiet: bool, as_jso
     if as_json:
         print(json.dumps(report.as_dict(), indent=2))
     elif not quiet:
-        _print(report, settings["inputs"].mapping, time.perf_counter() - start)
+        _print(report, time.perf_counter() - start)
     for warning in () if quiet else report.warnings:
         console.say(f"warning: {warning}", error=True)
 
 
-def _print(report: FrameReport, mapped: Collection[str], seconds: float) -> None:
+def _print(report: FrameReport, seconds: float) -> None:
     """Print which layers were used, what was repaired, and the time of each stage."""
     from oiio_msspl.aovs.views import name_of
 
@@ -223,7 +223,7 @@ def _print(report: FrameReport, mapped: Collection[str], seconds: float) -> None
     rest = [name for name in map(name_of, report.hr.other_views) if name not in fused]
     others = f" (also there: {', '.join(rest)})" if rest else ""
     console.say(f"{renderer} at x{report.scale}{average}{console.views_in_words(fused)}{others}")
-    console.aov_table(report.aovs(), report.hr.notes, mapped)
+    console.aov_table(report.aovs(), report.hr.notes)
     for view in report.other_views:
         rows = view.aovs()
         read = [f"{row['feature']} {row['source']}" for row in rows if row["status"] in ("found", "computed")]

@@ -39,7 +39,6 @@ def inspect(
 
     If a file can't be used, the reason is printed and the exit code is 2.
     """
-    from oiio_msspl.aovs.features import FEATURES
     from oiio_msspl.inspection import inspect_file, inspect_noise
 
     inputs = options.make_inputs(mapping, map_file, view_layer, None, None)
@@ -55,7 +54,7 @@ def inspect(
                 console.say(f"  {line}")
             if inspection.render is not None:
                 console.say(f"  what {inspection.model} would read:")
-                console.aov_table(inspection.aovs(), inspection.render.notes, FEATURES)
+                console.aov_table(inspection.aovs(), inspection.render.notes)
                 if inspection.unused:
                     console.say(f"  neither read nor fused: {', '.join(inspection.unused)}")
             for problem in inspection.problems:

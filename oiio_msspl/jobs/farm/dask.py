@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot on the workers of a Dask cluster: each frame is a task, or a few frames that are averaged with each other.
+"""Fuses a shot on the workers of a Dask cluster. A task is a frame, or a few that are averaged with each other.
 
-If a worker dies, Dask gives its task to another one. An EXR gets its name last, so a task that runs again finds a
+If a worker dies, Dask gives its task to another worker. An EXR gets its name last, so a task that runs again finds a
 complete frame or none.
 """
 
@@ -37,7 +37,7 @@ log = logging.getLogger(__name__)
 #: How often a frame is tried again after a failure that may pass, such as a file server that did not answer.
 RETRIES = 2
 #: Frames of a task if frames are averaged with their neighbours. A task fuses the neighbours of its first and last
-#: frames once more, so longer ones compute less, and shorter ones keep more workers busy.
+#: frames once more, so longer tasks compute less, and shorter tasks keep more workers busy.
 CHUNK = 8
 
 
@@ -58,13 +58,14 @@ def connect(scheduler: str) -> Client:
     except ImportError as error:
         raise InputError("--scheduler needs Dask: pip install 'dask[distributed]'") from error
     logging.getLogger("distributed").setLevel(logging.CRITICAL)  # its tracebacks repeat our messages
-    if Path(scheduler).is_file():
+    is_file = Path(scheduler).is_file()
+    if is_file:
         try:
             json.loads(Path(scheduler).read_text(encoding="utf-8"))["address"]
         except (OSError, ValueError, TypeError, KeyError) as error:
             raise InputError(f"--scheduler {scheduler}: is no scheduler file of Dask; it has no address") from error
     try:
-        return Client(scheduler_file=scheduler) if Path(scheduler).is_file() else Client(scheduler)
+        return Client(scheduler_file=scheduler) if is_file else Client(scheduler)
     except (OSError, ValueError) as error:
         raise InputError(f"--scheduler {scheduler}: no Dask scheduler answers there ({error})") from error
 
@@ -77,11 +78,11 @@ def fuse_frames(
     Args:
         client: of the cluster, whose workers see the same files.
         settings, plan: how frames are fused. Every worker gets them.
-        frames: what to fuse. Frames end in any order.
+        frames: the frames to fuse. They end in any order.
 
     Yields:
-        Each frame as soon as it ends, with its report as a dict, the reason for its failure, or None if its EXR
-        already existed.
+        A frame as soon as it ends, with its report as a dict, the reason for its failure, or None if its EXR already
+        existed.
 
     Raises:
         InputError: there is no such model, or a worker takes several frames at a time.
@@ -98,7 +99,7 @@ def fuse_frames(
     find_model(2, settings.model)  # refuses an unknown model before any task is submitted
     address = client.scheduler.address
     run = uuid.uuid4().hex
-    #: What is under way, and how often a frame of it may still be tried again.
+    #: The chunks under way, and how often a frame of a chunk may still be tried again.
     futures: dict[Future, tuple[list[FrameFiles], int]] = {}
     settings, plan = replace(settings, inputs=settings.inputs.absolute()), plan.absolute()
     existing = ExistingResults(settings, plan)
@@ -136,12 +137,12 @@ def fuse_frames(
 
 
 def _may_pass(outcome: dict[str, Any] | Exception | None) -> bool:
-    """Whether a frame has failed for a reason that another try may not meet."""
+    """Return whether a frame has failed for a reason that another try may not meet."""
     return isinstance(outcome, Exception) and not isinstance(outcome, InputError)
 
 
 def _most_workers_on_a_machine(client: Client) -> int:
-    """The largest number of workers that share the cores of one machine.
+    """Return the largest number of workers that share the cores of one machine.
 
     Raises:
         InputError: a worker takes several frames at a time.
@@ -159,28 +160,16 @@ def _most_workers_on_a_machine(client: Client) -> int:
     return max(Counter(worker["host"] for worker in workers.values()).values())
 
 
-# ---------------------------------------------------------------------------------------------- in a worker
-
-
 @lru_cache(maxsize=2)
 def _sessions(run: str) -> dict[tuple[int, str | None], Session]:
-    """The models that this worker has loaded for a run. A later run gets its own: a file may have been replaced."""
+    """Return the models that this worker has loaded for a run. A later run loads them anew: files may have changed."""
     return {}
 
 
 def _fuse_chunk(
     run: str, settings: Settings, plan: ShotPlan, frames: list[FrameFiles], workers: int
 ) -> list[dict[str, Any] | Exception | None]:
-    """Fuse frames in a worker.
-
-    Args:
-        run: identifies the run.
-        settings, plan, frames: what to do, with absolute paths.
-        workers: those on this machine, which share its cores.
-
-    Returns:
-        For each frame its report as a dict, the reason for its failure, or None if the EXR exists.
-    """
+    """Fuse frames in a worker, and return their outcomes as :func:`fuse_frames` does. ``workers`` share the cores."""
     from dask.system import CPU_COUNT
 
     threads = settings.threads or (max(1, CPU_COUNT // workers) if workers > 1 else 0)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A shot as an Open Job Description job: a bundle with the job's template and the values of its parameters.
+"""Describes a shot as an Open Job Description job: a bundle of the job's template and the values of its parameters.
 
 Each task runs ``msspl-fuse`` on a chunk of the frames. Its arguments are a list that no shell reads, so names may
 contain spaces and quotes. Paths are job parameters, which a farm can map to its own folders or copy.
@@ -46,14 +46,15 @@ class Job:
 
     @property
     def missing(self) -> list[tuple[str, list[int]]]:
-        """Each pattern that lacks files of the shot, and the frames. Their tasks fail unless the files appear."""
-        sides = ((self.shot.lr, "lr"), (self.shot.hr, "hr"))
-        frames = [(str(found.pattern), [f.number for f in self.shot.frames if not getattr(f, k)]) for found, k in sides]
-        return [(pattern, sorted(numbers)) for pattern, numbers in frames if numbers]
+        """The patterns that lack files of the shot, and the frames. Their tasks fail unless the files appear."""
+        low = sorted(frame.number for frame in self.shot.frames if frame.lr is None)
+        high = sorted(frame.number for frame in self.shot.frames if frame.hr is None)
+        sides = ((self.shot.lr, low), (self.shot.hr, high))
+        return [(str(sequence.pattern), numbers) for sequence, numbers in sides if numbers]
 
     @property
     def existing(self) -> int:
-        """How many frames have a result already. Their tasks skip them."""
+        """Number of frames that have a result already. Their tasks skip them."""
         return sum(frame.output.exists() for frame in self.shot.frames)
 
 
@@ -77,9 +78,9 @@ def make_job(
     Args:
         lr, hr, output, frames: as in :func:`oiio_msspl.jobs.sequence.find_shot`. Frames without a partner are part of
             the job, because the partner may exist when their task runs.
-        inputs: what the options say of the files, to read the first pair.
+        inputs: the options about the files, to read the first pair.
         model: as in :func:`oiio_msspl.fuse_files`. None and ``auto`` are a family that suits the noise of the first
-            pair; the job names it, because all frames of a shot need the same one.
+            pair. The job names it, because all frames of a shot need the same model.
         map_file: TOML file with the user's mapping.
         device: a key of :data:`oiio_msspl.model.devices.PROVIDERS`. It need not be usable on this machine.
         view: None, or the OpenColorIO view of the previews.
@@ -119,20 +120,14 @@ def make_job(
     folder = shot.output.folder if shot.output.folder.exists() else shot.output.folder.parent
     if not folder.is_dir():
         raise InputError(f"{output}: the folder {folder} does not exist; create it first")
-    return _describe(lr, hr, output, shot, options, files, chunk, timeout)
+    return _describe(shot, (lr, hr, output), options, files, chunk, timeout)
 
 
 def _describe(
-    lr: Path,
-    hr: Path,
-    output: Path,
-    shot: Shot,
-    options: Sequence[str],
-    files: dict[str, Path],
-    chunk: int,
-    timeout: int,
+    shot: Shot, paths: Sequence[Path], options: Sequence[str], files: dict[str, Path], chunk: int, timeout: int
 ) -> Job:
-    """The job of a shot that was checked. ``files`` are options of ``msspl-fuse`` that name a file."""
+    """Write the job of a shot that was checked. ``files`` are options of ``msspl-fuse`` that name a file."""
+    lr, hr, output = paths
     parameters: list[dict[str, Any]] = []
     values: dict[str, Any] = {}
 
@@ -169,29 +164,23 @@ def _describe(
         file = add(name, str(path.absolute()), f"{option} of msspl-fuse", type="PATH", objectType="FILE", dataFlow="IN")
         arguments += [option, file]
     arguments += ["--frames", "{{Task.Param.Frame}}", "--skip-existing", "--progress", "openjd"]
-    arguments += [_literal(option) for option in options]
+    arguments += map(_literal, options)
+    task_frames = {
+        "name": "Frame",
+        "type": "CHUNK[INT]",
+        "range": frame_range,
+        "chunks": {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"},
+    }
+    command = {
+        "command": "msspl-fuse",
+        "args": arguments,
+        "timeout": chunk * timeout,
+        "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": GRACE},
+    }
     step = {
         "name": "Fuse",
-        "parameterSpace": {
-            "taskParameterDefinitions": [
-                {
-                    "name": "Frame",
-                    "type": "CHUNK[INT]",
-                    "range": frame_range,
-                    "chunks": {"defaultTaskCount": size, "rangeConstraint": "NONCONTIGUOUS"},
-                }
-            ]
-        },
-        "script": {
-            "actions": {
-                "onRun": {
-                    "command": "msspl-fuse",
-                    "args": arguments,
-                    "timeout": chunk * timeout,
-                    "cancelation": {"mode": "NOTIFY_THEN_TERMINATE", "notifyPeriodInSeconds": GRACE},
-                }
-            }
-        },
+        "parameterSpace": {"taskParameterDefinitions": [task_frames]},
+        "script": {"actions": {"onRun": command}},
     }
     template = {
         "specificationVersion": "jobtemplate-2023-09",
@@ -228,7 +217,7 @@ def write_bundle(folder: Path, job: Job) -> None:
 
 
 def _literal(text: str) -> str:
-    """Text that a template takes as it is. Two braces can't be escaped in a template, so they are refused."""
+    """Return text that a template takes as it is. Two braces are refused, because they can't be escaped in it."""
     if "{{" in text:
         raise InputError(f"{text!r}: a job template takes '{{{{' for the start of a parameter")
     return text

@@ -24,7 +24,7 @@ from oiio_msspl.jobs.run import ShotRun
 from oiio_msspl.jobs.sequence import FrameFiles
 from oiio_msspl.jobs.settings import Settings
 from oiio_msspl.jobs.timeline import Reach
-from tests.jobs.test_temporal import make_shot_with_passes
+from tests.jobs.test_over_time import make_shot_with_passes
 from tests.programs import fuse
 from tests.shots import contents, make_shot
 

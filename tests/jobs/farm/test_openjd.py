@@ -16,7 +16,7 @@ import pytest
 from oiio_msspl.errors import MssplError
 from oiio_msspl.jobs.farm import openjd as bundles
 from tests.conftest import write_exr
-from tests.jobs.test_temporal import make_shot_with_passes
+from tests.jobs.test_over_time import make_shot_with_passes
 from tests.programs import fuse, run
 from tests.shots import contents, layers, make_shot, pixels
 

@@ -88,8 +88,7 @@ def fuse_files(
     # A frame that can't fit is refused below. Its noise is not looked at, because that reads pixels.
     alignment = align(frame.lr, frame.hr)
     if memory_to_write(alignment, frame.hr, write) <= max_memory:
-        frame.read_if_small()
-        run.settings = replace(settings, model=choose_model(frame.lr, frame.hr, model, frame.renders)[0])
+        run.settings = replace(settings, model=choose_model(frame.lr, frame.hr, model, frame.read_if_small)[0])
     run.settings.session(alignment.scale)
     opened = time.perf_counter()
     for settled in run.take(views):

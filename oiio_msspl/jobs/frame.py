@@ -152,14 +152,15 @@ class ShotFrame:
             raise self.error
         raise MssplError(f"frame {self.number}, its neighbour, has failed: {explain(self.error)[0]}") from self.error
 
-    def read_if_small(self) -> None:
-        """Read the pixels of a frame that has few, so that they are decoded once for all that needs them.
+    def read_if_small(self) -> RenderPair:
+        """Return the renders. Those of a small frame are read into memory, so that they are decoded once.
 
         Raises:
             InputError: pixels can't be decoded.
         """
-        if not is_large(self.hr):
+        if self.renders.hr is self.stored[1] and not is_large(self.hr):
             self.renders = RenderPair(self.stored[0].load(), self.stored[1].load())
+        return self.renders
 
     def motion_frame(self) -> MotionFrame:
         """Return what is needed to follow its surfaces."""

@@ -3,6 +3,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 from oiio_msspl.aovs.features import ALBEDO, NORMAL
 from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.fusion.checks.spread_noise import is_noise_spread
@@ -13,7 +15,7 @@ from oiio_msspl.model.contract import SPREAD
 
 
 def choose_model(
-    lr: MappedRender, hr: MappedRender, model: str | None, pixels: RenderPair | None = None
+    lr: MappedRender, hr: MappedRender, model: str | None, read: Callable[[], RenderPair] | None = None
 ) -> tuple[str, bool]:
     """Return the model to use, and whether the pair has noise that decides it: a black frame has none.
 
@@ -24,17 +26,21 @@ def choose_model(
     Args:
         lr, hr: the pair.
         model: what the user has chosen.
-        pixels: the pair in memory; None to read the files.
+        read: gives the pair in memory; None to look at small samples of the files.
 
     Raises:
         InputError: the pair does not fit together.
     """
-    renders = (lr, hr) if pixels is None else (pixels.lr, pixels.hr)
+
+    def is_spread() -> bool | None:
+        pair = RenderPair(lr, hr) if read is None else read()
+        return is_noise_spread(pair.lr, pair.hr, align(lr, hr))
+
     family = family_of(model)
     if family is None:
         assert model is not None
         suited = for_spread_noise(model)
-        spread = suited is not None and is_noise_spread(*renders, align(lr, hr))
+        spread = suited is not None and is_spread()
         if spread:
             hr.notes.append(
                 f"the pixel filter has spread the noise over neighbouring pixels, and {model} leaves such noise; use "
@@ -45,7 +51,7 @@ def choose_model(
     if suited != family:
         family = suited
         hr.notes.append(f"without an albedo and a normal, the quality best gains nothing, so the model is {family}")
-    spread = is_noise_spread(*renders, align(lr, hr))
+    spread = is_spread()
     if not spread:
         return family, spread is not None
     hr.notes.append(f"the pixel filter has spread the noise over neighbouring pixels, so the model is {family}{SPREAD}")

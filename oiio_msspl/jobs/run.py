@@ -122,7 +122,7 @@ class ShotRun:
                 frame.lr, frame.hr, frame.session, frame.write, self.settings.max_memory, frame.held_bytes
             )
             before, after = self._hops_of_renders(frame) if frame.plan.reach.renders else ([], [])
-            frame.averaged = frame.renders
+            frame.averaged = frame.read_if_small() if self._only_frame else frame.renders
             if before or after:
                 _replace_by_means(frame, before, after)
             frame.state = State.AVERAGED

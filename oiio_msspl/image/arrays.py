@@ -122,21 +122,11 @@ def _file_of(values: NDArray[Any]) -> mmap.mmap | None:
     return owner if isinstance(owner, mmap.mmap) else None
 
 
-def map_rows(function: Callable[[Array], object], source: Array, out: Array | None = None) -> Array:
-    """Apply an in-place, per-value function to a float32 copy of an image.
-
-    Args:
-        function: changes a block of rows in place.
-        source: (height, ...).
-        out: gets the result; a new array if None.
-
-    Returns:
-        The result, in the shape of ``source``.
-    """
-    result = np.empty(np.shape(source), np.float32) if out is None else out
+def map_rows(function: Callable[[Array], object], source: Array) -> Array:
+    """Return a float32 copy of an image (height, ...), whose blocks of rows ``function`` has changed in place."""
+    result = np.empty(source.shape, np.float32)
 
     def work(rows: slice) -> None:
-        # The copy keeps the memory layout of the source. That of the result may differ.
         block = np.array(source[rows], np.float32)
         function(block)
         result[rows] = block
@@ -145,9 +135,9 @@ def map_rows(function: Callable[[Array], object], source: Array, out: Array | No
     return result
 
 
-def clip(values: Array, lowest: float, highest: float, out: Array | None = None) -> Array:
+def clip(values: Array, lowest: float, highest: float) -> Array:
     """Clip values to a range, as ``np.clip``, on all cores."""
-    return map_rows(lambda block: np.clip(block, lowest, highest, out=block), values, out)
+    return map_rows(lambda block: np.clip(block, lowest, highest, out=block), values)
 
 
 def repair(values: Array, *, signed: bool = False) -> tuple[Array, NDArray[np.bool_] | None]:

@@ -174,41 +174,19 @@ def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:
     """
     height, width = plane.shape
     sums = np.zeros((height + 1, width + 1))
-
-    def add_columns(rows: slice) -> None:
-        np.cumsum(plane[rows], axis=1, out=sums[1:, 1:][rows])
-
-    def add_rows(columns: slice) -> None:
-        for row in range(1, height):  # twice as fast as a cumulative sum along the first axis
-            sums[row + 1, columns] += sums[row, columns]
-
-    for_row_blocks(add_columns, height, 2 * width)
-    for_row_blocks(add_rows, width + 1, 2 * height)
-    return [_mean_of_sums(sums, reach) for reach in reaches]
-
-
-def _mean_of_sums(sums: NDArray[np.float64], reach: int) -> Array:
-    """Return the means (h, w) for one reach. ``sums`` (h + 1, w + 1): of all values above and to the left."""
-    height, width = (size - 1 for size in sums.shape)
-    (top, bottom), (left, right) = (
-        (np.maximum(np.arange(size) - reach, 0), np.minimum(np.arange(size) + reach + 1, size))
-        for size in (height, width)
-    )
-    result = np.empty((height, width), np.float32)
+    np.cumsum(np.cumsum(plane, axis=1, dtype=np.float64), axis=0, out=sums[1:, 1:])
+    results = [np.empty((height, width), np.float32) for _ in reaches]
 
     def work(rows: slice) -> None:
-        lines = sums.take(bottom[rows], axis=0)
-        lines -= sums.take(top[rows], axis=0)
-        squares = np.empty((len(lines), width))
-        if width > 2 * reach:  # slices are read much faster than by index
-            inside = slice(reach, width - reach)
-            np.subtract(lines[:, 2 * reach + 1 :], lines[:, : width - 2 * reach], out=squares[:, inside])
-            squares[:, :reach] = lines[:, reach + 1 : 2 * reach + 1]
-            squares[:, width - reach :] = lines[:, -1:] - lines[:, width - 2 * reach : width - reach]
-        else:
-            np.subtract(lines.take(right, axis=1), lines.take(left, axis=1), out=squares)
-        squares *= 1 / (right - left)
-        np.multiply(squares, 1 / (bottom - top)[rows, None], out=result[rows], casting="same_kind")
+        for reach, result in zip(reaches, results, strict=True):
+            (top, bottom), (left, right) = (
+                (np.maximum(positions - reach, 0), np.minimum(positions + reach + 1, size))
+                for positions, size in ((np.arange(rows.start, rows.stop), height), (np.arange(width), width))
+            )
+            lines = sums.take(bottom, axis=0) - sums.take(top, axis=0)
+            squares = lines.take(right, axis=1) - lines.take(left, axis=1)
+            squares *= 1 / (right - left)
+            np.multiply(squares, 1 / (bottom - top)[:, None], out=result[rows], casting="same_kind")
 
     for_row_blocks(work, height, 4 * width)
-    return result
+    return results

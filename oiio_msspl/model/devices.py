@@ -74,9 +74,12 @@ def providers(device: str) -> list[Provider]:
     """Return the execution providers of a device with their settings. The first that supports an operator runs it."""
     if device == "tensorrt":
         # Building an engine takes minutes, so it is stored for the next run.
+        base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
+        folder = Path(base, "oiio_msspl", "tensorrt")
+        folder.mkdir(parents=True, exist_ok=True)
         settings = {
             "trt_engine_cache_enable": "1",
-            "trt_engine_cache_path": str(_cache_folder("tensorrt")),
+            "trt_engine_cache_path": str(folder),
             "trt_timing_cache_enable": "1",
         }
         return [(PROVIDERS[device], settings), (PROVIDERS["cuda"], {}), (CPU, {})]
@@ -88,14 +91,6 @@ def providers(device: str) -> list[Provider]:
         "coreml": [(PROVIDERS["coreml"], {"ModelFormat": "MLProgram"})],
     }
     return [*first.get(device, [(PROVIDERS[device], {})]), (CPU, {})]
-
-
-def _cache_folder(name: str) -> Path:
-    """Make a folder for files that can be made again."""
-    base = os.environ.get("XDG_CACHE_HOME") or os.environ.get("LOCALAPPDATA") or Path.home() / ".cache"
-    folder = Path(base, "oiio_msspl", name)
-    folder.mkdir(parents=True, exist_ok=True)
-    return folder
 
 
 def gpu_file(path: Path) -> Path | None:

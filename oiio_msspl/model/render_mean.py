@@ -50,17 +50,14 @@ def find_shares(pairs: Sequence[tuple[Images, Images]], exposure: float) -> Shar
     def high(name: str) -> Array:
         return np.stack([box_downsample(_comparable(name, hrls[name]), scale) for _, hrls in pairs])
 
-    lrhs, hrls = (encode_radiance(images, exposure) for images in (low(RGB), high(RGB)))
-    share = lrhs_share(lrhs, hrls)
+    share = lrhs_share(*(encode_radiance(images, exposure) for images in (low(RGB), high(RGB))))
     shared = set(pairs[0][0]) & set(pairs[0][1])
     return {RGB: share} | {name: share for name in (ALBEDO, NORMAL) if name in shared and _agree(low(name), high(name))}
 
 
 def _comparable(name: str, image: Array) -> Array:
     """Clip a feature to the range in which the models average it."""
-    if name == RGB:
-        return image
-    return clip(image, 0.0 if name == ALBEDO else -1.0, 1.0)
+    return image if name == RGB else clip(image, 0.0 if name == ALBEDO else -1.0, 1.0)
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:

@@ -107,8 +107,7 @@ def dropped_channels(file: ExrFile, beauty: Sequence[Channel], patterns: Sequenc
     Args:
         file: the HRLS.
         beauty: channels of the HRLS that the fused beauty replaces.
-        patterns: ``WriteOptions.layers``. A pattern matches the name of a layer or of a channel, see
-            :func:`oiio_msspl.exr.layers.matches_layer`.
+        patterns: ``WriteOptions.layers``, which :func:`oiio_msspl.exr.layers.matches_layer` compares with names.
 
     Raises:
         InputError: a pattern matches nothing.

@@ -18,17 +18,19 @@ from oiio_msspl.exr.reader import Channel, ExrFile, Part
 from oiio_msspl.exr.write_options import COMPONENTS
 
 #: Attributes that say how the source was stored. The writer sets them again, or they have no meaning in the copy.
-_STRUCTURE = ("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type")
-#: ST 2065-4 forbids compression and AOVs in a file that carries this flag.
-_ACES_FLAG = "acesImageContainerFlag"
+_STRUCTURE = (
+    *("openexr:chunkCount", "openexr:lineOrder", "oiio:subimages", "oiio:RowsPerChunk", "compression", "type"),
+    "acesImageContainerFlag",  # ST 2065-4 forbids compression and AOVs in a file that carries it
+)
 #: Effort of ZIP, 1 to 9. OpenEXR's default is 4, which takes a third longer and makes renders 1 to 2 % smaller.
 ZIP_LEVEL = 1
 #: Attributes that OpenEXR requires to be equal in all parts of a file. Only the first part may have one alone.
 _SHARED = ("PixelAspectRatio", "chromaticities", "smpte:TimeCode")
-#: Attributes that OpenImageIO would fill in with defaults in every part that lacks them.
-_FILLED_IN = ("screenWindowWidth", "screenWindowCenter", "DateTime")
-#: Attributes that every part keeps.
-_KEPT_IN_EVERY_PART = (*_FILLED_IN, *_SHARED, "view", "name", "oiio:subimagename", "compression")
+#: Attributes that every part keeps. OpenImageIO would fill in defaults for the first three.
+_KEPT_IN_EVERY_PART = (
+    *("screenWindowWidth", "screenWindowCenter", "DateTime"),
+    *(*_SHARED, "view", "name", "oiio:subimagename", "compression"),
+)
 
 #: Bytes of the largest part of mixed pixel types that stays whole, because it is held in memory while it is copied.
 LARGEST_MIXED_PART = 256 << 20
@@ -157,11 +159,9 @@ def _has_one_type(part: Part) -> bool:
 def _whole_part(part: Part, name: str) -> PassedOnPart:
     spec = oiio.ImageSpec(part.spec)
     spec.channelnames = tuple(channel.name for channel in part.channels)
-    _name_and_compress(spec, name, lossless(part))
-    if not _has_one_type(part):
-        return PassedOnPart(spec, part, None)
     spec.tile_width = spec.tile_height = spec.tile_depth = 0
-    return PassedOnPart(spec, part, (part.channels,))
+    _name_and_compress(spec, name, lossless(part))
+    return PassedOnPart(spec, part, (part.channels,) if _has_one_type(part) else None)
 
 
 def _layer_name(
@@ -184,8 +184,7 @@ def _layer_name(
 
 def _layer_part(contents: FileContents, piece: _Piece, name: str) -> PassedOnPart:
     channels = piece.channels
-    nuke = contents.options.layout == "nuke"
-    names = _components(channels) if nuke else [c.name for c in channels]
+    names = _components(channels) if contents.options.layout == "nuke" else [c.name for c in channels]
     spec = _spec(piece.source, name, names, channels[0].type, piece.view)
     if piece.repeats_metadata:
         _drop_repeated_attributes(spec)
@@ -258,7 +257,7 @@ def _drop_repeated_attributes(spec: Any) -> None:
 
 
 def _name_and_compress(spec: Any, name: str, compression: str) -> None:
-    for attribute in (*_STRUCTURE, _ACES_FLAG):
+    for attribute in _STRUCTURE:
         spec.erase_attribute(attribute)
     spec.attribute("oiio:subimagename", name)
     spec.attribute("name", name)

@@ -49,11 +49,7 @@ def old_preview(exr: Path) -> Path | None:
 
 
 def check_view(view: str) -> None:
-    """Check the name of an OpenColorIO view.
-
-    Raises:
-        InputError: the configuration has no such view.
-    """
+    """Raise InputError if the OpenColorIO configuration has no such view."""
     views = oiio.ColorConfig(OCIO_CONFIG).getViewNames(OCIO_DISPLAY)
     if view not in views:
         raise InputError(f"--view {view!r}: {OCIO_CONFIG} has {', '.join(views)}")

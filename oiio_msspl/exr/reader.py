@@ -279,13 +279,8 @@ def open_exr(path: str | Path) -> ExrFile:
         raise InputError(f"{path}: holds no image")
     first = parts[0].spec
     x, y = first.full_x, first.full_y
-    return ExrFile(
-        path=path,
-        parts=tuple(parts),
-        display_window=Window(x, y, x + first.full_width, y + first.full_height),
-        pixel_aspect=float(metadata.get("PixelAspectRatio", 1.0)),
-        metadata=metadata,
-    )
+    frame = Window(x, y, x + first.full_width, y + first.full_height)
+    return ExrFile(path, tuple(parts), frame, float(metadata.get("PixelAspectRatio", 1.0)), metadata)
 
 
 def _open(path: Path) -> Any:
@@ -310,14 +305,12 @@ def _refused(path: Path, reason: str) -> InputError:
 
 def _part(path: Path, index: int, spec: Any) -> Part:
     types = [str(t) for t in spec.channelformats] or [str(spec.format)] * spec.nchannels
+    named = enumerate(zip(map(_text, spec.channelnames), types, strict=True))
     return Part(
         index=index,
         name=_text(str(spec.getattribute("oiio:subimagename") or "")),
         view=_text(str(spec.getattribute("view") or "")),
-        channels=tuple(
-            Channel(path, index, i, _text(name), kind)
-            for i, (name, kind) in enumerate(zip(spec.channelnames, types, strict=True))
-        ),
+        channels=tuple(Channel(path, index, i, name, kind) for i, (name, kind) in named),
         data_window=Window(spec.x, spec.y, spec.x + spec.width, spec.y + spec.height),
         compression=str(spec.getattribute("compression") or "none").split(":")[0],
         tile=(spec.tile_width, spec.tile_height),

@@ -140,7 +140,9 @@ class Contract:
         """
         metadata = network.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
-            raise InputError(f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m research.training.export")
+            raise InputError(
+                f"{path}: has no '{METADATA_KEY}' metadata; make it with python -m research.training.export"
+            )
         return cls.from_json(metadata[METADATA_KEY], str(path))
 
     @classmethod

@@ -86,7 +86,7 @@ def _log_mean(lit: Array) -> float:
 
 
 def encode_radiance(radiance: Array, exposure: float) -> Array:
-    """Log-encode scene-linear radiance: ``log(1 + MU e x) / log(1 + MU)``, with ``e x`` clipped to [0, MAX_RADIANCE]."""
+    """Log-encode scene-linear radiance: ``log(1 + MU e x) / log(1 + MU)``, ``e x`` clipped to [0, MAX_RADIANCE]."""
 
     def encode(values: Array) -> None:
         with np.errstate(over="ignore"):  # values that overflow are clipped

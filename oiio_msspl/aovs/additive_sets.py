@@ -102,7 +102,7 @@ def find_additive_sets(
     for entry in [*renderer.get("sets", ()), *(generic["sets"] if renderer is not generic else ())]:
         if any(entry["name"] == additive.name for additive in sets):
             continue
-        lights = dict.fromkeys(light for candidate in entry["layers"] for light in finder.find(candidate))
+        lights = list(dict.fromkeys(light for candidate in entry["layers"] for light in finder.find(candidate)))
         unwanted = entry.get("except", ())
         lights = [light for light in lights if not any(fnmatchcase(light.name.lower(), p) for p in unwanted)]
         coarser = [a for a in lights if entry.get("finest") and any(a.words < b.words for b in lights)]

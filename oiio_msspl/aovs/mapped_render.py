@@ -54,17 +54,14 @@ class MappedRender:
 
     @property
     def name(self) -> str:
-        """Path of the file."""
         return str(self.file.path)
 
     @property
     def display_window(self) -> Window:
-        """The frame that the camera shows."""
         return self.file.display_window
 
     @property
     def pixel_aspect(self) -> float:
-        """Width of a pixel divided by its height."""
         return self.file.pixel_aspect
 
     @property
@@ -110,13 +107,9 @@ class MappedRender:
     def unused_layers(self, views: Sequence[MappedRender], fused: Iterable[AdditiveSet]) -> list[str]:
         """Name the flat layers that are neither read as features nor fused.
 
-        Args:
-            views: the file, mapped for the other views.
-            fused: the additive sets that are fused.
-
-        Returns:
-            Names of layers; those of single channels if the layer is read in part or has no name. The view follows in
-            brackets if it is not the chosen one.
+        ``views`` are the file, mapped for the other views, and ``fused`` the additive sets that are fused. Of a layer
+        that is read in part or has no name, the channels are named. The view follows in brackets if it is not the
+        chosen one.
         """
         used = {c for view in (self, *views) for formula in view._formulas.values() for c in formula.channels}
         used |= {channel for additive in fused for layer in additive.layers for channel in layer.channels}
@@ -177,7 +170,6 @@ class MappedRender:
         return result, take(more) if more else pixels[..., :0]
 
     def cache_strips(self, max_bytes: int) -> AbstractContextManager[None]:
-        """Keep decoded rows between reads, see :meth:`oiio_msspl.exr.reader.ExrFile.cache_strips`."""
         return self.file.cache_strips(max_bytes)
 
     def unload(self) -> None:
@@ -215,11 +207,7 @@ class MappedRender:
         return Render(layers, whole, self.display_window, self.pixel_aspect, self.metadata, self.name), stored
 
     def check_pixels(self, channels: Sequence[Channel], features: Iterable[str]) -> None:
-        """Decode the pixels that :meth:`load_with` would read, and keep nothing.
-
-        Raises:
-            InputError: pixels can't be decoded, because a file is truncated or corrupt.
-        """
+        """Raise InputError if pixels that :meth:`load_with` would read can't be decoded."""
         for window in self.data_window.bands(ROWS_PER_LOAD):
             self._read_with(window, features, channels)
 

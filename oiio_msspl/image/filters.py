@@ -143,26 +143,27 @@ def max_3x3(values: Array) -> Array:
 def sum_3x3(values: Array) -> Array:
     """Return the sum of the 3 x 3 values around each pixel, (h, w, ...). The edge pixel is repeated."""
     for axis in (1, 0):
-        lines = values.swapaxes(0, axis)
-        total = lines.copy(order="K")
-        for pixels, beside in ((slice(1, None), slice(-1)), (slice(-1), slice(1, None)), ((0,), (0,)), ((-1,), (-1,))):
-            total[pixels] += lines[beside]
-        values = total.swapaxes(0, axis)
+        values = _sum_of_three(values, axis, 1)
     return values
 
 
 def blurred(plane: Array, times: int = 1) -> Array:
     """Blur a plane (h, w) with the weights 1, 2, 1 in rows and in columns, repeatedly. The edge pixel is repeated."""
     for axis in (0, 1) * times:
-        lines = plane.swapaxes(0, axis)
-        total = 2 * lines
-        total[1:] += lines[:-1]
-        total[:-1] += lines[1:]
-        total[0] += lines[0]
-        total[-1] += lines[-1]
-        total *= np.float32(1 / 4)
-        plane = total.swapaxes(0, axis)
+        plane = _sum_of_three(plane, axis, 2)
+        plane *= np.float32(1 / 4)
     return plane
+
+
+def _sum_of_three(values: Array, axis: int, weight: int) -> Array:
+    """Return each pixel, times ``weight``, plus those on both sides of it along an axis."""
+    lines = values.swapaxes(0, axis)
+    total = weight * lines
+    total[1:] += lines[:-1]
+    total[:-1] += lines[1:]
+    total[0] += lines[0]
+    total[-1] += lines[-1]
+    return total.swapaxes(0, axis)
 
 
 def means_around(plane: Array, reaches: Sequence[int]) -> list[Array]:

@@ -130,14 +130,7 @@ class Contract:
 
     @classmethod
     def of_network(cls, network: Network, path: str | Path) -> Contract:
-        """Read the contract of a loaded network.
-
-        Args:
-            path: the file that errors name.
-
-        Raises:
-            InputError: no contract that fits this version.
-        """
+        """Read the contract of a loaded network, as :meth:`of_file` does; ``path`` is for messages."""
         metadata = network.get_modelmeta().custom_metadata_map
         if METADATA_KEY not in metadata:
             raise InputError(
@@ -147,14 +140,7 @@ class Contract:
 
     @classmethod
     def from_json(cls, text: str, source: str) -> Contract:
-        """Read a contract.
-
-        Args:
-            source: the file that errors name.
-
-        Raises:
-            InputError: the text is no contract, or does not fit this version.
-        """
+        """Read a contract, or raise InputError if it does not fit this version; ``source`` is for messages."""
         again = "export it again"
         try:
             contract = cls(**json.loads(text))

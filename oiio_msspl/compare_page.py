@@ -169,8 +169,8 @@ def _picture(render: MappedRender, window: Window) -> _Picture:
     shown = set(beauty.terms)
     for additive in render.additive_sets:
         for light in additive.layers:
-            name = f"{light.name} x colour" if light.factor else light.name
-            layers.setdefault(same_spelling(name), _Layer(name, light.formula, True, additive.name, light.name))
+            layer = _Layer(light.label, light.formula, True, additive.name, light.name)
+            layers.setdefault(same_spelling(light.label), layer)
             shown.add(light.channels)
     views = render.view.split("/")
     for stored in layers_of(render.file):

@@ -40,11 +40,13 @@ class AdditiveLayer:
     """R, G, B of the layer that it is multiplied by: Cycles' light passes leave the surface colour out."""
 
     @property
-    def words(self) -> frozenset[str]:
-        """What its name says of its light: ``diffuse`` and ``key`` for ``diffuse_key``.
+    def label(self) -> str:
+        """Name for the user."""
+        return f"{self.name} x colour" if self.factor else self.name
 
-        Words for all light are left out.
-        """
+    @property
+    def words(self) -> frozenset[str]:
+        """The kinds of light in its name: ``diffuse`` and ``key`` for ``diffuse_key``."""
         return frozenset(_WORD.findall(self.name.lower())) - _ALL_LIGHT
 
     @property
@@ -68,7 +70,7 @@ class AdditiveSet:
     @property
     def layer_names(self) -> str:
         """Its layers, for the user."""
-        names = ", ".join(f"{layer.name} x colour" if layer.factor else layer.name for layer in self.layers)
+        names = ", ".join(layer.label for layer in self.layers)
         return names + (f"; sums of these: {', '.join(layer.name for layer in self.coarser)}" if self.coarser else "")
 
     def matches(self, pattern: str) -> bool:
@@ -85,10 +87,9 @@ def find_additive_sets(
 
     Args:
         renderer: entry of the table.
-        layers: of the file.
+        layers, path: of the file.
         beauty: the one that the sets should sum to; its view and view layer are searched.
         sums: the user's, as ``NAME=a+b+c*d``.
-        path: of the file, for messages.
 
     Raises:
         InputError: a sum of the user can't be read, names a layer that is not there, or has the name of another.

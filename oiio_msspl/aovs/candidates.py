@@ -41,15 +41,12 @@ class LayerFinder:
         self._view, self._view_layer = view, view_layer
 
     def formula(self, feature: str, candidate: Any, problems: list[str]) -> FeatureFormula | None:
-        """Return the formula that a candidate describes.
+        """Return the formula that a candidate describes; None if a layer is missing or has the wrong channels.
 
         Args:
             feature: the feature that is wanted.
             candidate: checked by :func:`oiio_msspl.aovs.mapping.check_mapping`.
             problems: a sentence is added for a layer that exists but has the wrong channels.
-
-        Returns:
-            None if a layer is missing or has the wrong channels.
 
         Raises:
             InputError: the candidate names another file, which can't be read, shows another frame, or does not have

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import reduce
 
 import numpy as np
 
@@ -51,9 +52,7 @@ class FeatureFormula:
 
     def evaluate(self, take: Take) -> Array:
         """Return the feature, unless it is a variance: float32 (height, width, 3), in the units of the features."""
-        value = take(self.terms[0])
-        for term in self.terms[1:]:
-            value = value + take(term)
+        value = reduce(np.add, map(take, self.terms))
         if self.factor is not None:
             value = value * take(self.factor)
         if self.encoding != "unsigned":
@@ -68,10 +67,7 @@ class FeatureFormula:
         A variance of colours is turned into one of luminance as if the noise of R, G and B were fully correlated:
         sigma_Y = sum of w_c sigma_c. Monte Carlo noise nearly is, because one path carries all three.
 
-        Args:
-            take: gives the pixels of channels.
-            mean: the pixel's colour, (height, width, 3).
-            spp: samples per pixel; needed for the kinds in ``NEEDS_SPP``.
+        ``mean`` is the pixel's colour, (height, width, 3). The kinds in ``NEEDS_SPP`` need the samples per pixel.
         """
         if self.kind == "halves":
             # The mean of two independent halves a and b of the samples has the variance (a - b)^2 / 4.

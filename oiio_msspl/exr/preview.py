@@ -70,8 +70,7 @@ def write_preview(
     Args:
         path: the PNG to write.
         rgb: scene linear, (height, width, 3), over ``data_window``.
-        data_window: the pixels that ``rgb`` covers.
-        display_window: the frame, which the PNG shows.
+        data_window, display_window: the pixels that ``rgb`` covers, and the frame, which the PNG shows.
         view: None for the paper's sRGB curve; otherwise a view of OpenColorIO's built-in CG configuration, e.g.
             ``Un-tone-mapped`` or ``ACES 1.0 - SDR Video``.
         space: linear RGB space of ``rgb``; converted to Rec. 709 for the picture.
@@ -100,13 +99,9 @@ def write_preview(
 
 
 def write_png(path: Path, display: Array, *, software: str = SOFTWARE, overwrite: bool = False) -> None:
-    """Write a PNG of display values, atomically.
+    """Write a PNG of display values (height, width, 3), clipped to [0, 1], atomically.
 
-    Args:
-        path: the PNG to write.
-        display: (height, width, 3), clipped to [0, 1].
-        software: the PNG's "Software" entry. :func:`is_our_preview` takes a picture for a preview by it.
-        overwrite: replace an existing file.
+    ``software`` is the PNG's "Software" entry. :func:`is_our_preview` takes a picture for a preview by it.
 
     Raises:
         InputError: ``path`` exists.

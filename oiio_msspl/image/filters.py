@@ -37,14 +37,9 @@ def box_downsample(image: NDArray[Any], scale: int) -> Array:
 
 
 def interpolate(values: Array, positions: NDArray[np.float64], axis: int) -> Array:
-    """Sample an image linearly along one axis, at positions between pixels. The edge pixel is repeated outside.
+    """Sample an image (height, width, ...) linearly at positions between pixels along an axis, in pixels.
 
-    Args:
-        values: (height, width, ...).
-        positions: pixel indices along ``axis``, one for each pixel of the result.
-
-    Returns:
-        The samples; the image itself if the positions are exactly its pixels.
+    The edge pixel is repeated outside. If the positions are exactly the pixels, the image itself is returned.
     """
     last = values.shape[axis] - 1
     if np.array_equal(positions, np.arange(last + 1)):

@@ -61,16 +61,11 @@ def _comparable(name: str, image: Array) -> Array:
 
 
 def lrhs_share(lrhs: Array, hrls: Array) -> float:
-    """Return the share of the LRHS in the mean of both renders that has the least noise.
+    """Return the share of the LRHS in the mean of both renders that has the least noise, in [0.05, 0.95].
 
-    High-pass filtered, each render is picture plus noise. The picture is the same in both and the noise is independent,
-    so their covariance is the variance of the picture. The rest of each render's variance is noise.
-
-    Args:
-        lrhs, hrls: (..., h, w, 3), log-encoded, at one resolution.
-
-    Returns:
-        A share in [0.05, 0.95]; 0.5 if both are equally noisy, or not noisy.
+    It is 0.5 if both are equally noisy, or not noisy. Both are log-encoded, (..., h, w, 3), at one resolution.
+    High-pass filtered, each is picture plus noise. The picture is the same in both and the noise is independent, so
+    their covariance is the variance of the picture. The rest of each render's variance is noise.
     """
     a, b = (x[..., 1:, 1:, :] - x[..., 1:, :-1, :] - x[..., :-1, 1:, :] + x[..., :-1, :-1, :] for x in (lrhs, hrls))
     if a.size == 0:  # one row or column

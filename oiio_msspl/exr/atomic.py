@@ -175,7 +175,7 @@ def remove_leftovers(targets: Iterable[Path]) -> None:
 
 
 def temporary_folder(folder: Path) -> tempfile.TemporaryDirectory[str]:
-    """Make a hidden folder ``.msspl-MACHINE-PROCESS-RANDOM``, deleted when its ``with`` block ends, or raise OSError."""
+    """Make a hidden folder ``.msspl-MACHINE-PROCESS-RANDOM``, deleted when its ``with`` block ends (or OSError)."""
     return tempfile.TemporaryDirectory(prefix=f".msspl-{_machine()}-{os.getpid()}-", dir=folder.absolute())
 
 

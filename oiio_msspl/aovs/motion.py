@@ -127,7 +127,7 @@ def find_motion_layers(renderer: Mapping[str, Any], layers: Sequence[Layer], bea
         layers: of the file.
         beauty: the one that was chosen; its view and view layer are searched.
     """
-    named = dict(_layers_of_view(layers, beauty))
+    named = {name: layer for name, layer in beauty.layers_of_view(layers) if name}
     common = renderers()[-1]
     entries = [*renderer.get("motion", ()), *common["motion"]]
     vectors: dict[tuple[Channel, Channel], MotionField] = {}
@@ -225,15 +225,6 @@ def _is_number(value: str) -> bool:
         return math.isfinite(float(value))
     except ValueError:
         return False
-
-
-def _layers_of_view(layers: Sequence[Layer], beauty: Beauty) -> Iterator[tuple[str, Layer]]:
-    """Yield the layers of the beauty's view and view layer, and those of none, with their short names."""
-    for layer in layers:
-        if layer.view not in (beauty.view, "") or not layer.name:
-            continue
-        short = layer.name.removeprefix(beauty.view_layer + ".") if beauty.view_layer else layer.name
-        yield short, layer
 
 
 def _named(layers: Mapping[str, Layer], alias: str) -> tuple[str, Layer] | None:

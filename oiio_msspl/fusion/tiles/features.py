@@ -75,7 +75,7 @@ def read_tile(
     hr: ReadableRender,
     alignment: Alignment,
     features: Iterable[str],
-    counts: RepairCounts,
+    counts: RepairCounts | None = None,
 ) -> TileFeatures:
     """Read both renders over a tile.
 
@@ -134,7 +134,7 @@ def read_lrhs(
     alignment: Alignment,
     grid: Window,
     features: Iterable[str],
-    counts: RepairCounts,
+    counts: RepairCounts | None = None,
     *,
     exact: bool = False,
 ) -> dict[str, Array]:

@@ -94,14 +94,14 @@ def fuse(
         pair = FramePair(lr, hr, alignment, session.contract, aovs, on_read=averages.add)
         frame = _blank_frame(alignment, pair.exposure, error=error, half=half)
         with hr.cache_strips(strips_memory(max_memory, held)):
-            for _, number, count in fuse_tiles(tile_tasks(pair, frame), session):
-                frame.tiles = count
+            for task in fuse_tiles(tile_tasks(pair, frame), session):
+                frame.tiles = task.count
                 for image in frame.clean_aovs.values():
                     unload(image)
                 for render in (lr, hr):
                     render.unload()
                 if progress is not None:
-                    progress(number, count)
+                    progress(task.number, task.count)
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb

@@ -20,7 +20,7 @@ from oiio_msspl.fusion.checks.colours import different_colours
 from oiio_msspl.fusion.checks.edges import foreign_aovs
 from oiio_msspl.fusion.checks.framing import central_slices, find_framing, jackknife_error, parts
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
-from oiio_msspl.fusion.tiles.features import RepairCounts, TileFeatures, in_hrls_pixels, read_lrhs, read_tile
+from oiio_msspl.fusion.tiles.features import TileFeatures, in_hrls_pixels, read_lrhs, read_tile
 from oiio_msspl.fusion.tiles.tiling import Tile
 from oiio_msspl.image.arrays import Array, planes_of, quantile
 from oiio_msspl.image.colour import luminance
@@ -75,10 +75,8 @@ class HrlsAverages:
     Attributes:
         rgb: luminance (h, w) over the grid of the alignment.
         albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
-        normal_edges: length of the difference of the normals to the next pixels, over the same area; None if there are
-            none.
-        normal_noise: root mean square of that difference if the normals were constant, by their noise; None if there
-            are no normals.
+        normal_edges: length of the difference of the normals to the next pixels, over the same area, or None.
+        normal_noise: root mean square of that difference if the normals were constant, by their noise, or None.
         blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
             difference of luminance, and that which the noise of the HRLS explains.
         noisy_pixels, equal_pixels: numbers of LRHS pixels over which the HRLS is noisy, and of those among them that
@@ -125,12 +123,7 @@ class HrlsAverages:
             self.normal_edges[target] = _edge_lengths(box_downsample(pixels, pair.scale))
 
     def _add_beauty(self, low: Array, high: Array, place: Window) -> None:
-        """Fill ``rgb``, and sum ``blocks``.
-
-        Args:
-            low, high: colours of both renders (h, w, 3) and (s*h, s*w, 3).
-            place: of the LRHS's pixels in the grid.
-        """
+        """Fill ``rgb`` and sum ``blocks``, given the colours (h, w, 3) and (s*h, s*w, 3) of a ``place`` in the grid."""
         scale = self.alignment.scale
         phases = list(itertools.product(range(scale), repeat=2))
         averages = self.rgb[place.y0 : place.y1, place.x0 : place.x1]
@@ -187,12 +180,10 @@ def _noise_of_edges(pixels: Array, scale: int) -> Array:
 
 
 def _noise_variance(pixels: Array) -> Array:
-    """Estimate the variance of noise (h / 2, w / 2, ...) from 2 x 2 pixels each.
-
-    Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
-    """
-    quads = [pixels[i::2, j::2] for i in (0, 1) for j in (0, 1)]
-    variance: Array = np.square(quads[0] - quads[1] - quads[2] + quads[3]) / np.float32(4)
+    """Estimate the variance of noise (h / 2, w / 2, ...) from 2 x 2 pixels each."""
+    # Gradients and straight edges cancel out of a diagonal difference. Its variance is four times that of the noise.
+    a, b, c, d = (pixels[i::2, j::2] for i in (0, 1) for j in (0, 1))
+    variance: Array = np.square(a - b - c + d) / np.float32(4)
     return variance
 
 
@@ -202,25 +193,17 @@ def _hrls_pixels(pair: TileFeatures, feature: str, window: Window) -> Array:
 
 
 def check_renders(lr: ReadableRender, hr: ReadableRender) -> list[str]:
-    """Check whether two renders show the same frame, without fusing them.
-
-    Args:
-        lr, hr: files with their layers mapped, or renders in memory.
-
-    Returns:
-        Warnings of :func:`check_pair`.
+    """Check whether two renders show the same frame, without fusing them. Return warnings of :func:`check_pair`.
 
     Raises:
         InputError: the pair does not fit together, or can't be read.
     """
     alignment = align(lr, hr)
-    grid, counts = alignment.grid, RepairCounts()
-    lrhs = read_lrhs(lr, alignment, grid, [RGB], counts)
+    grid = alignment.grid
+    lrhs = read_lrhs(lr, alignment, grid, [RGB])
     averages = HrlsAverages(alignment)
-    rows = max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))
-    for top in range(grid.y0, grid.y1, rows):
-        band = Window(grid.x0, top, grid.x1, min(top + rows, grid.y1))
-        averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL], counts))
+    for band in grid.bands(max(1, PIXELS_PER_READ // (grid.width * alignment.scale**2))):
+        averages.add(read_tile(Tile(band, band), lrhs, grid, hr, alignment, [RGB, ALBEDO, NORMAL]))
     return check_pair(bounded_luminance(lrhs[RGB]), averages, lr.name, hr.name)
 
 
@@ -253,13 +236,11 @@ def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> li
             if np.count_nonzero(lit) > min(MOST_BY_CHANCE, lit.size // 2):
                 raise _black_beauty(black_name, lit_name)
             return []  # a dark frame in which few samples find the light
-    warnings = []
-    for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high)):
-        if _is_region(black, lit):
-            warnings.append(
-                f"the {black_name} is black outside of a rectangle, where the {lit_name} is lit: was a render region "
-                "on?"
-            )
+    warnings = [
+        f"the {black_name} is black outside of a rectangle, where the {lit_name} is lit: was a render region on?"
+        for black_name, black, lit_name, lit in (("HRLS", high, "LRHS", low), ("LRHS", low, "HRLS", high))
+        if _is_region(black, lit)
+    ]
     framing = in_background(lambda: find_framing(low, high))
     foreign = in_background(lambda: foreign_aovs(low, high, hrls.albedo, hrls.normal_edges, hrls.normal_noise))
     if _has_same_noise(hrls):

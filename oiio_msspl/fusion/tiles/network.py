@@ -70,15 +70,11 @@ def tile_tasks(
         yield TileTask(prepared, shares, result, number, len(tiles))
 
 
-def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[tuple[FusedPixels, int, int]]:
-    """Run the network on each tile and write it into its result. The next tile is prepared meanwhile.
-
-    Yields:
-        After each tile: its result, the number of the tile, and the number of tiles of this result.
-    """
+def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[TileTask]:
+    """Run the network on each tile, write it into its result, and yield it. The next tile is prepared meanwhile."""
     for task in one_ahead(tasks):
         _fuse_tile(task.tile, session, task.result, task.shares)
-        yield task.result, task.number, task.count
+        yield task
 
 
 def _fuse_tile(tile: PreparedTile, session: Session, result: FusedPixels, shares: FrameShares) -> None:
@@ -170,10 +166,10 @@ def fuse_layers(
                     render.unload()
                 yield task
 
-    for result, number, count in fuse_tiles(tasks(), session):
-        unload(result.rgb)
-        if number == count:
-            yield result.rgb
+    for task in fuse_tiles(tasks(), session):
+        unload(task.result.rgb)
+        if task.number == task.count:
+            yield task.result.rgb
 
 
 def layer_fuser(

@@ -68,22 +68,19 @@ class FramePair:
         aovs: Sequence[str] = (),
         *,
         of_pass: tuple[float, int] | None = None,
-        on_read: Callable[[TileFeatures], object] | None = None,
+        on_read: Callable[[TileFeatures], object] = lambda _: None,
     ) -> None:
         self._lr, self._hr, self._alignment, self._contract = lr, hr, alignment, contract
         self._aovs, self._on_read = aovs, on_read
         self.grid = network_grid(alignment, contract)
         self._lrhs_counts, self._hrls_counts = RepairCounts(), RepairCounts()
         self._lrhs = read_lrhs(lr, alignment, self.grid, [*contract.lrhs, "alpha"], self._lrhs_counts)
+        self.lrhs_has_alpha = "alpha" in self._lrhs
         self.lrhs_rgb = self._lrhs[RGB][alignment.grid.slices(self.grid)]
         """Colour of the LRHS (h, w, 3) over the grid of the alignment."""
         self.exposure, reach = of_pass or (find_exposure(self.lrhs_rgb), FAR)
         self._empty_regions = EmptyRegions(self._lrhs[RGB], reach, of_pass=of_pass is not None)
         self._part = self._lit_part(reach) if of_pass else None
-
-    @property
-    def lrhs_has_alpha(self) -> bool:
-        return "alpha" in self._lrhs
 
     def counts(self, kind: str) -> dict[str, int]:
         """Return the numbers of values that were ``repaired`` or ``negative``, by render and feature (``lrhs.rgb``)."""
@@ -97,8 +94,7 @@ class FramePair:
     def prepare(self, tile: Tile) -> PreparedTile:
         """Read a tile and apply the guards."""
         features = self._read(tile, [*self._contract.hrls, "alpha"], self._hrls_counts)
-        if self._on_read is not None:
-            self._on_read(features)
+        self._on_read(features)
         empty = self._empty_regions.mask(features, tile.area.slices(self.grid))
         guides = {name: values for name, values in features.hrls.items() if name in (ALBEDO, NORMAL, "alpha")}
         aovs = tuple(name for name in self._aovs if name in features.hrls)
@@ -117,7 +113,7 @@ class FramePair:
             return FrameShares()
         colours, alphas = [], []
         for band in sample_bands(self._alignment.grid, self._contract.scale):
-            features = self._read(Tile(band, band), [RGB, ALBEDO, NORMAL, "alpha"], RepairCounts())
+            features = self._read(Tile(band, band), [RGB, ALBEDO, NORMAL, "alpha"])
             lrhs_rgb, hrls = dim_fireflies(features)
             colours.append((features.lrhs | {RGB: lrhs_rgb}, hrls))
             if "alpha" in features.lrhs and "alpha" in features.hrls:
@@ -131,9 +127,9 @@ class FramePair:
         """
         if self._alignment.stretch == (1.0, 1.0):
             return self.lrhs_rgb
-        return read_lrhs(self._lr, self._alignment, self._alignment.grid, [RGB], RepairCounts(), exact=True)[RGB]
+        return read_lrhs(self._lr, self._alignment, self._alignment.grid, [RGB], exact=True)[RGB]
 
-    def _read(self, tile: Tile, features: Sequence[str], counts: RepairCounts) -> TileFeatures:
+    def _read(self, tile: Tile, features: Sequence[str], counts: RepairCounts | None = None) -> TileFeatures:
         return read_tile(tile, self._lrhs, self.grid, self._hr, self._alignment, features, counts)
 
     def _lit_part(self, reach: int) -> Window | None:

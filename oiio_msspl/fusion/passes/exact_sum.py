@@ -110,14 +110,12 @@ def spread_rest(layers: Array, beauty: Array, doubts: Array | None) -> None:
             lacking = np.clip(wanted - total, -most, most)
             weights = part * np.maximum(doubt, LEAST_DOUBT)
             lacking /= np.maximum(weights.sum(axis=0), tiny)
-            weights *= lacking
-            part += np.maximum(weights, -MOST_SPREAD * part)
+            part += np.maximum(weights * lacking, -MOST_SPREAD * part)
             total = part.sum(axis=0)
             if is_far:
                 weights = part * np.maximum(np.square(doubt), LEAST_SQUARED_DOUBT)
                 weights /= np.maximum(weights.sum(axis=0), tiny)
-                weights *= np.maximum(wanted - total, 0)
-                part += weights
+                part += weights * np.maximum(wanted - total, 0)
                 total = part.sum(axis=0)
         # The beauty divided by a tiny total would overflow; a layer's part of the total never does.
         part /= np.where(total > 0, total, 1)
@@ -151,17 +149,13 @@ class SharesAround:
         return sample_linear(self._shares[job.layers.name], columns, rows).T
 
     def _measure(self, job: PassJob) -> Array:
-        """Return the shares in each square of the frame, (rows, columns, layers).
-
-        A square without light gets those of the squares around, and all get equal ones if none has light.
-        """
+        """Return the shares in each square of the frame, (rows, columns, layers); of those around where it is black."""
         grid, side = self._sources.alignment.grid, SQUARE // self._sources.alignment.scale
         light = np.stack([self._light_of(job, rows) for rows in grid.bands(side)])
         total = light.sum(axis=-1, keepdims=True)
-        lit = total[..., 0] > 0
-        if not lit.any():
-            return np.full(light.shape, 1, np.float32)
-        return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), ~lit)
+        if not total.any():
+            return np.ones(light.shape, np.float32)
+        return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), total[..., 0] <= 0)
 
     def _light_of(self, job: PassJob, area: Window) -> NDArray[np.float64]:
         """Return the light of the layers in each square of a row of squares, (columns, layers)."""

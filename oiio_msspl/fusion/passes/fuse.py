@@ -21,7 +21,7 @@ from oiio_msspl.exr.replaced import ReplacedChannels
 from oiio_msspl.fusion.passes.bands import Band, PassInputs, PassSources, band_windows
 from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR, SharesAround, doubts_of, make_exact
 from oiio_msspl.fusion.passes.fit import fit_to_beauty
-from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, load_pixels, lrhs_names
+from oiio_msspl.fusion.passes.layers import LayerLight, is_large, layer_names, light_of, lrhs_names
 from oiio_msspl.fusion.passes.network import LayerFuser, LayersByNetwork
 from oiio_msspl.fusion.passes.plan import PassJob, PassPlan, plan_passes
 from oiio_msspl.fusion.tiles.alignment import Alignment
@@ -140,7 +140,7 @@ def _sources_of(inputs: PassInputs, low: LayerLight, high: LayerLight) -> PassSo
     renders: tuple[ReadableRender, ReadableRender] = (low.pixels, high.pixels)
     if inputs.averaged is not None:
         # Light is divided by the colours of this frame, because those are written.
-        colours = load_pixels(high.file, high.colours.values()).layers
+        colours = high.file.load(high.colours.values(), on_disk=is_large(high.file)).layers
         renders = inputs.averaged[0], replace(inputs.averaged[1], layers=inputs.averaged[1].layers | colours)
     return PassSources(**vars(inputs), low=renders[0], high=renders[1], colours=high.colours)
 
@@ -166,7 +166,7 @@ def _read_bands(sources: PassSources, jobs: Sequence[PassJob], network: LayersBy
         with half_of_the_threads():
             return Band(sources, core, jobs, network.at_full_size)
 
-    for band in one_ahead(map(prepare, band_windows(sources.alignment))) if jobs else ():
+    for band in one_ahead(map(prepare, band_windows(sources.alignment) if jobs else ())):
         yield band
         sources.unload()
         network.unload()

@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -58,12 +58,7 @@ def light_of(render: MappedRender, names: Mapping[AdditiveLayer, str], *, decode
     formulas |= {name: layer.formula for layer, name in names.items()}
     formulas |= {name: FeatureFormula((factor,)) for factor, name in LayerLight(render, names).colours.items()}
     file = replace(render, features=formulas)
-    return LayerLight(file, names, load_pixels(file, formulas) if decode else None)
-
-
-def load_pixels(render: MappedRender, features: Iterable[str]) -> Render:
-    """Decode features of a render: into temporary files if there are many pixels."""
-    return render.load(features, on_disk=is_large(render))
+    return LayerLight(file, names, file.load(formulas, on_disk=is_large(file)) if decode else None)
 
 
 def is_large(render: MappedRender) -> bool:
@@ -109,8 +104,8 @@ def pass_features(lr: MappedRender, hr: MappedRender, sets: Sequence[AdditiveSet
 
     The LRHS may lack some of them.
     """
-    members = {layer for additive_set in sets for layer in additive_set.layers}
-    high = {name: layer.formula for layer, name in layer_names(sets).items() if layer in members}
+    names = layer_names(sets)
+    high = {names[layer]: layer.formula for additive_set in sets for layer in additive_set.layers}
     low = {name: layer.formula for layer, name in lrhs_names(lr, sets).items()}
     return replace(lr, features=lr.features | low), replace(hr, features=hr.features | high)
 

@@ -16,7 +16,7 @@ from oiio_msspl.aovs.features import ALBEDO, NORMAL, RADIANCE_FEATURES, RGB
 from oiio_msspl.errors import MssplError
 from oiio_msspl.exr.render import Window
 from oiio_msspl.fusion.tiles.features import FIREFLY_FACTOR, TileFeatures
-from oiio_msspl.image.arrays import Array, Mask
+from oiio_msspl.image.arrays import Array, Mask, planes_of
 from oiio_msspl.image.filters import all_within, box_downsample, grown, max_3x3, neighbours
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.model.encoding import encode_radiance
@@ -52,7 +52,9 @@ def _limit(hrls: Array, limit: Array, scale: int) -> Array:
     result = np.empty_like(hrls)
 
     def work(rows: slice) -> None:
-        np.minimum(hrls[rows], repeated(limit[rows.start // scale : rows.stop // scale], scale), out=result[rows])
+        limits = limit[rows.start // scale : rows.stop // scale]
+        for y, x in np.ndindex(scale, scale):
+            np.minimum(hrls[rows][y::scale, x::scale], limits, out=result[rows][y::scale, x::scale])
 
     for_row_blocks(work, len(hrls), hrls[0].size, multiple=scale)
     return result
@@ -136,7 +138,8 @@ def _rare_light(rgb: Array, top: int, left: int) -> Array:
     reached = (lines > least).sum(axis=2, dtype=np.uint8).reshape(sides).sum(axis=3)
     brightest[reached > _RARE * _SQUARE**2] = 0
     nine = np.stack(list(neighbours(brightest.transpose(1, 2, 0))))
-    return repeated(np.median(nine, axis=0), _SQUARE)[inside[1:]]
+    light = planes_of(np.median(nine, axis=0)).repeat(_SQUARE, axis=1).repeat(_SQUARE, axis=2)
+    return light[inside].transpose(1, 2, 0)
 
 
 def is_noise_free(tile: TileFeatures, lrhs_rgb: Array, hrls_rgb: Array, exposure: float) -> bool:

@@ -213,15 +213,11 @@ def bounded_luminance(rgb: Array) -> Array:
 
 
 def check_pair(low: Array, hrls: HrlsAverages, lr_name: str, hr_name: str) -> list[str]:
-    """Check whether two renders show the same frame.
+    """Check whether two renders show the same frame. Return warnings, one sentence each.
 
     Args:
         low: luminance of the LRHS (h, w) over the grid of the alignment, see :func:`bounded_luminance`.
         hrls: averages of all tiles.
-        lr_name, hr_name: names of the renders in messages.
-
-    Returns:
-        Warnings, one sentence each.
 
     Raises:
         InputError: one render is black, most likely a wrong layer, and the other one is lit by more than chance.

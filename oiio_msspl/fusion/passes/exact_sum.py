@@ -153,9 +153,10 @@ class SharesAround:
         grid, side = self._sources.alignment.grid, SQUARE // self._sources.alignment.scale
         light = np.stack([self._light_of(job, rows) for rows in grid.bands(side)])
         total = light.sum(axis=-1, keepdims=True)
-        if not total.any():
+        lit = total[..., 0] > 0
+        if not lit.any():
             return np.ones(light.shape, np.float32)
-        return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), total[..., 0] <= 0)
+        return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), ~lit)
 
     def _light_of(self, job: PassJob, area: Window) -> NDArray[np.float64]:
         """Return the light of the layers in each square of a row of squares, (columns, layers)."""

@@ -6,6 +6,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -130,8 +131,15 @@ def _scene_linear_error(rgb: Array, error: Array, exposure: float) -> Array:
     return decode_radiance(grey + error, exposure) - decode_radiance(grey, exposure)
 
 
-def fuse_layers(
-    renders: Iterable[tuple[Render, Render]], session: Session, alignment: Alignment, exposure: float, reach: int
+def layer_fuser(
+    session: Session, beauty: FusedPixels
+) -> Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]] | None:
+    """Return a function that fuses passes of a frame whose beauty ``session`` has fused; None if no network does."""
+    return None if session.layers is None else partial(_fuse_layers, session, beauty)
+
+
+def _fuse_layers(
+    session: Session, beauty: FusedPixels, renders: Iterable[tuple[Render, Render]], alignment: Alignment
 ) -> Iterator[Array]:
     """Fuse passes of a frame, such as the light of each lamp.
 
@@ -140,10 +148,7 @@ def fuse_layers(
     Args:
         renders: LRHS and HRLS with a pass in place of the beauty, for each pass. The next two are taken in the
             background while the network works.
-        session: a model for the scale of the renders.
         alignment: of the renders.
-        exposure: that of the beauty, because networks tell light from noise by its brightness.
-        reach: see :class:`oiio_msspl.fusion.tiles.guards.EmptyRegions`.
 
     Yields:
         The fused passes, (height, width, 3) over the HRLS's data window, finite and >= 0: in temporary files if they
@@ -153,37 +158,25 @@ def fuse_layers(
         InputError: pixels can't be decoded.
         MssplError: the network failed, or returned NaN or infinite values.
     """
+    whole = alignment.scale == beauty.alignment.scale
+    layer_session = session.layer_session if whole else session.half_layer_session
+    assert layer_session is not None
+    # Networks tell light from noise by its brightness, so the exposure is that of the beauty.
+    of_pass = (beauty.exposure, max(LAYER_REACH // beauty.alignment.scale - 1, 1))
     size = alignment.hr_data_window.height, alignment.hr_data_window.width
 
     def tasks() -> Iterator[TileTask]:
         for lr, hr in renders:
             # The network works at the same time, and has threads on all cores.
             with half_of_the_threads():
-                pair = FramePair(lr, hr, alignment, session.contract, of_pass=(exposure, reach))
-            result = FusedPixels(blank((*size, 3)), None, None, alignment, exposure)
+                pair = FramePair(lr, hr, alignment, layer_session.contract, of_pass=of_pass)
+            result = FusedPixels(blank((*size, 3)), None, None, alignment, beauty.exposure)
             for task in tile_tasks(pair, result, half_of_the_threads):
                 for render in (lr, hr):
                     render.unload()
                 yield task
 
-    for task in fuse_tiles(tasks(), session):
+    for task in fuse_tiles(tasks(), layer_session):
         unload(task.result.rgb)
         if task.number == task.count:
             yield task.result.rgb
-
-
-def layer_fuser(
-    session: Session, beauty: FusedPixels
-) -> Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Array]] | None:
-    """Return a function that fuses passes of a frame whose beauty ``session`` has fused; None if no network does."""
-    if session.layers is None:
-        return None
-
-    def fuse_passes(renders: Iterable[tuple[Render, Render]], alignment: Alignment) -> Iterator[Array]:
-        whole = alignment.scale == beauty.alignment.scale
-        layer_session = session.layer_session if whole else session.half_layer_session
-        assert layer_session is not None
-        reach = max(LAYER_REACH // beauty.alignment.scale - 1, 1)
-        return fuse_layers(renders, layer_session, alignment, beauty.exposure, reach)
-
-    return fuse_passes

@@ -167,16 +167,10 @@ def _edge_lengths(normal: Array) -> Array:
 
 def _noise_of_edges(pixels: Array, scale: int) -> Array:
     """Return :func:`_edge_lengths` of constant normals with the noise of the HRLS's (s*h, s*w, 3), RMS, (h, w)."""
-    result = np.empty([side // scale for side in pixels.shape[:2]], np.float32)
-
-    def work(rows: slice) -> None:
-        block = pixels[rows.start * scale : rows.stop * scale]
-        variance = reduce(np.add, planes_of(_noise_variance(block)))
-        # Means over scale x scale pixels, in two differences of two of them each.
-        result[rows] = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
-
-    for_row_blocks(work, len(result), pixels[0].size * scale)
-    return result
+    variance = reduce(np.add, planes_of(_noise_variance(pixels)))
+    # Means over scale x scale pixels, in two differences of two of them each.
+    noise: Array = np.sqrt(box_downsample(variance, scale // 2)) * np.float32(2 / scale)
+    return noise
 
 
 def _noise_variance(pixels: Array) -> Array:

@@ -116,12 +116,13 @@ class Band:
         self._beauty = sources.planes(sources.rgb, self._hrls_area)
         self.low_beauty = downsampled(self._beauty, self.scale)
         """The fused beauty (3, h, w) over the area, at the LRHS's resolution."""
-        self._to_fit = [job for job in jobs if job.remainder or self._has_light(job, full_size)]
+        self.to_fit = [job for job in jobs if job.remainder or self._has_light(job, full_size)]
+        """The sets that have light here that no network has fused at full resolution."""
         factors = {layer.factor for job in jobs for layer in job.estimated}
         colours = {factor: name for factor, name in sources.colours.items() if factor in factors}
         names = {name: layer for job in jobs for layer, name in job.names.items()}
         # A file decodes all layers together, so all are read at once.
-        needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self._to_fit else [])]
+        needed = [*colours.values(), RGB, *names, *([ALBEDO, NORMAL] if self.to_fit else [])]
         window, counts = alignment.hr_data_window, RepairCounts()
         features = read_features(sources.high, self._hrls_area, window, needed, counts=counts, counted=self.hrls_core)
         self.repaired = {names[name].name: count for name, count in counts.repaired.items() if name in names}
@@ -143,16 +144,12 @@ class Band:
         lrhs = [name for job in jobs for name in job.lrhs]
         self._lrhs_layers = read_lrhs(sources.low, alignment, self.area, [RGB, *lrhs]) if lrhs else {}
         self._fits: dict[Sequence[int], BeautyFit] = {}
-        self._guides = self._compared(images) if self._to_fit else None
+        self._guides = self._compared(images) if self.to_fit else None
 
     @property
     def beauty(self) -> Array:
         """The fused beauty (3, h, w) over the core."""
         return self._beauty[:, self._hrls_rows]
-
-    def needs_fit(self, job: PassJob) -> bool:
-        """Return whether a set has light here that no network has fused at full resolution."""
-        return job in self._to_fit
 
     def fit_at(self, steps: tuple[int, ...]) -> BeautyFit:
         """Return the beauty that layers are fitted to, see :data:`oiio_msspl.fusion.passes.lines.STEPS`."""

@@ -118,10 +118,7 @@ def fuse_passes(
 
 
 def pass_steps(alignment: Alignment, sets: Sequence[AdditiveSet], *, by_network: bool) -> int:
-    """Return the steps in which sets are fused, for progress: each set in each band of rows.
-
-    A layer that a network fuses counts as much as a set.
-    """
+    """Return the steps for progress: each set in each band of rows. A layer for a network counts as much as a set."""
     layers = sum(len(additive_set.layers) for additive_set in sets) if by_network else 0
     return len(band_windows(alignment)) * (len(sets) + layers)
 
@@ -186,7 +183,7 @@ def _fuse_set(
         doubts = doubts_of(job, band, *renders) if job.lrhs else None
         layers = np.zeros((len(job.estimated) + job.remainder, *rest.shape), np.float32)
         fused = network.estimate(band, job, layers)
-        if band.needs_fit(job):
+        if job in band.to_fit:
             fit_to_beauty(band, job, renders, layers, [i for i in range(len(layers)) if i not in fused])
         make_exact(layers, rest, job, band, shares, doubts)
         lights |= dict(zip(job.estimated, layers, strict=False))

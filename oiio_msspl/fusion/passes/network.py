@@ -110,7 +110,7 @@ class LayersByNetwork:
         )
         for i, light in full.items():
             out[i] = band.sources.planes(light, band.hrls_core)
-        if half and band.needs_fit(job):
+        if half and job in band.to_fit:
             area = band.area.slices(self._alignment.grid)
             low = [planes_of(light[area]) for light in half.values()]
             band.fit_at(HALF_STEPS).fit_layers(low, [out[i] for i in half])

@@ -16,7 +16,7 @@ from oiio_msspl.exr.render import Render
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.fusion.tiles.alpha import fuse_alpha
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH, check_finite
-from oiio_msspl.fusion.tiles.prepare import FramePair, FrameShares, PreparedTile
+from oiio_msspl.fusion.tiles.prepare import FramePair, PreparedTile
 from oiio_msspl.image.arrays import HALF_MAX, Array, blank, unload
 from oiio_msspl.image.parallel import half_of_the_threads, one_ahead
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance
@@ -50,7 +50,8 @@ class TileTask:
     """A tile that is ready for the network, and the result into which it is written."""
 
     tile: PreparedTile
-    shares: FrameShares
+    shares: tuple[Shares, Shares]
+    """Of colour and alpha, see :meth:`FramePair.sample_shares`."""
     result: FusedPixels
     number: int
     """Tiles of the result up to this one."""
@@ -74,17 +75,18 @@ def tile_tasks(
 def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[TileTask]:
     """Run the network on each tile, write it into its result, and yield it. The next tile is prepared meanwhile."""
     for task in one_ahead(tasks):
-        _fuse_tile(task.tile, session, task.result, task.shares)
+        _fuse_tile(task, session)
         yield task
 
 
-def _fuse_tile(tile: PreparedTile, session: Session, result: FusedPixels, shares: FrameShares) -> None:
+def _fuse_tile(task: TileTask, session: Session) -> None:
     """Run the network on a tile and write its core into the result."""
+    tile, result, (shares, alpha_shares) = task.tile, task.result, task.shares
     features, empty = tile.features, tile.empty
     target = features.hrls_target.slices(result.alignment.hr_data_window)
     core = features.hrls_target.slices(features.hrls_area)
     if tile.hrls is not None:
-        images = _run_network(tile, session, result.exposure, shares.rgb, error=result.error is not None)
+        images = _run_network(tile, session, result.exposure, shares, error=result.error is not None)
         for name in tile.aovs:
             if name not in result.clean_aovs:
                 result.clean_aovs[name] = blank(result.rgb.shape, np.float16)
@@ -107,7 +109,7 @@ def _fuse_tile(tile: PreparedTile, session: Session, result: FusedPixels, shares
     if "alpha" in features.hrls:
         if result.alpha is None:
             result.alpha = np.empty((*result.rgb.shape[:2], 1), dtype=np.float32)
-        result.alpha[target] = fuse_alpha(features, session, shares.alpha)[core]
+        result.alpha[target] = fuse_alpha(features, session, alpha_shares)[core]
 
 
 def _run_network(tile: PreparedTile, session: Session, exposure: float, shares: Shares, *, error: bool) -> Images:

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 from oiio_msspl.aovs.features import ALBEDO, NORMAL, RGB
 from oiio_msspl.exr.render import ReadableRender, Window
@@ -17,14 +17,6 @@ from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.model.contract import Contract
 from oiio_msspl.model.encoding import find_exposure
 from oiio_msspl.model.render_mean import Images, Shares, find_shares
-
-
-@dataclass(frozen=True)
-class FrameShares:
-    """The LRHS's shares in the mean of both renders, which many models denoise."""
-
-    rgb: Shares = field(default_factory=dict)
-    alpha: Shares = field(default_factory=dict)
 
 
 @dataclass
@@ -107,10 +99,13 @@ class FramePair:
             prepared.noise_free = is_noise_free(features, lrhs_rgb, prepared.hrls[RGB], self.exposure)
         return prepared
 
-    def sample_shares(self) -> FrameShares:
-        """Decide how both renders are averaged, from bands of the frame, so that neighbouring tiles agree."""
+    def sample_shares(self) -> tuple[Shares, Shares]:
+        """Return the LRHS's shares in the mean of both renders, of colour and of alpha, which many models denoise.
+
+        They come from bands of the frame, so that neighbouring tiles agree.
+        """
         if not self._contract.denoiser:
-            return FrameShares()
+            return {}, {}
         colours, alphas = [], []
         for band in sample_bands(self._alignment.grid, self._contract.scale):
             features = self._read(Tile(band, band), [RGB, ALBEDO, NORMAL, "alpha"])
@@ -118,7 +113,7 @@ class FramePair:
             colours.append((features.lrhs | {RGB: lrhs_rgb}, hrls))
             if "alpha" in features.lrhs and "alpha" in features.hrls:
                 alphas.append(alpha_as_colour(features))
-        return FrameShares(find_shares(colours, self.exposure), find_shares(alphas, 1.0) if alphas else {})
+        return find_shares(colours, self.exposure), find_shares(alphas, 1.0) if alphas else {}
 
     def exact_lrhs_rgb(self) -> Array:
         """Return the colour of the LRHS at the places of its HRLS pixels, (h, w, 3) over the grid of the alignment.

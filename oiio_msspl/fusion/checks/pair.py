@@ -77,10 +77,9 @@ class HrlsAverages:
         albedo: luminance over the central area of the grid, where edges are compared; None if the HRLS has none.
         normal_edges: length of the difference of the normals to the next pixels, over the same area, or None.
         normal_noise: root mean square of that difference if the normals were constant, by their noise, or None.
-        blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 8): the LRHS's RGB, the HRLS's RGB, the squared
-            difference of luminance, and that which the noise of the HRLS explains.
-        noisy_pixels, equal_pixels: numbers of LRHS pixels over which the HRLS is noisy, and of those among them that
-            equal an HRLS pixel.
+        blocks: sums over blocks of `BLOCK` pixels, (rows, columns, 10): the LRHS's RGB, the HRLS's RGB, the squared
+            difference of luminance, that which the noise of the HRLS explains, and the numbers of LRHS pixels over
+            which the HRLS is noisy, and of those among them that equal an HRLS pixel.
         is_lost: the HRLS's beauty is NaN in all tiles, so its averages are those of the LRHS.
     """
 
@@ -93,8 +92,7 @@ class HrlsAverages:
         self.albedo: Array | None = None
         self.normal_edges: Array | None = None
         self.normal_noise: Array | None = None
-        self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 8))
-        self.noisy_pixels = self.equal_pixels = 0
+        self.blocks = np.zeros((-(-self.rgb.shape[0] // BLOCK), -(-self.rgb.shape[1] // BLOCK), 10))
         self.is_lost = True
 
     def add(self, pair: TileFeatures) -> None:
@@ -127,8 +125,7 @@ class HrlsAverages:
         scale = self.alignment.scale
         phases = list(itertools.product(range(scale), repeat=2))
         averages = self.rgb[place.y0 : place.y1, place.x0 : place.x1]
-        values = np.empty((8, *low.shape[:2]), np.float32)
-        counts: list[tuple[int, int]] = []
+        values = np.empty((10, *low.shape[:2]), np.float32)
 
         def work(rows: slice) -> None:
             colour = np.minimum(low[rows], BRIGHTEST)
@@ -140,14 +137,11 @@ class HrlsAverages:
             # Black pixels are equal in any two renders where light is rare.
             noisy = (grey > 0) & (expected > np.square(np.float32(5 * NOISY) * grey))
             nearest = reduce(np.minimum, (np.abs(pixels[i::scale, j::scale] - grey) for i, j in phases))
-            equal = noisy & (nearest <= 1e-3 * grey)
-            counts.append((int(np.count_nonzero(noisy)), int(np.count_nonzero(equal))))
             values[:3, rows], values[3:6, rows] = planes_of(colour), planes_of(mean)
             values[6, rows], values[7, rows] = np.square(averages[rows] - grey), expected
+            values[8, rows], values[9, rows] = noisy, noisy & (nearest <= 1e-3 * grey)
 
         for_row_blocks(work, len(low), high[0].size * scale)
-        self.noisy_pixels += sum(noisy for noisy, _ in counts)
-        self.equal_pixels += sum(equal for _, equal in counts)
         sums: NDArray[Any] = values
         for axis, (start, stop) in ((1, (place.y0, place.y1)), (2, (place.x0, place.x1))):
             first = np.maximum(np.arange(start // BLOCK * BLOCK, stop, BLOCK) - start, 0)
@@ -301,7 +295,8 @@ def _has_same_noise(hrls: HrlsAverages) -> bool:
     if int(np.count_nonzero(noisy)) < max(MIN_NOISY_BLOCKS, int(np.count_nonzero(brightness)) // 4):
         return False
     scaled_down = float(np.quantile(difference[noisy] / expected[noisy], 0.75)) < SAME_NOISE
-    return scaled_down or hrls.equal_pixels > EQUAL_PIXELS * max(hrls.noisy_pixels, 1)
+    noisy_pixels, equal_pixels = hrls.blocks[..., 8:].sum(axis=(0, 1))
+    return scaled_down or bool(equal_pixels > EQUAL_PIXELS * max(noisy_pixels, 1))
 
 
 def _log_correlation(hrls: HrlsAverages) -> float:

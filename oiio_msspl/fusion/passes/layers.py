@@ -30,13 +30,8 @@ class LayerLight:
     """Has these features, the beauty, albedo, normal and :attr:`colours`."""
     names: Mapping[AdditiveLayer, str]
     """Names of features, by layer."""
-    decoded: Render | None = None
-    """All of them; None if each read decodes what it needs."""
-
-    @property
-    def pixels(self) -> ReadableRender:
-        """Where the features are read."""
-        return self.decoded or self.file
+    pixels: ReadableRender
+    """Where the features are read: all are decoded, or each read decodes what it needs."""
 
     @property
     def colours(self) -> dict[Factor, str]:
@@ -56,9 +51,9 @@ def light_of(render: MappedRender, names: Mapping[AdditiveLayer, str], *, decode
     """
     formulas = {name: render.features[name] for name in (RGB, ALBEDO, NORMAL) if name in render.features}
     formulas |= {name: layer.formula for layer, name in names.items()}
-    formulas |= {name: FeatureFormula((factor,)) for factor, name in LayerLight(render, names).colours.items()}
+    formulas |= {name: FeatureFormula((factor,)) for factor, name in LayerLight(render, names, render).colours.items()}
     file = replace(render, features=formulas)
-    return LayerLight(file, names, file.load(formulas, on_disk=is_large(file)) if decode else None)
+    return LayerLight(file, names, file.load(formulas, on_disk=is_large(file)) if decode else file)
 
 
 def is_large(render: MappedRender) -> bool:

@@ -89,9 +89,8 @@ def foreign_aovs(
 
 def _are_noise(edges: Array, noise: Array) -> bool:
     """Return whether most edges (h, w) come from noise."""
-    strong = edges > EDGE
     noisy = blurred(np.square(noise), 4) > NOISE * blurred(np.square(edges), 4)
-    return bool(np.count_nonzero(strong & noisy) > NOISE * np.count_nonzero(strong))
+    return bool(np.mean(noisy[edges > EDGE]) > NOISE)
 
 
 def _log_differences(values: Array, floor: float) -> list[Array]:

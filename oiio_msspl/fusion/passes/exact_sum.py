@@ -159,7 +159,7 @@ class SharesAround:
         return filled(np.divide(light, np.where(total > 0, total, 1), dtype=np.float32), ~lit)
 
     def _light_of(self, job: PassJob, area: Window) -> NDArray[np.float64]:
-        """Return the light of the layers in each square of a row of squares, (columns, layers)."""
+        """Return the light of the layers in each of a row of squares, (columns, layers)."""
         sources, alignment = self._sources, self._sources.alignment
         hrls_area = in_hrls_pixels(area, alignment.scale)
         beauty = downsampled(sources.planes(sources.rgb, hrls_area), alignment.scale)

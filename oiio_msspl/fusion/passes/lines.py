@@ -16,7 +16,7 @@ from numpy.lib.stride_tricks import sliding_window_view
 from oiio_msspl.fusion.tiles.guards import LAYER_REACH
 from oiio_msspl.image.arrays import Array, planes_of
 from oiio_msspl.image.filters import blurred, box_downsample, grown, max_3x3
-from oiio_msspl.image.parallel import for_row_blocks
+from oiio_msspl.image.parallel import for_row_blocks, two_at_a_time
 
 #: Rows of a band whose weights stay in a core's cache while several planes are averaged.
 CACHED_ROWS = 16
@@ -168,16 +168,10 @@ class BeautyFit:
     """The fused beauty of some rows, to which layers at the LRHS's resolution are fitted.
 
     A layer is ``slope beauty + offset`` around every low-resolution pixel, fitted to pixels that look alike.
-
-    Args:
-        beauty: the fused one, (3, h, w).
-        guides: planes (guides, h, w) in units of their spread.
-        scale: layers have 1/scale of this resolution.
-        steps: see :data:`STEPS`.
-        rows: the rows of the layers that are wanted.
     """
 
     def __init__(self, beauty: Array, guides: Array, scale: int, steps: Sequence[int], rows: slice) -> None:
+        """``beauty``: (3, h, w). ``guides``: (n, h, w), in units of their spread. ``rows``: of the layers, to fit."""
         low, self._low_beauty = downsampled(guides, scale), downsampled(beauty, scale)
         with np.errstate(over="ignore", invalid="ignore"):
             self._kernels = {step: _kernel(low, step) for step in steps}
@@ -234,16 +228,13 @@ def smoothed(planes: Array, log: Array) -> Array:
     """
     mean = blurred(log)
     variance = blurred(log * log) - mean * mean + np.float32(FLAT)
-    result = np.empty_like(planes)
 
-    def smooth(part: slice) -> None:
-        for plane, out in zip(planes[part], result[part], strict=True):
-            average = blurred(plane)
-            slope = (blurred(plane * log) - average * mean) / variance
-            np.add(average, slope * (log - mean), out=out)
+    def smooth(plane: Array) -> Array:
+        average = blurred(plane)
+        slope = (blurred(plane * log) - average * mean) / variance
+        return average + slope * (log - mean)
 
-    for_row_blocks(smooth, len(planes), log.size)
-    return result
+    return np.stack(two_at_a_time(smooth, list(planes)))
 
 
 def downsampled(planes: Array, scale: int) -> Array:

@@ -159,11 +159,11 @@ class LayerFinder:
             self._file.siblings[path] = open_exr(path)
         sibling = self._file.siblings[path]
         window, frame, render = sibling.display_window, self._file.display_window, self._file.path
+        hint = "give layers of the same frame"
+        if window.size != frame.size:
+            raise InputError(f"{path}: is {window.size}, but {render} is {frame.size}; {hint}")
         if window != frame:  # pixels are read by their place, so all would be beside the frame
-            sizes = f"is {window.size}, but {render} is {frame.size}"
-            windows = f"its display window is {window}, but that of {render} is {frame}"
-            problem = windows if window.size == frame.size else sizes
-            raise InputError(f"{path}: {problem}; give layers of the same frame")
+            raise InputError(f"{path}: its display window is {window}, but that of {render} is {frame}; {hint}")
         return sibling
 
 

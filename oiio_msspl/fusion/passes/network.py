@@ -39,10 +39,15 @@ LayerFuser = Callable[[Iterable[tuple[Render, Render]], Alignment], Iterator[Arr
 
 
 class LayersByNetwork:
-    """The layers of a frame that a network fuses, at full or at half of the resolution."""
+    """The layers of a frame that a network fuses, at full or at half of the resolution.
+
+    Args:
+        sources: the pair; decoded if there is a network.
+        jobs: the sets of layers.
+        fuse: the network; None to fuse nothing.
+    """
 
     def __init__(self, sources: PassSources, jobs: Sequence[PassJob], fuse: LayerFuser | None) -> None:
-        """``sources``: decoded if there is a network, ``fuse``."""
         self._fuse, self._alignment = fuse if any(job.lrhs for job in jobs) else None, sources.alignment
         self._renders = cast(tuple[Render, Render], (sources.low, sources.high))
         self.at_full_size: dict[AdditiveLayer, Array] = {}

@@ -138,7 +138,7 @@ def _summary(column: Column, rows: Sequence[Row]) -> str:
 def _format(column: Column, measure: str, value: float) -> str:
     if measure not in accuracy.MEASURES or column.form:
         return (column.form or "{:.2f}").format(value)
-    return accuracy.cell({measure: value}, measure)
+    return accuracy.cell(measure, value)
 
 
 def _comparison(column: Column, pairs: Sequence[tuple[Row, Row]]) -> str:

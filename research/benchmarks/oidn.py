@@ -29,22 +29,19 @@ def denoise(color: Array, albedo: Array | None = None, normal: Array | None = No
     return np.asarray(pyoidn.denoise(color, albedo, normal, hdr=True, quality=quality))
 
 
-def denoise_prefiltered(
-    color: Array, albedo: Array | None = None, normal: Array | None = None, guides: str = "high"
-) -> Array:
+def denoise_prefiltered(color: Array, albedo: Array | None = None, normal: Array | None = None) -> Array:
     """Denoise by the recommended call: the albedo and the normal are first denoised, each by a filter of its own.
 
-    The filter of the beauty gets the results and is told by ``cleanAux`` that they have no noise. It has the quality
-    "high", and those of albedo and normal the quality ``guides``. See https://github.com/RenderKit/oidn,
-    "prefiltering".
+    The filter of the beauty gets the results and is told by ``cleanAux`` that they have no noise. See
+    https://github.com/RenderKit/oidn, "prefiltering".
     """
     auxiliary = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
-    return denoise_with_clean(color, prefiltered(auxiliary, guides))
+    return denoise_with_clean(color, prefiltered(auxiliary))
 
 
-def prefiltered(auxiliary: Mapping[str, Array], quality: str = "high") -> dict[str, Array]:
+def prefiltered(auxiliary: Mapping[str, Array]) -> dict[str, Array]:
     """Return albedo and normal without noise, each by a filter of its own."""
-    return {name: run_filter({name: image}, quality=quality) for name, image in auxiliary.items()}
+    return {name: run_filter({name: image}, quality="high") for name, image in auxiliary.items()}
 
 
 def denoise_with_clean(color: Array, clean: Mapping[str, Array]) -> Array:

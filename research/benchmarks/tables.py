@@ -224,7 +224,6 @@ GPU_TIMES = Table(
         Column("time / OIDN's", "ms", LARGE, "ratio", against={"method": "OIDN"}),
         Column("time / prefiltered OIDN's", "ms", LARGE, "ratio", against={"method": "OIDN prefiltered"}),
         Column("with copies", "with_copies_ms", LARGE, form="{:.1f}"),
-        Column("convolutions, at least", "floor_ms", LARGE, form="{:.1f}"),
     ],
 )
 
@@ -273,7 +272,7 @@ SHOTS = Table(
 
 TIME_OF_SHOTS = Table(
     ("time_shots",),
-    ("quality", "temporal", "machine", "lamps"),
+    ("quality", "temporal", "machine"),
     ("machine", "frames", "quality", "`--temporal`"),
     ("machine", "frames", "quality", "temporal"),
     [
@@ -281,7 +280,6 @@ TIME_OF_SHOTS = Table(
         Column("ratio", "seconds", how="ratio", against={"temporal": "off"}),
         Column("peak MB", "peak_mb", form="{:.0f}"),
     ],
-    {"lamps": 0},
 )
 
 

@@ -21,7 +21,6 @@ from numpy.typing import NDArray
 
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import CROP, frame_size, set_crop, write_exr
-from research.benchmarks.render.generated_frames import splat
 from research.datagen.mitsuba.start import start as start_mitsuba
 from research.datagen.views import FILTERS
 
@@ -82,7 +81,6 @@ def mean_of_samples(
     placing: Any,
     *,
     layers: bool,
-    spread: bool = False,
 ) -> NDArray[np.float64]:
     """Render samples in launches that fit into memory and average them: (h, w, 15), or (h, w, 3) without layers.
 
@@ -90,21 +88,18 @@ def mean_of_samples(
         size: width and height.
         title: the random numbers follow from it.
         placing: pixel filter of :mod:`research.datagen.mitsuba.trace`.
-        spread: each sample also counts in the pixels around, as with Mitsuba's default filter.
     """
     from research.datagen.mitsuba.trace import LAYERS as SAMPLED
     from research.datagen.mitsuba.trace import render_samples
 
     per_launch = max(1, LAUNCH // (size[0] * size[1]))
     names = SAMPLED[:5] if layers else SAMPLED[:1]
-    total, weight = np.zeros((size[1], size[0], 3 * len(names))), np.zeros((size[1], size[0], 1))
+    total = np.zeros((size[1], size[0], 3 * len(names)))
     for done in range(0, spp, per_launch):
         count, seed = min(per_launch, spp - done), zlib.crc32(f"{title} {done}".encode())
         samples = render_samples(scene, camera, size, count, seed, names, pixel_filter=placing)  # type: ignore[arg-type]
-        values = np.concatenate([samples[name] for name in names], axis=-1)
-        sums = splat(values, samples["place"]) if spread else (values.sum(axis=0, dtype=np.float64), count)
-        total, weight = total + sums[0], weight + sums[1]
-    return total / np.maximum(weight, 1e-6)
+        total += np.concatenate([samples[name] for name in names], axis=-1).sum(axis=0, dtype=np.float64)
+    return total / spp
 
 
 def main() -> None:

@@ -46,9 +46,3 @@ def test_oidn_denoises_a_file_as_it_is_recommended(tmp_path):
     with OpenEXR.File(str(tmp_path / "out.exr")) as file:
         written = file.channels()["RGB"].pixels
     np.testing.assert_allclose(written, np.maximum(expected, 0), rtol=2e-3, atol=1e-4)
-
-
-def test_light_groups_sum_to_the_beauty(tmp_path):
-    _, high = runtime.write_pair(tmp_path, 64, 48, 2, 3)
-    (groups,) = map_render(open_exr(high)).additive_sets
-    assert len(groups.layers) == 3

@@ -101,7 +101,7 @@ def test_every_method_gets_its_share_of_the_samples(samples, spp):
             more, less = (int(n) for n in method.rpartition(", ")[2].split(":"))
             assert hrls == spp * more // (more + less), method
             assert lrhs == (spp - hrls if method.startswith("joint") else 0), method
-        elif method.endswith("same samples") or method == "full resolution":
+        elif method.endswith("same samples"):
             assert (hrls, lrhs) == (spp, 0), method
         elif method.startswith("joint") or "together" in method:
             assert (hrls, lrhs) == (half, half), method
@@ -125,20 +125,18 @@ def test_files_have_the_samples_that_their_names_say(tmp_path, monkeypatch):
 
 
 def test_each_call_of_oidn_is_the_one_that_its_name_says(monkeypatch):
-    """ "fast" has the small networks, "base guides" the base ones for albedo and normal; all others the largest."""
+    """ "fast" has the small networks; all others the largest."""
     for call in ("oidn", "oidn_prefiltered", "oidn_split"):
         monkeypatch.setattr(accuracy, call, lambda source, quality="high", call=call: (call, quality))
     monkeypatch.setattr(accuracy, "oidn_on_average", lambda lr, hr: "average")
     monkeypatch.setattr(accuracy, "match_local_means", lambda image, means: (image, means))
     scene = scenes.Scene("a", GREY, Source, lambda s, n: Source(lrhs=n, scale=s))
-    made = {name: call() for name, call in accuracy.methods(scene, [], 8) if "OIDN" in name and "bicubic" not in name}
+    made = {name: call() for name, call in accuracy.methods(scene, [], 8) if "OIDN" in name}
     for name, result in made.items():
         call = "oidn_split" if "split" in name else "oidn_prefiltered" if "prefiltered" in name else "oidn"
-        quality = "fast" if "fast" in name else "balanced" if "base guides" in name else "high"
+        quality = "fast" if "fast" in name else "high"
         if "together" in name:
             assert result == ((call, "high"), "average"), name
-        elif "on both" in name:
-            assert result == ((call, "high"), ("oidn", "high")), name
         else:
             assert result == (call, quality), name
 

@@ -12,7 +12,7 @@ otherwise. :mod:`research.benchmarks.stability.measures` says what is measured a
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,32 +20,29 @@ import numpy as np
 from oiio_msspl import fuse
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.compare import upsample_bicubic
-from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.session import Session
 from research.benchmarks import peers, results
-from research.benchmarks.stability import bases, cases, measures, report
+from research.benchmarks.stability import cases
+from research.benchmarks.stability.cases import Pair
+from research.benchmarks.stability.measures import ENLARGED, KEYS, judged, measure
 
 #: Side of the analytic frames.
 SIZE = 256
 
 #: From a pair to the picture (h, w, 3) and the warnings.
-Method = Callable[[bases.Pair], tuple[Array, list[str]]]
+Method = Callable[[Pair], tuple[Array, list[str]]]
 
 
-def enlarged(pair: bases.Pair) -> tuple[Array, list[str]]:
+def enlarged(pair: Pair) -> tuple[Array, list[str]]:
     """Enlarge the LRHS."""
-    low = measures.repaired(pair.lr.layers[RGB])
+    low = repair(pair.lr.layers[RGB])[0]
     return upsample_bicubic(low, pair.hr.data_window.width, pair.hr.data_window.height), []
 
 
-def oidn(pair: bases.Pair) -> tuple[Array, list[str]]:
-    """Denoise the HRLS."""
-    return peers.oidn(pair.hr), []
-
-
-def oidn_prefiltered(pair: bases.Pair) -> tuple[Array, list[str]]:
+def oidn_prefiltered(pair: Pair) -> tuple[Array, list[str]]:
     """Denoise the HRLS with denoised albedo and normal."""
     return peers.oidn_prefiltered(pair.hr), []
 
@@ -53,7 +50,7 @@ def oidn_prefiltered(pair: bases.Pair) -> tuple[Array, list[str]]:
 def ours(session: Session) -> Method:
     """Return the method that fuses with a model."""
 
-    def run(pair: bases.Pair) -> tuple[Array, list[str]]:
+    def run(pair: Pair) -> tuple[Array, list[str]]:
         fused = fuse(pair.lr, pair.hr, session)
         return fused.rgb, fused.warnings
 
@@ -63,32 +60,23 @@ def ours(session: Session) -> Method:
 def methods_for(scale: int, sessions: list[Session]) -> dict[str, Method]:
     """Return the methods of a scale by name."""
     models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-    denoisers = {"OIDN on the HRLS": oidn, "OIDN prefiltered on the HRLS": oidn_prefiltered}
-    return {report.ENLARGED: enlarged, **models, **denoisers}
-
-
-def groups_of(scale: int, size: int) -> Iterator[tuple[str, Iterator[cases.Case]]]:
-    """Yield each group and its cases."""
-    for name, anywhere in cases.ANYWHERE.items():
-        yield name, anywhere(cases.room(size), scale)
-    for name, made in cases.MADE.items():
-        yield name, made(size, scale)
+    return {ENLARGED: enlarged, **models, "OIDN prefiltered on the HRLS": oidn_prefiltered}
 
 
 def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any]]:
-    """Return what :func:`measures.measure` finds for each case and method, and the columns that tell them apart."""
+    """Return what :func:`measure` finds for each case and method, and the columns that tell them apart."""
     rows = []
-    for group, members in groups_of(scale, size):
-        undisturbed: dict[tuple[str, bases.Pair], Array] = {}
-        for case in members:
+    for group, make in cases.GROUPS.items():
+        undisturbed: dict[tuple[str, Pair], Array] = {}
+        for case in make(size, scale):
             pictures: dict[str, Array] = {}
             for name, method in methods.items():
                 if case.clean is not None and (name, case.clean) not in undisturbed:
                     undisturbed[name, case.clean] = method(case.clean)[0]
                 pictures[name], warnings = method(case.pair)
                 clean = undisturbed[name, case.clean] if case.clean is not None else None
-                figures = measures.measure(case, pictures[name], clean, pictures[report.ENLARGED], warnings)
-                key = {"scale": scale, "scenes": "analytic", "group": group, "case": case.name, "method": name}
+                figures = measure(case, pictures[name], clean, pictures[ENLARGED], warnings)
+                key = {"scale": scale, "group": group, "case": case.name, "method": name}
                 rows.append({**key, **figures})
         print(f"x{scale}: {group}", file=sys.stderr)
     return rows
@@ -106,7 +94,7 @@ def main() -> None:
     sessions = [Session(file, threads=args.threads) for file in files]
     scales = args.scale or (sorted({session.contract.scale for session in sessions}) if args.model else [4])
     rows = [row for scale in scales for row in run(scale, methods_for(scale, sessions), args.size)]
-    results.show(results.plain, report.judged(rows), args.table, report.KEYS)
+    results.show(results.plain, judged(rows), args.table, KEYS)
 
 
 if __name__ == "__main__":

@@ -4,31 +4,21 @@
     python -m research.benchmarks.passes PASSES --table research/benchmarks/results/passes.csv
     python -m research.benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
 
-PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datagen.cycles.passes``. The methods, all but
-the first two with the albedo and the normal:
+PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datagen.cycles.passes``. The methods:
 
 - "HRLS": the layers as they are rendered.
-- "ratio": the fused beauty, divided as the noisy layers of the HRLS divide theirs.
-- "OIDN": Open Image Denoise on each layer of the HRLS, the plain call. Its layers do not sum to a denoised beauty.
-- "OIDN, rescaled": the same, scaled so that they sum to the fused beauty.
-- "OIDN, prefiltered, rescaled": the same with the call that OIDN's documentation recommends.
-- "OIDN, prefiltered, stored": the same, but light of a layer that is stored as light and colour is left out where the
-  colour is black, because no file can hold it. The layers are then scaled to the sum.
+- "OIDN, prefiltered, rescaled": Open Image Denoise on each layer of the HRLS, as its documentation recommends. The
+  layers are scaled so that they sum to the beauty of ``--quality best``. Albedo and normal are prefiltered once.
 - "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
   so that they sum to the beauty that OIDN makes of this render.
 - "msspl": :mod:`oiio_msspl.fusion.passes.fuse`.
-- "msspl, HRLS alone": the same without the layers of the LRHS.
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
 - "msspl, best, at half size": light groups at half of the frame's resolution, as if there were many of them.
-
-Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
 
 Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
 part of the sum, but is not scored: every method has a high PSNR there.
 
-"Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
-"Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
-beauty, as a multiple of OIDN's plain call on the beauty.
+The time is that of all layers of a set, without the beauty, as a multiple of OIDN's plain call on the beauty.
 """
 
 from __future__ import annotations
@@ -51,7 +41,6 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import layer_names, light_of
 from oiio_msspl.fusion.tiles.network import layer_fuser
@@ -75,10 +64,6 @@ FAINT = 0.01
 BALANCED, BEST = "joint", "joint-large"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
-#: The peer as a file can hold it.
-STORED_PEER = "OIDN, prefiltered, stored"
-#: The set whose layers are products of light and colour in some renderers.
-COMPONENTS = "components"
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
@@ -117,19 +102,15 @@ def methods(
     """
     noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
-    beauty = fused[BEST][0].rgb
-
-    def plain() -> Array:
-        return np.maximum([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy], np.float32(0))
 
     def recommended(noisy: Array, guides: Mapping[str, Array]) -> Array:
         clean = prefiltered({name: guides[name] for name in (ALBEDO, NORMAL)})
         return np.maximum([denoise_with_clean(layer, clean) for layer in noisy], np.float32(0))
 
-    def ours(low: MappedRender, model: str, *, half: bool = False) -> Array:
+    def ours(model: str, *, half: bool = False) -> Array:
         frame, session = fused[model]
         with patch("oiio_msspl.fusion.passes.network.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
-            inputs = PassInputs(low, hr, frame.rgb, frame.alignment, [layers], frame.clean_aovs)
+            inputs = PassInputs(lr, hr, frame.rgb, frame.alignment, [layers], frame.clean_aovs)
             made = fuse_passes(inputs, fuse_layers=layer_fuser(session, frame))
         assert not made.refused
         height = hr.data_window.height
@@ -137,22 +118,16 @@ def methods(
         return colours * np.moveaxis(np.asarray(planes, np.float32), 1, -1)
 
     yield "HRLS", lambda: noisy
-    yield "ratio", lambda: rescaled(noisy, beauty)
-    yield "OIDN", plain
-    yield "OIDN, rescaled", lambda: rescaled(plain(), beauty)
-    yield PEER, lambda: rescaled(recommended(noisy, guides), beauty)
-    if layers.name == COMPONENTS:
-        yield STORED_PEER, lambda: rescaled(recommended(noisy, guides) * (colours >= DARKEST_COLOUR), beauty)
+    yield PEER, lambda: rescaled(recommended(noisy, guides), fused[BEST][0].rgb)
     if ordinary is not None:
         theirs = layers_of(ordinary, layers_like(ordinary, layers))
         pixels = ordinary.load().layers
         total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
         yield "OIDN, ordinary render", lambda: rescaled(recommended(theirs, pixels), total)
-    yield "msspl", lambda: ours(lr, BALANCED)
-    yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]), BALANCED)
-    yield "msspl, best", lambda: ours(lr, BEST)
+    yield "msspl", lambda: ours(BALANCED)
+    yield "msspl, best", lambda: ours(BEST)
     if layers.name == LIGHT_GROUPS:
-        yield "msspl, best, at half size", lambda: ours(lr, BEST, half=True)
+        yield "msspl, best, at half size", lambda: ours(BEST, half=True)
 
 
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
@@ -191,26 +166,21 @@ def picture(folder: Path, output: Path) -> None:
 
 
 def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
-    """Return a row for each layer that is bright enough, and their mean with the regraded picture."""
+    """Return the mean of the layers that are bright enough, and a row for each."""
     light = reference.sum(axis=(1, 2, 3))
     rows: list[Row] = [
         {"layer": name, "psnr": psnr(layer, truth), "relmse": relmse(layer, truth)}
         for name, layer, truth, share in zip(names, layers, reference, light / light.sum(), strict=True)
         if share >= FAINT
     ]
-    graded, truth = regraded(layers), regraded(reference)
-    errors = np.mean((srgb(graded) - srgb(truth)) ** 2, axis=-1).ravel()
-    worst = np.sort(errors)[-len(errors) // 100 :].mean()
-    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}
-    regrade = {"regraded_psnr": psnr(graded, truth), "regraded_relmse": relmse(graded, truth)}
-    return [{"layer": ALL, **means, **regrade, "worst_psnr": float(-10 * np.log10(worst))}, *rows]
+    return [{"layer": ALL} | {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}, *rows]
 
 
 def model_used(method: str, scale: int) -> Row:
-    """Return the column ``model`` of a method: the model of its beauty, to which all but two methods are rescaled."""
+    """Return the column ``model`` of a method: the model of its beauty, to which `PEER` is rescaled, too."""
     if method.startswith("msspl"):
         return {"model": f"{BEST if 'best' in method else BALANCED}-x{scale}"}
-    return {"model": f"{BEST}-x{scale}"} if any(w in method for w in ("rescaled", "stored", "ratio")) else {}
+    return {"model": f"{BEST}-x{scale}"} if method == PEER else {}
 
 
 def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
@@ -273,7 +243,7 @@ def main() -> None:
     rows: list[Row] = []
     for scene, spp, scale in itertools.product(scenes, SPP, SCALES):
         measured = {tuple(row[key] for key in KEYS) for row in rows}
-        # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
+        # Methods without an LRHS are measured at the first scale alone.
         rows += measure(args.passes / scene, scale, spp, measured)
         print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
     print(results.plain(means(rows)))

@@ -2,7 +2,6 @@
 """Measure how long every method takes: a frame in memory, whole commands, shots, and rendering itself.
 
     python -m research.benchmarks.runtime command --table research/benchmarks/results/time_command.csv
-    python -m research.benchmarks.runtime command --size 8192x4320 --scale 4 --quality balanced
     python -m research.benchmarks.runtime frame --table research/benchmarks/results/time_frame.csv
     python -m research.benchmarks.runtime shots --table research/benchmarks/results/time_shots.csv
     python -m research.benchmarks.runtime render SCENES --table research/benchmarks/results/time_render.csv
@@ -99,16 +98,16 @@ def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Path,
     return paths
 
 
-def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[[], Any]:
+def prepare_model(name: str, height: int, width: int) -> Callable[[], Any]:
     """Return a call of :func:`oiio_msspl.fuse` on arrays."""
     from oiio_msspl import Session, find_model, fuse
 
-    session = Session(find_model(0, name), threads=threads)
+    session = Session(find_model(0, name))
     low, high = pair(height, width, session.contract.scale)
     return partial(fuse, low, high, session)
 
 
-def prepare_oidn(name: str, height: int, width: int, _: int = 0) -> Callable[[], Any]:
+def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
     """Return a call of OIDN on arrays."""
     from oiio_msspl import Render
     from research.benchmarks import oidn, peers
@@ -136,7 +135,7 @@ def time_frame(args: argparse.Namespace) -> list[Row]:
     jobs = {}
     for case in fnmatch.filter(cases, args.methods):
         name = "prepare_oidn" if case in SAME_WORK.values() else "prepare_model"
-        arguments = (case, height, width, args.threads)
+        arguments = (case, height, width)
         jobs[case] = timer.Function(f"research.benchmarks.runtime:{name}", arguments, args.repeats)
     return [
         {"method": case, "size": f"{width}x{height}", **results.model_of(case), **timer.summary(runs)}
@@ -155,9 +154,7 @@ def time_command(args: argparse.Namespace) -> list[Row]:
         fuse = [str(Path(sys.executable).with_name("msspl-fuse")), str(low), str(high), "-o", f"{folder}/out.exr"]
         fuse += ["--overwrite", "--no-preview"]
         jobs = {find_model(args.scale, name).stem: [*fuse, "--model", name] for name in args.quality}
-        if not args.without_oidn:
-            oidn = [sys.executable, "-m", "research.benchmarks.oidn", str(high), f"{folder}/oidn.exr"]
-            jobs[OIDN_PREFILTERED] = oidn
+        jobs[OIDN_PREFILTERED] = [sys.executable, "-m", "research.benchmarks.oidn", str(high), f"{folder}/oidn.exr"]
         runs = timer.in_turn(jobs, args.rounds)
     size = {"size": f"{width}x{height}", "scale": args.scale}
     return [
@@ -246,8 +243,6 @@ def main() -> None:
     parser.add_argument("--quality", nargs="+", default=["fast", "balanced", "best", "paper"], help="or models")
     parser.add_argument("--methods", metavar="PATTERN", default="*", help="frame: measure only these")
     parser.add_argument("--repeats", type=int, default=2, help="frame: calls that are timed in a process")
-    parser.add_argument("--threads", type=int, default=0, help="frame: of ONNX Runtime; 0: one a core")
-    parser.add_argument("--without-oidn", action="store_true", help="command: leave OIDN out")
     parser.add_argument("--frames", type=int, default=24, help="shots: frames of the shot")
     args = parser.parse_args()
     measure, keys, size = QUESTIONS[args.question]

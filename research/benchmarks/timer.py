@@ -36,14 +36,8 @@ class Function:
 
     def command(self) -> list[str]:
         """Return the command that runs it."""
-        return [
-            sys.executable,
-            "-m",
-            "research.benchmarks.timer",
-            self.name,
-            str(self.repeats),
-            json.dumps(self.arguments),
-        ]
+        module = [sys.executable, "-m", "research.benchmarks.timer"]
+        return [*module, self.name, str(self.repeats), json.dumps(self.arguments)]
 
 
 @dataclass(frozen=True)
@@ -56,12 +50,8 @@ class Run:
     peak_mb: float
 
 
-def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int, idle: float = 0.0) -> dict[Any, list[Run]]:
-    """Run every job once in each round, in the order of the mapping; return the runs of each.
-
-    Args:
-        jobs: functions, or commands as lists of words.
-        idle: seconds to wait before each run.
+def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int) -> dict[Any, list[Run]]:
+    """Run every job, a function or a command as a list of words, once in each round; return the runs of each.
 
     Raises:
         SystemExit: a job fails. The message is what it printed.
@@ -69,7 +59,6 @@ def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int, idle: flo
     runs: dict[Any, list[Run]] = {name: [] for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
-            time.sleep(idle)
             runs[name].append(run(job))
     return runs
 

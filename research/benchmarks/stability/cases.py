@@ -120,9 +120,9 @@ def fireflies(size: int, scale: int) -> Iterator[Case]:
         hot = value * float(clean.reference.mean())
         lobes = (RGB, SPECULAR)
         hr, lr = with_pixels(clean.hr, hot, 1e-3, lobes), with_pixels(clean.lr, hot, 1e-3)
-        size = f"{value:.0e}".replace("e+0", "e")
-        yield Case(f"0.1 % of the HRLS, {size} times the mean", Pair(clean.lr, hr, clean.reference), clean)
-        yield Case(f"0.1 % of the LRHS, {size} times the mean", Pair(lr, clean.hr, clean.reference), clean)
+        times = f"{value:.0e}".replace("e+0", "e")
+        yield Case(f"0.1 % of the HRLS, {times} times the mean", Pair(clean.lr, hr, clean.reference), clean)
+        yield Case(f"0.1 % of the LRHS, {times} times the mean", Pair(lr, clean.hr, clean.reference), clean)
 
 
 def broken_values(size: int, scale: int) -> Iterator[Case]:

@@ -25,7 +25,7 @@ def test_whole_commands_read_the_same_pair(monkeypatch):
         return {name: [RUN] * rounds for name in jobs}
 
     monkeypatch.setattr(timer, "in_turn", in_turn)
-    args = Namespace(size=(64, 32), scale=2, quality=["fast", "best", "paper"], without_oidn=False, rounds=3)
+    args = Namespace(size=(64, 32), scale=2, quality=["fast", "best", "paper"], rounds=3)
     rows = runtime.time_command(args)
     assert list(given) == ["joint-small-x2", "joint-large-x2", "paper-x2", runtime.OIDN_PREFILTERED]
     for name, quality in zip(given, args.quality, strict=False):

@@ -79,7 +79,7 @@ class Table:
         for row in rows:
             row["kind"] = row.get("kind", re.sub(r"_\d+$", "", row.get("layer", "")))  # lamps count as one layer
             row["family"] = re.sub(r"-x\d$", "", row.get("method", ""))
-        rows = matching(rows, self.where)
+        rows = results.where(rows, **self.where)
         peers = results.index(rows, "source", *self.keys)
         used: list[Row] = []
         body = []
@@ -103,7 +103,7 @@ class Table:
         wanted = {**line.where, **column.where}
         if "method" in wanted and column.renamed:
             wanted["method"] = column.renamed.get(wanted["method"], wanted["method"])
-        chosen = [row for row in matching(rows, wanted) if all(name in row for name in _measures(column))]
+        chosen = [row for row in results.where(rows, **wanted) if all(name in row for name in _measures(column))]
         if not chosen:
             return ""
         against = column.against or line.against
@@ -184,15 +184,6 @@ def _ends(means: NDArray[np.float64]) -> tuple[float, float]:
 def _with_ends(value: tuple[float, float, float], form: str) -> str:
     middle, low, high = (format(number, form) for number in value)
     return f"{middle} ({low} to {high})"
-
-
-def matching(rows: Sequence[Row], wanted: Mapping[str, Wanted]) -> list[Row]:
-    """Return the rows that have the wanted values, or whose values pass the tests."""
-    return [row for row in rows if all(_fits(row.get(name), value) for name, value in wanted.items())]
-
-
-def _fits(value: Any, wanted: Wanted) -> bool:
-    return bool(wanted(value)) if callable(wanted) else value == wanted
 
 
 def label(value: Any) -> str:

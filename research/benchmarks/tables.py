@@ -19,12 +19,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SPREAD
 from research.benchmarks import accuracy, paper, passes, results, runtime
-from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label, matching
+from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
 from research.benchmarks.scenes import NOISY_REFERENCE
@@ -47,21 +45,10 @@ def _on(instructions: str) -> dict[str, Wanted]:
     return {"machine": lambda name: name is not None and name.endswith(instructions)}
 
 
-def strongest(rows: Sequence[Row], input_name: str) -> str:
-    """Return the call of OIDN on this input with the highest mean PSNR over all average spp."""
-    means = [row for row in rows if row["scene"] == MEAN and row["method"].startswith("OIDN")]
-    psnr: dict[str, list[float]] = {}
-    for row in means:
-        if row["method"].endswith(input_name):
-            psnr.setdefault(row["method"], []).append(row["psnr"])
-    return max(psnr, key=lambda method: float(np.mean(psnr[method])))
-
-
 FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "joint-large-x2"
-ON_HRLS, JOINED, SAME_SAMPLES = (
-    strongest(results.read("accuracy"), name) for name in (" on the HRLS", " on both x2, together", ", same samples")
-)
-#: OIDN at its best -> which render it gets.
+ON_HRLS, SAME_SAMPLES = "OIDN prefiltered on the HRLS", "OIDN prefiltered, same samples"
+JOINED = "OIDN prefiltered on both x2, together"
+#: OIDN at its best on each input -> which render it gets.
 PLACES = {ON_HRLS: "on the HRLS", JOINED: "on both renders, joined", SAME_SAMPLES: "at full resolution, same samples"}
 SETS = {
     "Mitsuba": "accuracy",
@@ -375,7 +362,7 @@ def measured_models() -> str:
         for noise, table in sets.items()
     }
     times = results.read("time_frame")
-    runs = [results.index(matching(times, _on(ending)), "method") for ending in MACHINES.values()]
+    runs = [results.index(results.where(times, **_on(ending)), "method") for ending in MACHINES.values()]
     lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
         rows = [means[SPREAD if f"{SPREAD}-x" in name else ""].get((spp, name)) for spp in (2, 8)]

@@ -11,7 +11,6 @@ LRHS have albedo, normal, diffuse and specular. Files that exist are kept.
 from __future__ import annotations
 
 import argparse
-import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -112,9 +111,8 @@ def main() -> None:
     args = parser.parse_args()
     start_mitsuba(args.threads)
     for file in sorted(args.scenes.glob("*/scene.xml")):
-        start = time.perf_counter()
+        print(file.parent.name, flush=True)
         render(file, args.out / file.parent.name, args.filter, args.reference)
-        print(f"{file.parent.name}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ exist is kept.
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 from typing import Any
 
@@ -88,9 +87,8 @@ def main() -> None:
     args = parser.parse_args()
     start_mitsuba(args.threads)
     for file in sorted(args.scenes.glob("*/scene.xml")):
-        start = time.perf_counter()
+        print(file.parent.name, flush=True)
         render(file, args.out / file.parent.name, args.reference)
-        print(f"{file.parent.name}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

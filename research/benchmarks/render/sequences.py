@@ -24,7 +24,6 @@ counts in the pixels around it, too, in layers as in the beauty.
 from __future__ import annotations
 
 import argparse
-import time
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -264,10 +263,10 @@ def main() -> None:
     mi = start_mitsuba(args.threads)
     for name in args.sequence or names:
         scene, _, kind = name.partition("/")
-        file, start = args.scenes / scene / "scene.xml", time.perf_counter()
+        print(name, flush=True)
+        file = args.scenes / scene / "scene.xml"
         made = _AnimatedRoom(kind) if scene == "room" else _FileScene(mi, file, moving=kind == "moving")
         render_sequence(mi, made, args.folder / scene / kind, "gaussian" if args.spread else "box")
-        print(f"{name}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

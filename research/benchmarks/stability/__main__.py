@@ -86,14 +86,12 @@ def main() -> None:
     """Measure the models of some scales."""
     parser = results.parser(__doc__)
     parser.add_argument("--model", action="append", default=[], help="ONNX file or shipped name; repeat it for more")
-    parser.add_argument("--scale", type=int, action="append", choices=SCALES, help="default: those of --model, or 4")
+    parser.add_argument("--scale", type=int, nargs="+", choices=SCALES, default=[2, 4], help="default: 2 4")
     parser.add_argument("--size", type=int, default=SIZE, help="side of the frames (%(default)s)")
-    parser.add_argument("--threads", type=int, default=0, help="of ONNX Runtime; 0: one a core")
     args = parser.parse_args()
     files = [find_model(4, name) for name in args.model] or list(shipped_models().values())
-    sessions = [Session(file, threads=args.threads) for file in files]
-    scales = args.scale or (sorted({session.contract.scale for session in sessions}) if args.model else [4])
-    rows = [row for scale in scales for row in run(scale, methods_for(scale, sessions), args.size)]
+    sessions = [Session(file) for file in files]
+    rows = [row for scale in args.scale for row in run(scale, methods_for(scale, sessions), args.size)]
     results.show(results.plain, judged(rows), args.table, KEYS)
 
 

@@ -22,6 +22,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
 from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
@@ -38,7 +39,7 @@ SCALE, BATCH, PATCH, LEARNING_RATE = 4, 4, 96, 4e-4
 POOL = 400
 #: Features by the tables' names; each entry includes those before it.
 LAYERS = {"RGB": [RGB], "and albedo": [ALBEDO], "and normal": [NORMAL], "and diffuse, specular": [DIFFUSE, SPECULAR]}
-NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
+NONE, COLOUR, ALL = "none", "RGB", "and diffuse, specular"
 #: The paper's upper bound of radiance.
 CLIP = 100.0
 
@@ -48,8 +49,8 @@ class Variant:
     """One row of the tables."""
 
     name: str
-    lrhs: str = RGB
-    hrls: str = RGB
+    lrhs: str = COLOUR
+    hrls: str = COLOUR
     loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
 
 
@@ -63,7 +64,7 @@ def _robust(beta: float) -> Callable[[Tensor, Tensor], Tensor]:
 
 VARIANTS = [
     Variant("both RGB, l1"),
-    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != RGB),
+    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != COLOUR),
     *(Variant(f"LRHS: {name}", lrhs=name) for name in (NONE, ALL)),
     *(Variant(f"robust loss, beta {beta:g}", loss=_robust(beta)) for beta in (0.01, 0.1, 1.0)),
     Variant("l1 of linear radiance", loss=_in_linear(losses.l1)),
@@ -71,21 +72,13 @@ VARIANTS = [
 ]
 
 
-@dataclass(frozen=True)
-class Pair:
-    """One crop of one view, encoded; channels in the order of :data:`oiio_msspl.aovs.features.HRLS_FEATURES`."""
+def pair_of(view: View, top: int, left: int, patch: int, chosen: int) -> tuple[Array, Array, Array]:
+    """Return a crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``.
 
-    lrhs: np.ndarray
-    """(h, w, 16)"""
-    hrls: np.ndarray
-    """(s*h, s*w, 16)"""
-    target: np.ndarray
-    """(s*h, s*w, 3), linear"""
-    exposure: float
-
-
-def pair_of(view: View, top: int, left: int, patch: int, chosen: int) -> Pair:
-    """Return a crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
+    Returns:
+        The LRHS (h, w, 16) and the HRLS (s h, s w, 16), encoded, with the channels of
+        :data:`oiio_msspl.aovs.features.HRLS_FEATURES`, and the reference (s h, s w, 3), exposed.
+    """
     rows, columns = slice(top, top + patch), slice(left, left + patch)
     colour = mean_lrhs(view, list(range(len(view.lr_spp))), SCALE)
     exposure = find_exposure(colour)
@@ -95,8 +88,8 @@ def pair_of(view: View, top: int, left: int, patch: int, chosen: int) -> Pair:
     low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), SCALE)
     low[..., :3] = colour[low_rows, low_columns]
     high = read_hrls(view, [chosen], rows, columns)[0]
-    encoded = [packed(split_features(passes), exposure) for passes in (low, high)]
-    return Pair(encoded[0], encoded[1], as_float32(view.ref[rows, columns]), exposure)
+    lrhs, hrls = (packed(split_features(passes), exposure) for passes in (low, high))
+    return lrhs, hrls, as_float32(view.ref[rows, columns]) * np.float32(exposure)
 
 
 def channels_of(name: str) -> Tensor:
@@ -106,7 +99,7 @@ def channels_of(name: str) -> Tensor:
     return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
 
 
-def pool(views: tuple[View, ...]) -> list[tuple[Tensor, Tensor, Tensor]]:
+def pool(views: list[View]) -> list[list[Tensor]]:
     """Return batches of LRHS, HRLS and target, encoded."""
     rng = np.random.default_rng(0)
     batches = []
@@ -115,19 +108,12 @@ def pool(views: tuple[View, ...]) -> list[tuple[Tensor, Tensor, Tensor]]:
         for view in (views[i] for i in rng.integers(len(views), size=BATCH)):
             top, left = 8 * rng.integers((view.ref.shape[0] - PATCH) // 8 + 1, size=2)
             pairs.append(pair_of(view, int(top), int(left), PATCH, int(rng.integers(len(view.hr)))))
-        stacks = (
-            [pair.lrhs for pair in pairs],
-            [pair.hrls for pair in pairs],
-            [encode_radiance(pair.target, pair.exposure) for pair in pairs],
-        )
-        lrhs, hrls, target = (to_tensor(np.stack(images), torch.device("cpu")) for images in stacks)
-        batches.append((lrhs, hrls, target))
+        lrhs, hrls, references = (np.stack(images) for images in zip(*pairs, strict=True))
+        batches.append([to_tensor(x, torch.device("cpu")) for x in (lrhs, hrls, encode_radiance(references, 1.0))])
     return batches
 
 
-def train(
-    variant: Variant, batches: list[tuple[Tensor, Tensor, Tensor]], steps: int, *, bfloat16: bool
-) -> MultiResolutionFusion:
+def train(variant: Variant, batches: list[list[Tensor]], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
     """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
     network = MultiResolutionFusion(SCALE, **REDUCED, lrhs_channels=HRLS_CHANNELS)
@@ -148,14 +134,13 @@ def train(
 
 
 @torch.inference_mode()
-def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
+def evaluate(network: MultiResolutionFusion, variant: Variant, views: list[View]) -> dict[str, float]:
     """Return mean sRGB PSNR and RelMSE of the network."""
     scored = []
     for view in views:
-        pair = pair_of(view, 0, 0, view.ref.shape[0], 0)
-        lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
+        *pair, reference = pair_of(view, 0, 0, view.ref.shape[0], 0)
+        lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in pair)
         fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
-        reference = pair.target * np.float32(pair.exposure)
         image = decode_radiance(fused.numpy(), 1.0)
         scored.append([psnr(image, reference), relmse(image, reference)])
     return dict(zip(("psnr", "relmse"), np.mean(scored, axis=0).tolist(), strict=True))
@@ -171,7 +156,7 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     folder = Folder(args.views)
-    views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
+    views, held_out = (folder.split(split) for split in ("train", "validation"))
     effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in results.read(args.table)} if args.table and args.table.exists() else set()
     batches = pool(views)
@@ -179,7 +164,7 @@ def main() -> None:
         if variant.name not in done:
             network = train(variant, batches, args.steps, bfloat16=args.precision == "bf16")
             row = {"name": variant.name, **evaluate(network, variant, held_out), **effort}
-            results.show(results.plain, [row], args.table, ("name",))
+            results.show([row], args.table, ("name",))
 
 
 if __name__ == "__main__":

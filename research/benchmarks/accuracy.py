@@ -188,7 +188,7 @@ def main() -> None:
     rows = [row for scene in loaded for row in measure(scene, sessions, flip=args.flip, pattern=pattern)]
     if not rows:
         parser.error(f"no method matches {args.methods}")
-    results.show(results.plain, with_means(rows), args.table, KEYS if args.methods else ())
+    results.show(with_means(rows), args.table, KEYS if args.methods else ())
 
 
 if __name__ == "__main__":

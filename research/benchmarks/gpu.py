@@ -120,7 +120,7 @@ def main() -> None:
         key = {"size": f"{width} x {height}", "machine": torch.cuda.get_device_name()}
         rows += [key | {"method": name, **time_oidn(name, height, width)} for name in OIDN]
         rows += [{**key, "method": name, "model": f"gpu/{name}", **time_model(name, height, width)} for name in MODELS]
-    results.show(results.plain, rows, args.table)
+    results.show(rows, args.table)
 
 
 if __name__ == "__main__":

@@ -69,7 +69,6 @@ class Table:
     lines: Sequence[Line] | Sequence[str]
     """The lines; or names of columns: then each combination of their values is a line."""
     columns: Sequence[Column]
-    where: Mapping[str, Wanted] = field(default_factory=dict)
     means: bool = False
     """Say which scenes means are over."""
 
@@ -79,7 +78,6 @@ class Table:
         for row in rows:
             row["kind"] = row.get("kind", re.sub(r"_\d+$", "", row.get("layer", "")))  # lamps count as one layer
             row["family"] = re.sub(r"-x\d$", "", row.get("method", ""))
-        rows = results.where(rows, **self.where)
         peers = results.index(rows, "source", *self.keys)
         used: list[Row] = []
         body = []

@@ -231,7 +231,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     args = parser.parse_args()
     views = [View(file.parent) for file in sorted(args.frames.glob("*/hr_1spp.exr"))]
-    results.show(results.plain, rows_of(args.scenes, views, args.processes), args.table, ("scenes", "pairs"))
+    results.show(rows_of(args.scenes, views, args.processes), args.table, ("scenes", "pairs"))
 
 
 if __name__ == "__main__":

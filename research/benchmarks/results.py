@@ -14,7 +14,7 @@ import functools
 import platform
 import re
 import subprocess
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -195,8 +195,8 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return made
 
 
-def show(layout: Callable[[list[Row]], str], rows: list[Row], table: Path | None, keys: Sequence[str] = ()) -> None:
+def show(rows: list[Row], table: Path | None, keys: Sequence[str] = ()) -> None:
     """Print rows, and write them to a table if there is one."""
-    print(layout(rows))
+    print(plain(rows))
     if table:
         write(table, rows, keys)

@@ -98,20 +98,14 @@ def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Path,
     return paths
 
 
-def prepare_model(name: str, height: int, width: int) -> Callable[[], Any]:
-    """Return a call of :func:`oiio_msspl.fuse` on arrays."""
-    from oiio_msspl import Session, find_model, fuse
-
-    session = Session(find_model(0, name))
-    low, high = pair(height, width, session.contract.scale)
-    return partial(fuse, low, high, session)
-
-
-def prepare_oidn(name: str, height: int, width: int) -> Callable[[], Any]:
-    """Return a call of OIDN on arrays."""
-    from oiio_msspl import Render
+def prepare(name: str, height: int, width: int) -> Callable[[], Any]:
+    """Return a call of a model or of OIDN on arrays."""
+    from oiio_msspl import Render, Session, find_model, fuse
     from research.benchmarks import oidn, peers
 
+    if name not in SAME_WORK.values():
+        session = Session(find_model(0, name))
+        return partial(fuse, *pair(height, width, session.contract.scale), session)
     layers = frame(height, width)
     images = {"color": layers["rgb"], "albedo": layers["albedo"], "normal": layers["normal"]}
     if name == OIDN_SPLIT:
@@ -132,11 +126,10 @@ def time_frame(args: argparse.Namespace) -> list[Row]:
 
     width, height = args.size
     cases = [*shipped_models(), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_SPLIT]
-    jobs = {}
-    for case in fnmatch.filter(cases, args.methods):
-        name = "prepare_oidn" if case in SAME_WORK.values() else "prepare_model"
-        arguments = (case, height, width)
-        jobs[case] = timer.Function(f"research.benchmarks.runtime:{name}", arguments, args.repeats)
+    jobs = {
+        case: timer.Function("research.benchmarks.runtime:prepare", (case, height, width), args.repeats)
+        for case in fnmatch.filter(cases, args.methods)
+    }
     return [
         {"method": case, "size": f"{width}x{height}", **results.model_of(case), **timer.summary(runs)}
         | (oidn_version() if case in SAME_WORK.values() else {})
@@ -248,7 +241,7 @@ def main() -> None:
     measure, keys, size = QUESTIONS[args.question]
     args.size = [int(side) for side in (args.size or size).split("x")]
     rows = [{"machine": results.processor(), **row} for row in measure(args)]
-    results.show(results.plain, rows, args.table, keys)
+    results.show(rows, args.table, keys)
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def main() -> None:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))
         rows = list(measure(sequence, made, spread=args.spread))
-        results.show(results.plain, rows, args.table, KEYS)
+        results.show(rows, args.table, KEYS)
         if index == 0 and (args.picture or args.film):
             draw(args, sequence, made)
 

@@ -27,7 +27,7 @@ from oiio_msspl.model.session import Session
 from research.benchmarks import peers, results
 from research.benchmarks.stability import cases
 from research.benchmarks.stability.cases import Pair
-from research.benchmarks.stability.measures import ENLARGED, KEYS, judged, measure
+from research.benchmarks.stability.measures import KEYS, judged, measure
 
 #: Side of the analytic frames.
 SIZE = 256
@@ -36,10 +36,9 @@ SIZE = 256
 Method = Callable[[Pair], tuple[Array, list[str]]]
 
 
-def enlarged(pair: Pair) -> tuple[Array, list[str]]:
+def enlarged(pair: Pair) -> Array:
     """Enlarge the LRHS."""
-    low = repair(pair.lr.layers[RGB])[0]
-    return upsample_bicubic(low, pair.hr.data_window.width, pair.hr.data_window.height), []
+    return upsample_bicubic(repair(pair.lr.layers[RGB])[0], pair.hr.data_window.width, pair.hr.data_window.height)
 
 
 def oidn_prefiltered(pair: Pair) -> tuple[Array, list[str]]:
@@ -60,7 +59,7 @@ def ours(session: Session) -> Method:
 def methods_for(scale: int, sessions: list[Session]) -> dict[str, Method]:
     """Return the methods of a scale by name."""
     models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-    return {ENLARGED: enlarged, **models, "OIDN prefiltered on the HRLS": oidn_prefiltered}
+    return models | {"OIDN prefiltered on the HRLS": oidn_prefiltered}
 
 
 def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any]]:
@@ -69,15 +68,14 @@ def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any
     for group, make in cases.GROUPS.items():
         undisturbed: dict[tuple[str, Pair], Array] = {}
         for case in make(size, scale):
-            pictures: dict[str, Array] = {}
+            small = enlarged(case.pair)
             for name, method in methods.items():
                 if case.clean is not None and (name, case.clean) not in undisturbed:
                     undisturbed[name, case.clean] = method(case.clean)[0]
-                pictures[name], warnings = method(case.pair)
+                image, warnings = method(case.pair)
                 clean = undisturbed[name, case.clean] if case.clean is not None else None
-                figures = measure(case, pictures[name], clean, pictures[ENLARGED], warnings)
                 key = {"scale": scale, "group": group, "case": case.name, "method": name}
-                rows.append({**key, **figures})
+                rows.append(key | measure(case, image, clean, small, warnings))
         print(f"x{scale}: {group}", file=sys.stderr)
     return rows
 
@@ -92,7 +90,7 @@ def main() -> None:
     files = [find_model(4, name) for name in args.model] or list(shipped_models().values())
     sessions = [Session(file) for file in files]
     rows = [row for scale in args.scale for row in run(scale, methods_for(scale, sessions), args.size)]
-    results.show(results.plain, judged(rows), args.table, KEYS)
+    results.show(judged(rows), args.table, KEYS)
 
 
 if __name__ == "__main__":

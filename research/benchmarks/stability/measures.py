@@ -19,7 +19,6 @@ from research.benchmarks import results
 from research.benchmarks.results import Row
 from research.benchmarks.stability.cases import DISAGREE, Case, Pair
 
-ENLARGED = "LRHS enlarged"
 #: Columns of the table: what tells its rows apart, and figures.
 KEYS = ("scale", "group", "case", "method")
 COLUMNS = ("psnr", "cost", "range", "holes", "stamps")
@@ -124,12 +123,11 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
 
 
 def judged(measured: Sequence[dict[str, Any]]) -> list[Row]:
-    """Return the table's rows: `KEYS`, `COLUMNS`, and, except for the enlarged LRHS, ``verdict`` and ``sentence``."""
+    """Return the table's rows: `KEYS`, `COLUMNS`, ``verdict`` and ``sentence``."""
     rows = []
     for figures in measured:
         row = {key: figures[key] for key in (*KEYS, *COLUMNS) if key in figures} | results.model_of(figures["method"])
-        if row["method"] != ENLARGED:
-            row["verdict"], row["sentence"] = verdict(figures)
+        row["verdict"], row["sentence"] = verdict(figures)
         rows.append(row)
     return rows
 

@@ -95,10 +95,10 @@ WHEN_IT_PAYS = Table(
         for m in (FAST, BALANCED, BEST, ON_HRLS, SAME_SAMPLES, "paper-x2")
     ],
     [
-        Column("PSNR, 2 spp", "psnr", {"source": "accuracy", "scene": MEAN, "spp": 2}),
-        Column("PSNR, 8 spp", "psnr", {"source": "accuracy", "scene": MEAN, "spp": 8}),
-        Column("RelMSE, 2 spp", "relmse", {"source": "accuracy", "scene": MEAN, "spp": 2}),
-        Column("RelMSE, 8 spp", "relmse", {"source": "accuracy", "scene": MEAN, "spp": 8}),
+        *(
+            Column(f"{title}, {spp} spp", title.lower(), {"source": "accuracy", "scene": MEAN, "spp": spp})
+            for title, spp in itertools.product(("PSNR", "RelMSE"), (2, 8))
+        ),
         Column(
             "whole command at 1080p, processor seconds",
             "cpu_seconds",
@@ -135,18 +135,18 @@ HOW_SURE = Table(
 )
 
 
-#: Method with the ending of a division of the samples.
-def _divided(more: int, less: int) -> dict[str, str]:
-    return {method: f"{method}, {more}:{less}" for method in METHODS}
-
-
 SAMPLE_COUNTS = Table(
     ("accuracy_box",),
     BY_SCENE,
     ("PSNR, samples of the HRLS : LRHS",),
     [Line([METHODS[method]], {"method": method, "scene": MEAN}) for method in (BALANCED, BEST, ON_HRLS, SAME_SAMPLES)],
     [
-        Column(f"{spp} spp, {more}:{less}", "psnr", {"spp": spp}, renamed=_divided(more, less) if more > 1 else {})
+        Column(
+            f"{spp} spp, {more}:{less}",
+            "psnr",
+            {"spp": spp},
+            renamed={m: f"{m}, {more}:{less}" for m in METHODS if more > 1},
+        )
         for spp, more, less in ((4, 1, 1), (4, 3, 1), (8, 1, 1), (8, 3, 1), (8, 7, 1))
     ],
 )
@@ -208,7 +208,6 @@ GPU_TIMES = Table(
 )
 
 
-#: A sequence's rows with neighbours -> those of single frames.
 def _alone(row: Row) -> dict[str, str]:
     return {"method": row["method"].replace(NEIGHBOURS, ALONE)}
 

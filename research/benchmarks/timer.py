@@ -23,6 +23,9 @@ from typing import Any
 
 from research.benchmarks.results import Row
 
+#: The kernel counts memory in KB, on macOS in bytes.
+MAXRSS_IN_MB = 1 << 20 if sys.platform == "darwin" else 1 << 10
+
 
 @dataclass(frozen=True)
 class Function:
@@ -76,12 +79,9 @@ def run(job: Function | Sequence[str]) -> Run:
             file.seek(0)
         if process.returncode:
             raise SystemExit(f"{' '.join(command)}\n{errors.read()}")
-        cpu, peak = (
-            usage.ru_utime + usage.ru_stime,
-            usage.ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10),
-        )
+        cpu = usage.ru_utime + usage.ru_stime
         if not isinstance(job, Function):
-            return Run((seconds,), cpu, peak)
+            return Run((seconds,), cpu, usage.ru_maxrss / MAXRSS_IN_MB)
         measured = json.loads(output.read().splitlines()[-1])
         return Run(tuple(measured["seconds"]), cpu, measured["peak_mb"])
 
@@ -119,7 +119,7 @@ def peak_mb() -> float:
         return int(mark[1]) / (1 << 10)
     import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MAXRSS_IN_MB
 
 
 def main() -> None:

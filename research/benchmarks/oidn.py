@@ -110,4 +110,6 @@ def denoise_file(source: str, target: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     denoise_file(*sys.argv[1:])

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Repeat the paper's ablations: the features that each branch reads, the loss, and super-resolution without an HRLS.
+"""Repeat the paper's ablations at x4: the features that each branch reads, and the loss.
 
     python -m research.benchmarks.ablations VIEWS --table research/benchmarks/results/ablations.csv
 
@@ -12,7 +12,6 @@ table already has are kept.
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,7 +22,7 @@ from torch import Tensor
 from torch.optim.lr_scheduler import LambdaLR
 
 from oiio_msspl.aovs.features import ALBEDO, DIFFUSE, HRLS_FEATURES, NORMAL, RGB, SPECULAR
-from oiio_msspl.compare import upsample_bicubic
+from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import box_downsample
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
@@ -35,12 +34,12 @@ from research.training.encoding import log_decode, packed
 from research.training.paper import HRLS_CHANNELS, MultiResolutionFusion
 
 REDUCED = {"channels": 32, "growth": 16, "groups": 2, "blocks": 3}
-BATCH, PATCH, LEARNING_RATE = 4, 96, 4e-4
-#: Batches that are drawn per scale. Every row trains on them repeatedly.
+SCALE, BATCH, PATCH, LEARNING_RATE = 4, 4, 96, 4e-4
+#: Batches that are drawn. Every row trains on them repeatedly.
 POOL = 400
 #: Features by the tables' names; each entry includes those before it.
 LAYERS = {"RGB": [RGB], "and albedo": [ALBEDO], "and normal": [NORMAL], "and diffuse, specular": [DIFFUSE, SPECULAR]}
-NONE, RGB, ALL = "none", "RGB", "and diffuse, specular"
+NONE, COLOUR, ALL = "none", "RGB", "and diffuse, specular"
 #: The paper's upper bound of radiance.
 CLIP = 100.0
 
@@ -50,9 +49,8 @@ class Variant:
     """One row of the tables."""
 
     name: str
-    scale: int = 4
-    lrhs: str = RGB
-    hrls: str = RGB
+    lrhs: str = COLOUR
+    hrls: str = COLOUR
     loss: Callable[[Tensor, Tensor], Tensor] = losses.l1
 
 
@@ -66,41 +64,32 @@ def _robust(beta: float) -> Callable[[Tensor, Tensor], Tensor]:
 
 VARIANTS = [
     Variant("both RGB, l1"),
-    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != RGB),
+    *(Variant(f"HRLS: {name}", hrls=name) for name in (NONE, *LAYERS) if name != COLOUR),
     *(Variant(f"LRHS: {name}", lrhs=name) for name in (NONE, ALL)),
     *(Variant(f"robust loss, beta {beta:g}", loss=_robust(beta)) for beta in (0.01, 0.1, 1.0)),
     Variant("l1 of linear radiance", loss=_in_linear(losses.l1)),
     Variant("robust loss of linear radiance, beta 0.1", loss=_in_linear(losses.robust)),
-    *(Variant(f"x{scale}, HRLS: {name}", scale, hrls=name) for scale in (2, 8) for name in (NONE, ALL)),
 ]
 
 
-@dataclass(frozen=True)
-class Pair:
-    """One crop of one view, encoded; channels in the order of :data:`oiio_msspl.aovs.features.HRLS_FEATURES`."""
+def pair_of(view: View, top: int, left: int, patch: int, chosen: int) -> tuple[Array, Array, Array]:
+    """Return a crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``.
 
-    lrhs: np.ndarray
-    """(h, w, 16)"""
-    hrls: np.ndarray
-    """(s*h, s*w, 16)"""
-    target: np.ndarray
-    """(s*h, s*w, 3), linear"""
-    exposure: float
-
-
-def pair_of(view: View, scale: int, top: int, left: int, patch: int, chosen: int) -> Pair:
-    """Return a crop at ``top``, ``left`` whose HRLS is the ``hr`` pass ``chosen``."""
+    Returns:
+        The LRHS (h, w, 16) and the HRLS (s h, s w, 16), encoded, with the channels of
+        :data:`oiio_msspl.aovs.features.HRLS_FEATURES`, and the reference (s h, s w, 3), exposed.
+    """
     rows, columns = slice(top, top + patch), slice(left, left + patch)
-    colour = mean_lrhs(view, list(range(len(view.lr_spp))), scale)
+    colour = mean_lrhs(view, list(range(len(view.lr_spp))), SCALE)
     exposure = find_exposure(colour)
-    low_rows, low_columns = (slice(side.start // scale, side.stop // scale) for side in (rows, columns))
+    low_rows, low_columns = (slice(side.start // SCALE, side.stop // SCALE) for side in (rows, columns))
 
     others = [p for p in range(len(view.hr)) if p != chosen]
-    low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), scale)
+    low = box_downsample(read_hrls(view, others, rows, columns).mean(axis=0), SCALE)
     low[..., :3] = colour[low_rows, low_columns]
     high = read_hrls(view, [chosen], rows, columns)[0]
-    encoded = [packed(split_features(passes), exposure) for passes in (low, high)]
-    return Pair(encoded[0], encoded[1], as_float32(view.ref[rows, columns]), exposure)
+    lrhs, hrls = (packed(split_features(passes), exposure) for passes in (low, high))
+    return lrhs, hrls, as_float32(view.ref[rows, columns]) * np.float32(exposure)
 
 
 def channels_of(name: str) -> Tensor:
@@ -110,8 +99,7 @@ def channels_of(name: str) -> Tensor:
     return torch.cat([torch.full((n,), float(f in read)) for f, n in HRLS_FEATURES.items()])[None, :, None, None]
 
 
-@functools.lru_cache(maxsize=1)  # some GB; VARIANTS are sorted by scale
-def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tensor]]:
+def pool(views: list[View]) -> list[list[Tensor]]:
     """Return batches of LRHS, HRLS and target, encoded."""
     rng = np.random.default_rng(0)
     batches = []
@@ -119,25 +107,19 @@ def pool(views: tuple[View, ...], scale: int) -> list[tuple[Tensor, Tensor, Tens
         pairs = []
         for view in (views[i] for i in rng.integers(len(views), size=BATCH)):
             top, left = 8 * rng.integers((view.ref.shape[0] - PATCH) // 8 + 1, size=2)
-            pairs.append(pair_of(view, scale, int(top), int(left), PATCH, int(rng.integers(len(view.hr)))))
-        stacks = (
-            [pair.lrhs for pair in pairs],
-            [pair.hrls for pair in pairs],
-            [encode_radiance(pair.target, pair.exposure) for pair in pairs],
-        )
-        lrhs, hrls, target = (to_tensor(np.stack(images), torch.device("cpu")) for images in stacks)
-        batches.append((lrhs, hrls, target))
+            pairs.append(pair_of(view, int(top), int(left), PATCH, int(rng.integers(len(view.hr)))))
+        lrhs, hrls, references = (np.stack(images) for images in zip(*pairs, strict=True))
+        batches.append([to_tensor(x, torch.device("cpu")) for x in (lrhs, hrls, encode_radiance(references, 1.0))])
     return batches
 
 
-def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
+def train(variant: Variant, batches: list[list[Tensor]], steps: int, *, bfloat16: bool) -> MultiResolutionFusion:
     """Return a network after ``steps`` training steps."""
     torch.manual_seed(0)
-    network = MultiResolutionFusion(variant.scale, **REDUCED, lrhs_channels=HRLS_CHANNELS)
+    network = MultiResolutionFusion(SCALE, **REDUCED, lrhs_channels=HRLS_CHANNELS)
     network.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
     optimizer = torch.optim.AdamW(network.parameters(), lr=LEARNING_RATE, eps=1e-6)
     low_mask, high_mask = channels_of(variant.lrhs), channels_of(variant.hrls)
-    batches = pool(views, variant.scale)
     schedule = LambdaLR(optimizer, lambda step: min(1.0, 2 * (1 - step / steps)))  # constant, then linear to zero
     for step in range(steps):
         lrhs, hrls, target = (torch.rot90(image, step // POOL % 4, (2, 3)) for image in batches[step % POOL])
@@ -152,21 +134,16 @@ def train(variant: Variant, views: tuple[View, ...], steps: int, *, bfloat16: bo
 
 
 @torch.inference_mode()
-def evaluate(network: MultiResolutionFusion, variant: Variant, views: tuple[View, ...]) -> dict[str, float]:
-    """Return mean sRGB PSNR and RelMSE of the network and of bicubic upsampling."""
+def evaluate(network: MultiResolutionFusion, variant: Variant, views: list[View]) -> dict[str, float]:
+    """Return mean sRGB PSNR and RelMSE of the network."""
     scored = []
     for view in views:
-        height, width = view.ref.shape[:2]
-        pair = pair_of(view, variant.scale, 0, 0, height, 0)
-        lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in (pair.lrhs, pair.hrls))
+        *pair, reference = pair_of(view, 0, 0, view.ref.shape[0], 0)
+        lrhs, hrls = (to_tensor(image[None], torch.device("cpu")) for image in pair)
         fused = network(lrhs * channels_of(variant.lrhs), hrls * channels_of(variant.hrls))[0].permute(1, 2, 0)
-        reference = pair.target * np.float32(pair.exposure)
-        bicubic = upsample_bicubic(decode_radiance(pair.lrhs[..., :3], 1.0), width, height)
-        images = (decode_radiance(fused.numpy(), 1.0), bicubic)
-        scored.append([measure(i, reference) for i in images for measure in (psnr, relmse)])
-    return dict(
-        zip(("psnr", "relmse", "bicubic_psnr", "bicubic_relmse"), np.mean(scored, axis=0).tolist(), strict=True)
-    )
+        image = decode_radiance(fused.numpy(), 1.0)
+        scored.append([psnr(image, reference), relmse(image, reference)])
+    return dict(zip(("psnr", "relmse"), np.mean(scored, axis=0).tolist(), strict=True))
 
 
 def main() -> None:
@@ -179,14 +156,15 @@ def main() -> None:
     args = parser.parse_args()
     torch.set_num_threads(args.threads)
     folder = Folder(args.views)
-    views, held_out = (tuple(folder.split(split)) for split in ("train", "validation"))
+    views, held_out = (folder.split(split) for split in ("train", "validation"))
     effort = {"steps": args.steps, "train_views": len(views), "held_out_views": len(held_out)}
     done = {row["name"] for row in results.read(args.table)} if args.table and args.table.exists() else set()
+    batches = pool(views)
     for variant in VARIANTS:
         if variant.name not in done:
-            network = train(variant, views, args.steps, bfloat16=args.precision == "bf16")
-            row = {"name": variant.name, "scale": variant.scale, **evaluate(network, variant, held_out), **effort}
-            results.show(results.plain, [row], args.table, ("name",))
+            network = train(variant, batches, args.steps, bfloat16=args.precision == "bf16")
+            row = {"name": variant.name, **evaluate(network, variant, held_out), **effort}
+            results.show([row], args.table, ("name",))
 
 
 if __name__ == "__main__":

@@ -12,16 +12,14 @@ spp_HRLS.
 Methods that get an LRHS and an HRLS, each with half of the samples as in the paper:
 
 - the models of this project, by name. "joint-x2, 3:1" has three quarters of the samples in the HRLS.
-- "OIDN on both x2": OIDN on the HRLS, with the local means of OIDN on the LRHS.
 - "OIDN on both x2, together": OIDN on the HRLS, with the local means of
   :func:`research.benchmarks.peers.oidn_on_average`. "OIDN prefiltered on both x2, together" has prefiltered OIDN on
   the HRLS.
 
-Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), "full resolution" and
-"OIDN, same samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
-:func:`research.benchmarks.oidn.denoise_prefiltered`; "with base guides" has OIDN's base networks for albedo and
-normal, which saves a third of its time. "OIDN prefiltered and split" is that on every second pixel. All others are
-OIDN's plain call with the quality "high".
+Methods that get one render: "HRLS", "LRHS x2 bicubic", "OIDN on the HRLS" (half of the samples), and "OIDN, same
+samples" (all samples at full resolution). "OIDN fast" has the quality "fast". "OIDN prefiltered" is
+:func:`research.benchmarks.oidn.denoise_prefiltered`. "OIDN prefiltered and split" is that on every second pixel. All
+others are OIDN's plain call with the quality "high".
 """
 
 from __future__ import annotations
@@ -73,31 +71,18 @@ def methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Itera
     yield "OIDN on the HRLS", denoised
     yield "OIDN fast on the HRLS", partial(oidn, hr, "fast")
     yield "OIDN prefiltered on the HRLS", prefiltered
-    yield "OIDN prefiltered with base guides on the HRLS", partial(oidn_prefiltered, hr, "balanced")
-    yield "full resolution", partial(beauty, full)
     yield "OIDN, same samples", partial(oidn, full)
     yield "OIDN prefiltered, same samples", partial(oidn_prefiltered, full)
-    yield "OIDN prefiltered with base guides, same samples", partial(oidn_prefiltered, full, "balanced")
     yield "OIDN prefiltered and split, same samples", partial(oidn_split, full)
     for scale in SCALES:
         lr = scene.lrhs(scale, spp // 2)
-        yield from _lrhs_methods(lr, scale, scene.reference.shape)
+        yield f"LRHS x{scale} bicubic", partial(_enlarged, lr, scene.reference.shape)
         for call, picture in (("OIDN", denoised), ("OIDN prefiltered", prefiltered)):
-            if call == "OIDN":
-                yield f"{call} on both x{scale}", partial(_joined, picture, partial(oidn, lr))
-            yield f"{call} on both x{scale}, together", partial(_joined, picture, partial(oidn_on_average, lr, hr))
+            yield f"{call} on both x{scale}, together", partial(_joined, picture, lr, hr)
         for session in sessions:
             if session.contract.scale == scale:
                 yield session.name, partial(_fused, session, lr, hr)
     yield from _uneven_methods(scene, sessions, spp)
-
-
-def _lrhs_methods(lr: ReadableRender, scale: int, shape: Sequence[int]) -> Iterator[tuple[str, Picture]]:
-    """Yield the methods that enlarge the LRHS to (h, w)."""
-    height, width = shape[:2]
-    yield f"LRHS x{scale} nearest", lambda: beauty(lr).repeat(scale, 0).repeat(scale, 1)
-    yield f"LRHS x{scale} bicubic", lambda: upsample_bicubic(beauty(lr), width, height)
-    yield f"OIDN on the LRHS x{scale}, bicubic", lambda: upsample_bicubic(oidn(lr), width, height)
 
 
 def _uneven_methods(scene: scenes.Scene, sessions: Sequence[Session], spp: int) -> Iterator[tuple[str, Picture]]:
@@ -118,8 +103,12 @@ def _fused(session: Session, lr: ReadableRender, hr: ReadableRender) -> Array:
     return fuse(lr, hr, session).rgb
 
 
-def _joined(picture: Picture, means: Picture) -> Array:
-    return match_local_means(picture(), means())
+def _enlarged(lr: ReadableRender, shape: Sequence[int]) -> Array:
+    return upsample_bicubic(beauty(lr), shape[1], shape[0])
+
+
+def _joined(picture: Picture, lr: ReadableRender, hr: ReadableRender) -> Array:
+    return match_local_means(picture(), oidn_on_average(lr, hr))
 
 
 def load_models(names: Sequence[str], pattern: str) -> list[Session]:
@@ -171,22 +160,6 @@ def _mean(rows: Sequence[Row], scene: str) -> Row:
     return key | {name: float(np.mean([row[name] for row in rows])) for name in MEASURES if name in rows[0]}
 
 
-def layout(rows: Sequence[Row]) -> str:
-    """Lay out a table of all measures for each average spp: means, then PSNR and RelMSE by scene."""
-    names = list(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
-    by_key = results.index(rows, *KEYS)
-    shown = [measure for measure in MEASURES if measure in rows[0]]
-    text = mean_note(rows) + "\n"
-    for spp in dict.fromkeys(row["spp"] for row in rows):
-        body = []
-        for method in dict.fromkeys(row["method"] for row in rows if row["spp"] == spp):
-            means = [cell(by_key.get((MEAN, spp, method)), measure) for measure in shown]
-            body.append([method, *means, *(cell(by_key.get((n, spp, method)), "psnr", "relmse") for n in names)])
-        titles = [MEASURES[measure][0] for measure in shown]
-        text += f"\n{spp} spp on average\n\n{results.markdown(['method', *titles, *names], body)}"
-    return text
-
-
 def mean_note(rows: Sequence[Row]) -> str:
     """Say what the means are over."""
     names = list(dict.fromkeys(row["scene"] for row in rows if row["scene"] != MEAN))
@@ -196,13 +169,8 @@ def mean_note(rows: Sequence[Row]) -> str:
     return note + f" Left out, because the reference is noisy: {', '.join(left_out)}." * bool(left_out)
 
 
-def cell(row: Row | None, *measures: str) -> str:
-    """Return some measures of a row as text; empty if there is no row."""
-    return " / ".join(_digits(measure, row[measure]) for measure in measures) if row else ""
-
-
-def _digits(measure: str, value: float) -> str:
-    """Return a value as text, with no more than the four digits that the table has."""
+def cell(measure: str, value: float) -> str:
+    """Return a measure as text, with no more than the four digits that the table has."""
     return f"{value:.4g}" if "relmse" in measure and value >= 1 else MEASURES[measure][1].format(value)
 
 
@@ -220,7 +188,7 @@ def main() -> None:
     rows = [row for scene in loaded for row in measure(scene, sessions, flip=args.flip, pattern=pattern)]
     if not rows:
         parser.error(f"no method matches {args.methods}")
-    results.show(layout, with_means(rows), args.table, KEYS if args.methods else ())
+    results.show(with_means(rows), args.table, KEYS if args.methods else ())
 
 
 if __name__ == "__main__":

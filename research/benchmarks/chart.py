@@ -1,8 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Draw accuracy against time, from the tables of `research.benchmarks.accuracy`, `research.benchmarks.runtime`.
 
-    python -m research.benchmarks.chart -o docs/chart.html              # every scene; needs only a browser
-    python -m research.benchmarks.chart -o docs/images/chart.png        # the mean of the scenes
+    python -m research.benchmarks.chart -o docs/chart.html
 
 There is a panel for each average spp. Left and up is better: axes of errors point downwards. Methods whose time was not
 measured are left out.
@@ -103,67 +102,11 @@ def page(shown: dict[str, Any]) -> str:
     return TEMPLATE.read_text().replace("DATA", json.dumps(shown, separators=(",", ":")))
 
 
-def draw(shown: dict[str, Any], path: Path) -> None:
-    """Draw the mean against the method's own time: a row for each measure, a column for each average spp."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    import matplotlib.pyplot as plt
-    from matplotlib.ticker import LogLocator
-
-    colours = dict(zip(_families(shown), ("#009E73", "#0072B2", "#D55E00", "#CC79A7"), strict=True))
-    markers = dict(zip(PEERS, "*XDPd", strict=True))
-    measures, averages = shown["measures"], shown["spp"]
-    size = (4.2 * len(averages), 3.5 * len(measures))
-    figure, axes = plt.subplots(len(measures), len(averages), figsize=size, sharex=True, sharey="row", squeeze=False)
-    for row, (line, (measure, title)) in enumerate(zip(axes, measures.items(), strict=True)):
-        for axis, spp in zip(line, averages, strict=True):
-            for series in shown["series"]:
-                points = [point for point in series["points"] if point["spp"] == spp]
-                x, y = [p["seconds"] for p in points], [p["values"][MEAN][row] for p in points]
-                if series.get("peer"):
-                    style = {"marker": markers[series["name"]], "color": "black", "markersize": 8, "linestyle": "none"}
-                    axis.plot(x, y, label=series["name"], **style)
-                elif series["name"].endswith(UNEVEN):
-                    axis.plot(x, y, "--^", color=colours[series["name"].removesuffix(UNEVEN)], lw=1, markersize=4)
-                else:
-                    axis.plot(x, y, "-o", color=colours[series["name"]], label=series["name"], lw=1)
-                    for point, place in zip(points, zip(x, y, strict=True), strict=True):
-                        label = point["method"].rpartition("-")[2]
-                        axis.annotate(label, place, (4, 4), textcoords="offset points", fontsize=8)
-            axis.set_xscale("log")
-            axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
-            axis.xaxis.set_major_formatter("{x:g}")
-            axis.xaxis.set_minor_formatter("")
-            axis.grid(True, which="both", alpha=0.25)
-            if row == 0:
-                axis.set_title(f"{spp} spp on average")
-            if measure != "psnr":
-                axis.set_yscale("log")
-            if row == len(measures) - 1:
-                axis.set_xlabel("seconds for 1024 x 1024")
-        line[0].set_ylabel(title)
-        if measure != "psnr":
-            line[0].invert_yaxis()
-    figure.suptitle(f"Accuracy against time on {shown['machine']}: mean of the scenes (left and up is better)")
-    handles, labels = axes[0][0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="lower center", ncols=4, fontsize=9)
-    figure.tight_layout(rect=(0, 0.05, 1, 1))
-    figure.savefig(path, dpi=110)
-
-
-def _families(shown: dict[str, Any]) -> list[str]:
-    return [s["name"] for s in shown["series"] if not s.get("peer") and not s["name"].endswith(UNEVEN)]
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", type=Path, required=True, help="an HTML page, or a PNG, SVG or PDF picture")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="an HTML page")
     args = parser.parse_args()
-    if args.output.suffix == ".html":
-        args.output.write_text(page(data()))
-    else:
-        draw(data(), args.output)
+    args.output.write_text(page(data()))
 
 
 if __name__ == "__main__":

@@ -74,7 +74,7 @@ def main() -> None:
         session = Session(find_model(scale, args.model))
         pairs = [errors(scene, session, spp) for scene in clean for spp in AVERAGES]
         rows.append(measure(session.contract.name, pairs))
-    results.show(results.plain, rows, args.table)
+    results.show(rows, args.table)
 
 
 if __name__ == "__main__":

@@ -88,7 +88,7 @@ def main() -> None:
         views = [scene for scene in scenes.load(args.scenes) if scene.name not in scenes.NOISY_REFERENCE]
     else:
         views = [scenes.of_view(view) for view in Folder(args.scenes).split("validation")[::3]]
-    results.show(results.plain, list(measure(views, args.models)), args.table)
+    results.show(list(measure(views, args.models)), args.table)
 
 
 if __name__ == "__main__":

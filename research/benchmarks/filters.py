@@ -105,7 +105,7 @@ def main() -> None:
     views = [view for split in ("validation", "test") for view in folder.sample_views(split)]
     if not views:
         raise SystemExit(f"{args.views}: no views with samples for validation or testing")
-    results.show(results.plain, list(measure(views, args.model)), args.table)
+    results.show(list(measure(views, args.model)), args.table)
 
 
 if __name__ == "__main__":

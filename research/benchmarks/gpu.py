@@ -5,16 +5,12 @@
 
 Inputs and outputs lie in the GPU's memory, so no copies are timed; ``with_copies_ms`` has them for our models. OIDN is
 called plainly, with the small networks ("fast"), and as its documentation recommends (albedo and normal prefiltered).
-``floor_ms`` is the least time that the convolutions of a model could take: the larger one of their operations over the
-rate of a large half-float matrix product, and of their inputs and outputs over the rate of a large copy, both measured
-here.
 """
 
 from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -34,47 +30,8 @@ def median_ms(call: Callable[[], Any], wait: Callable[[], Any]) -> float:
     return 1000 * statistics.median(timer.seconds_of(call, REPEATS, 3, wait))
 
 
-def ceilings() -> tuple[float, float]:
-    """Return operations and bytes a second of the GPU: of a product of half-float matrices, and of a copy."""
-    import torch
-
-    a, b = (torch.randn(8192, 8192, device="cuda", dtype=torch.float16) for _ in range(2))
-    source = torch.randn(2**29, device="cuda")
-    target = torch.empty_like(source)
-    product = median_ms(lambda: a @ b, torch.cuda.synchronize)
-    copy = median_ms(lambda: target.copy_(source), torch.cuda.synchronize)
-    return 2 * 8192**3 / product * 1000, 2 * source.nbytes / copy * 1000
-
-
-def convolution_work(path: Path, sizes: dict[str, int]) -> tuple[float, float]:
-    """Count the operations of a model's convolutions for a frame, and the bytes that they move in half floats.
-
-    Args:
-        sizes: values of the graph's symbolic dimensions.
-    """
-    import onnx
-
-    model = onnx.load(path)
-    for value in model.graph.input:
-        for dimension in value.type.tensor_type.shape.dim:
-            if dimension.dim_param:
-                dimension.dim_value = sizes[dimension.dim_param]
-    del model.graph.value_info[:]
-    inferred = onnx.shape_inference.infer_shapes(model, data_prop=True).graph
-    values = (*inferred.value_info, *inferred.input, *inferred.output)
-    shapes = {v.name: [d.dim_value for d in v.type.tensor_type.shape.dim] for v in values}
-    shapes |= {tensor.name: list(tensor.dims) for tensor in inferred.initializer}
-    operations = transferred = 0.0
-    for node in inferred.node:
-        if node.op_type == "Conv":
-            taken, kernel, given = (shapes[name] for name in (*node.input[:2], node.output[0]))
-            operations += 2 * np.prod(kernel) * np.prod(given[2:])
-            transferred += 2 * (np.prod(taken) + np.prod(kernel) + np.prod(given))
-    return operations, transferred
-
-
 def time_model(name: str, height: int, width: int) -> dict[str, float]:
-    """Time one of our models for a frame, and the work of its convolutions."""
+    """Time one of our models for a frame."""
     import onnxruntime as ort
     import torch
 
@@ -102,8 +59,7 @@ def time_model(name: str, height: int, width: int) -> dict[str, float]:
     binding.bind_output("fused", "cuda")
     on_gpu = median_ms(lambda: network.run_with_iobinding(binding), torch.cuda.synchronize)
     copies = median_ms(lambda: network.run(["fused"], feed), torch.cuda.synchronize)
-    operations, transferred = convolution_work(path, sizes)
-    return {"ms": on_gpu, "with_copies_ms": copies, "gflop": operations / 1e9, "gbyte": transferred / 1e9}
+    return {"ms": on_gpu, "with_copies_ms": copies}
 
 
 def time_oidn(name: str, height: int, width: int) -> dict[str, float]:
@@ -159,18 +115,12 @@ def main() -> None:
     args = results.parser(__doc__).parse_args()
     import torch
 
-    operations, transfer = ceilings()
-    card = torch.cuda.get_device_name()
-    print(f"{card}: {operations / 1e12:.0f} TFLOP/s, {transfer / 1e12:.2f} TB/s")
     rows: list[Row] = []
     for height, width in SIZES:
-        key = {"size": f"{width} x {height}", "machine": card}
+        key = {"size": f"{width} x {height}", "machine": torch.cuda.get_device_name()}
         rows += [key | {"method": name, **time_oidn(name, height, width)} for name in OIDN]
-        for name in MODELS:
-            row: Row = {**key, "method": name, "model": f"gpu/{name}", **time_model(name, height, width)}
-            row["floor_ms"] = 1000 * max(row["gflop"] * 1e9 / operations, row["gbyte"] * 1e9 / transfer)
-            rows.append(row)
-    results.show(results.plain, rows, args.table)
+        rows += [{**key, "method": name, "model": f"gpu/{name}", **time_model(name, height, width)} for name in MODELS]
+    results.show(rows, args.table)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Lay out tables of results from specifications: which rows of which CSV files, and what each column shows of them."""
+"""Lay out tables of results from specifications: which rows of which CSV files, and what each column shows of them.
+
+Intervals are 95 % of a bootstrap over scenes: as many scenes as there are, drawn again and again with repetition. They
+say what other scenes of the same kind might have given. With five scenes they are rather too narrow than too wide.
+"""
 
 from __future__ import annotations
 
+import functools
 import itertools
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -10,11 +15,14 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from research.benchmarks import accuracy, results, versus
+from research.benchmarks import accuracy, results
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.scenes import NOISY_REFERENCE
 
+#: How often the scenes are drawn, and the percentiles of the means that bound an interval.
+DRAWS, PERCENTILES = 20_000, (2.5, 97.5)
 #: Value that a row must have, or a test of it.
 Wanted = Any
 
@@ -30,7 +38,7 @@ class Column:
     how: str = "mean"
     """mean, sum or max of the rows; count (of those whose measure is what stands behind ``=``); quotient of two
     measures' sums; or a comparison with their peers: difference, interval (that with its 95 % interval), ratio (mean of
-    ratios), ratio interval (ratio of means with its 95 % interval), wins."""
+    ratios), ratio interval (ratio of means with its 95 % interval)."""
     form: str = ""
     """Format of a number; by default that of the measure."""
     against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]] = field(default_factory=dict)
@@ -61,7 +69,6 @@ class Table:
     lines: Sequence[Line] | Sequence[str]
     """The lines; or names of columns: then each combination of their values is a line."""
     columns: Sequence[Column]
-    where: Mapping[str, Wanted] = field(default_factory=dict)
     means: bool = False
     """Say which scenes means are over."""
 
@@ -71,7 +78,6 @@ class Table:
         for row in rows:
             row["kind"] = row.get("kind", re.sub(r"_\d+$", "", row.get("layer", "")))  # lamps count as one layer
             row["family"] = re.sub(r"-x\d$", "", row.get("method", ""))
-        rows = matching(rows, self.where)
         peers = results.index(rows, "source", *self.keys)
         used: list[Row] = []
         body = []
@@ -95,11 +101,11 @@ class Table:
         wanted = {**line.where, **column.where}
         if "method" in wanted and column.renamed:
             wanted["method"] = column.renamed.get(wanted["method"], wanted["method"])
-        chosen = [row for row in matching(rows, wanted) if all(name in row for name in _measures(column))]
+        chosen = [row for row in results.where(rows, **wanted) if all(name in row for name in _measures(column))]
         if not chosen:
             return ""
         against = column.against or line.against
-        if column.how not in COMPARISONS:
+        if column.how not in ("difference", "interval", "ratio", "ratio interval"):
             used += chosen
             return _summary(column, chosen)
         pairs = [(row, peers.get(self._peer_key(row, against))) for row in chosen]
@@ -112,9 +118,6 @@ class Table:
     def _peer_key(self, row: Row, against: Mapping[str, Any] | Callable[[Row], Mapping[str, Any]]) -> tuple[Any, ...]:
         peer = {**row, **(against(row) if callable(against) else against)}
         return tuple(peer.get(name) for name in ("source", *self.keys))
-
-
-COMPARISONS = ("difference", "interval", "ratio", "ratio interval", "wins")
 
 
 def _measures(column: Column) -> list[str]:
@@ -138,31 +141,47 @@ def _summary(column: Column, rows: Sequence[Row]) -> str:
 def _format(column: Column, measure: str, value: float) -> str:
     if measure not in accuracy.MEASURES or column.form:
         return (column.form or "{:.2f}").format(value)
-    return accuracy.cell({measure: value}, measure)
+    return accuracy.cell(measure, value)
 
 
 def _comparison(column: Column, pairs: Sequence[tuple[Row, Row]]) -> str:
     """Return a comparison of rows with their peers as text."""
     ours, theirs = (np.array([pair[side][column.measure] for pair in pairs], float) for side in (0, 1))
     differences = ours - theirs
-    if column.how == "wins":
-        return f"{int((differences > 0).sum())} of {len(pairs)}"
     if column.how == "interval":
-        return versus.cell(versus.with_interval(differences), "+.2f")
+        return _with_ends(with_interval(differences), "+.2f")
     if column.how == "difference":
         return (column.form or "{:+.2f}").format(float(differences.mean()))
     if column.how == "ratio interval":
-        return versus.cell(versus.ratio_with_interval(ours, theirs), ".2f")
+        return _with_ends(ratio_with_interval(ours, theirs), ".2f")
     return (column.form or "{:.2f}").format(float((ours / theirs).mean()))
 
 
-def matching(rows: Sequence[Row], wanted: Mapping[str, Wanted]) -> list[Row]:
-    """Return the rows that have the wanted values, or whose values pass the tests."""
-    return [row for row in rows if all(_fits(row.get(name), value) for name, value in wanted.items())]
+def with_interval(values: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the mean of one value for each scene, and the ends of its interval."""
+    return float(values.mean()), *_ends(values[_draws(len(values))].mean(axis=1))
 
 
-def _fits(value: Any, wanted: Wanted) -> bool:
-    return bool(wanted(value)) if callable(wanted) else value == wanted
+def ratio_with_interval(ours: NDArray[np.float64], theirs: NDArray[np.float64]) -> tuple[float, float, float]:
+    """Return the ratio of the means of two methods' values, one for each scene, and the ends of its interval."""
+    drawn = _draws(len(ours))
+    return float(ours.mean() / theirs.mean()), *_ends(ours[drawn].mean(axis=1) / theirs[drawn].mean(axis=1))
+
+
+@functools.cache
+def _draws(count: int) -> NDArray[np.int64]:
+    """Return the indices of the drawn scenes, (DRAWS, count), equal in every run."""
+    return np.random.default_rng(0).integers(count, size=(DRAWS, count))
+
+
+def _ends(means: NDArray[np.float64]) -> tuple[float, float]:
+    low, high = np.percentile(means, PERCENTILES)
+    return float(low), float(high)
+
+
+def _with_ends(value: tuple[float, float, float], form: str) -> str:
+    middle, low, high = (format(number, form) for number in value)
+    return f"{middle} ({low} to {high})"
 
 
 def label(value: Any) -> str:

@@ -5,7 +5,8 @@ Images are (h, w, 3) and linear. All functions need pyoidn: ``pip install '.[ben
 
     python -m research.benchmarks.oidn FRAME.exr DENOISED.exr
 
-denoises a file as the documentation recommends. The file has the layers RGB, ``albedo`` and ``N``.
+denoises a file as the documentation recommends. The file has the layers RGB, ``albedo`` and ``N``. This program is
+timed beside ours, so it imports nothing of this project.
 """
 
 from __future__ import annotations
@@ -29,22 +30,19 @@ def denoise(color: Array, albedo: Array | None = None, normal: Array | None = No
     return np.asarray(pyoidn.denoise(color, albedo, normal, hdr=True, quality=quality))
 
 
-def denoise_prefiltered(
-    color: Array, albedo: Array | None = None, normal: Array | None = None, guides: str = "high"
-) -> Array:
+def denoise_prefiltered(color: Array, albedo: Array | None = None, normal: Array | None = None) -> Array:
     """Denoise by the recommended call: the albedo and the normal are first denoised, each by a filter of its own.
 
-    The filter of the beauty gets the results and is told by ``cleanAux`` that they have no noise. It has the quality
-    "high", and those of albedo and normal the quality ``guides``. See https://github.com/RenderKit/oidn,
-    "prefiltering".
+    The filter of the beauty gets the results and is told by ``cleanAux`` that they have no noise. See
+    https://github.com/RenderKit/oidn, "prefiltering".
     """
     auxiliary = {name: image for name, image in (("albedo", albedo), ("normal", normal)) if image is not None}
-    return denoise_with_clean(color, prefiltered(auxiliary, guides))
+    return denoise_with_clean(color, prefiltered(auxiliary))
 
 
-def prefiltered(auxiliary: Mapping[str, Array], quality: str = "high") -> dict[str, Array]:
+def prefiltered(auxiliary: Mapping[str, Array]) -> dict[str, Array]:
     """Return albedo and normal without noise, each by a filter of its own."""
-    return {name: run_filter({name: image}, quality=quality) for name, image in auxiliary.items()}
+    return {name: run_filter({name: image}, quality="high") for name, image in auxiliary.items()}
 
 
 def denoise_with_clean(color: Array, clean: Mapping[str, Array]) -> Array:
@@ -112,4 +110,6 @@ def denoise_file(source: str, target: str) -> None:
 
 
 if __name__ == "__main__":
+    if len(sys.argv) != 3:
+        sys.exit(__doc__)
     denoise_file(*sys.argv[1:])

@@ -17,7 +17,7 @@ import re
 import zlib
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -47,33 +47,23 @@ class View:
     folder: Path
 
     @property
-    def name(self) -> str:
-        return f"{self.folder.parent.name}/{self.folder.name}"
-
-    @property
     def scene(self) -> str:
         """The scene's name: that of the folder without the name of the camera."""
         return re.sub(r"-(left|right)$", "", self.folder.name)
 
-    def layers(self, file: str) -> Layers | None:
-        """Return the features of one render; None if there is no such file."""
-        path = self.folder / f"{file}.exr"
-        if not path.exists():
-            return None
-        read = map_render(open_exr(path)).load().layers
+    def layers(self, file: str) -> Layers:
+        """Return the features of one render."""
+        read = map_render(open_exr(self.folder / f"{file}.exr")).load().layers
         return {name: read[name] for name in (RGB, ALBEDO, NORMAL) if name in read}
 
     def pairs(self) -> Iterator[Pair]:
         """Yield all pairs of the folder."""
         for high in sorted(self.folder.glob("hr_*spp.exr")):
             hrls = self.layers(high.stem)
-            assert hrls is not None
             for low in sorted(self.folder.glob("lr_x*spp.exr")):
-                numbers = re.findall(r"\d+", f"{low.stem} {high.stem}")
-                lrhs, scale = self.layers(low.stem), int(numbers[0])
-                assert lrhs is not None
-                spp = int(numbers[2])
-                yield Pair(f"{self.name} {low.stem} {high.stem}", scale, spp, int(numbers[1]), lrhs, hrls)
+                name = f"{self.folder.parent.name}/{self.folder.name} {low.stem} {high.stem}"
+                scale, lr_spp, hr_spp = (int(n) for n in re.findall(r"\d+", f"{low.stem} {high.stem}"))
+                yield Pair(name, scale, hr_spp, lr_spp, self.layers(low.stem), hrls)
 
 
 @dataclass(frozen=True)
@@ -98,18 +88,13 @@ class Pair:
         """Whether both renders have the same number of samples for an area, and 1 spp in the HRLS."""
         return self.hr_spp == 1 and self.lr_spp == self.scale**2
 
-    def cut(self, y: int, x: int, height: int, width: int) -> Pair:
-        """Return a rectangle, in LRHS pixels."""
-        s = self.scale
-        low = {name: v[y : y + height, x : x + width] for name, v in self.lrhs.items()}
-        high = {name: v[s * y : s * (y + height), s * x : s * (x + width)] for name, v in self.hrls.items()}
-        return Pair(self.name, s, self.hr_spp, self.lr_spp, low, high)
-
     def quarters(self) -> Iterator[Pair]:
         """Yield the four quarters of the frame."""
-        height, width = (n // 2 for n in self.lrhs[RGB].shape[:2])
+        height, width, s = (*(n // 2 for n in self.lrhs[RGB].shape[:2]), self.scale)
         for y, x in ((0, 0), (0, width), (height, 0), (height, width)):
-            yield self.cut(y, x, height, width)
+            low = {name: v[y : y + height, x : x + width] for name, v in self.lrhs.items()}
+            high = {name: v[s * y : s * (y + height), s * x : s * (x + width)] for name, v in self.hrls.items()}
+            yield replace(self, lrhs=low, hrls=high)
 
     def warnings(self) -> list[str]:
         """Return what the checks say, or why they refuse the pair."""
@@ -130,13 +115,12 @@ def wrong_pairs(pair: Pair, stranger: View, following: Layers | None) -> Iterato
     rng = np.random.default_rng(zlib.crc32(pair.name.encode()))
     lrhs, scale = pair.lrhs[RGB], pair.scale
     foreign = stranger.layers("hr_1spp")
-    assert foreign is not None
 
     def low(rgb: Array) -> Pair:
-        return Pair(pair.name, scale, pair.hr_spp, pair.lr_spp, {RGB: rgb}, pair.hrls)
+        return replace(pair, lrhs={RGB: rgb})
 
     def high(**layers: Array) -> Pair:
-        return Pair(pair.name, scale, pair.hr_spp, pair.lr_spp, pair.lrhs, pair.hrls | layers)
+        return replace(pair, hrls=pair.hrls | layers)
 
     matrix = conversion(REC709, ACESCG).astype(np.float32).T
     x, y = ((1, 0), (-1, 0), (0, 1), (0, -1))[rng.integers(4)]
@@ -203,11 +187,6 @@ def _moved_object(layers: Layers, scale: int, rng: np.random.Generator) -> Layer
     return moved
 
 
-def find_views(folder: Path) -> list[View]:
-    """Return the views in a folder."""
-    return [View(file.parent) for file in sorted(folder.glob("*/hr_1spp.exr"))]
-
-
 def measure(view: View, stranger: View) -> list[tuple[str, list[str]]]:
     """Check all pairs of a view: the kind of each pair, and its warnings. ``stranger`` is of another scene."""
     outcomes = []
@@ -224,7 +203,8 @@ def measure(view: View, stranger: View) -> list[tuple[str, list[str]]]:
         for quarter in pair.quarters():
             check(RIGHT_QUARTER, quarter)
         if pair.equal_samples:
-            for kind, wrong in wrong_pairs(pair, stranger, view.layers("next_1spp")):
+            following = view.layers("next_1spp") if (view.folder / "next_1spp.exr").exists() else None
+            for kind, wrong in wrong_pairs(pair, stranger, following):
                 check(kind, wrong)
     return outcomes
 
@@ -251,7 +231,7 @@ def main() -> None:
     parser.add_argument("--processes", type=int, default=2)
     args = parser.parse_args()
     views = [View(file.parent) for file in sorted(args.frames.glob("*/hr_1spp.exr"))]
-    results.show(results.plain, rows_of(args.scenes, views, args.processes), args.table, ("scenes", "pairs"))
+    results.show(rows_of(args.scenes, views, args.processes), args.table, ("scenes", "pairs"))
 
 
 if __name__ == "__main__":

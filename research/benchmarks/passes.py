@@ -2,41 +2,23 @@
 """Measure accuracy and time of fused passes, beside other ways to get clean layers that sum to the beauty.
 
     python -m research.benchmarks.passes PASSES --table research/benchmarks/results/passes.csv
-    python -m research.benchmarks.passes PASSES --spread --table research/benchmarks/results/passes_spread.csv
-    python -m research.benchmarks.passes PASSES --half --table research/benchmarks/results/passes_half.csv
     python -m research.benchmarks.passes PASSES --picture docs/images/passes.webp --scene cycles_10121_blackman_harris
 
-PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datagen.cycles.passes``. The methods, all but
-the first two with the albedo and the normal:
+PASSES is made by :mod:`research.benchmarks.render.passes` and ``research.datagen.cycles.passes``. The methods:
 
 - "HRLS": the layers as they are rendered.
-- "ratio": the fused beauty, divided as the noisy layers of the HRLS divide theirs.
-- "OIDN": Open Image Denoise on each layer of the HRLS, the plain call. Its layers do not sum to a denoised beauty.
-- "OIDN, rescaled": the same, scaled so that they sum to the fused beauty.
-- "OIDN, prefiltered, rescaled": the same with the call that OIDN's documentation recommends.
-- "OIDN, prefiltered, stored": the same, but light of a layer that is stored as light and colour is left out where the
-  colour is black, because no file can hold it. The layers are then scaled to the sum.
+- "OIDN, prefiltered, rescaled": Open Image Denoise on each layer of the HRLS, as its documentation recommends. The
+  layers are scaled so that they sum to the beauty of ``--quality best``. Albedo and normal are prefiltered once.
 - "OIDN, ordinary render": that call on a render with as many samples as LRHS and HRLS together. The layers are scaled
   so that they sum to the beauty that OIDN makes of this render.
-- "OIDN, every second pixel, rescaled": with ``--spread``, the recommended call on every second pixel, see
-  :func:`research.benchmarks.peers.oidn_split`.
 - "msspl": :mod:`oiio_msspl.fusion.passes.fuse`.
-- "msspl, HRLS alone": the same without the layers of the LRHS.
 - "msspl, best": with the beauty of ``--quality best``. A network fuses each layer.
-- "msspl, best, at half size": the same at half of the frame's resolution, as if the set had many layers.
-
-``--spread`` is for renders whose pixel filter has spread the noise. It takes the models for such noise.
-
-``--half`` measures light groups alone: at full and at half of the resolution, fitted, and by OIDN at its best.
-
-Other methods are rescaled to the beauty of ``--quality best``. OIDN prefilters albedo and normal once for all layers.
+- "msspl, best, at half size": light groups at half of the frame's resolution, as if there were many of them.
 
 Light and colour that are stored apart are multiplied first. A layer with less than `FAINT` of the beauty's light is
 part of the sum, but is not scored: every method has a high PSNR there.
 
-"Regraded" is what a compositor makes of the layers: the first one is switched off, the second has four times its light.
-"Worst" is the PSNR of the worst percent of the regraded pixels. The time is that of all layers of a set, without the
-beauty, as a multiple of OIDN's plain call on the beauty.
+The time is that of all layers of a set, without the beauty, as a multiple of OIDN's plain call on the beauty.
 """
 
 from __future__ import annotations
@@ -59,7 +41,6 @@ from oiio_msspl.aovs.mapped_render import MappedRender
 from oiio_msspl.aovs.matching import map_render
 from oiio_msspl.exr.atomic import replacing
 from oiio_msspl.exr.reader import open_exr
-from oiio_msspl.fusion.passes.exact_sum import DARKEST_COLOUR
 from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
 from oiio_msspl.fusion.passes.layers import layer_names, light_of
 from oiio_msspl.fusion.tiles.network import layer_fuser
@@ -67,11 +48,8 @@ from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.image.metrics import psnr, relmse
 from oiio_msspl.model.catalogue import load_model
-from oiio_msspl.model.contract import SPREAD
-from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exposure
 from research.benchmarks import results, timer
 from research.benchmarks.oidn import denoise, denoise_prefiltered, denoise_with_clean, prefiltered
-from research.benchmarks.peers import places, without_grid
 from research.benchmarks.results import MEAN, Row
 
 SCALES, SPP = (2, 4), (1, 2)
@@ -86,15 +64,6 @@ FAINT = 0.01
 BALANCED, BEST = "joint", "joint-large"
 #: What the gain is measured against.
 PEER = "OIDN, prefiltered, rescaled"
-#: The peer for noise that a pixel filter has spread.
-SPLIT_PEER = "OIDN, every second pixel, rescaled"
-#: The peer as a file can hold it.
-STORED_PEER = "OIDN, prefiltered, stored"
-#: The set whose layers are products of light and colour in some renderers.
-COMPONENTS = "components"
-#: How many light groups are fused, and what ``--half`` compares.
-AT_HALF = "msspl, best, at half size"
-BESIDE_HALF = (PEER, "msspl", "msspl, best", AT_HALF)
 
 
 def layers_of(render: MappedRender, layers: AdditiveSet) -> Array:
@@ -124,39 +93,24 @@ def methods(
     fused: Mapping[str, tuple[FusedFrame, Session]],
     layers: AdditiveSet,
     ordinary: MappedRender | None = None,
-    *,
-    spread: bool = False,
 ) -> Iterator[tuple[str, Callable[[], Array]]]:
     """Yield the name of each method, and a function that computes the layers.
 
     Args:
         fused: the fused frame of each model, and the model.
         ordinary: a render with as many samples as LRHS and HRLS together. Without it, its method is left out.
-        spread: a pixel filter has spread the noise.
     """
     noisy, colours = layers_of(hr, layers), colours_of(hr, layers)
     guides = hr.read(hr.data_window, [ALBEDO, NORMAL])
-    beauty = fused[BEST][0].rgb
-
-    def plain() -> Array:
-        return np.maximum([denoise(layer, guides[ALBEDO], guides[NORMAL]) for layer in noisy], np.float32(0))
 
     def recommended(noisy: Array, guides: Mapping[str, Array]) -> Array:
         clean = prefiltered({name: guides[name] for name in (ALBEDO, NORMAL)})
         return np.maximum([denoise_with_clean(layer, clean) for layer in noisy], np.float32(0))
 
-    def on_every_second_pixel() -> Array:
-        joined = np.empty_like(noisy)
-        for place in places():
-            joined[:, *place] = recommended(noisy[:, *place], {name: image[place] for name, image in guides.items()})
-        exposure = find_exposure(beauty)
-        encoded = (encode_radiance(layer, exposure) for layer in joined)
-        return np.stack([decode_radiance(without_grid(layer), exposure) for layer in encoded])
-
-    def ours(low: MappedRender, model: str, *, half: bool = False) -> Array:
+    def ours(model: str, *, half: bool = False) -> Array:
         frame, session = fused[model]
         with patch("oiio_msspl.fusion.passes.network.MOST_AT_FULL_SIZE", 0 if half else len(layers.layers)):
-            inputs = PassInputs(low, hr, frame.rgb, frame.alignment, [layers], frame.clean_aovs)
+            inputs = PassInputs(lr, hr, frame.rgb, frame.alignment, [layers], frame.clean_aovs)
             made = fuse_passes(inputs, fuse_layers=layer_fuser(session, frame))
         assert not made.refused
         height = hr.data_window.height
@@ -164,24 +118,16 @@ def methods(
         return colours * np.moveaxis(np.asarray(planes, np.float32), 1, -1)
 
     yield "HRLS", lambda: noisy
-    yield "ratio", lambda: rescaled(noisy, beauty)
-    yield "OIDN", plain
-    yield "OIDN, rescaled", lambda: rescaled(plain(), beauty)
-    yield PEER, lambda: rescaled(recommended(noisy, guides), beauty)
-    if spread:
-        yield SPLIT_PEER, lambda: rescaled(on_every_second_pixel(), beauty)
-    if layers.name == COMPONENTS:
-        yield STORED_PEER, lambda: rescaled(recommended(noisy, guides) * (colours >= DARKEST_COLOUR), beauty)
+    yield PEER, lambda: rescaled(recommended(noisy, guides), fused[BEST][0].rgb)
     if ordinary is not None:
         theirs = layers_of(ordinary, layers_like(ordinary, layers))
         pixels = ordinary.load().layers
         total = np.maximum(denoise_prefiltered(pixels["rgb"], pixels[ALBEDO], pixels[NORMAL]), 0)
         yield "OIDN, ordinary render", lambda: rescaled(recommended(theirs, pixels), total)
-    yield "msspl", lambda: ours(lr, BALANCED)
-    yield "msspl, HRLS alone", lambda: ours(replace(lr, additive_sets=[]), BALANCED)
-    yield "msspl, best", lambda: ours(lr, BEST)
+    yield "msspl", lambda: ours(BALANCED)
+    yield "msspl, best", lambda: ours(BEST)
     if layers.name == LIGHT_GROUPS:
-        yield AT_HALF, lambda: ours(lr, BEST, half=True)
+        yield "msspl, best, at half size", lambda: ours(BEST, half=True)
 
 
 def layers_like(render: MappedRender, layers: AdditiveSet) -> AdditiveSet:
@@ -197,15 +143,9 @@ def regraded(layers: Array) -> Array:
     return np.einsum("i,ihwc->hwc", grades, layers)
 
 
-def fused_frames(
-    lr: MappedRender, hr: MappedRender, scale: int, noise: str = ""
-) -> dict[str, tuple[FusedFrame, Session]]:
-    """Return the fused frame of each model, and the model. That of single layers is loaded, too.
-
-    Args:
-        noise: the ending of the models' names.
-    """
-    sessions = {model: load_model(scale, model + noise) for model in (BALANCED, BEST)}
+def fused_frames(lr: MappedRender, hr: MappedRender, scale: int) -> dict[str, tuple[FusedFrame, Session]]:
+    """Return the fused frame of each model, and the model. That of single layers is loaded, too."""
+    sessions = {model: load_model(scale, model) for model in (BALANCED, BEST)}
     sessions[BEST].layer_session  # noqa: B018 - loads it
     return {model: (fuse(lr, hr, session, clean_aovs=True), session) for model, session in sessions.items()}
 
@@ -226,58 +166,37 @@ def picture(folder: Path, output: Path) -> None:
 
 
 def scores(layers: Array, reference: Array, names: list[str]) -> list[Row]:
-    """Return a row for each layer that is bright enough, and their mean with the regraded picture."""
+    """Return the mean of the layers that are bright enough, and a row for each."""
     light = reference.sum(axis=(1, 2, 3))
     rows: list[Row] = [
         {"layer": name, "psnr": psnr(layer, truth), "relmse": relmse(layer, truth)}
         for name, layer, truth, share in zip(names, layers, reference, light / light.sum(), strict=True)
         if share >= FAINT
     ]
-    graded, truth = regraded(layers), regraded(reference)
-    errors = np.mean((srgb(graded) - srgb(truth)) ** 2, axis=-1).ravel()
-    worst = np.sort(errors)[-len(errors) // 100 :].mean()
-    means = {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}
-    regrade = {"regraded_psnr": psnr(graded, truth), "regraded_relmse": relmse(graded, truth)}
-    return [{"layer": ALL, **means, **regrade, "worst_psnr": float(-10 * np.log10(worst))}, *rows]
+    return [{"layer": ALL} | {key: float(np.mean([row[key] for row in rows])) for key in ("psnr", "relmse")}, *rows]
 
 
-def model_used(method: str, scale: int, noise: str = "") -> Row:
-    """Return the column ``model`` of a method: the model of its beauty, to which all but two methods are rescaled."""
+def model_used(method: str, scale: int) -> Row:
+    """Return the column ``model`` of a method: the model of its beauty, to which `PEER` is rescaled, too."""
     if method.startswith("msspl"):
-        return {"model": f"{BEST if 'best' in method else BALANCED}{noise}-x{scale}"}
-    return {"model": f"{BEST}{noise}-x{scale}"} if any(w in method for w in ("rescaled", "stored", "ratio")) else {}
+        return {"model": f"{BEST if 'best' in method else BALANCED}-x{scale}"}
+    return {"model": f"{BEST}-x{scale}"} if method == PEER else {}
 
 
-def measure(
-    folder: Path,
-    scale: int,
-    spp: int,
-    known: Collection[tuple[object, ...]] = (),
-    *,
-    spread: bool = False,
-    half: bool = False,
-) -> list[Row]:
-    """Measure one scene: rows for each set and method, without those whose `KEYS` are known.
-
-    With ``half``, only light groups by the methods `BESIDE_HALF`; else by all but `AT_HALF`.
-    """
+def measure(folder: Path, scale: int, spp: int, known: Collection[tuple[object, ...]] = ()) -> list[Row]:
+    """Measure one scene: rows for each set and method, without those whose `KEYS` are known."""
     names = f"lr_x{scale}_{scale**2 * spp}spp", f"hr_{spp}spp", "ref"
     lr, hr, reference = (map_render(open_exr(folder / f"{name}.exr")) for name in names)
     full = folder / f"hr_{2 * spp}spp.exr"
     ordinary = map_render(open_exr(full)) if full.exists() else None
-    noise = SPREAD if spread else ""
-    fused = fused_frames(lr, hr, scale, noise)
+    fused = fused_frames(lr, hr, scale)
     pixels = hr.load().layers
     plain = partial(denoise, pixels["rgb"], pixels[ALBEDO], pixels[NORMAL])
     oidn_seconds = timer.seconds_of(plain, 1, WARM_UP)[0]
     rows = []
     for layers in hr.additive_sets:
-        if half and layers.name != LIGHT_GROUPS:
-            continue
         clean = layers_of(reference, layers_like(reference, layers))
-        for name, function in methods(lr, hr, fused, layers, ordinary, spread=spread):
-            if name not in BESIDE_HALF if half else name == AT_HALF:
-                continue
+        for name, function in methods(lr, hr, fused, layers, ordinary):
             title = name.replace("msspl", f"msspl-x{scale}") if name.startswith("msspl") else name
             key: Row = {"scene": folder.name, "set": layers.name, "spp": 2 * spp, "method": title}
             if tuple(key.values()) in known:
@@ -286,7 +205,7 @@ def measure(
             made = function()
             seconds = time.perf_counter() - start
             total, *single = scores(made, clean, [layer.name for layer in layers.layers])
-            key |= model_used(name, scale, noise)
+            key |= model_used(name, scale)
             rows += [key | total | {"time": 0.0 if name == "HRLS" else seconds / oidn_seconds}]
             rows += [key | row for row in single]
     return rows
@@ -315,8 +234,6 @@ def main() -> None:
     parser = results.parser(__doc__)
     parser.add_argument("passes", type=Path)
     parser.add_argument("--scene", action="append", default=[], help="a folder in PASSES; default: all")
-    parser.add_argument("--spread", action="store_true", help="a pixel filter has spread the noise")
-    parser.add_argument("--half", action="store_true", help="compare light groups at full and at half resolution")
     parser.add_argument("--picture", type=Path, metavar="FILE.webp", help="draw the first scene instead")
     args = parser.parse_args()
     scenes = args.scene or sorted(file.parent.name for file in args.passes.glob("*/ref.exr"))
@@ -326,8 +243,8 @@ def main() -> None:
     rows: list[Row] = []
     for scene, spp, scale in itertools.product(scenes, SPP, SCALES):
         measured = {tuple(row[key] for key in KEYS) for row in rows}
-        # What has no LRHS, and the ratio of another beauty, are measured at the first scale alone.
-        rows += measure(args.passes / scene, scale, spp, measured, spread=args.spread, half=args.half)
+        # Methods without an LRHS are measured at the first scale alone.
+        rows += measure(args.passes / scene, scale, spp, measured)
         print(f"{scene}, x{scale}, {2 * spp} spp", flush=True)
     print(results.plain(means(rows)))
     if args.table:

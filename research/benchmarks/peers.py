@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 
@@ -19,8 +19,6 @@ from oiio_msspl.model.encoding import decode_radiance, encode_radiance, find_exp
 from oiio_msspl.model.render_mean import find_shares
 from research.benchmarks.oidn import denoise, denoise_prefiltered, run_filter
 
-#: Pixels of one picture of :func:`on_every_second_pixel` are this far apart.
-STRIDE = 2
 #: Log-encoded pixels that differ by this much count 0.6 times as much in the filter that removes the grid.
 SIMILAR = 0.07
 
@@ -30,9 +28,9 @@ def oidn(source: ReadableRender, quality: str = "high") -> Array:
     return denoise(**_inputs(source), quality=quality)
 
 
-def oidn_prefiltered(source: ReadableRender, guides: str = "high") -> Array:
-    """Denoise as OIDN's documentation recommends: albedo and normal first, in the quality ``guides``."""
-    return denoise_prefiltered(**_inputs(source), guides=guides)
+def oidn_prefiltered(source: ReadableRender) -> Array:
+    """Denoise as OIDN's documentation recommends: albedo and normal first."""
+    return denoise_prefiltered(**_inputs(source))
 
 
 def oidn_split(source: ReadableRender) -> Array:
@@ -85,17 +83,12 @@ def match_local_means(image: Array, low: Array) -> Array:
     return image * upsample_bicubic(((low + 1e-3) / (means + 1e-3)).astype(np.float32), width, height)
 
 
-def places() -> Iterator[tuple[slice, slice]]:
-    """Yield the rows and columns of each of the four pictures."""
-    for y, x in itertools.product(range(STRIDE), repeat=2):
-        yield slice(y, None, STRIDE), slice(x, None, STRIDE)
-
-
 def on_every_second_pixel(denoise: Callable[..., Array], images: dict[str, Array]) -> Array:
     """Call ``denoise`` with every second pixel of the images (h, w, c), four times; join the results (h, w, 3)."""
     height, width = next(iter(images.values())).shape[:2]
     result = np.empty((height, width, 3), np.float32)
-    for place in places():
+    for y, x in itertools.product(range(2), repeat=2):
+        place = slice(y, None, 2), slice(x, None, 2)
         result[place] = denoise(**{name: np.ascontiguousarray(image[place]) for name, image in images.items()})
     return result
 

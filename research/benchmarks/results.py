@@ -14,7 +14,7 @@ import functools
 import platform
 import re
 import subprocess
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
+from collections.abc import Hashable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -148,16 +148,11 @@ def stamp_note(rows: Iterable[Row]) -> str:
     when = " to ".join(dict.fromkeys((min(dates), max(dates))))
     note = f"*Measured {when} with version {' to '.join(dict.fromkeys((versions[0], versions[-1])))}"
     note += f", {some}on {', '.join(sorted(machines))}.*" if machines else ".*"
-    older = sorted({row["model"] for row in rows if "model" in row and is_older(row)})
+    older = sorted({r["model"] for r in rows if "model" in r and r.get("digest") != shipped_digest(r["model"])})
     if older:
         names = ", ".join(f"`{name}`" for name in older)
         note += f" **Older than the model that ships** are rows of {names}."
     return note
-
-
-def is_older(row: Mapping[str, Any]) -> bool:
-    """Return whether a row was measured with another file of its model than the one that ships."""
-    return "model" in row and row.get("digest") != shipped_digest(row["model"])
 
 
 def _cell(value: Any) -> Any:
@@ -173,8 +168,12 @@ def index(rows: Iterable[Row], *keys: str) -> dict[Hashable, Row]:
 
 
 def where(rows: Iterable[Row], **wanted: Any) -> list[Row]:
-    """Return the rows that have these values."""
-    return [row for row in rows if all(row.get(column) == value for column, value in wanted.items())]
+    """Return the rows that have these values, or whose values pass these tests."""
+
+    def fits(value: Any, wish: Any) -> bool:
+        return bool(wish(value)) if callable(wish) else value == wish
+
+    return [row for row in rows if all(fits(row.get(column), wish) for column, wish in wanted.items())]
 
 
 def markdown(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
@@ -196,8 +195,8 @@ def parser(description: str | None) -> argparse.ArgumentParser:
     return made
 
 
-def show(layout: Callable[[list[Row]], str], rows: list[Row], table: Path | None, keys: Sequence[str] = ()) -> None:
+def show(rows: list[Row], table: Path | None, keys: Sequence[str] = ()) -> None:
     """Print rows, and write them to a table if there is one."""
-    print(layout(rows))
+    print(plain(rows))
     if table:
         write(table, rows, keys)

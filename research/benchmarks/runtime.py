@@ -1,19 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Measure how long every method takes: a frame in memory, whole commands, shots, passes, and rendering itself.
+"""Measure how long every method takes: a frame in memory, whole commands, shots, and rendering itself.
 
     python -m research.benchmarks.runtime command --table research/benchmarks/results/time_command.csv
-    python -m research.benchmarks.runtime command --size 8192x4320 --scale 4 --quality balanced
     python -m research.benchmarks.runtime frame --table research/benchmarks/results/time_frame.csv
-    python -m research.benchmarks.runtime shots --lamps 4 --frames 8 --table research/benchmarks/results/time_shots.csv
-    python -m research.benchmarks.runtime passes --pair LR.exr HR.exr
+    python -m research.benchmarks.runtime shots --table research/benchmarks/results/time_shots.csv
     python -m research.benchmarks.runtime render SCENES --table research/benchmarks/results/time_render.csv
 
 - ``command``: `msspl-fuse` on a pair of half-float EXRs with beauty, albedo and normal, from start to written file, and
   a program that denoises the full-resolution render with prefiltered Open Image Denoise (OIDN).
 - ``frame``: the call on arrays alone, as in the paper's table of runtimes.
 - ``shots``: :mod:`research.benchmarks.shots.moving_wall`, frame by frame and averaged with neighbours.
-- ``passes``: all layers of eight light groups, or of a rendered pair, beside OIDN on each layer. All groups have light
-  everywhere, which takes longest. Ours reads the layers from the files; OIDN gets arrays, without black layers.
 - ``render``: Mitsuba 3 on the development scenes, for one sample in each of 1024 x 1024 pixels.
 
 :mod:`research.benchmarks.timer` runs each in a fresh process, in turn with the others.
@@ -27,7 +23,7 @@ import os
 import statistics
 import sys
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -41,8 +37,6 @@ from research.benchmarks.results import Row
 #: Width of the squares of :func:`frame` in pixels.
 SQUARE = 24
 OIDN, OIDN_FAST, OIDN_PREFILTERED = "OIDN", "OIDN fast", "OIDN prefiltered"
-#: OIDN prefiltered with its base networks for albedo and normal.
-OIDN_BASE_GUIDES = "OIDN prefiltered with base guides"
 #: See :func:`research.benchmarks.peers.oidn_split`.
 OIDN_SPLIT = "OIDN prefiltered, on every second pixel"
 #: Method of :mod:`research.benchmarks.accuracy` -> its name here, where it does not matter which render it gets.
@@ -52,14 +46,8 @@ SAME_WORK = {
     "OIDN fast on the HRLS": OIDN_FAST,
     "OIDN prefiltered on the HRLS": OIDN_PREFILTERED,
     "OIDN prefiltered, same samples": OIDN_PREFILTERED,
-    "OIDN prefiltered with base guides on the HRLS": OIDN_BASE_GUIDES,
-    "OIDN prefiltered with base guides, same samples": OIDN_BASE_GUIDES,
     "OIDN prefiltered and split, same samples": OIDN_SPLIT,
 }
-#: Light groups of the frame whose passes are timed.
-GROUPS = 8
-BEAUTY, OURS = "beauty", "ours"
-PLAIN, PREFILTERED = "OIDN on each layer", "OIDN on each layer, prefiltered once"
 #: Values of ``--temporal``: the first one is what the others are compared with.
 OFF = "off"
 WAYS = (OFF, "2", "auto")
@@ -88,20 +76,17 @@ def pair(height: int, width: int, scale: int) -> tuple[Any, Any]:
     return Render.from_arrays("lr", **low), Render.from_arrays("hr", **frame(height, width))
 
 
-def write_pair(folder: Path, width: int, height: int, scale: int, groups: int = 0) -> tuple[Path, Path]:
-    """Write both renders as half-float EXRs, with light groups that sum to the beauty; return their paths."""
+def write_pair(folder: Path, width: int, height: int, scale: int) -> tuple[Path, Path]:
+    """Write both renders as half-float EXRs; return their paths."""
     import OpenEXR
 
     from oiio_msspl.image.arrays import planes_of
     from oiio_msspl.image.filters import box_downsample
 
-    shares = np.random.default_rng(1).dirichlet(np.ones(groups or 1), (-(-height // 8), -(-width // 8)))
-    shares = shares.repeat(8, axis=0).repeat(8, axis=1)[:height, :width].astype(np.float32)
     paths = folder / "lr.exr", folder / "hr.exr"
     for path, factor, seed in zip(paths, (scale, 1), (1, 0), strict=True):
         pixels = frame(height, width, seed)
-        lights = {f"light_{i}": pixels["rgb"] * shares[..., i, None] for i in range(groups)}
-        layers = {"": pixels["rgb"], "albedo": pixels["albedo"], "N": pixels["normal"], **lights}
+        layers = {"": pixels["rgb"], "albedo": pixels["albedo"], "N": pixels["normal"]}
         channels = {
             f"{layer}.{component}".lstrip("."): np.ascontiguousarray(plane, np.float16)
             for layer, image in layers.items()
@@ -113,26 +98,20 @@ def write_pair(folder: Path, width: int, height: int, scale: int, groups: int = 
     return paths
 
 
-def prepare_model(name: str, height: int, width: int, threads: int) -> Callable[[], Any]:
-    """Return a call of :func:`oiio_msspl.fuse` on arrays."""
-    from oiio_msspl import Session, find_model, fuse
-
-    session = Session(find_model(0, name), threads=threads)
-    low, high = pair(height, width, session.contract.scale)
-    return partial(fuse, low, high, session)
-
-
-def prepare_oidn(name: str, height: int, width: int, _: int = 0) -> Callable[[], Any]:
-    """Return a call of OIDN on arrays."""
-    from oiio_msspl import Render
+def prepare(name: str, height: int, width: int) -> Callable[[], Any]:
+    """Return a call of a model or of OIDN on arrays."""
+    from oiio_msspl import Render, Session, find_model, fuse
     from research.benchmarks import oidn, peers
 
+    if name not in SAME_WORK.values():
+        session = Session(find_model(0, name))
+        return partial(fuse, *pair(height, width, session.contract.scale), session)
     layers = frame(height, width)
     images = {"color": layers["rgb"], "albedo": layers["albedo"], "normal": layers["normal"]}
     if name == OIDN_SPLIT:
         return partial(peers.oidn_split, Render.from_arrays("full", **layers))
-    if name in (OIDN_PREFILTERED, OIDN_BASE_GUIDES):
-        return partial(oidn.denoise_prefiltered, **images, guides="high" if name == OIDN_PREFILTERED else "balanced")
+    if name == OIDN_PREFILTERED:
+        return partial(oidn.denoise_prefiltered, **images)
     return partial(oidn.denoise, **images, quality="fast" if name == OIDN_FAST else "high")
 
 
@@ -146,12 +125,11 @@ def time_frame(args: argparse.Namespace) -> list[Row]:
     from oiio_msspl.model.catalogue import shipped_models
 
     width, height = args.size
-    cases = [*shipped_models(), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_BASE_GUIDES, OIDN_SPLIT]
-    jobs = {}
-    for case in fnmatch.filter(cases, args.methods):
-        name = "prepare_oidn" if case in SAME_WORK.values() else "prepare_model"
-        arguments = (case, height, width, args.threads)
-        jobs[case] = timer.Function(f"research.benchmarks.runtime:{name}", arguments, args.repeats)
+    cases = [*shipped_models(), OIDN, OIDN_FAST, OIDN_PREFILTERED, OIDN_SPLIT]
+    jobs = {
+        case: timer.Function("research.benchmarks.runtime:prepare", (case, height, width), args.repeats)
+        for case in fnmatch.filter(cases, args.methods)
+    }
     return [
         {"method": case, "size": f"{width}x{height}", **results.model_of(case), **timer.summary(runs)}
         | (oidn_version() if case in SAME_WORK.values() else {})
@@ -169,9 +147,7 @@ def time_command(args: argparse.Namespace) -> list[Row]:
         fuse = [str(Path(sys.executable).with_name("msspl-fuse")), str(low), str(high), "-o", f"{folder}/out.exr"]
         fuse += ["--overwrite", "--no-preview"]
         jobs = {find_model(args.scale, name).stem: [*fuse, "--model", name] for name in args.quality}
-        if not args.without_oidn:
-            oidn = [sys.executable, "-m", "research.benchmarks.oidn", str(high), f"{folder}/oidn.exr"]
-            jobs[OIDN_PREFILTERED] = oidn
+        jobs[OIDN_PREFILTERED] = [sys.executable, "-m", "research.benchmarks.oidn", str(high), f"{folder}/oidn.exr"]
         runs = timer.in_turn(jobs, args.rounds)
     size = {"size": f"{width}x{height}", "scale": args.scale}
     return [
@@ -201,85 +177,14 @@ def time_shots(args: argparse.Namespace) -> list[Row]:
     width, height = args.size
     ways = [(quality, frames) for quality in args.quality for frames in WAYS]
     with tempfile.TemporaryDirectory() as folder:
-        write_shot(Path(folder), args.frames, width, height, args.scale, args.lamps)
+        write_shot(Path(folder), args.frames, width, height, args.scale)
         name = "research.benchmarks.runtime:fuse_shot_in_process"
         runs = timer.in_turn({way: timer.Function(name, (folder, *way)) for way in ways}, args.rounds)
-    shot = {"frames": args.frames, "size": f"{width}x{height}", "scale": args.scale, "lamps": args.lamps}
+    shot = {"frames": args.frames, "size": f"{width}x{height}", "scale": args.scale}
     return [
         {"quality": quality, "temporal": frames, **shot, "model": find_model(args.scale, quality).stem}
         | timer.summary(runs[quality, frames])
         for quality, frames in ways
-    ]
-
-
-def pass_calls(low: Any, high: Any, models: Sequence[str], scale: int) -> dict[tuple[str, str, str], Callable[[], Any]]:
-    """Return what is timed, by set, method and model: the beauty, and the layers of each set, ours and OIDN's."""
-    from oiio_msspl import fuse
-    from oiio_msspl.aovs.features import ALBEDO, NORMAL
-    from oiio_msspl.fusion.passes.fuse import PassInputs, fuse_passes
-    from oiio_msspl.fusion.tiles.network import layer_fuser
-    from oiio_msspl.fusion.tiles.tiling import MAX_MEMORY, strips_memory
-    from oiio_msspl.model.catalogue import load_model
-    from research.benchmarks.oidn import denoise, denoise_with_clean, prefiltered
-    from research.benchmarks.passes import layers_of
-
-    guides = high.read(high.data_window, [ALBEDO, NORMAL])
-
-    def passes(layers: Any, session: Any, beauty: Any) -> None:
-        cache_bytes = strips_memory(MAX_MEMORY, beauty.nbytes)  # as in the job of a frame
-        fuser = layer_fuser(session, beauty)
-        inputs = PassInputs(low, high, beauty.rgb, beauty.alignment, [layers], beauty.clean_aovs)
-        made = fuse_passes(inputs, fuse_layers=fuser, cache_bytes=cache_bytes)
-        assert not made.refused
-
-    def each_plain(noisy: Sequence[Any]) -> None:
-        for layer in noisy:
-            denoise(layer, guides[ALBEDO], guides[NORMAL])
-
-    def each_prefiltered(noisy: Sequence[Any]) -> None:
-        clean = prefiltered(guides)
-        for layer in noisy:
-            denoise_with_clean(layer, clean)
-
-    calls: dict[tuple[str, str, str], Callable[[], Any]] = {}
-    sessions = [load_model(scale, model) for model in models]
-    beauties = {session.name: fuse(low, high, session, clean_aovs=True) for session in sessions}
-    for session in sessions:
-        calls["", BEAUTY, session.name] = partial(fuse, low, high, session)
-    for layers in high.additive_sets:
-        noisy = [layer for layer in layers_of(high, layers) if layer.any()]
-        title = f"{layers.name}: {len(noisy)} of {len(layers.layers)} layers have light"
-        for session in sessions:
-            calls[title, OURS, session.name] = partial(passes, layers, session, beauties[session.name])
-        calls[title, PLAIN, ""] = partial(each_plain, noisy)
-        calls[title, PREFILTERED, ""] = partial(each_prefiltered, noisy)
-    return calls
-
-
-def time_passes(args: argparse.Namespace) -> list[Row]:
-    """Time passes in this process, because both peers share what they read; the calls take turns."""
-    from oiio_msspl import map_render, open_exr
-    from oiio_msspl.fusion.tiles.alignment import align
-
-    times: dict[tuple[str, str, str], list[float]] = {}
-    with tempfile.TemporaryDirectory() as folder:
-        width, height = args.size
-        paths = args.pair or write_pair(Path(folder), width, height, args.scale, GROUPS)
-        low, high = (map_render(open_exr(path)) for path in paths)
-        scale, window = align(low, high).scale, high.data_window
-        calls = pass_calls(low, high, args.quality, scale)
-        for _ in range(args.rounds + 1):
-            for key, call in calls.items():
-                times.setdefault(key, []).extend(timer.seconds_of(call, 1, 0))
-    size = {
-        "size": f"{window.width}x{window.height}",
-        "scale": scale,
-        "kind": "rendered" if args.pair else "light everywhere",
-    }
-    return [
-        {"set": name, "method": method, **size, "cores": os.cpu_count(), **({"model": model} if model else {})}
-        | {"seconds": statistics.median(seconds[1:])}
-        for (name, method, model), seconds in times.items()
     ]
 
 
@@ -315,8 +220,7 @@ def time_render(args: argparse.Namespace) -> list[Row]:
 QUESTIONS = {
     "frame": (time_frame, ("method", "machine"), "1024x1024"),
     "command": (time_command, ("method", "size", "machine"), "1920x1080"),
-    "shots": (time_shots, ("quality", "temporal", "lamps", "machine"), "1920x1080"),
-    "passes": (time_passes, ("set", "method", "model", "scale", "kind", "machine"), "1920x1080"),
+    "shots": (time_shots, ("quality", "temporal", "machine"), "1920x1080"),
     "render": (time_render, ("scene", "machine"), "1024x1024"),
 }
 
@@ -332,16 +236,12 @@ def main() -> None:
     parser.add_argument("--quality", nargs="+", default=["fast", "balanced", "best", "paper"], help="or models")
     parser.add_argument("--methods", metavar="PATTERN", default="*", help="frame: measure only these")
     parser.add_argument("--repeats", type=int, default=2, help="frame: calls that are timed in a process")
-    parser.add_argument("--threads", type=int, default=0, help="frame: of ONNX Runtime; 0: one a core")
-    parser.add_argument("--without-oidn", action="store_true", help="command: leave OIDN out")
     parser.add_argument("--frames", type=int, default=24, help="shots: frames of the shot")
-    parser.add_argument("--lamps", type=int, default=0, help="shots: light groups whose passes are fused")
-    parser.add_argument("--pair", type=Path, nargs=2, metavar=("LR.exr", "HR.exr"), help="passes: a rendered pair")
     args = parser.parse_args()
     measure, keys, size = QUESTIONS[args.question]
     args.size = [int(side) for side in (args.size or size).split("x")]
     rows = [{"machine": results.processor(), **row} for row in measure(args)]
-    results.show(results.plain, rows, args.table, keys)
+    results.show(rows, args.table, keys)
 
 
 if __name__ == "__main__":

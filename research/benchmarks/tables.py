@@ -19,12 +19,10 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from oiio_msspl.model.catalogue import MEASURED, shipped_models
 from oiio_msspl.model.contract import SPREAD
-from research.benchmarks import accuracy, paper, passes, results, runtime
-from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label, matching
+from research.benchmarks import paper, passes, results, runtime
+from research.benchmarks.layout import Column, Line, Table, Wanted, clean, label
 from research.benchmarks.results import MEAN, Row
 from research.benchmarks.runtime import SAME_WORK
 from research.benchmarks.scenes import NOISY_REFERENCE
@@ -37,7 +35,6 @@ from research.benchmarks.shots.methods import (
     OIDN_SPLIT_NEIGHBOURS,
     QUALITIES,
 )
-from research.benchmarks.stability.report import ENLARGED
 
 ROOT = Path(__file__).parents[2]
 
@@ -47,21 +44,10 @@ def _on(instructions: str) -> dict[str, Wanted]:
     return {"machine": lambda name: name is not None and name.endswith(instructions)}
 
 
-def strongest(rows: Sequence[Row], input_name: str) -> str:
-    """Return the call of OIDN on this input with the highest mean PSNR over all average spp."""
-    means = [row for row in rows if row["scene"] == MEAN and row["method"].startswith("OIDN")]
-    psnr: dict[str, list[float]] = {}
-    for row in means:
-        if row["method"].endswith(input_name):
-            psnr.setdefault(row["method"], []).append(row["psnr"])
-    return max(psnr, key=lambda method: float(np.mean(psnr[method])))
-
-
 FAST, BALANCED, BEST = "joint-small-x2", "joint-x2", "joint-large-x2"
-ON_HRLS, JOINED, SAME_SAMPLES = (
-    strongest(results.read("accuracy"), name) for name in (" on the HRLS", " on both x2, together", ", same samples")
-)
-#: OIDN at its best -> which render it gets.
+ON_HRLS, SAME_SAMPLES = "OIDN prefiltered on the HRLS", "OIDN prefiltered, same samples"
+JOINED = "OIDN prefiltered on both x2, together"
+#: OIDN at its best on each input -> which render it gets.
 PLACES = {ON_HRLS: "on the HRLS", JOINED: "on both renders, joined", SAME_SAMPLES: "at full resolution, same samples"}
 SETS = {
     "Mitsuba": "accuracy",
@@ -109,10 +95,10 @@ WHEN_IT_PAYS = Table(
         for m in (FAST, BALANCED, BEST, ON_HRLS, SAME_SAMPLES, "paper-x2")
     ],
     [
-        Column("PSNR, 2 spp", "psnr", {"source": "accuracy", "scene": MEAN, "spp": 2}),
-        Column("PSNR, 8 spp", "psnr", {"source": "accuracy", "scene": MEAN, "spp": 8}),
-        Column("RelMSE, 2 spp", "relmse", {"source": "accuracy", "scene": MEAN, "spp": 2}),
-        Column("RelMSE, 8 spp", "relmse", {"source": "accuracy", "scene": MEAN, "spp": 8}),
+        *(
+            Column(f"{title}, {spp} spp", title.lower(), {"source": "accuracy", "scene": MEAN, "spp": spp})
+            for title, spp in itertools.product(("PSNR", "RelMSE"), (2, 8))
+        ),
         Column(
             "whole command at 1080p, processor seconds",
             "cpu_seconds",
@@ -122,12 +108,6 @@ WHEN_IT_PAYS = Table(
         ),
     ],
 )
-
-
-def _accuracy_columns(source: str, spps: Sequence[int] = accuracy.AVERAGES) -> list[Column]:
-    """Return columns of mean PSNR and RelMSE for some average spp."""
-    where = {"source": source, "scene": MEAN}
-    return [Column(f"{spp} spp: PSNR / RelMSE", "psnr/relmse", {**where, "spp": spp}) for spp in spps]
 
 
 ACCURACY_BY_SCENE = Table(
@@ -155,18 +135,18 @@ HOW_SURE = Table(
 )
 
 
-#: Method with the ending of a division of the samples.
-def _divided(more: int, less: int) -> dict[str, str]:
-    return {method: f"{method}, {more}:{less}" for method in METHODS}
-
-
 SAMPLE_COUNTS = Table(
     ("accuracy_box",),
     BY_SCENE,
     ("PSNR, samples of the HRLS : LRHS",),
     [Line([METHODS[method]], {"method": method, "scene": MEAN}) for method in (BALANCED, BEST, ON_HRLS, SAME_SAMPLES)],
     [
-        Column(f"{spp} spp, {more}:{less}", "psnr", {"spp": spp}, renamed=_divided(more, less) if more > 1 else {})
+        Column(
+            f"{spp} spp, {more}:{less}",
+            "psnr",
+            {"spp": spp},
+            renamed={m: f"{m}, {more}:{less}" for m in METHODS if more > 1},
+        )
         for spp, more, less in ((4, 1, 1), (4, 3, 1), (8, 1, 1), (8, 3, 1), (8, 7, 1))
     ],
 )
@@ -185,7 +165,7 @@ SPREAD_NOISE = Table(
             "OIDN prefiltered and split, same samples": "the call above on every second pixel",
         }.items()
     ],
-    _accuracy_columns("accuracy_gauss", (2, 8)),
+    [Column(f"{spp} spp: PSNR / RelMSE", "psnr/relmse", {"scene": MEAN, "spp": spp}) for spp in (2, 8)],
     means=True,
 )
 
@@ -224,12 +204,10 @@ GPU_TIMES = Table(
         Column("time / OIDN's", "ms", LARGE, "ratio", against={"method": "OIDN"}),
         Column("time / prefiltered OIDN's", "ms", LARGE, "ratio", against={"method": "OIDN prefiltered"}),
         Column("with copies", "with_copies_ms", LARGE, form="{:.1f}"),
-        Column("convolutions, at least", "floor_ms", LARGE, form="{:.1f}"),
     ],
 )
 
 
-#: A sequence's rows with neighbours -> those of single frames.
 def _alone(row: Row) -> dict[str, str]:
     return {"method": row["method"].replace(NEIGHBOURS, ALONE)}
 
@@ -273,7 +251,7 @@ SHOTS = Table(
 
 TIME_OF_SHOTS = Table(
     ("time_shots",),
-    ("quality", "temporal", "machine", "lamps"),
+    ("quality", "temporal", "machine"),
     ("machine", "frames", "quality", "`--temporal`"),
     ("machine", "frames", "quality", "temporal"),
     [
@@ -281,7 +259,6 @@ TIME_OF_SHOTS = Table(
         Column("ratio", "seconds", how="ratio", against={"temporal": "off"}),
         Column("peak MB", "peak_mb", form="{:.0f}"),
     ],
-    {"lamps": 0},
 )
 
 
@@ -299,7 +276,7 @@ PASSES_SUMMARY = Table(
 
 STABILITY = Table(
     ("stability",),
-    ("scale", "scenes", "group", "case", "method"),
+    ("scale", "group", "case", "method"),
     ("method",),
     ("family",),
     [
@@ -312,7 +289,6 @@ STABILITY = Table(
             Column("stamps", "stamps", {"scale": scale}, "sum", "{:.0f}"),
         )
     ],
-    {"method": lambda name: name not in (ENLARGED, "OIDN on the HRLS")},
 )
 
 PAIR_CHECKS = Table(
@@ -377,7 +353,7 @@ def measured_models() -> str:
         for noise, table in sets.items()
     }
     times = results.read("time_frame")
-    runs = [results.index(matching(times, _on(ending)), "method") for ending in MACHINES.values()]
+    runs = [results.index(results.where(times, **_on(ending)), "method") for ending in MACHINES.values()]
     lines = [",".join(["model,psnr_2spp,relmse_2spp,psnr_8spp,relmse_8spp", *(f"time_{x.lower()}" for x in MACHINES)])]
     for name in shipped_models():
         rows = [means[SPREAD if f"{SPREAD}-x" in name else ""].get((spp, name)) for spp in (2, 8)]

@@ -23,6 +23,9 @@ from typing import Any
 
 from research.benchmarks.results import Row
 
+#: The kernel counts memory in KB, on macOS in bytes.
+MAXRSS_IN_MB = 1 << 20 if sys.platform == "darwin" else 1 << 10
+
 
 @dataclass(frozen=True)
 class Function:
@@ -36,14 +39,8 @@ class Function:
 
     def command(self) -> list[str]:
         """Return the command that runs it."""
-        return [
-            sys.executable,
-            "-m",
-            "research.benchmarks.timer",
-            self.name,
-            str(self.repeats),
-            json.dumps(self.arguments),
-        ]
+        module = [sys.executable, "-m", "research.benchmarks.timer"]
+        return [*module, self.name, str(self.repeats), json.dumps(self.arguments)]
 
 
 @dataclass(frozen=True)
@@ -56,12 +53,8 @@ class Run:
     peak_mb: float
 
 
-def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int, idle: float = 0.0) -> dict[Any, list[Run]]:
-    """Run every job once in each round, in the order of the mapping; return the runs of each.
-
-    Args:
-        jobs: functions, or commands as lists of words.
-        idle: seconds to wait before each run.
+def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int) -> dict[Any, list[Run]]:
+    """Run every job, a function or a command as a list of words, once in each round; return the runs of each.
 
     Raises:
         SystemExit: a job fails. The message is what it printed.
@@ -69,7 +62,6 @@ def in_turn(jobs: Mapping[Any, Function | Sequence[str]], rounds: int, idle: flo
     runs: dict[Any, list[Run]] = {name: [] for name in jobs}
     for _ in range(rounds):
         for name, job in jobs.items():
-            time.sleep(idle)
             runs[name].append(run(job))
     return runs
 
@@ -87,12 +79,9 @@ def run(job: Function | Sequence[str]) -> Run:
             file.seek(0)
         if process.returncode:
             raise SystemExit(f"{' '.join(command)}\n{errors.read()}")
-        cpu, peak = (
-            usage.ru_utime + usage.ru_stime,
-            usage.ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10),
-        )
+        cpu = usage.ru_utime + usage.ru_stime
         if not isinstance(job, Function):
-            return Run((seconds,), cpu, peak)
+            return Run((seconds,), cpu, usage.ru_maxrss / MAXRSS_IN_MB)
         measured = json.loads(output.read().splitlines()[-1])
         return Run(tuple(measured["seconds"]), cpu, measured["peak_mb"])
 
@@ -130,7 +119,7 @@ def peak_mb() -> float:
         return int(mark[1]) / (1 << 10)
     import resource
 
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / (1 << 20 if sys.platform == "darwin" else 1 << 10)
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / MAXRSS_IN_MB
 
 
 def main() -> None:

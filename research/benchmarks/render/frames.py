@@ -12,7 +12,6 @@ from __future__ import annotations
 
 import argparse
 import itertools
-import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -91,9 +90,8 @@ def main() -> None:
     args = parser.parse_args()
     mi = start_mitsuba(args.threads)
     for camera, file in itertools.product(CAMERAS, sorted(args.scenes.glob("*/scene.xml"))):
-        start = time.perf_counter()
+        print(f"{file.parent.name}{camera}", flush=True)
         render(mi, file, args.out, camera)
-        print(f"{file.parent.name}{camera}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import gc
 import itertools
-import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -110,14 +109,13 @@ def main() -> None:
 
     assets = Assets(args.assets)
     for seed in range(args.first, args.first + args.scenes):
-        start = time.perf_counter()
         scene, plan = scenes.build(seed, assets)
+        print(f"{plan.kind}-{seed}", flush=True)
         for view, (suffix, size) in enumerate(SIZES.items()):
             camera = next(find_cameras(scene, plan, seed, view), None)
             if camera is not None:
                 render(scene, camera, args.out / f"{plan.kind}-{seed}{suffix}", size, seed % 2 == 1)
         gc.collect()  # scenes are reference cycles, which only the collector frees
-        print(f"{plan.kind}-{seed}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

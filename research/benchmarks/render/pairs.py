@@ -11,7 +11,6 @@ LRHS have albedo, normal, diffuse and specular. Files that exist are kept.
 from __future__ import annotations
 
 import argparse
-import time
 import zlib
 from pathlib import Path
 from typing import Any
@@ -21,7 +20,6 @@ from numpy.typing import NDArray
 
 from oiio_msspl.model.contract import SCALES
 from research.benchmarks.render.film import CROP, frame_size, set_crop, write_exr
-from research.benchmarks.render.generated_frames import splat
 from research.datagen.mitsuba.start import start as start_mitsuba
 from research.datagen.views import FILTERS
 
@@ -82,7 +80,6 @@ def mean_of_samples(
     placing: Any,
     *,
     layers: bool,
-    spread: bool = False,
 ) -> NDArray[np.float64]:
     """Render samples in launches that fit into memory and average them: (h, w, 15), or (h, w, 3) without layers.
 
@@ -90,21 +87,18 @@ def mean_of_samples(
         size: width and height.
         title: the random numbers follow from it.
         placing: pixel filter of :mod:`research.datagen.mitsuba.trace`.
-        spread: each sample also counts in the pixels around, as with Mitsuba's default filter.
     """
     from research.datagen.mitsuba.trace import LAYERS as SAMPLED
     from research.datagen.mitsuba.trace import render_samples
 
     per_launch = max(1, LAUNCH // (size[0] * size[1]))
     names = SAMPLED[:5] if layers else SAMPLED[:1]
-    total, weight = np.zeros((size[1], size[0], 3 * len(names))), np.zeros((size[1], size[0], 1))
+    total = np.zeros((size[1], size[0], 3 * len(names)))
     for done in range(0, spp, per_launch):
         count, seed = min(per_launch, spp - done), zlib.crc32(f"{title} {done}".encode())
         samples = render_samples(scene, camera, size, count, seed, names, pixel_filter=placing)  # type: ignore[arg-type]
-        values = np.concatenate([samples[name] for name in names], axis=-1)
-        sums = splat(values, samples["place"]) if spread else (values.sum(axis=0, dtype=np.float64), count)
-        total, weight = total + sums[0], weight + sums[1]
-    return total / np.maximum(weight, 1e-6)
+        total += np.concatenate([samples[name] for name in names], axis=-1).sum(axis=0, dtype=np.float64)
+    return total / spp
 
 
 def main() -> None:
@@ -117,9 +111,8 @@ def main() -> None:
     args = parser.parse_args()
     start_mitsuba(args.threads)
     for file in sorted(args.scenes.glob("*/scene.xml")):
-        start = time.perf_counter()
+        print(file.parent.name, flush=True)
         render(file, args.out / file.parent.name, args.filter, args.reference)
-        print(f"{file.parent.name}: {time.perf_counter() - start:.0f} s", flush=True)
 
 
 if __name__ == "__main__":

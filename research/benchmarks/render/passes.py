@@ -2,20 +2,18 @@
 """Render pairs and references whose layers sum to the beauty, for `research.benchmarks.passes`.
 
     python -m research.benchmarks.render.passes SCENES OUT
-    python -m research.benchmarks.render.passes SCENES OUT2 --spread
 
 Of every ``NAME/scene.xml`` the crop of `research.benchmarks.render.pairs` is rendered with Mitsuba 3, once for each
 group of lamps with the same random numbers: a lamp's share of each path, as renderers write light groups. So the file
 has two additive sets: ``light_1`` to ``light_n``, and ``diffuse``, ``specular`` and ``other`` (seen directly or
 through glass). There are HRLS of 1, 2 and 4 spp, LRHS with as many samples a HRLS pixel, and a reference. Mitsuba
 orders the lamps of a scene anew when it loads it, so all files of a scene come from one run: a scene whose files all
-exist is kept. With ``--spread``, each sample counts in the pixels around it, too, as with Mitsuba's default filter.
+exist is kept.
 """
 
 from __future__ import annotations
 
 import argparse
-import time
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +47,7 @@ class Lamps:
             lamp.update()
 
 
-def render(file: Path, folder: Path, reference: int, *, spread: bool) -> None:
+def render(file: Path, folder: Path, reference: int) -> None:
     """Render the files of one scene, unless all of them exist. ``reference`` is in spp."""
     import mitsuba as mi
 
@@ -69,7 +67,7 @@ def render(file: Path, folder: Path, reference: int, *, spread: bool) -> None:
         for group in range(len(lamps.groups)):
             lamps.switch_on(group)
             title = f"{folder.name} {name}"
-            images.append(mean_of_samples(scene, camera, size, spp, title, box, layers=True, spread=spread))
+            images.append(mean_of_samples(scene, camera, size, spp, title, box, layers=True))
         total = np.stack(images)
         beauty, diffuse, specular = (total[..., i : i + 3].sum(axis=0) for i in (0, 9, 12))
         layers = {"": beauty, "albedo.": total[0, ..., 3:6], "nn.": total[0, ..., 6:9], "diffuse.": diffuse}
@@ -85,14 +83,12 @@ def main() -> None:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--reference", type=int, default=512, help="spp")
-    parser.add_argument("--spread", action="store_true", help="spread samples over pixels")
     parser.add_argument("--threads", type=int, default=2)
     args = parser.parse_args()
     start_mitsuba(args.threads)
     for file in sorted(args.scenes.glob("*/scene.xml")):
-        start = time.perf_counter()
-        render(file, args.out / file.parent.name, args.reference, spread=args.spread)
-        print(f"{file.parent.name}: {time.perf_counter() - start:.0f} s", flush=True)
+        print(file.parent.name, flush=True)
+        render(file, args.out / file.parent.name, args.reference)
 
 
 if __name__ == "__main__":

@@ -18,7 +18,6 @@ says so, give that sequence Blender's format, in one line::
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -26,8 +25,6 @@ from pathlib import Path
 import numpy as np
 
 from oiio_msspl import map_render, open_exr
-from oiio_msspl.errors import InputError, MssplError
-from oiio_msspl.exr.atomic import check_target
 from oiio_msspl.image.colour import srgb
 from oiio_msspl.jobs.plan import AUTO, TemporalOptions
 from oiio_msspl.model.catalogue import QUALITIES as MODELS
@@ -67,8 +64,8 @@ def measure(sequence: Sequence, made: list[Made], *, spread: bool = False) -> It
         yield row | {"motion": method.motion}
 
 
-def main() -> int:
-    """Measure sequences; return the exit code."""
+def main() -> None:
+    """Measure sequences. Their rows replace those of the same sequences and methods in the table."""
     parser = results.parser(__doc__)
     parser.add_argument("folder", type=Path, help="the sequences")
     parser.add_argument("--sequence", action="append", default=[], help="SCENE/KIND; default: all that are there")
@@ -80,28 +77,10 @@ def main() -> int:
     parser.add_argument("--picture", type=Path, help="draw a PNG")
     parser.add_argument("--film", type=Path, help="draw an animated WebP")
     args = parser.parse_args()
-    try:
-        run(args)
-    except MssplError as error:
-        print(error, file=sys.stderr)
-        return error.exit_code
-    return 0
-
-
-def run(args: argparse.Namespace) -> None:
-    """Measure sequences. Their rows replace those of the same sequences and methods in the table.
-
-    Raises:
-        InputError: there are none, one is not complete, or a picture can't be written.
-    """
-    for path in filter(None, (args.picture, args.film)):
-        check_target(path, overwrite=True)
     files = args.folder.glob("*/*/hr.0001.exr")
     names = args.sequence or sorted(f"{path.parent.parent.name}/{path.parent.name}" for path in files)
     if not names:
-        raise InputError(
-            f"{args.folder}: holds no sequences; python -m research.benchmarks.render.sequences makes them"
-        )
+        parser.error(f"{args.folder}: holds no sequences; python -m research.benchmarks.render.sequences makes them")
     for index, name in enumerate(names):
         sequence = load(args.folder / name, args.motion_format)
         options = TemporalOptions(args.temporal, args.motion_format)
@@ -109,7 +88,7 @@ def run(args: argparse.Namespace) -> None:
             judged = without_vectors(sequence, Path(folder)) if args.without_vectors else sequence
             made = list(all_methods(judged, options, args.methods, spread=args.spread))
         rows = list(measure(sequence, made, spread=args.spread))
-        results.show(results.plain, rows, args.table, KEYS)
+        results.show(rows, args.table, KEYS)
         if index == 0 and (args.picture or args.film):
             draw(args, sequence, made)
 
@@ -128,4 +107,4 @@ def draw(args: argparse.Namespace, sequence: Sequence, made: list[Made]) -> None
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

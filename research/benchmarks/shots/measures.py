@@ -31,7 +31,8 @@ def flicker(images: Array, truth: tuple[Array, Array]) -> float:
 def psnr(image: Array, truth: tuple[Array, Array], mask: Mask | None = None) -> float:
     """Return PSNR in dB of sRGB values (..., 3) against two references, where the mask (...) is set if there is one."""
     products = (image - truth[0]) * (image - truth[1])
-    return decibels(_mean(products if mask is None else products[mask]))
+    square = _mean(products if mask is None else products[mask])
+    return math.inf if square == 0 else -10 * math.log10(square)
 
 
 def relmse(image: Array, truth: tuple[Array, Array]) -> float:
@@ -39,11 +40,6 @@ def relmse(image: Array, truth: tuple[Array, Array]) -> float:
     factor, offset = RELMSE_BCR
     brightness = np.square((truth[0] + truth[1]) / 2)
     return factor * _mean((image - truth[0]) * (image - truth[1]) / (brightness + offset))
-
-
-def decibels(square: float) -> float:
-    """Return a mean squared error of values from 0 to 1 as PSNR."""
-    return math.inf if square == 0 else -10 * math.log10(square)
 
 
 def _mean(products: NDArray[Any]) -> float:

@@ -3,10 +3,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -68,23 +69,10 @@ def all_methods(
 
 
 class _RunOfPeer(ShotRun):
-    """A shot whose full-resolution renders are averaged as ours are, and then denoised by another program.
+    """A shot whose full-resolution renders are averaged as ours are, and then denoised by another program."""
 
-    Args:
-        denoised: what denoises a render.
-        folder: of the full-resolution renders.
-        settings, plan, wanted: of the shot.
-    """
-
-    def __init__(
-        self,
-        denoised: Callable[[ReadableRender], Array],
-        folder: Path,
-        settings: Settings,
-        plan: ShotPlan,
-        wanted: Sequence[FrameFiles],
-    ) -> None:
-        super().__init__(settings, plan, wanted)
+    def __init__(self, denoised: Callable[[ReadableRender], Array], folder: Path, *shot: Any) -> None:
+        super().__init__(*shot)
         self._denoised, self._folder = denoised, folder
 
     def read(self, files: FrameFiles) -> list[ShotFrame]:
@@ -127,12 +115,7 @@ def _motion(plan: ShotPlan) -> str:
 
 
 def _images(run: ShotRun) -> Array:
-    """Return the images of all frames.
-
-    Raises:
-        MssplError: a frame can't be fused.
-        InputError: a neighbour is not averaged.
-    """
+    """Return the images of all frames, which must all be fused and averaged."""
     images = []
     for files in run.order:
         for frame in run.take(run.read(files)):

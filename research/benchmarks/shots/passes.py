@@ -75,7 +75,7 @@ def main() -> None:
             write_shot(Path(folder), args.frames, *SIZE, scale, LAMPS)
             for quality, frames in itertools.product(("balanced", "best"), ("off", "auto")):
                 rows += measure(Path(folder), args.frames, scale, quality, frames)
-    results.show(results.plain, rows, args.table)
+    results.show(rows, args.table)
 
 
 if __name__ == "__main__":

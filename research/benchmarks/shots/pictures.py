@@ -61,13 +61,5 @@ def film(path: Path, shown: dict[str, Array], crop: tuple[slice, slice]) -> None
             ImageDraw.Draw(picture).text((i * (wide[0].shape[2] + 2) + 3, 0), title, fill="white")
         frames.append(picture)
     with replacing(path, overwrite=True) as temporary:
-        frames[0].save(
-            temporary,
-            format="WEBP",
-            save_all=True,
-            append_images=frames[1:],
-            duration=120,
-            loop=0,
-            quality=80,
-            method=6,
-        )
+        timing = {"append_images": frames[1:], "duration": 120, "loop": 0}
+        frames[0].save(temporary, format="WEBP", save_all=True, quality=80, method=6, **timing)

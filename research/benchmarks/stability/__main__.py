@@ -12,7 +12,7 @@ otherwise. :mod:`research.benchmarks.stability.measures` says what is measured a
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -20,32 +20,28 @@ import numpy as np
 from oiio_msspl import fuse
 from oiio_msspl.aovs.features import RGB
 from oiio_msspl.compare import upsample_bicubic
-from oiio_msspl.image.arrays import Array
+from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.model.catalogue import find_model, shipped_models
 from oiio_msspl.model.contract import SCALES
 from oiio_msspl.model.session import Session
 from research.benchmarks import peers, results
-from research.benchmarks.stability import bases, cases, measures, report
+from research.benchmarks.stability import cases
+from research.benchmarks.stability.cases import Pair
+from research.benchmarks.stability.measures import KEYS, judged, measure
 
 #: Side of the analytic frames.
 SIZE = 256
 
 #: From a pair to the picture (h, w, 3) and the warnings.
-Method = Callable[[bases.Pair], tuple[Array, list[str]]]
+Method = Callable[[Pair], tuple[Array, list[str]]]
 
 
-def enlarged(pair: bases.Pair) -> tuple[Array, list[str]]:
+def enlarged(pair: Pair) -> Array:
     """Enlarge the LRHS."""
-    low = measures.repaired(pair.lr.layers[RGB])
-    return upsample_bicubic(low, pair.hr.data_window.width, pair.hr.data_window.height), []
+    return upsample_bicubic(repair(pair.lr.layers[RGB])[0], pair.hr.data_window.width, pair.hr.data_window.height)
 
 
-def oidn(pair: bases.Pair) -> tuple[Array, list[str]]:
-    """Denoise the HRLS."""
-    return peers.oidn(pair.hr), []
-
-
-def oidn_prefiltered(pair: bases.Pair) -> tuple[Array, list[str]]:
+def oidn_prefiltered(pair: Pair) -> tuple[Array, list[str]]:
     """Denoise the HRLS with denoised albedo and normal."""
     return peers.oidn_prefiltered(pair.hr), []
 
@@ -53,7 +49,7 @@ def oidn_prefiltered(pair: bases.Pair) -> tuple[Array, list[str]]:
 def ours(session: Session) -> Method:
     """Return the method that fuses with a model."""
 
-    def run(pair: bases.Pair) -> tuple[Array, list[str]]:
+    def run(pair: Pair) -> tuple[Array, list[str]]:
         fused = fuse(pair.lr, pair.hr, session)
         return fused.rgb, fused.warnings
 
@@ -63,33 +59,23 @@ def ours(session: Session) -> Method:
 def methods_for(scale: int, sessions: list[Session]) -> dict[str, Method]:
     """Return the methods of a scale by name."""
     models = {session.contract.name: ours(session) for session in sessions if session.contract.scale == scale}
-    denoisers = {"OIDN on the HRLS": oidn, "OIDN prefiltered on the HRLS": oidn_prefiltered}
-    return {report.ENLARGED: enlarged, **models, **denoisers}
-
-
-def groups_of(scale: int, size: int) -> Iterator[tuple[str, Iterator[cases.Case]]]:
-    """Yield each group and its cases."""
-    for name, anywhere in cases.ANYWHERE.items():
-        yield name, anywhere(cases.room(size), scale)
-    for name, made in cases.MADE.items():
-        yield name, made(size, scale)
+    return models | {"OIDN prefiltered on the HRLS": oidn_prefiltered}
 
 
 def run(scale: int, methods: dict[str, Method], size: int) -> list[dict[str, Any]]:
-    """Return what :func:`measures.measure` finds for each case and method, and the columns that tell them apart."""
+    """Return what :func:`measure` finds for each case and method, and the columns that tell them apart."""
     rows = []
-    for group, members in groups_of(scale, size):
-        undisturbed: dict[tuple[str, bases.Pair], Array] = {}
-        for case in members:
-            pictures: dict[str, Array] = {}
+    for group, make in cases.GROUPS.items():
+        undisturbed: dict[tuple[str, Pair], Array] = {}
+        for case in make(size, scale):
+            small = enlarged(case.pair)
             for name, method in methods.items():
                 if case.clean is not None and (name, case.clean) not in undisturbed:
                     undisturbed[name, case.clean] = method(case.clean)[0]
-                pictures[name], warnings = method(case.pair)
+                image, warnings = method(case.pair)
                 clean = undisturbed[name, case.clean] if case.clean is not None else None
-                figures = measures.measure(case, pictures[name], clean, pictures[report.ENLARGED], warnings)
-                key = {"scale": scale, "scenes": "analytic", "group": group, "case": case.name, "method": name}
-                rows.append({**key, **figures})
+                key = {"scale": scale, "group": group, "case": case.name, "method": name}
+                rows.append(key | measure(case, image, clean, small, warnings))
         print(f"x{scale}: {group}", file=sys.stderr)
     return rows
 
@@ -98,15 +84,13 @@ def main() -> None:
     """Measure the models of some scales."""
     parser = results.parser(__doc__)
     parser.add_argument("--model", action="append", default=[], help="ONNX file or shipped name; repeat it for more")
-    parser.add_argument("--scale", type=int, action="append", choices=SCALES, help="default: those of --model, or 4")
+    parser.add_argument("--scale", type=int, nargs="+", choices=SCALES, default=[2, 4], help="default: 2 4")
     parser.add_argument("--size", type=int, default=SIZE, help="side of the frames (%(default)s)")
-    parser.add_argument("--threads", type=int, default=0, help="of ONNX Runtime; 0: one a core")
     args = parser.parse_args()
     files = [find_model(4, name) for name in args.model] or list(shipped_models().values())
-    sessions = [Session(file, threads=args.threads) for file in files]
-    scales = args.scale or (sorted({session.contract.scale for session in sessions}) if args.model else [4])
-    rows = [row for scale in scales for row in run(scale, methods_for(scale, sessions), args.size)]
-    results.show(results.plain, report.judged(rows), args.table, report.KEYS)
+    sessions = [Session(file) for file in files]
+    rows = [row for scale in args.scale for row in run(scale, methods_for(scale, sessions), args.size)]
+    results.show(judged(rows), args.table, KEYS)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Make the cases: what can go wrong with a pair. There is one function for each group."""
+"""Make pairs from analytic scenes, and the cases: what can go wrong with a pair, one function for each group."""
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cache
@@ -14,10 +15,64 @@ from oiio_msspl.exr.render import Render
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.model.encoding import MAX_RADIANCE
 from research.benchmarks.stability import analytic
-from research.benchmarks.stability.bases import Base, Pair, seeded
 
 #: The group in which both renders show different things, by a mistake of the user.
 DISAGREE = "LRHS and HRLS disagree"
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """An LRHS, an HRLS and the reference (h, w, 3)."""
+
+    lr: Render
+    hr: Render
+    reference: Array
+
+    @property
+    def scale(self) -> int:
+        return self.hr.data_window.width // self.lr.data_window.width
+
+
+@dataclass(frozen=True, eq=False)
+class Base:
+    """An analytic scene that gives pairs of any scale and spp."""
+
+    name: str
+    scene: analytic.Scene
+
+    @cache  # noqa: B019 - undisturbed results are kept by pair, so equal arguments must give the same object
+    def pair(
+        self,
+        scale: int,
+        hr_spp: int = 1,
+        lr_spp: int | None = None,
+        lr_filter: analytic.Footprint | None = None,
+        hr_filter: analytic.Footprint | None = None,
+        lr_scene: analytic.Scene | None = None,
+    ) -> Pair:
+        """Render a pair.
+
+        Args:
+            lr_spp: spp of the LRHS; by default one for every HRLS pixel.
+            lr_filter: pixel filter of the LRHS; by default a box, as that of the HRLS.
+            lr_scene: what the LRHS shows, if it is another scene.
+        """
+        low_noise, high_noise = seeded(self.name, "LRHS", scale), seeded(self.name, "HRLS")
+        low_scene, low_spp = lr_scene or self.scene, lr_spp or scale**2
+        low = analytic.render(low_scene, low_spp, low_noise, footprint=lr_filter, scale=scale)
+        high = analytic.render(self.scene, hr_spp, high_noise, footprint=hr_filter)
+        return Pair(low, high, analytic.reference(self.scene, hr_filter))
+
+
+def seeded(*key: object) -> np.random.Generator:
+    """Return a random generator that is different for every key and the same in every run."""
+    return np.random.default_rng(zlib.crc32(repr(key).encode()))
+
+
+@cache
+def room(size: int) -> Base:
+    """Return the scene that most groups disturb."""
+    return Base("room", analytic.room(size))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,26 +114,19 @@ def with_pixels(render: Render, value: float, share: float, layers: tuple[str, .
     return changed(render, **result)
 
 
-def mean_light(pair: Pair) -> float:
-    return float(pair.reference.mean())
-
-
-# Groups for any base
-
-
-def fireflies(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale)
+def fireflies(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale)
     for value in (1e3, 1e6):
-        hot = value * mean_light(clean)
+        hot = value * float(clean.reference.mean())
         lobes = (RGB, SPECULAR)
         hr, lr = with_pixels(clean.hr, hot, 1e-3, lobes), with_pixels(clean.lr, hot, 1e-3)
-        size = f"{value:.0e}".replace("e+0", "e")
-        yield Case(f"0.1 % of the HRLS, {size} times the mean", Pair(clean.lr, hr, clean.reference), clean)
-        yield Case(f"0.1 % of the LRHS, {size} times the mean", Pair(lr, clean.hr, clean.reference), clean)
+        times = f"{value:.0e}".replace("e+0", "e")
+        yield Case(f"0.1 % of the HRLS, {times} times the mean", Pair(clean.lr, hr, clean.reference), clean)
+        yield Case(f"0.1 % of the LRHS, {times} times the mean", Pair(lr, clean.hr, clean.reference), clean)
 
 
-def broken_values(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale)
+def broken_values(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale)
     every = (RGB, *OPTIONAL_FEATURES)
     for name, value in (("NaN", np.nan), ("Inf", np.inf), ("-Inf", -np.inf), ("-1", -1.0)):
         hr = with_pixels(clean.hr, value, 1e-3, every)
@@ -93,16 +141,16 @@ def broken_values(base: Base, scale: int) -> Iterator[Case]:
     yield Case("a bucket of the HRLS all NaN", Pair(clean.lr, changed(clean.hr, **holed), clean.reference), clean)
 
 
-def exposure(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale)
+def exposure(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale)
     for stops in (-10, -5, 5, 10):
         yield Case(f"2^{stops}", scaled(clean, 2.0**stops), clean, factor=2.0**stops)
 
 
-def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
+def hot_pixel(size: int, scale: int) -> Iterator[Case]:
     """Yield pairs with one bright pixel. In ``clean`` it is one pixel further left."""
-    clean = base.pair(scale)
-    value = 1e4 * mean_light(clean)
+    clean = room(size).pair(scale)
+    value = 1e4 * float(clean.reference.mean())
 
     def at(render: Render, column: int) -> Render:
         rgb = render.layers[RGB].copy()
@@ -122,16 +170,16 @@ def hot_pixel(base: Base, scale: int) -> Iterator[Case]:
     )
 
 
-def layers(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale, 4)  # 4 spp: with 1 there is no variance to remove
+def layers(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale, 4)  # 4 spp: with 1 there is no variance to remove
     for name in OPTIONAL_FEATURES:
         yield Case(f"no {name}", Pair(clean.lr, changed(clean.hr, **{name: None}), clean.reference), clean)
     bare = changed(clean.hr, **dict.fromkeys(OPTIONAL_FEATURES))
     yield Case("none at all", Pair(clean.lr, bare, clean.reference), clean)
 
 
-def garbage(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale, 4)
+def garbage(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale, 4)
     have = clean.hr.layers
     rng = seeded("garbage")
     noise = rng.random(have[RGB].shape, dtype=np.float32)
@@ -149,8 +197,8 @@ def garbage(base: Base, scale: int) -> Iterator[Case]:
         yield Case(name, Pair(clean.lr, changed(clean.hr, **layers), clean.reference), clean)
 
 
-def variance(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale, 4)
+def variance(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale, 4)
     true = clean.hr.layers[VARIANCE]
     for name, values in {
         "constant": np.full_like(true, true.mean()),
@@ -162,8 +210,8 @@ def variance(base: Base, scale: int) -> Iterator[Case]:
         yield Case(name, Pair(clean.lr, changed(clean.hr, variance=values), clean.reference), clean)
 
 
-def unusual_spp(base: Base, scale: int) -> Iterator[Case]:
-    clean = base.pair(scale)
+def unusual_spp(size: int, scale: int) -> Iterator[Case]:
+    clean = room(size).pair(scale)
     for name, hr_spp, lr_spp in (
         ("LRHS 2", 1, 2),
         ("HRLS 8, LRHS 2", 8, 2),
@@ -171,16 +219,17 @@ def unusual_spp(base: Base, scale: int) -> Iterator[Case]:
         ("HRLS 64, LRHS 2", 64, 2),
         ("LRHS 1024", 1, 1024),
     ):
-        yield Case(name, base.pair(scale, hr_spp, lr_spp), clean)
+        yield Case(name, room(size).pair(scale, hr_spp, lr_spp), clean)
 
 
-def footprints(base: Base, scale: int) -> Iterator[Case]:
-    yield Case("point: nearest-neighbour LRHS", base.pair(scale, nearest=True), base.pair(scale))
+def footprints(size: int, scale: int) -> Iterator[Case]:
+    base = room(size)
+    yield Case("point: nearest-neighbour LRHS", base.pair(scale, lr_filter=analytic.point(scale)), base.pair(scale))
 
 
-def overflow(base: Base, scale: int) -> Iterator[Case]:
+def overflow(size: int, scale: int) -> Iterator[Case]:
     """Yield light beyond 65504, the largest half float."""
-    clean = base.pair(scale)
+    clean = room(size).pair(scale)
     bright = scaled(clean, 4 * MAX_RADIANCE / float(np.quantile(clean.reference, 0.999)))
     with np.errstate(over="ignore"):
         lr, hr = (
@@ -189,29 +238,6 @@ def overflow(base: Base, scale: int) -> Iterator[Case]:
         )
     truth = np.minimum(bright.reference, MAX_RADIANCE)  # the largest value that such a file can hold
     yield Case("a frame that reaches 4 times the largest half", Pair(lr, hr, truth), Pair(bright.lr, bright.hr, truth))
-
-
-ANYWHERE: dict[str, Callable[[Base, int], Iterator[Case]]] = {
-    "fireflies": fireflies,
-    "NaN, Inf, negative": broken_values,
-    "exposure": exposure,
-    "a hot pixel moves": hot_pixel,
-    "missing layers": layers,
-    "garbage layers": garbage,
-    "wrong variance": variance,
-    "spp outside training": unusual_spp,
-    "pixel footprint": footprints,
-    "16-bit overflow": overflow,
-}
-
-
-# Groups with scenes of their own
-
-
-@cache
-def room(size: int) -> Base:
-    """Return the analytic base. The groups for any base use it, too."""
-    return Base("room", analytic.room(size))
 
 
 def lights(size: int, scale: int) -> Iterator[Case]:
@@ -253,9 +279,9 @@ def filters(size: int, scale: int) -> Iterator[Case]:
     base = room(size)
     clean = base.pair(scale)
     wide, low = analytic.blackman_harris(), analytic.blackman_harris(scale)
-    yield Case("Blackman-Harris in both", base.make(scale, hr_filter=wide, lr_filter=low), clean)
-    yield Case("Blackman-Harris LRHS, box HRLS", base.make(scale, lr_filter=low), clean)
-    yield Case("box LRHS, Blackman-Harris HRLS", base.make(scale, hr_filter=wide), clean)
+    yield Case("Blackman-Harris in both", base.pair(scale, hr_filter=wide, lr_filter=low), clean)
+    yield Case("Blackman-Harris LRHS, box HRLS", base.pair(scale, lr_filter=low), clean)
+    yield Case("box LRHS, Blackman-Harris HRLS", base.pair(scale, hr_filter=wide), clean)
 
 
 def disagreement(size: int, scale: int) -> Iterator[Case]:
@@ -265,19 +291,29 @@ def disagreement(size: int, scale: int) -> Iterator[Case]:
     hairs = analytic.hairy(size)
     assert hairs.front is not None and hairs.coverage is not None
     stranger = analytic.Scene(*(part[::-1, ::-1] for part in (hairs.back, hairs.front, hairs.coverage)))
-    yield Case("another scene", base.make(scale, lr_scene=stranger), clean)
+    yield Case("another scene", base.pair(scale, lr_scene=stranger), clean)
     ball = analytic.room(size, ball=(0.41, 0.5))
-    yield Case("another frame: the ball 6 % further", base.make(scale, lr_scene=ball), clean)
+    yield Case("another frame: the ball 6 % further", base.pair(scale, lr_scene=ball), clean)
     for factor in (0.25, 0.67, 1.5, 4.0):
         lr = changed(clean.lr, rgb=clean.lr.layers[RGB] * np.float32(factor))
         yield Case(f"LRHS {factor:g} times as bright", Pair(lr, clean.hr, clean.reference), clean)
     for pixels in sorted({1, 2, 3, scale, 2 * scale, 3 * scale}):
         moved = analytic.moved(base.scene, pixels, pixels)
         unit = f"{pixels} HRLS pixel{'s' * (pixels > 1)}"
-        yield Case(f"shifted by {unit}, x and y", base.make(scale, lr_scene=moved), clean)
+        yield Case(f"shifted by {unit}, x and y", base.pair(scale, lr_scene=moved), clean)
 
 
-MADE: dict[str, Callable[[int, int], Iterator[Case]]] = {
+GROUPS: dict[str, Callable[[int, int], Iterator[Case]]] = {
+    "fireflies": fireflies,
+    "NaN, Inf, negative": broken_values,
+    "exposure": exposure,
+    "a hot pixel moves": hot_pixel,
+    "missing layers": layers,
+    "garbage layers": garbage,
+    "wrong variance": variance,
+    "spp outside training": unusual_spp,
+    "pixel footprint": footprints,
+    "16-bit overflow": overflow,
     "lights and emitters": lights,
     "near-black": dark,
     "rare light": rare_light,
@@ -286,3 +322,4 @@ MADE: dict[str, Callable[[int, int], Iterator[Case]]] = {
     "hair, glass": detail,
     DISAGREE: disagreement,
 }
+"""A group's name -> its cases, by the side of the frame in pixels and the scale."""

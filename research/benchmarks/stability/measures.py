@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -15,9 +15,13 @@ from oiio_msspl.image.arrays import Array, repair
 from oiio_msspl.image.colour import luminance
 from oiio_msspl.image.metrics import psnr, relmse_map
 from oiio_msspl.model.encoding import KEY, find_exposure
-from research.benchmarks.stability.bases import Pair
-from research.benchmarks.stability.cases import DISAGREE, Case
+from research.benchmarks import results
+from research.benchmarks.results import Row
+from research.benchmarks.stability.cases import DISAGREE, Case, Pair
 
+#: Columns of the table: what tells its rows apart, and figures.
+KEYS = ("scale", "group", "case", "method")
+COLUMNS = ("psnr", "cost", "range", "holes", "stamps")
 #: Share of pixels that the trimmed RelMSE leaves out: the worst ones.
 TRIMMED = 1e-4
 #: A result should stay in the range of the inputs within this many pixels to each side. Our networks average 10 x 10
@@ -61,17 +65,13 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
     truth = pair.reference
     grey = np.float32(find_exposure(truth))  # the scores are made for exposed pictures
     floor = np.float32(FLOOR * KEY) / grey
-    finite = bool(np.isfinite(image).all())
     low, high = input_range(pair)
     low = np.minimum(low, window(truth, HRLS_REACH, np.minimum))
     high = np.maximum(high, window(truth, HRLS_REACH, np.maximum))
     beyond = np.maximum((image + floor) / (high + floor), (low + floor) / (np.maximum(image, 0) + floor))
-    brightest = window(truth, HRLS_REACH, np.maximum)
     errors = relmse_map(image * grey, truth * grey).mean(axis=-1)
     row: dict[str, Any] = {
-        "finite": finite,
-        "worst_pixel": float(((image + floor) / (brightest + floor)).max()),
-        "relmse": float(errors.mean()),
+        "finite": bool(np.isfinite(image).all()) and math.isfinite(errors.mean()),
         "relmse_trimmed": trimmed(errors),
         "relmse_enlarged": trimmed(relmse_map(enlarged * grey, truth * grey).mean(axis=-1)),
         "psnr": psnr(image * grey, truth * grey),
@@ -95,7 +95,7 @@ def measure(case: Case, image: Array, clean: Array | None, enlarged: Array, warn
 
 def verdict(row: dict[str, Any]) -> tuple[str, str]:
     """Return "holds", "suffers" or "fails", and a sentence, from the figures of :func:`measure` and the ``group``."""
-    if not row["finite"] or not math.isfinite(row["relmse"]):
+    if not row["finite"]:
         return "fails", "NaN or Inf comes out."
     faults = []
     if row["range"] > EXCESS:
@@ -120,6 +120,16 @@ def verdict(row: dict[str, Any]) -> tuple[str, str]:
     if row["warnings"] or silent:
         text += "; the tool warns" if row["warnings"] else "; nothing is said"
     return "fails" if worse or silent else "suffers" if faults else "holds", text[0].upper() + text[1:] + "."
+
+
+def judged(measured: Sequence[dict[str, Any]]) -> list[Row]:
+    """Return the table's rows: `KEYS`, `COLUMNS`, ``verdict`` and ``sentence``."""
+    rows = []
+    for figures in measured:
+        row = {key: figures[key] for key in (*KEYS, *COLUMNS) if key in figures} | results.model_of(figures["method"])
+        row["verdict"], row["sentence"] = verdict(figures)
+        rows.append(row)
+    return rows
 
 
 def holes(image: Array, truth: Array, floor: float, scale: int) -> NDArray[np.bool_]:
@@ -172,10 +182,6 @@ def trimmed(errors: NDArray[np.float64]) -> float:
     return float(np.partition(errors.ravel(), kept - 1)[:kept].mean())
 
 
-def repaired(values: Array) -> Array:
-    return repair(values)[0]
-
-
 def window(
     values: NDArray[Any], reach: int, extreme: Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 ) -> NDArray[Any]:
@@ -191,7 +197,7 @@ def window(
 
 def input_range(pair: Pair) -> tuple[Array, Array]:
     """Return the smallest and largest value of both renders around every pixel, for each channel (h, w, 3)."""
-    low, high = repaired(pair.lr.layers[RGB]), repaired(pair.hr.layers[RGB])
+    low, high = (repair(render.layers[RGB])[0] for render in (pair.lr, pair.hr))
     s = pair.scale
     result = []
     for extreme in (np.minimum, np.maximum):

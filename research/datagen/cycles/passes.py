@@ -2,9 +2,6 @@
 """Pairs and references with light groups and all component passes, for :mod:`research.benchmarks.passes`.
 
     python -m research.datagen.cycles.passes PASSES
-    python -m research.datagen.cycles.passes FRAMES --seeds 10121 --size 1920x1080 --reference 0
-
-The second call renders pairs of real size for :mod:`research.benchmarks.runtime`.
 
 Of every seed a folder ``cycles_SEED_FILTER`` is written, with the files that :mod:`research.benchmarks.render.passes`
 describes:

@@ -58,8 +58,6 @@ def test_a_mean_is_as_old_as_its_oldest_row():
 
 @pytest.mark.parametrize("path", sorted(results.FOLDER.glob("*.csv")), ids=lambda path: path.stem)
 def test_every_row_says_what_it_was_measured_with(path):
-    if "training" in path.stem:
-        return  # the logs of training
     for row in results.read(path):
         assert "version" in row and "date" in row
         assert ("model" in row) == ("digest" in row)
@@ -138,9 +136,7 @@ def test_a_finding_that_the_measures_dispute_is_no_agreement():
     assert paper.verdict(rows((1, 0.5), (2, 0.4))) == "agrees"
     assert paper.verdict(rows((1, 0.5), (2, 0.6))) == "PSNR and RelMSE disagree"
     assert paper.verdict(rows((2, 0.5), (1, 0.6))) == "**differs**"
-    assert paper.verdict([{"psnr": 1}, {"psnr": 2}]) == "agrees"
     assert "| PSNR and RelMSE disagree |" in paper.findings()
-    assert "## Table 6" in paper.page()
 
 
 def job(log, name):

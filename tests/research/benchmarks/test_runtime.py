@@ -25,7 +25,7 @@ def test_whole_commands_read_the_same_pair(monkeypatch):
         return {name: [RUN] * rounds for name in jobs}
 
     monkeypatch.setattr(timer, "in_turn", in_turn)
-    args = Namespace(size=(64, 32), scale=2, quality=["fast", "best", "paper"], without_oidn=False, rounds=3)
+    args = Namespace(size=(64, 32), scale=2, quality=["fast", "best", "paper"], rounds=3)
     rows = runtime.time_command(args)
     assert list(given) == ["joint-small-x2", "joint-large-x2", "paper-x2", runtime.OIDN_PREFILTERED]
     for name, quality in zip(given, args.quality, strict=False):
@@ -46,9 +46,3 @@ def test_oidn_denoises_a_file_as_it_is_recommended(tmp_path):
     with OpenEXR.File(str(tmp_path / "out.exr")) as file:
         written = file.channels()["RGB"].pixels
     np.testing.assert_allclose(written, np.maximum(expected, 0), rtol=2e-3, atol=1e-4)
-
-
-def test_light_groups_sum_to_the_beauty(tmp_path):
-    _, high = runtime.write_pair(tmp_path, 64, 48, 2, 3)
-    (groups,) = map_render(open_exr(high)).additive_sets
-    assert len(groups.layers) == 3

@@ -6,10 +6,15 @@ import math
 import numpy as np
 import pytest
 
+from research.benchmarks.shots import methods
 from research.benchmarks.shots.measures import blur, flicker, psnr, relmse, warped
-from tests.conftest import picture
+from research.benchmarks.shots.moving_wall import STEP, clean_frame, write_shot
+from research.benchmarks.shots.sequence import load, without_vectors
+from tests.conftest import noisy, picture, rgb, write_exr
+from tests.moving_plane import layer
 
 SIGMA = 0.02
+FRAMES, WIDTH, HEIGHT = 3, 96, 64
 
 
 def still(frames=6, height=96, width=128):
@@ -73,3 +78,43 @@ def test_warping_brings_the_next_frame_of_a_pan_to_its_place():
     moving = panned(step=3)
     vectors = np.broadcast_to(np.float32((-3, 0)), (96, 128, 2))
     assert warped(moving[1], vectors)[:, 3:] == pytest.approx(moving[0][:, 3:], abs=1e-6)
+
+
+@pytest.fixture
+def sequence(tmp_path):
+    """A wall past which the camera moves. Its full-resolution renders have 2 spp."""
+    folder = tmp_path / "wall/pan"
+    for scale in methods.SCALES:
+        shot = folder / f"x{scale}"
+        shot.mkdir(parents=True)
+        write_shot(shot, FRAMES, WIDTH, HEIGHT, scale)
+        for path in shot.glob("*/*.exr"):
+            path.rename(folder / path.name.replace("lr", f"lr_x{scale}"))
+    steps = np.full((HEIGHT, WIDTH, 2), (STEP, 0), np.float32)
+    mask = {f"{name}.Y": np.zeros((HEIGHT, WIDTH), np.float32) for name in ("moves", "reflects")}
+    mask |= layer("motionBack", steps) | layer("motionFore", -steps)
+    for number in range(1, FRAMES + 1):
+        _, (clean,) = clean_frame(number, FRAMES, WIDTH, HEIGHT, 0)
+        images = {"full": noisy(clean, 2, number), "ref_a": clean, "ref_b": clean}
+        for name, channels in {"mask": mask, **{name: rgb(image) for name, image in images.items()}}.items():
+            write_exr(folder / f"{name}.{number:04d}.exr", channels)
+    return load(folder)
+
+
+def test_frames_of_another_program_are_averaged_along_the_motion(sequence, monkeypatch):
+    """A denoiser that changes nothing returns the full-resolution render, or its mean with those of its neighbours."""
+    monkeypatch.setattr(methods, "oidn_prefiltered", lambda render: render.read(render.data_window, ["rgb"])["rgb"])
+    made = list(methods.all_methods(sequence, pattern="OIDN prefiltered*"))
+    assert [(m.method, m.scale) for m in made] == [(methods.OIDN_BEST, 1)] + [
+        (methods.OIDN_NEIGHBOURS, s) for s in (2, 4)
+    ]
+    single, *averaged = ((m.images - sequence.truth[0])[:, :, STEP * FRAMES : -STEP * FRAMES] for m in made)
+    for errors in averaged:
+        assert np.square(errors).mean() < 0.5 * np.square(single).mean()
+    assert not made[0].motion and "motionBack" in made[1].motion
+
+
+def test_a_sequence_without_vectors_has_its_other_files(sequence, tmp_path):
+    bare = without_vectors(sequence, tmp_path / "bare")
+    assert {path.name for path in bare.folder.iterdir()} == {path.name for path in sequence.folder.iterdir()}
+    assert list(load(bare.folder).masks) == list(sequence.masks)

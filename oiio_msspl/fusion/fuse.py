@@ -105,6 +105,7 @@ def fuse(
                     render.unload()
                 if progress is not None:
                     progress(task.number, task.count)
+                del task  # or its memory would be held while the next one is fused
         if frame.tiles > 1:
             session.release_memory()  # to check a large frame needs memory, too
         frame.lrhs_luminance, frame.hrls_luminance = bounded_luminance(pair.exact_lrhs_rgb()), averages.rgb

@@ -77,6 +77,7 @@ def fuse_tiles(tasks: Iterable[TileTask], session: Session) -> Iterator[TileTask
     for task in one_ahead(tasks):
         _fuse_tile(task, session)
         yield task
+        del task  # or its memory would be held while the next one is fused
 
 
 def _fuse_tile(task: TileTask, session: Session) -> None:
@@ -180,5 +181,7 @@ def _fuse_layers(
 
     for task in fuse_tiles(tasks(), layer_session):
         unload(task.result.rgb)
-        if task.number == task.count:
-            yield task.result.rgb
+        finished = task.result.rgb if task.number == task.count else None
+        del task  # or its memory would be held while the next one is fused
+        if finished is not None:
+            yield finished

@@ -44,10 +44,6 @@ class Projection:
     depth: str = ""
     """How depth is measured, along the ``axis`` or the ``ray``; empty if frames have positions."""
 
-    def matrix(self, render: MappedRender) -> NDArray[np.float32] | None:
-        """Return the matrix of a frame, for row vectors; None if its header has none."""
-        return _matrix(render, self.attribute)
-
     def project(self, positions: Array, matrix: NDArray[np.float32]) -> Array:
         """Project positions (..., 3) to pixels of the frame, x and y (..., 2); NaN behind the camera."""
         seen = positions @ matrix[:3] + matrix[3]
@@ -96,7 +92,7 @@ def camera_vectors(render: MappedRender, neighbour: MappedRender, projection: Pr
     window = render.data_window
     vectors = np.zeros((window.height, window.width, 2), np.float32)
     known = np.zeros(vectors.shape[:2], np.bool_)
-    here, there = projection.matrix(render), projection.matrix(neighbour)
+    here, there = (_matrix(frame, projection.attribute) for frame in (render, neighbour))
     positions = _positions(render, projection)
     if here is None or there is None or positions is None:
         return vectors, known
@@ -162,7 +158,7 @@ def _positions(render: MappedRender, projection: Projection) -> Array | None:
     if not projection.depth:
         return render.file.read(render.motion.position, window) if render.motion.position else None
     attribute = next((key for key in render.metadata if key.lower() in ("worldtocamera", "nl")), "")
-    screen, camera = projection.matrix(render), _matrix(render, attribute)
+    screen, camera = _matrix(render, projection.attribute), _matrix(render, attribute)
     if screen is None or camera is None or render.motion.depth is None or np.linalg.matrix_rank(camera) < 4:
         return None
     depth = render.file.read([render.motion.depth], window)

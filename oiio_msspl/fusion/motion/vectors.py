@@ -31,11 +31,6 @@ UNEVEN = 0.25
 INVERSION_ROUNDS, INVERSION_ERROR = 3, 0.5
 
 
-def channels_to_read(render: MappedRender, channels: tuple[Channel, Channel]) -> list[Channel]:
-    """Return the channels that :func:`judged_vectors` needs: two with vectors, and the alpha if there is one."""
-    return [*channels, *([render.alpha] if render.alpha else [])]
-
-
 def judged_vectors(
     render: MappedRender, stored: Array, channels: tuple[Channel, Channel], form: MotionFormat, pixels: ReadableRender
 ) -> tuple[Array, Mask]:
@@ -43,7 +38,7 @@ def judged_vectors(
 
     Args:
         render: the frame.
-        stored: :func:`channels_to_read` over its data window, (h, w, 2 or 3).
+        stored: these channels over its data window, and its alpha if it has one, (h, w, 2 or 3).
         channels: the two that hold the vectors.
         form: how they are stored.
         pixels: the frame's features.

@@ -74,38 +74,14 @@ class RenderPair:
         high = for_bands(alignment, lambda core, _: to_grid(alignment, self.read_hr_luminance(core), core))
         return bounded_luminance(lrhs), np.concatenate(high)
 
-    @cached_property
-    def hr_luminance(self) -> Array | None:
-        """Luminance (h, w) of the HRLS over its data window, finite and >= 0; None if its pixels are not in memory."""
-        if not isinstance(self.hr, Render):
-            return None
-        rgb = np.asarray(self.hr.layers[RGB])
-        result: Array = blank(rgb.shape[:2])
-
-        def work(rows: slice) -> None:
-            result[rows] = _luminance(rgb[rows])
-
-        for_row_blocks(work, len(rgb), rgb[0].size)
-        unload(result)
-        return result
-
     def read_hr_luminance(self, window: Window) -> Array:
         """Read the luminance (h, w) of the HRLS over a window that counts from the top left of the display window."""
-        if self.hr_luminance is None:
-            return _luminance(read(self.hr, window, [RGB])[RGB])
-        return np.asarray(self.hr_luminance)[window.slices(self.alignment.hr_data_window)]
-
-    @cached_property
-    def hr_is_finite(self) -> bool:
-        """Whether the HRLS is in memory and all its pixels are finite."""
-        return isinstance(self.hr, Render) and _finite_pixels(self.hr.layers) is None
+        return _luminance(read(self.hr, window, [RGB])[RGB])
 
     def unload(self) -> None:
         """Give the memory of pixels that wait in temporary files back to the system."""
         self.lr.unload()
         self.hr.unload()
-        if self.hr_luminance is not None:
-            unload(self.hr_luminance)
 
 
 def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
@@ -281,14 +257,11 @@ class _Nearest:
         window = neighbour.alignment.hr_data_window
         place = path.place_in(window)
         self._size = path.valid.shape
-        pixels = read(neighbour.hr, place, features)
-        if not neighbour.hr_is_finite:
-            pixels = _with_finite_passes(pixels)
+        pixels = _with_finite_passes(read(neighbour.hr, place, features))
         self._planes = {name: _flat_planes(values) for name, values in pixels.items()}
         #: Flat indices in the data window; these pixels begin at ``_first``.
         self._nearest, self._first = path.nearest, (place.y0 - window.y0) * window.width
-        self._finite = None if neighbour.hr_is_finite else _finite_pixels(pixels)
-        self._luminance = None if neighbour.hr_luminance is None else neighbour.read_hr_luminance(place).reshape(-1)
+        self._finite = _finite_pixels(pixels)
 
     def finite(self) -> Mask:
         """Return where all features are finite, (h, w)."""
@@ -301,10 +274,7 @@ class _Nearest:
         result = np.empty(self._size, np.float32)
 
         def work(rows: slice) -> None:
-            if self._luminance is None:
-                result[rows] = _luminance(self.pixels(RGB, rows.start, rows.stop))
-            else:
-                self._luminance.take(self._indices(rows.start, rows.stop), out=result[rows], mode="wrap")
+            result[rows] = _luminance(self.pixels(RGB, rows.start, rows.stop))
 
         for_row_blocks(work, self._size[0], 3 * self._size[1])
         return result

@@ -33,8 +33,7 @@ class ResultBand:
     """Some rows of a fused frame, to which those of neighbours are added.
 
     Args:
-        frame: the frame.
-        light: its light.
+        frame, light: the frame and its light.
         images: gets colour and alpha over the rows of ``core`` of its data window.
         core, area: see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
     """
@@ -42,8 +41,6 @@ class ResultBand:
     def __init__(self, frame: FusedFrame, light: Light, images: Images, core: Window, area: Window) -> None:
         self._light, self._area, self._window = light, area, frame.alignment.hr_data_window
         self._own = images_of(frame, area)
-        self._luminance = luminance(self._own[RGB])
-        #: The rows of ``core`` in the area.
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         target = {name: image[core.slices(self._window)] for name, image in images.items()}
         for name, image in target.items():
@@ -56,9 +53,10 @@ class ResultBand:
         """Add a fused neighbour that a path leads to."""
         alignment, area = self._light.alignment, self._area
         if path.hops == 1:
-            self._borders = self._find_borders(hop.there)
+            part, objects = area.slices(self._window), hop.there.moved_objects
+            self._borders = _union(_borders(hop.there, part), None if objects is None else grown(objects[part], 2))
         warped = _warp(hop.frame, path)
-        here, there = self._luminance, luminance(warped[RGB])
+        here, there = luminance(self._own[RGB]), luminance(warped[RGB])
         low = to_grid(alignment, np.where(path.valid, there, here), area)
         weight = from_grid(alignment, judge(low, low), area) * path.valid
         mixed = _union(self._borders, _borders_at(hop, path))
@@ -71,12 +69,6 @@ class ResultBand:
     def finish(self) -> Array:
         """Turn the sums into means. Return the number of frames, see :meth:`WeightedSum.divide`."""
         return self._sum.divide()
-
-    def _find_borders(self, motion: Motion) -> Mask | None:
-        """Find the pixels (h, w) of the area that may show two surfaces; None if nothing moves."""
-        part = self._area.slices(self._window)
-        moved = motion.moved_objects
-        return _union(_borders(motion, part), None if moved is None else grown(moved[part], 2))
 
 
 def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask | None:
@@ -91,9 +83,7 @@ def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask | None:
 
 def _borders(motion: Motion, part: tuple[slice, slice]) -> Mask | None:
     """Return the borders of surfaces in a part of a frame; None if nothing moves."""
-    if motion.vectors is None:
-        return None
-    return near_borders(motion.vectors[part], motion.tolerance) if motion.borders is None else motion.borders[part]
+    return None if motion.vectors is None else near_borders(motion.vectors[part], motion.tolerance)
 
 
 def _union(first: Mask | None, second: Mask | None) -> Mask | None:

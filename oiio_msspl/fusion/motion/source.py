@@ -30,7 +30,7 @@ from oiio_msspl.fusion.motion.flow import flow_vectors, has_optical_flow
 from oiio_msspl.fusion.motion.formats import FEWEST, MARGIN, FieldCheck, check_field, is_silent
 from oiio_msspl.fusion.motion.guides import TwoFrames, has_guide, open_frames, still_and_moved
 from oiio_msspl.fusion.motion.surfaces import other_surfaces
-from oiio_msspl.fusion.motion.vectors import invert, judged_vectors
+from oiio_msspl.fusion.motion.vectors import invert, judged_vectors, no_vectors
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.parallel import in_parallel
 
@@ -102,7 +102,7 @@ class MotionSource:
             if frame.rgb is None or neighbour.rgb is None:
                 raise ValueError("optical flow needs the fused beauty of both frames")
             return flow_vectors(frame.rgb, neighbour.rgb, frame.hr.data_window, neighbour.hr.data_window)
-        vectors, known = _nothing(frame.hr)
+        vectors, known = no_vectors(frame.hr)
         if self.kind == STATIC:
             known[:] = True
             for field in self.fields:  # the camera may move elsewhere in the shot, by vectors that nobody has verified
@@ -193,16 +193,11 @@ class MotionSource:
         if hop in frame.vectors:
             return frame.vectors[hop]
         one_way = replace(self, fields=tuple(field for field in self.fields if field.format.hop == hop))
-        return one_way._read_stored(frame.hr).get(hop) or _nothing(frame.hr)
+        return one_way._read_stored(frame.hr).get(hop) or no_vectors(frame.hr)
 
     def _read_stored(self, hr: MappedRender) -> dict[int, tuple[Array, Mask]]:
         channels = self.channels(hr)
         return self.vectors_of(hr, hr, hr.file.read(channels, hr.data_window)) if channels else {}
-
-
-def _nothing(render: MappedRender) -> tuple[Array, Mask]:
-    size = render.data_window.height, render.data_window.width
-    return np.zeros((*size, 2), np.float32), np.zeros(size, np.bool_)
 
 
 def find_motion(

@@ -7,8 +7,6 @@ surface in another frame. Pixels count in the display window, so frames may have
 
 from __future__ import annotations
 
-import functools
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -29,6 +27,12 @@ NO_MOTION = 1e-3
 UNEVEN = 0.25
 #: Rounds of the inversion, and how far from its pixel a round trip may end, in pixels.
 INVERSION_ROUNDS, INVERSION_ERROR = 3, 0.5
+
+
+def no_vectors(render: MappedRender) -> tuple[Array, Mask]:
+    """Return vectors (h, w, 2) over a data window that are all 0 and can't be believed, and where they can (h, w)."""
+    size = render.data_window.height, render.data_window.width
+    return np.zeros((*size, 2), np.float32), np.zeros(size, np.bool_)
 
 
 def judged_vectors(
@@ -104,11 +108,9 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
     Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
     surfaces do not move either.
     """
-    still = known & _all_planes(np.abs(vectors) < NO_MOTION)
-    surface = known
+    still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
     normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
-    if normal is not None:
-        surface = known & ~_all_planes(normal == 0)
+    surface = known if normal is None else known & (normal != 0).any(axis=-1)
     count = np.count_nonzero(surface)
     camera_stands = count > 0 and np.count_nonzero(still & surface) * 2 >= count
     return np.zeros_like(known) if camera_stands else still
@@ -128,11 +130,6 @@ def _uneven(vectors: Array) -> Mask:
             fast = np.abs(changes) > UNEVEN
             uneven[1:-1] |= fast[1:] & fast[:-1] & ((changes[1:] * changes[:-1].conj()).real > 0)
     return result
-
-
-def _all_planes(mask: Mask) -> Mask:
-    """Return where a mask (h, w, c) is true in all channels, several times as fast as ``all`` along the last axis."""
-    return functools.reduce(np.logical_and, np.moveaxis(mask, -1, 0))
 
 
 def invert(own: Array, other: Array, other_known: Mask, window: Window, other_window: Window) -> tuple[Array, Mask]:

@@ -25,11 +25,11 @@ from oiio_msspl.exr.render import ReadableRender, Render, Window
 from oiio_msspl.fusion.checks.pair import bounded_luminance
 from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_rows, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
-from oiio_msspl.fusion.neighbours.trust import Judge, Light, relative_difference
+from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.fusion.tiles.alignment import Alignment, align
 from oiio_msspl.fusion.tiles.features import RepairCounts, read_lrhs
-from oiio_msspl.image.arrays import Array, Mask, blank, repair, unload
+from oiio_msspl.image.arrays import Array, Mask, repair, unload
 from oiio_msspl.image.filters import grown, interpolate, means_around
 from oiio_msspl.image.parallel import for_row_blocks
 from oiio_msspl.image.sampling import nearest_indices, sample_cubic
@@ -41,7 +41,7 @@ COVERED = 0.9
 NEAR_OBJECTS, FEW = 8, 0.125
 #: Where another surface is near, a neighbour counts half if it is brighter or darker by this: the difference, divided
 #: by the root of the product. That is a factor of 5.
-OTHER_BRIGHTNESS = np.float32(4 / np.sqrt(5))
+OTHER_BRIGHTNESS = 4 / 5**0.5
 #: There, a neighbour counts less by this, too. It lacks some pixels, so the noise changes from pixel to pixel, and the
 #: network takes single noisy pixels for detail.
 BESIDE_HIDDEN = np.float32(0.7)
@@ -121,8 +121,7 @@ class RenderBand:
     """Some rows of both renders, to which those of neighbours are added.
 
     Args:
-        pair: the frame.
-        light: its light.
+        pair, light: the frame and its light.
         low: the LRHS's features over its data window; the rows of ``core`` are changed.
         high: gets the HRLS's features over the rows of ``core`` of its data window.
         core, area: see :func:`oiio_msspl.fusion.neighbours.bands.for_bands`.
@@ -132,14 +131,13 @@ class RenderBand:
         self, pair: RenderPair, light: Light, low: Features, high: Features, core: Window, area: Window
     ) -> None:
         self._pair, self._light, self._area = pair, light, area
-        self._features, self._low_features = list(high), list(low)
+        self._names, self._low_names = list(high), list(low)
         self._alignment = alignment = pair.alignment
         self._luminance = pair.read_hr_luminance(area)
         self._low_luminance = pair.luminances[0][grid_rows(alignment, area)]
-        #: The rows of ``core`` in the area.
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         self._high_images = {name: image[core.slices(alignment.hr_data_window)] for name, image in high.items()}
-        for name, values in read(pair.hr, core, self._features).items():
+        for name, values in read(pair.hr, core, self._names).items():
             self._high_images[name][:] = values
         self._high = WeightedSum(self._high_images)
         #: The grid pixels of the area, and those of ``core`` that the LRHS has: it may lack a row or a column.
@@ -151,7 +149,7 @@ class RenderBand:
     def add(self, hop: Hop[RenderPair], path: Path, judge: Judge) -> None:
         """Add the renders of a neighbour that a path leads to."""
         neighbour, alignment, area = hop.frame, self._alignment, self._area
-        high = _Nearest(neighbour, path, self._features)
+        high = _Nearest(neighbour, path, self._names)
         valid = high.finite() & path.valid
         share = to_grid(alignment, valid.astype(np.float32), area)
         low, usable = self._fetch_low(neighbour, path, valid, share)
@@ -161,17 +159,17 @@ class RenderBand:
         counted = judge(lrhs, hrls)
         if path.moved_objects is not None:
             counted = counted * self._far_from(path.moved_objects)
-        hidden = grown(share < 1, 2)
-        counted = counted * np.where(hidden, BESIDE_HIDDEN * self._as_bright(lrhs), np.float32(1))
+        bright = likeness(self._low_luminance, lrhs, self._light.darkest, OTHER_BRIGHTNESS, steep=True)
+        counted = counted * np.where(grown(share < 1, 2), BESIDE_HIDDEN * bright, np.float32(1))
         weight = from_grid(alignment, counted, area) * valid
-        first = self._rows.start
-        self._high.add(lambda name, rows: high.pixels(name, first + rows.start, first + rows.stop), weight[self._rows])
+        top = self._rows.start
+        self._high.add(lambda name, rows: high.pixels(name, top + rows.start, top + rows.stop), weight[self._rows])
         place = self._low_place.slices(self._grid)
         self._low.add(lambda name, rows: low[name][place][rows], (counted * usable)[place])
         neighbour.unload()
 
     def finish(self) -> Array:
-        """Turn the sums into means. Return the number of frames, see :meth:`WeightedSum.divide`."""
+        """Turn the sums into means, and return the number of frames."""
         self._low.divide()
         frames = self._high.divide()
         for image in self._high_images.values():
@@ -180,10 +178,7 @@ class RenderBand:
         return frames
 
     def _in_grid(self, lrhs: Array, usable: Mask, stretch: tuple[float, float]) -> Array:
-        """Bring the luminance (h, w) of a neighbour's LRHS to the places of the grid pixels.
-
-        Where it is not ``usable``, take the frame's own. ``stretch`` is :attr:`Alignment.stretch` of the neighbour.
-        """
+        """Bring the luminance (h, w) of an LRHS to the grid pixels; where it is not usable, take the frame's own."""
         if stretch != (1.0, 1.0):
             grid = self._grid
             columns, rows = (
@@ -197,27 +192,13 @@ class RenderBand:
         return np.where(usable, lrhs, self._low_luminance)
 
     def _far_from(self, moved_objects: Mask) -> Array:
-        """Return how much a neighbour counts around objects that are not followed: 0 to 1, (h, w) over the grid.
-
-        Beside them it does not count. Otherwise the noise would change from pixel to pixel, and the network takes
-        single noisy pixels for detail.
-        """
+        """Return how much a neighbour counts around objects that are not followed: 0 to 1, (h, w) over the grid."""
         share = to_grid(self._alignment, moved_objects.astype(np.float32), self._area)
         (near,) = means_around(share, [max(1, round(NEAR_OBJECTS / self._alignment.scale))])
         return np.maximum(1 - near / np.float32(FEW), 0)
 
-    def _as_bright(self, lrhs: Array) -> Array:
-        """Return how much a neighbour of this luminance counts where it may show another surface, too."""
-        difference = relative_difference(self._low_luminance, lrhs, self._light.darkest) / OTHER_BRIGHTNESS
-        with np.errstate(over="ignore"):
-            return np.asarray(1 / (1 + np.square(np.square(difference))), np.float32)
-
     def _fetch_low(self, neighbour: RenderPair, path: Path, valid: Mask, share: Array) -> tuple[Features, Mask]:
-        """Fetch a neighbour's LRHS over the grid pixels.
-
-        Returns:
-            Its features, and where they can be used: they lie in it, and enough HRLS pixels show the same surface.
-        """
+        """Fetch a neighbour's LRHS over the grid pixels, and where it shows enough of the same surface."""
         data = neighbour.alignment.lr_data_window
         x, y = self._low_positions(path, valid, share)
         usable = (x > data.x0 - 0.5) & (x < data.x1 - 0.5) & (y > data.y0 - 0.5) & (y < data.y1 - 0.5)
@@ -225,7 +206,7 @@ class RenderBand:
         x, y = np.clip(x, data.x0, data.x1 - 1), np.clip(y, data.y0, data.y1 - 1)
         top = max(int(np.floor(y.min())) - 1, data.y0)
         place = Window(data.x0, top, data.x1, min(int(np.floor(y.max())) + 3, data.y1))
-        pixels = _with_finite_passes(read(neighbour.lr, place, self._low_features))
+        pixels = _with_finite_passes(read(neighbour.lr, place, self._low_names))
         x, y = x - place.x0, y - place.y0
         light = (*RADIANCE_FEATURES, VARIANCE, "alpha")
         smooth = [name for name in pixels if path.x is not None and (name in light or is_light_of_pass(name))]

@@ -16,7 +16,7 @@ from oiio_msspl.fusion.motion.shot import Motion
 from oiio_msspl.fusion.motion.vectors import near_borders
 from oiio_msspl.fusion.neighbours.bands import from_grid, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path
-from oiio_msspl.fusion.neighbours.trust import Judge, Light, relative_difference
+from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
 from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.colour import luminance
@@ -61,13 +61,13 @@ class ResultBand:
         weight = from_grid(alignment, judge(low, low), area) * path.valid
         mixed = _union(self._borders, _borders_at(hop, path))
         if mixed is not None:
-            weight[mixed] *= _likeness(here[mixed], there[mixed], self._light.darkest)
+            weight[mixed] *= likeness(here[mixed], there[mixed], self._light.darkest, DIFFERENT_MIX)
         # A neighbour may have no alpha.
         inside = {name: warped.get(name, image)[self._rows] for name, image in self._own.items()}
         self._sum.add(lambda name, rows: inside[name][rows], weight[self._rows])
 
     def finish(self) -> Array:
-        """Turn the sums into means. Return the number of frames, see :meth:`WeightedSum.divide`."""
+        """Turn the sums into means, and return the number of frames."""
         return self._sum.divide()
 
 
@@ -88,13 +88,6 @@ def _borders(motion: Motion, part: tuple[slice, slice]) -> Mask | None:
 
 def _union(first: Mask | None, second: Mask | None) -> Mask | None:
     return first if second is None else second if first is None else first | second
-
-
-def _likeness(own: Array, other: Array, darkest: float) -> Array:
-    """Return how much pixels of these luminances count that may show other mixtures of two surfaces, from 0 to 1."""
-    difference = relative_difference(own, other, darkest)
-    with np.errstate(over="ignore"):
-        return np.asarray(1 / (1 + np.square(difference / np.float32(DIFFERENT_MIX))), np.float32)
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:

@@ -103,11 +103,9 @@ def decode(
 
 
 def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask:
-    """Find where a vector of 0 may mean that the renderer knows none.
-
-    Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of the
-    surfaces do not move either.
-    """
+    """Find where a vector of 0 may mean that the renderer knows none."""
+    # Cycles writes 0 for the sky, which moves with the camera like everything else. So zeros are believed if most of
+    # the surfaces do not move either.
     still = known & (np.abs(vectors) < NO_MOTION).all(axis=-1)
     normal = pixels.read(pixels.data_window, [NORMAL]).get(NORMAL) if still.any() else None
     surface = known if normal is None else known & (normal != 0).any(axis=-1)
@@ -117,11 +115,8 @@ def _doubtful_zeros(pixels: ReadableRender, vectors: Array, known: Mask) -> Mask
 
 
 def _uneven(vectors: Array) -> Mask:
-    """Find where vectors change by more than ``UNEVEN`` on both sides of a pixel, in one direction: things turn fast.
-
-    At the border of two surfaces, vectors change on one side. On a surface as thin as a pixel, they change and change
-    back.
-    """
+    """Find where vectors change by more than ``UNEVEN`` on both sides of a pixel, in one direction: turning things."""
+    # At the border of two surfaces, vectors change on one side. On one as thin as a pixel, they change and change back.
     motion = as_complex(vectors)
     result = np.zeros(motion.shape, np.bool_)
     for turned, uneven in ((motion, result), (motion.T, result.T)):
@@ -139,8 +134,8 @@ def invert(own: Array, other: Array, other_known: Mask, window: Window, other_wi
     finds it (Chen et al. 2008, "A simple fixed-point approach to invert a deformation field").
 
     Args:
-        own: this frame's vectors to its other neighbour (h, w, 2): where the movement is even, their opposite is right,
-            so the iteration starts there. Zeros do, too.
+        own: this frame's vectors to its other neighbour (h, w, 2). The iteration starts at their opposite, which is
+            right where the movement is even.
         other, other_known: vectors of the neighbour, and where they are known.
         window, other_window: data windows of this frame and of the neighbour.
 
@@ -194,9 +189,7 @@ def as_complex(vectors: Array) -> NDArray[np.complex64]:
 def sample_linear(image: Array, x: Array, y: Array) -> Array:
     """Interpolate an image (h, w, c) linearly at pixel positions; its edge is repeated outside."""
     height, width, channels = image.shape
-    # Two floats are fetched as one complex number, which takes half as long.
     pixels = np.ascontiguousarray(image).reshape(-1, channels)
-    pixels = pixels.view(np.complex64) if channels == 2 else pixels
     x, y = np.clip(x, 0, width - 1), np.clip(y, 0, height - 1)
     left, top = x.astype(np.int32), y.astype(np.int32)
     u, v = (x - left)[..., None], (y - top)[..., None]
@@ -208,8 +201,7 @@ def sample_linear(image: Array, x: Array, y: Array) -> Array:
     below = pixels.take(corner, 0)
     below += (pixels.take(corner + right, 0) - below) * u
     result += (below - result) * v
-    samples: Array = result.view(np.float32)
-    return samples
+    return result
 
 
 def nearest_values(image: NDArray[np.bool_], x: Array, y: Array) -> Mask:

@@ -33,15 +33,11 @@ def find_hops(
 
     Args:
         motion: between the frames.
-        number: of the frame.
-        neighbours: their numbers, the nearest first.
+        number, neighbours: the frame's number and those of its neighbours, the nearest first.
         frame_of: returns a frame, and its renders or fused picture. If it raises an InputError, the hops end with a
             warning, because the files are the reason, in every run. Any other error is passed on: it may not occur
             again, and the pixels would depend on it.
         warnings: gets a sentence for each problem.
-
-    Raises:
-        Exception: what ``frame_of`` raises.
     """
     hops: list[Hop[F]] = []
     own, picture = frame_of(number)

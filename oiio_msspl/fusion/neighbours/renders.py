@@ -21,9 +21,9 @@ from numpy.typing import NDArray
 
 from oiio_msspl.aovs.features import LIGHT_OF, RADIANCE_FEATURES, RGB, VARIANCE, is_light_of_pass
 from oiio_msspl.aovs.mapped_render import MappedRender
-from oiio_msspl.exr.render import ReadableRender, Render, Window
+from oiio_msspl.exr.render import ReadableRender, Window
 from oiio_msspl.fusion.checks.pair import bounded_luminance
-from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_rows, grid_window, to_grid
+from oiio_msspl.fusion.neighbours.bands import for_bands, from_grid, grid_window, to_grid
 from oiio_msspl.fusion.neighbours.path import Hop, Path, pixel_positions
 from oiio_msspl.fusion.neighbours.trust import Judge, Light, likeness
 from oiio_msspl.fusion.neighbours.weights import WeightedSum
@@ -106,15 +106,13 @@ def shared_noise(frame: RenderPair, neighbour: RenderPair) -> float:
 def lacking_passes(frame: RenderPair, neighbour: RenderPair) -> list[str]:
     """Return the names of the passes that a frame's renders have and those of a neighbour lack."""
     renders = (frame.lr, neighbour.lr), (frame.hr, neighbour.hr)
-    lacking = {name for own, other in renders for name in feature_names(own) - feature_names(other)}
-    return sorted(name.removeprefix(LIGHT_OF) for name in lacking if is_light_of_pass(name))
+    lacking = {name for own, other in renders for name in _passes(own) - _passes(other)}
+    return sorted(name.removeprefix(LIGHT_OF) for name in lacking)
 
 
-def feature_names(render: ReadableRender) -> set[str]:
-    """Return the features of a render in memory, or of a file whose layers are mapped."""
-    if isinstance(render, Render):
-        return set(render.layers)
-    return set(render.features) if isinstance(render, MappedRender) else set()
+def _passes(render: ReadableRender) -> set[str]:
+    names = render.features if isinstance(render, MappedRender) else getattr(render, "layers", ())
+    return {name for name in names if is_light_of_pass(name)}
 
 
 class RenderBand:
@@ -134,7 +132,6 @@ class RenderBand:
         self._names, self._low_names = list(high), list(low)
         self._alignment = alignment = pair.alignment
         self._luminance = pair.read_hr_luminance(area)
-        self._low_luminance = pair.luminances[0][grid_rows(alignment, area)]
         self._rows = slice(core.y0 - area.y0, core.y1 - area.y0)
         self._high_images = {name: image[core.slices(alignment.hr_data_window)] for name, image in high.items()}
         for name, values in read(pair.hr, core, self._names).items():
@@ -142,6 +139,7 @@ class RenderBand:
         self._high = WeightedSum(self._high_images)
         #: The grid pixels of the area, and those of ``core`` that the LRHS has: it may lack a row or a column.
         self._grid = grid_window(alignment, area)
+        self._low_luminance = pair.luminances[0][self._grid.slices(alignment.grid)]
         self._low_place = grid_window(alignment, core).intersect(alignment.lr_data_window)
         inside = self._low_place.slices(alignment.lr_data_window)
         self._low = WeightedSum({name: image[inside] for name, image in low.items()})

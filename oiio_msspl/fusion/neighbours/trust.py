@@ -13,7 +13,7 @@ from collections.abc import Callable
 import numpy as np
 
 from oiio_msspl.exr.render import Window
-from oiio_msspl.fusion.neighbours.bands import REACH, grid_rows
+from oiio_msspl.fusion.neighbours.bands import REACH, grid_window
 from oiio_msspl.fusion.tiles.alignment import Alignment
 from oiio_msspl.image.arrays import Array
 from oiio_msspl.image.filters import grown, max_3x3, means_around, sum_3x3
@@ -69,10 +69,11 @@ class Light:
         than a nearer one: a light that has changed there has changed in the farther one.
         """
         trust: Array | np.float32 = np.float32(1)
+        rows, _ = grid_window(self.alignment, area).slices(self.alignment.grid)
 
         def judge(lrhs: Array, hrls: Array) -> Array:
             nonlocal trust
-            trust = np.minimum(trust, self._trust(lrhs, hrls, grid_rows(self.alignment, area)))
+            trust = np.minimum(trust, self._trust(lrhs, hrls, rows))
             return trust
 
         return judge

@@ -185,21 +185,18 @@ def read_format(text: str) -> list[dict[str, Any]]:
     Raises:
         InputError: the text can't be read.
     """
-    return [_words(part, text) for part in re.split(r"\+(?=layer=)", text.strip())]
-
-
-def _words(part: str, text: str) -> dict[str, Any]:
-    """Read the words of one layer's format."""
-    words: dict[str, Any] = {}
-    for word in part.split(","):
-        key, equals, value = (piece.strip() for piece in word.partition("="))
-        problem = f"{key} is given twice" if key in words else _problem_of_word(key, equals, value)
-        if problem:
-            raise InputError(f"--motion-format {text!r}: {problem}; an example is layer=velocity,to=next,y=up,scale=2")
-        words[key] = True if key == "premultiplied" else float(value) if key in ("scale", "offset") else value
-    if "layer" not in words:
-        raise InputError(f"--motion-format {text!r}: starts with layer=NAME")
-    return words
+    layers: list[dict[str, Any]] = []
+    for part in re.split(r"\+(?=layer=)", text.strip()):
+        layers.append(words := {})
+        for word in part.split(","):
+            key, equals, value = (piece.strip() for piece in word.partition("="))
+            if problem := f"{key} is given twice" if key in words else _problem_of_word(key, equals, value):
+                example = "an example is layer=velocity,to=next,y=up,scale=2"
+                raise InputError(f"--motion-format {text!r}: {problem}; {example}")
+            words[key] = True if key == "premultiplied" else float(value) if key in ("scale", "offset") else value
+        if "layer" not in words:
+            raise InputError(f"--motion-format {text!r}: starts with layer=NAME")
+    return layers
 
 
 def _problem_of_word(key: str, equals: str, value: str) -> str:

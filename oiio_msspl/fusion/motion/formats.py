@@ -10,7 +10,6 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
@@ -18,7 +17,6 @@ from oiio_msspl.aovs.motion import CHOICES, MotionField, MotionFormat
 from oiio_msspl.fusion.motion.guides import POSITION, Guide, TwoFrames
 from oiio_msspl.fusion.motion.vectors import sample_linear
 from oiio_msspl.image.arrays import Array, Mask
-from oiio_msspl.image.parallel import in_parallel
 
 #: The best format must fit this many times as well as no motion, and as the runner-up.
 MARGIN = 1.5
@@ -196,12 +194,10 @@ class _Trial:
     """Compares the guides of two frames as formats bring them to each other."""
 
     def __init__(self, frames: TwoFrames, stored: tuple[Array, Array], offset: float) -> None:
-        self._frame = (frames.first.display_window.width, frames.first.display_window.height)
+        self._size = (frames.first.display_window.width, frames.first.display_window.height)
         self._reduction = frames.reduction
-        self.places: list[_Place] = []
-        for guide in frames.guides:
-            places = in_parallel(*(partial(_place, guide, frame, stored[frame], offset) for frame in (0, 1)))
-            self.places += [place for place in places if place]
+        places = (_place(guide, frame, stored[frame], offset) for guide in frames.guides for frame in (0, 1))
+        self.places = [place for place in places if place]
 
     def fits(self, formats: Iterable[MotionFormat]) -> dict[MotionFormat, float]:
         """Return the share of the differences without motion that each format leaves.
@@ -209,7 +205,7 @@ class _Trial:
         It is the geometric mean over the guides that some format explains.
         """
         # 1 in a unit may be 2 in another one.
-        formats = {(f.to, f.offset, *f.pixels_per_unit(*self._frame)): f for f in reversed(list(formats))}.values()
+        formats = {(f.to, f.offset, *f.pixels_per_unit(*self._size)): f for f in reversed(list(formats))}.values()
         left = {form: {p.guide.name: self._left(p, form) for p in self._of(form)} for form in formats}
         names = {name for shares in left.values() for name in shares}
         if not names:
@@ -263,7 +259,7 @@ class _Trial:
         return [place for place in self.places if place.frame == (0 if form.hop == 1 else 1)]
 
     def _vectors(self, place: _Place, form: MotionFormat) -> Array:
-        factors = np.array(form.pixels_per_unit(*self._frame), np.float32) / np.float32(self._reduction)
+        factors = np.array(form.pixels_per_unit(*self._size), np.float32) / np.float32(self._reduction)
         with np.errstate(over="ignore"):
             return np.asarray((place.stored - np.float32(form.offset)) * factors)
 

@@ -21,9 +21,6 @@ from oiio_msspl.image.arrays import Array, Mask
 from oiio_msspl.image.filters import box_downsample, sum_3x3
 from oiio_msspl.image.parallel import in_parallel
 
-#: Reads a window of a frame, (h, w, c).
-Reader = Callable[[Window], Array]
-
 POSITION = "position"
 #: Larger frames are averaged down to fewer pixels, which bounds memory.
 MAX_PIXELS = 1 << 22
@@ -123,7 +120,7 @@ def has_guide(render: MappedRender, name: str, *, moves: bool = True) -> bool:
     return formula is not None and not (moves and ("camera" in formula.note or "screen" in formula.note))
 
 
-def reduced(read: Reader, window: Window, reduction: int) -> Array:
+def reduced(read: Callable[[Window], Array], window: Window, reduction: int) -> Array:
     """Read a window in strips of rows and average it down. NaN and infinities become 0."""
     width, height = (size // reduction * reduction for size in (window.width, window.height))
     strips = []

@@ -67,29 +67,21 @@ class ShotMotion:
 
     def _read(self, first: MotionFrame, second: MotionFrame) -> tuple[Motion, Motion]:
         """Read the motion between two frames, forwards and backwards."""
-        source = self._source
-        stands = source.kind == STATIC and first.hr.data_window == second.hr.data_window
-        forth = source.read(first, second, 1)
-        back = forth if stands and not source.fields else source.read(second, first, -1)
-        moved = self._moved_objects(first, second, *forth)
-        # If the camera stands still, objects have moved at the same pixels of both frames.
-        same = stands and bool(forth[1].all() and back[1].all())
-        moved_back = moved if same or back is forth else self._moved_objects(second, first, *back)
-        motion = self._motion(*forth, moved)
-        return motion, motion if back is forth else self._motion(*back, moved_back)
+        source, forth = self._source, self._motion(first, second, 1)
+        # If nothing but objects moves, they have moved at the same pixels of both frames.
+        if source.kind == STATIC and not source.fields and first.hr.data_window == second.hr.data_window:
+            return forth, forth
+        return forth, self._motion(second, first, -1)
 
-    def _moved_objects(self, here: MotionFrame, there: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
-        """Find objects that have moved and that the vectors do not follow; None if there are none."""
+    def _motion(self, here: MotionFrame, there: MotionFrame, hop: int) -> Motion:
+        """Read the motion to a neighbour, and keep it as it waits for the frames that need it."""
+        vectors, known = self._source.read(here, there, hop)
         objects = self._source.moved_objects(here, there, vectors, known) if known.any() else None
-        return kept(objects) if objects is not None and objects.any() else None
-
-    def _motion(self, vectors: Array, known: Mask, moved_objects: Mask | None) -> Motion:
-        """Keep vectors as they wait for the frames that need them."""
-        if moved_objects is not None:
-            known &= ~moved_objects
+        if objects is not None:
+            known &= ~objects
         return Motion(
             kept(vectors) if vectors.any() else None,
             None if known.all() else kept(known),
-            moved_objects,
+            kept(objects) if objects is not None and objects.any() else None,
             ROUND_TRIP_OF_FLOW if self._source.kind == FLOW else ROUND_TRIP,
         )

@@ -79,23 +79,25 @@ class MotionSource:
         """Read where the surfaces of a frame are in a neighbour.
 
         Args:
-            frame: frame t.
-            neighbour: frame t + ``hop``.
+            frame, neighbour: frames t and t + ``hop``.
             hop: 1 or -1.
 
         Returns:
-            Vectors float32 (h, w, 2) over the data window of ``frame``: the surface that pixel (x, y) shows lies at
-            (x, y) + vector in the neighbour. In HRLS pixels, x to the right, y down, in coordinates of the display
-            window; the place may lie outside the neighbour. And a mask (h, w): where the vector can be believed. Other
-            vectors are 0. Unless the vectors were inverted, the mask does not know what hides a surface in the
-            neighbour.
+            Vectors float32 (h, w, 2) over the data window of ``frame``, in HRLS pixels, x to the right, y down: the
+            surface of pixel (x, y) lies at (x, y) + vector in the neighbour, or outside of it. And a mask (h, w): where
+            the vector can be believed. Other vectors are 0. Unless the vectors were inverted, the mask does not know
+            what hides a surface in the neighbour.
 
         Raises:
             InputError: pixels can't be decoded.
             ValueError: the source is optical flow, and a frame has no ``rgb``.
         """
         if self.kind == VECTORS:
-            return self._read_vectors(frame, neighbour, hop)
+            if any(field.format.hop == hop for field in self.fields):
+                return self._vectors(frame, hop)
+            vectors, _ = self._vectors(frame, -hop)
+            back, known = self._vectors(neighbour, -hop)
+            return invert(vectors, back, known, frame.hr.data_window, neighbour.hr.data_window)
         if self.projection:
             return camera_vectors(frame.hr, neighbour.hr, self.projection)
         if self.kind == FLOW:
@@ -126,9 +128,6 @@ class MotionSource:
 
     def moved_objects(self, frame: MotionFrame, neighbour: MotionFrame, vectors: Array, known: Mask) -> Mask | None:
         """Find where an object has moved that :meth:`read` does not follow, so that the frames show other surfaces.
-
-        Args:
-            vectors, known: what :meth:`read` returns.
 
         Returns:
             (h, w) over the data window of ``frame``. None if the source follows all objects.
@@ -165,8 +164,7 @@ class MotionSource:
         """Return the motion vectors of a frame, for :class:`MotionFrame`: by 1 to the next frame, -1 to the previous.
 
         Args:
-            hr: the frame.
-            pixels: its features.
+            hr, pixels: the frame and its features.
             stored: its :meth:`channels` (h, w, n).
         """
         layers = self._stored_in(hr)
@@ -180,13 +178,6 @@ class MotionSource:
         fields = self.fields if self.kind == VECTORS else ()
         layers = [(field, hr.motion.channels(field.layer, field.components)) for field in fields]
         return [(field, channels) for field, channels in layers if channels]
-
-    def _read_vectors(self, frame: MotionFrame, neighbour: MotionFrame, hop: int) -> tuple[Array, Mask]:
-        if any(field.format.hop == hop for field in self.fields):
-            return self._vectors(frame, hop)
-        own, _ = self._vectors(frame, -hop)
-        other, known = self._vectors(neighbour, -hop)
-        return invert(own, other, known, frame.hr.data_window, neighbour.hr.data_window)
 
     def _vectors(self, frame: MotionFrame, hop: int) -> tuple[Array, Mask]:
         """Return the vectors that a frame stores in one direction."""

@@ -47,21 +47,21 @@ class ResultBand:
             image[:] = self._own[name][self._rows]
         self._sum = WeightedSum(target)
         #: Where the frame may show two surfaces, by the motion to the nearest neighbour on a side.
-        self._borders: Mask | None = None
+        self._borders: Mask
 
     def add(self, hop: Hop[FusedFrame], path: Path, judge: Judge) -> None:
         """Add a fused neighbour that a path leads to."""
         alignment, area = self._light.alignment, self._area
         if path.hops == 1:
-            part, objects = area.slices(self._window), hop.there.moved_objects
-            self._borders = _union(_borders(hop.there, part), None if objects is None else grown(objects[part], 2))
+            self._borders = _borders(hop.there, self._window, area)
+            if hop.there.moved_objects is not None:
+                self._borders |= grown(hop.there.moved_objects[area.slices(self._window)], 2)
         warped = _warp(hop.frame, path)
         here, there = luminance(self._own[RGB]), luminance(warped[RGB])
         low = to_grid(alignment, np.where(path.valid, there, here), area)
         weight = from_grid(alignment, judge(low, low), area) * path.valid
-        mixed = _union(self._borders, _borders_at(hop, path))
-        if mixed is not None:
-            weight[mixed] *= likeness(here[mixed], there[mixed], self._light.darkest, DIFFERENT_MIX)
+        mixed = self._borders | _borders_at(hop, path)
+        weight[mixed] *= likeness(here[mixed], there[mixed], self._light.darkest, DIFFERENT_MIX)
         # A neighbour may have no alpha.
         inside = {name: warped.get(name, image)[self._rows] for name, image in self._own.items()}
         self._sum.add(lambda name, rows: inside[name][rows], weight[self._rows])
@@ -71,23 +71,21 @@ class ResultBand:
         return self._sum.divide()
 
 
-def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask | None:
-    """Find the pixels (h, w) that lead to pixels of a neighbour that may show two surfaces; None if nothing moves."""
+def _borders_at(hop: Hop[FusedFrame], path: Path) -> Mask:
+    """Find the pixels (h, w) that lead to pixels of a neighbour that may show two surfaces."""
     window = hop.frame.alignment.hr_data_window
     place = path.place_in(window)
-    borders = _borders(hop.back, place.slices(window))
-    if borders is None or path.nearest is None:
+    borders = _borders(hop.back, window, place)
+    if path.nearest is None:
         return borders
     return borders.reshape(-1).take(path.nearest - (place.y0 - window.y0) * window.width, mode="clip")
 
 
-def _borders(motion: Motion, part: tuple[slice, slice]) -> Mask | None:
-    """Return the borders of surfaces in a part of a frame; None if nothing moves."""
-    return None if motion.vectors is None else near_borders(motion.vectors[part], motion.tolerance)
-
-
-def _union(first: Mask | None, second: Mask | None) -> Mask | None:
-    return first if second is None else second if first is None else first | second
+def _borders(motion: Motion, window: Window, area: Window) -> Mask:
+    """Return the borders of surfaces (h, w) in an area of a frame."""
+    if motion.vectors is None:
+        return np.zeros((area.height, area.width), np.bool_)
+    return near_borders(motion.vectors[area.slices(window)], motion.tolerance)
 
 
 def _warp(frame: FusedFrame, path: Path) -> Images:

@@ -105,10 +105,8 @@ def _planes(image: Array) -> Array:
 
 
 def _roughness(planes: Array) -> Array:
-    """Return the usual difference of neighbouring pixels of one surface, mean of 3 x 3 pixels (h, w).
-
-    Of two neighbours on opposite sides, at least one lies on the surface of the pixel.
-    """
+    """Return the usual difference of neighbouring pixels of one surface, mean of 3 x 3 pixels (h, w)."""
+    # Of two neighbours on opposite sides, at least one lies on the surface of the pixel.
     total = np.zeros(planes.shape[1:], np.float32)
     for changes, sums in (
         (_distance(planes[:, 1:], planes[:, :-1]), total),
